@@ -13,7 +13,7 @@ from isocharge.cli.shared.options import parse_radius_mm, worker_count
 from isocharge.cli.shared.terminal import say
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT, FEW_ELECTRODES
 from isocharge.common.errors import InputError, IsochargeError
-from isocharge.simulate import Dataset, Film, Probe, Sensor, Sweep, noise_model, read_dataset, working_area
+from isocharge.simulate import Dataset, Film, Probe, Sensor, Sweep, read_dataset, working_area
 from isocharge.simulate.execution import dask_workers, local_workers
 from isocharge.simulate.sensor.probe import PROBE_HELP
 
@@ -61,7 +61,9 @@ def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tupl
     """
     if text != "auto":
         return parse_radius_mm(text)
-    from isocharge.simulate.identifiability.identification import map_to_search  # imports the solver
+    # imported late, because these imports load the solver and the noise levels
+    from isocharge.simulate import noise_model
+    from isocharge.simulate.identifiability.identification import map_to_search
 
     radii = []
     for probe in probes:

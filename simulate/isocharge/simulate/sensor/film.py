@@ -259,3 +259,11 @@ def check_range(what: str, value: float, allowed: tuple[float, float], unit: str
     expected = f"at least {low:g}" if high == math.inf else f"{low:g} to {high:g}"
     space = " " if unit else ""
     raise error(f"{what}: expected {expected}{space}{unit}, got {value:.6g}{space}{unit}{hint}")
+
+
+def increased(size: float, axis: float, addition: complex) -> tuple[float, float]:
+    """Add to a quantity size * exp(2 i axis), and return its new size and axis. The new size is not negative."""
+    if addition == 0.0:  # without rounding errors
+        return size, axis
+    total = cmath.rect(size, 2.0 * axis) + addition
+    return abs(total), 0.5 * cmath.phase(total)

@@ -11,7 +11,6 @@ itself. A property that depends on the direction has two components, the size of
 sine of twice the angle of its axis.
 """
 
-import cmath
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate.sensor.curved_probes import Circle
-from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.sensor.film import Film, increased
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.sensor import Calibration, Sensor
 
@@ -177,14 +176,6 @@ def _changed_mechanics(film: Film, value: Mapping[str, float]) -> Film:
         oval=oval,
         oval_axis=oval_axis,
     )
-
-
-def increased(size: float, axis: float, addition: complex) -> tuple[float, float]:
-    """Add to a quantity size * exp(2 i axis), and return its new size and axis. The new size is not negative."""
-    if addition == 0.0:  # without rounding errors
-        return size, axis
-    total = cmath.rect(size, 2.0 * axis) + addition
-    return abs(total), 0.5 * cmath.phase(total)
 
 
 @dataclass(frozen=True)

@@ -48,8 +48,7 @@ from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import Anisotropy, press_frame_anisotropy, side_force_unit
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, from_oval
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.sensor.film import Surface
-from isocharge.simulate.sensor.film_properties import increased
+from isocharge.simulate.sensor.film import Surface, increased
 from isocharge.simulate.solver.assembly import SolveTangent, assembly, factor_tangent
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
 
