@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from isocharge.common.errors import InputError, OutputError, cut, shown
-from isocharge.common.printable_text import is_printable, printable, printable_lines
+from isocharge.common.errors import InputError, OutputError, cut, is_printable, printable, printable_lines, shown
 from isocharge.common.toml_text import to_toml
 from kept import ROOT
 

@@ -6,8 +6,7 @@ import sys
 
 import pytest
 
-from isocharge.common.errors import MissingExtra
-from isocharge.common.extras import require
+from isocharge.common.errors import MissingExtra, require
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,7 @@ import typer
 
 from isocharge.cli.shared.lazy import LazyCommand, lazy_group
 from isocharge.cli.shared.terminal import open_closed_streams, say, show, warnings_to_stderr
-from isocharge.common.errors import InputError, IsochargeError
-from isocharge.common.extras import package_version
+from isocharge.common.errors import InputError, IsochargeError, package_version
 
 app = lazy_group(
     "Compute the position and the force of a contact on a piezoelectric tactile film from the charges of three to "

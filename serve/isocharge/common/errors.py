@@ -1,15 +1,75 @@
-"""The exceptions of isocharge.
+"""The exceptions of isocharge, the printable text of their messages, and imports that fail with advice.
 
-Each class also inherits from the built-in exception with the most similar meaning. A message states what was expected,
-what was given, where the error is, and what the user can do. `isocharge.cli.main` maps the exceptions to exit codes,
-which are 2 for wrong input and 1 for all other errors. `isocharge.serve.network.protocol.response` maps the exceptions
-to HTTP and gRPC statuses.
+Each exception also inherits from the built-in exception with the most similar meaning. A message states what was
+expected, what was given, where the error is, and what the user can do. `isocharge.cli.main` maps the exceptions to exit
+codes, which are 2 for wrong input and 1 for all other errors. `isocharge.serve.network.protocol.response` maps the
+exceptions to HTTP and gRPC statuses.
+
+A message may quote text from boards, files, models and recordings, which may contain characters that a terminal
+executes or hides. Examples are escape sequences that move the cursor or change the title of the window, marks that
+reverse the direction of writing, and characters without width. `printable` replaces such characters by the escape
+sequences that JSON uses, such as `\\u001b`. A text in JSON therefore remains valid JSON.
+
+If a package is not installed, an import within `require` fails with the command that installs the missing extra. The
+names of `lazy_names` are imported when they are used. A program that reads a dataset therefore does not wait for the
+import of the solver, a calibration does not wait for PyTorch, and a program that predicts contacts does not wait for
+the servers and the parsers of boards.
 """
 
-from collections.abc import Iterator
+import ast
+import json
+import pkgutil
+import re
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
+from importlib import import_module
+from typing import Any
 
-from isocharge.common.printable_text import printable, printable_lines
+INVISIBLE = re.compile("[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u3164\ufe00-\ufe0f\uffa0\U000e0100-\U000e01ef]")
+"""Invisible characters that `str.isprintable` accepts.
+
+These characters have the property Default_Ignorable_Code_Point (Unicode 15, DerivedCoreProperties.txt). They are
+letters or marks, and `str.isprintable` accepts all letters and marks.
+"""
+
+
+def is_printable(text: str) -> bool:
+    """Return whether all characters of a text are visible characters or blanks.
+
+    The result is False if the text contains a character that a terminal would execute or hide.
+    """
+    return text.isprintable() and INVISIBLE.search(text) is None
+
+
+def printable(text: str) -> str:
+    """Escape all characters of a text that a terminal would execute or hide, including line feeds.
+
+    Use this function for text that is inserted into a line, such as the name of a channel.
+
+    Example:
+        >>> print(printable("A\\x1b[2J\\u202e"))
+        A\\u001b[2J\\u202e
+    """
+    if is_printable(text):
+        return text
+    return "".join(character if is_printable(character) else _escape(character) for character in text)
+
+
+def printable_lines(text: str) -> str:
+    """Escape all characters of a text that a terminal would execute or hide, but keep the line feeds."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
+def _escape(character: str) -> str:
+    """Return the escape sequence that JSON uses for a character.
+
+    JSON escapes the code units of UTF-16. A character beyond U+FFFF has two code units, and therefore two sequences.
+    """
+    escaped = json.dumps(character)[1:-1]  # without the quotation marks
+    return f"\\u{ord(character):04x}" if escaped == character else escaped  # JSON does not escape U+007F
+
 
 MAX_VALUE_CHARACTERS = 200
 """Largest number of characters of a wrong value, or of a list of keys, in a message."""
@@ -191,3 +251,87 @@ def error_prefix(where: str, error_class: type[IsochargeError]) -> Iterator[None
         yield
     except error_class as error:
         raise error_class(f"{where}{error}") from error
+
+
+@contextmanager
+def require(*extras: str) -> Iterator[None]:
+    """If an import in the `with` block fails, raise an error with the command that installs the extras.
+
+    Args:
+        extras: Names of the extras in pyproject.toml. Without extras, no error is changed.
+
+    Raises:
+        MissingExtra: If an import in the block fails because a package other than isocharge is not installed. If an
+            import fails for any other reason, its error is not changed.
+
+    Example:
+        >>> with require("simulate"):
+        ...     from isocharge.simulate import load_sensor
+    """
+    try:
+        yield
+    except (ModuleNotFoundError, MissingExtra) as error:  # another `require` inside the block may raise MissingExtra
+        missing_module = error.name or ""
+        package = missing_module.partition(".")[0]  # for example "google" for the module "google.protobuf"
+        if not extras or package in ("", "isocharge"):
+            raise
+        raise MissingExtra(
+            f"this needs the package {package!r}, which is not installed; pip install 'isocharge[{','.join(extras)}]'",
+            name=package,
+        ) from error
+
+
+@cache
+def package_version() -> str:
+    """Return the version of isocharge from the metadata of the installed package.
+
+    The result is stored after the first call, because a busy server may have no file descriptor left for reading the
+    metadata again.
+    """
+    from importlib.metadata import version  # imported late, because the import is slow
+
+    return version("isocharge")
+
+
+def lazy_names(package: str, *extras: str) -> Callable[[str], Any]:
+    """Return a function that imports a public name of a package when the name is used for the first time.
+
+    The package assigns the function to the name `__getattr__`. Python calls a function of this name for each attribute
+    that the package does not contain. The modules of the names are stated once, as imports that only type checkers
+    execute:
+
+        if TYPE_CHECKING:
+            from isocharge.simulate.solver.press import press
+        else:
+            __getattr__ = lazy_names(__name__, "simulate")
+
+    Args:
+        package: Name of the package.
+        *extras: Extras of pyproject.toml that the package needs.
+    """
+
+    @cache
+    def modules() -> dict[str, str]:
+        """Return the module of each public name, from the imports in the source of the package."""
+        source = pkgutil.get_data(package, "__init__.py") or b""
+        imports = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ImportFrom)]
+        return {alias.name: node.module or "" for node in imports for alias in node.names}
+
+    def look_up(name: str) -> Any:
+        """Import a public name, and store it in the package, so that Python no longer calls this function for it.
+
+        Raises:
+            AttributeError: If the name is not public.
+            MissingExtra: If a package of the extra is not installed.
+        """
+        if name == "__version__":
+            return package_version()
+        namespace = sys.modules[package]
+        if name not in namespace.__all__:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        with require(*extras):
+            value = getattr(import_module(modules()[name]), name)
+        setattr(namespace, name, value)
+        return value
+
+    return look_up

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from isocharge.common.printable_text import printable
+from isocharge.common.errors import printable
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 """Key that needs no quotation marks."""

@@ -9,7 +9,7 @@ The packages are arranged in the order in which they process a frame. `serve/REA
 
 from typing import TYPE_CHECKING
 
-from isocharge.common.extras import lazy_names
+from isocharge.common.errors import lazy_names
 
 if TYPE_CHECKING:
     from isocharge.serve.examination.port_check import Examination, examine

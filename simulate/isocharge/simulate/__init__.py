@@ -13,7 +13,7 @@ Example:
 
 from typing import TYPE_CHECKING
 
-from isocharge.common.extras import lazy_names, require
+from isocharge.common.errors import lazy_names, require
 
 with require("simulate"):
     import scipy  # noqa: F401 (all modules need it; the error names the extra)

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from isocharge.common.extras import require
+from isocharge.common.errors import require
 from isocharge.common.files import new_folder, write_whole
 from isocharge.simulate.layout.design import Design
 from isocharge.simulate.plots.error_maps import error_maps_picture

@@ -22,8 +22,7 @@ from typing import Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
-from isocharge.common.errors import InputError, WorkersLost
-from isocharge.common.extras import require
+from isocharge.common.errors import InputError, WorkersLost, require
 
 Job = TypeVar("Job")
 

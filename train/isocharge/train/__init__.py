@@ -16,7 +16,7 @@ Example:
 
 from typing import TYPE_CHECKING
 
-from isocharge.common.extras import lazy_names, require
+from isocharge.common.errors import lazy_names, require
 
 with require("train"):
     import scipy  # noqa: F401 (all modules need it; the error names the extra)

@@ -7,8 +7,7 @@ import typer
 
 from isocharge.cli.shared.live_page import LiveOption
 from isocharge.cli.shared.terminal import say
-from isocharge.common.errors import InputError
-from isocharge.common.extras import require
+from isocharge.common.errors import InputError, require
 from isocharge.common.files import refuse_existing, write_whole
 
 

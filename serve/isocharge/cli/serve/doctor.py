@@ -11,9 +11,8 @@ from serial.tools import list_ports
 
 from isocharge.cli.shared.options import DeviceOption, JsonOption, ModelsOption, WaitOption
 from isocharge.cli.shared.terminal import say, show, show_json, show_result
-from isocharge.common.errors import InputError, IsochargeError
+from isocharge.common.errors import InputError, IsochargeError, printable
 from isocharge.common.files import as_output_errors, refuse_existing, write_whole
-from isocharge.common.printable_text import printable
 from isocharge.common.toml_text import to_toml
 from isocharge.serve import Examination, Port, Predictor, device_from_table, examine, load_device
 from isocharge.serve.examination.electrode_check import ElectrodeCheck, check_electrodes, corrected_table

@@ -20,8 +20,7 @@ from isocharge.cli.shared.live_page import (
     given_token,
 )
 from isocharge.cli.shared.terminal import announce, on_signal, unless_hung_up, write_stderr
-from isocharge.common.errors import IsochargeError
-from isocharge.common.extras import require
+from isocharge.common.errors import IsochargeError, require
 from isocharge.serve.network.address import Address, Tls, check_exposure
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.http import HttpServer

@@ -39,8 +39,7 @@ from isocharge.cli.shared.terminal import (
     until_stopped,
     write_stdout,
 )
-from isocharge.common.errors import InputError, shown
-from isocharge.common.printable_text import is_printable
+from isocharge.common.errors import InputError, is_printable, shown
 from isocharge.serve import (
     PredictionRecord,
     Predictor,

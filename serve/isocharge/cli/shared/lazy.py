@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from isocharge.common.extras import require
+from isocharge.common.errors import require
 
 DEFAULT_LIVE_ADDRESS = "127.0.0.1:8001"
 """Address of the live page if `--live` has no value."""

@@ -15,8 +15,7 @@ from msgspec import structs
 
 from isocharge.cli.shared.lazy import DEFAULT_LIVE_ADDRESS
 from isocharge.cli.shared.terminal import say, warnings_passed_to
-from isocharge.common.errors import InputError, shown
-from isocharge.common.extras import require
+from isocharge.common.errors import InputError, require, shown
 from isocharge.serve import PredictionRecord, Recorder, TouchStream
 from isocharge.serve.live.recorded_stream import RecordedStream
 from isocharge.serve.model.metadata import ModelMetadata

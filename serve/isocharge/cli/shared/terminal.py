@@ -23,7 +23,7 @@ from typing import Any
 
 import typer
 
-from isocharge.common.printable_text import printable, printable_lines
+from isocharge.common.errors import printable, printable_lines
 from isocharge.common.progress import Listener, listening
 
 STANDARD_DESCRIPTORS = (STDIN_FILENO, STDOUT_FILENO, STDERR_FILENO)

@@ -8,8 +8,7 @@ import numpy as np
 from msgspec import structs
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import ChargeError, shown
-from isocharge.common.printable_text import printable
+from isocharge.common.errors import ChargeError, printable, shown
 from isocharge.serve.examination.listening import Capture, ReceivedData
 from isocharge.serve.examination.press_detector import HeldPress
 from isocharge.serve.port.source import has_speed

@@ -14,8 +14,7 @@ import numpy as np
 from msgspec import structs
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import PressCheckError
-from isocharge.common.printable_text import printable
+from isocharge.common.errors import PressCheckError, printable
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.live.steady_press import PressWatch
 from isocharge.serve.live.stream import ReadingStream

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.common.printable_text import printable
+from isocharge.common.errors import printable
 from isocharge.serve.examination.board_health import (
     ChannelHealth,
     channel_count_sentences,

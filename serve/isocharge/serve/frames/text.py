@@ -28,7 +28,7 @@ bits, and a clock in s is assumed to be a time of day.
 from collections import deque
 from collections.abc import Mapping, Sequence
 
-from isocharge.common.printable_text import printable
+from isocharge.common.errors import printable
 from isocharge.serve.frames.frame import (
     SEQ,
     SEQ_MODULUS,

@@ -13,8 +13,7 @@ import numpy as np
 from msgspec import Meta, Struct, to_builtins
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import ModelError, shown
-from isocharge.common.printable_text import is_printable
+from isocharge.common.errors import ModelError, is_printable, shown
 from isocharge.common.structs import Finite, NotNegative, Positive, Settings, Text, WrongKey, convert, parse_json
 from isocharge.serve.model.model_search import ModelName
 

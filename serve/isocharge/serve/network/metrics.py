@@ -20,7 +20,7 @@ import onnxruntime as ort
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info, ProcessCollector
 from prometheus_client.metrics import MetricWrapperBase
 
-from isocharge.common.extras import package_version
+from isocharge.common.errors import package_version
 
 CONTENT_TYPE = b"text/plain; version=0.0.4; charset=utf-8"
 """Content type of the text format, which every version of Prometheus can read."""

@@ -15,7 +15,7 @@ import json
 import time
 from pathlib import Path
 
-from isocharge.common.extras import require
+from isocharge.common.errors import require
 from isocharge.common.files import as_output_errors
 from isocharge.serve.outputs.output import FileOutput
 from isocharge.serve.outputs.ros_messages import (

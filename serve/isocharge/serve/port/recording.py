@@ -24,9 +24,8 @@ from typing import Annotated, Any, NamedTuple, Self, TypeVar
 from msgspec import Meta, Struct, field
 from msgspec.json import encode
 
-from isocharge.common.errors import RecordingError, cut
+from isocharge.common.errors import RecordingError, cut, is_printable
 from isocharge.common.files import AtomicWriter, bounded_lines
-from isocharge.common.printable_text import is_printable
 from isocharge.common.progress import report
 from isocharge.common.structs import WrongKey, parse_json
 from isocharge.serve.model.model_search import ModelLabel

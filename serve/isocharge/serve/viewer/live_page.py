@@ -21,8 +21,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta, Struct
 
-from isocharge.common.errors import RequestError, UnknownPath, WrongMethod
-from isocharge.common.printable_text import is_printable
+from isocharge.common.errors import RequestError, UnknownPath, WrongMethod, is_printable
 from isocharge.common.structs import Finite, WrongKey, parse_json
 from isocharge.serve.flags import MEANINGS
 from isocharge.serve.network.address import Address, ServerLimits, Tls

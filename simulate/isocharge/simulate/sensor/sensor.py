@@ -14,8 +14,7 @@ import numpy as np
 import shapely
 
 from isocharge.common.arrays import Array, Complexes
-from isocharge.common.errors import SensorError, cut, shown
-from isocharge.common.printable_text import is_printable
+from isocharge.common.errors import SensorError, cut, is_printable, shown
 from isocharge.simulate.numerics.polygon import (
     area_of,
     is_convex,

@@ -8,7 +8,7 @@ Example:
     write_report(Path("report"), [(read_dataset(Path("presses")), find_model("three-25um-biaxial"))])
 """
 
-from isocharge.common.extras import require
+from isocharge.common.errors import require
 
 with require("train"):
     from isocharge.train.report.evaluation import QUICK, Settings

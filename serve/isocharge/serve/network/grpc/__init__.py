@@ -3,7 +3,7 @@
 May import: network.protocol, network.
 """
 
-from isocharge.common.extras import require
+from isocharge.common.errors import require
 
 with require("grpc"):
     from isocharge.serve.network.grpc.server import grpc_server

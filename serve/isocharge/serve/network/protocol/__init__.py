@@ -8,7 +8,7 @@ The two transports, `isocharge.serve.network.http` and `isocharge.serve.network.
 does not import the transports.
 """
 
-from isocharge.common.extras import require
+from isocharge.common.errors import require
 
 with require("http"):
     from isocharge.serve.network.protocol.handler import Handler

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 import orjson
 from prometheus_client import generate_latest
 
-from isocharge.common.errors import ModelError, RequestError
-from isocharge.common.extras import package_version
+from isocharge.common.errors import ModelError, RequestError, package_version
 from isocharge.common.structs import parse_json
 from isocharge.serve.model.session import INPUT, OUTPUTS
 from isocharge.serve.network.address import ServerLimits
