@@ -39,12 +39,10 @@ if TYPE_CHECKING:
     from isocharge.simulate.mechanics.scaling import Theory
     from isocharge.simulate.mesh.blocks import Resolution
     from isocharge.simulate.noise import NoiseModel
-    from isocharge.simulate.sensor.curved_probes import Circle, Ellipse, Finger, GrowingFinger
     from isocharge.simulate.sensor.film import Film, Piezo
     from isocharge.simulate.sensor.film_properties import FilmPrior, virtual_film
     from isocharge.simulate.sensor.footprint import Probe
-    from isocharge.simulate.sensor.polygon_probe import Polygon
-    from isocharge.simulate.sensor.probe import parse_probe
+    from isocharge.simulate.sensor.probe import Circle, Ellipse, Finger, GrowingFinger, Polygon, parse_probe
     from isocharge.simulate.sensor.sensor import Calibration, Electrode, Sensor
     from isocharge.simulate.sensor.sensor_file import built_in_sensors, load_sensor, write_sensor
     from isocharge.simulate.solver.equilibrium import Equilibrium, deflection, touch_stress

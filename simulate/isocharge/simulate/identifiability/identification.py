@@ -19,8 +19,8 @@ from isocharge.simulate.identifiability.working_area import DEFAULT_ERROR, Worki
 from isocharge.simulate.measuring_chain import noise_model
 from isocharge.simulate.noise import NoiseModel
 from isocharge.simulate.numerics.disk import Rings
-from isocharge.simulate.sensor.curved_probes import Circle
 from isocharge.simulate.sensor.footprint import Probe
+from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Sensor
 
 MAX_SEARCH_RADIUS = 0.9

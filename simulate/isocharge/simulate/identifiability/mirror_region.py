@@ -18,8 +18,8 @@ from isocharge.simulate.forward.charge_map import ChargeMap, within
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.identifiability.nearest_contact import search
 from isocharge.simulate.noise import NoiseModel
-from isocharge.simulate.sensor.curved_probes import Circle
 from isocharge.simulate.sensor.footprint import Probe
+from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Sensor
 
 DETECTABLE_SIGMAS = 5.0

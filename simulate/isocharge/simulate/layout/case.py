@@ -12,8 +12,8 @@ from isocharge.simulate.forward.family import check_family
 from isocharge.simulate.identifiability.cramer_rao import cramer_rao
 from isocharge.simulate.noise import NOISE_LEVELS, NoiseModel
 from isocharge.simulate.numerics.disk import sunflower
-from isocharge.simulate.sensor.curved_probes import Circle
 from isocharge.simulate.sensor.film import check_range
+from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Calibration, Electrode, Sensor, electrode_index
 
 MIN_ELECTRODES = 3

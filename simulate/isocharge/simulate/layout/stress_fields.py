@@ -19,9 +19,9 @@ from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.readout import ElectrodePieces, PressMeshes
 from isocharge.simulate.mechanics.stress import rotate_stress
 from isocharge.simulate.numerics.polygon import to_complex, to_corners
-from isocharge.simulate.sensor.curved_probes import Circle
 from isocharge.simulate.sensor.film import Surface
 from isocharge.simulate.sensor.footprint import Probe
+from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Electrode, Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress, touch_stress
 from isocharge.simulate.solver.load_case import SolveSettings

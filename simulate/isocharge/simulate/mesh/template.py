@@ -11,9 +11,8 @@ import numpy as np
 from isocharge.common.arrays import Complexes, Integers
 from isocharge.simulate.mesh.blocks import Blocks, Resolution
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.sensor.curved_probes import Circle, RoundProbe
 from isocharge.simulate.sensor.footprint import FootprintTopology, Probe
-from isocharge.simulate.sensor.polygon_probe import Polygon
+from isocharge.simulate.sensor.probe import Circle, Polygon, RoundProbe
 
 SAMPLE_REACH = 0.1
 """Reach of the footprint of the sample press, in film radii.

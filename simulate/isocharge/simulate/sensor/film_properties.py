@@ -20,9 +20,9 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import SceneError, SensorError
-from isocharge.simulate.sensor.curved_probes import Circle
 from isocharge.simulate.sensor.film import Film, increased
 from isocharge.simulate.sensor.footprint import Probe
+from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Calibration, Sensor
 
 MAX_DEVIATION = 4.0
