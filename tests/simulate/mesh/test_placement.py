@@ -11,8 +11,7 @@ from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Ellipse, Film, Polygon, Probe, SolveSettings, Theory
 from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.mesh.point_location import locate_points
-from isocharge.simulate.mesh.template import Template, template_for
+from isocharge.simulate.mesh.template import Template, locate_points, template_for
 from isocharge.simulate.solver.load_case import LoadCase, choose_mesh
 
 RADIUS = 45.0

@@ -22,8 +22,7 @@ from isocharge.common.errors import SensorError
 from isocharge.simulate.mechanics.stress import rotate_stress, tension_change
 from isocharge.simulate.mesh.placed_mesh import from_oval
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.mesh.point_location import locate_points
-from isocharge.simulate.mesh.template import Template
+from isocharge.simulate.mesh.template import Template, locate_points
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.numerics.polygon import (
     gauss_quadrilaterals,

@@ -13,8 +13,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.mesh.point_location import locate_points
-from isocharge.simulate.mesh.template import Template, template_for
+from isocharge.simulate.mesh.template import Template, locate_points, template_for
 from isocharge.simulate.numerics.interpolation import (
     gauss_reference_square,
     lobatto_nodes,

@@ -1,6 +1,11 @@
-"""Mesh templates, which contain the elements of a mesh and the numbers of the nodes.
+"""Mesh templates, which contain the elements of a mesh and the numbers of the nodes, and the search for points in them.
 
-A template is the same for all positions of a probe.
+A template is the same for all positions of a probe. `locate_points` finds the elements that contain given film points.
+For points outside the innermost circle, the elements are computed by closed formulas. For points inside the innermost
+circle, the local coordinates are computed by Newton's method. The docstring of the module `placement` describes the
+positions of the elements on the film. In the search, each element has two local coordinates from 0 to 1. The radial
+coordinate increases from the inner side to the outer side of the element. The angular coordinate increases
+anticlockwise.
 """
 
 from dataclasses import dataclass
@@ -8,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from isocharge.common.arrays import Complexes, Integers
+from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.simulate.mesh.blocks import Blocks, Resolution
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.footprint import FootprintTopology, Probe
@@ -137,3 +142,256 @@ def template_for(probe: Probe, resolution: Resolution, whole: bool = False) -> T
     # are the same for all of them, so that the cache contains their template only once.
     is_whole_circular_mesh = whole and topology.fills_circle
     return template(resolution, topology, is_whole_circular_mesh)
+
+
+def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
+    """Find the elements that contain film points, and the local coordinates of the points in their elements.
+
+    Args:
+        placement: k placements, one for each row of points.
+        blocks: The elements.
+        points: Film points x + iy, shape (k, n), in film radii. If only the upper half of the film is meshed, all
+            points must lie in the upper half.
+
+    Returns:
+        Index of the element and local coordinates xi and eta from -1 to 1, each of shape (k, n).
+    """
+    # First locate all points as if they were in the rings. Then locate the points inside the innermost circle again.
+    template_points = placement.to_template(points)
+    element, radial, angular = _locate_in_rings(placement, blocks, template_points)
+    is_inside = np.abs(template_points) <= placement.template_radius[:, None]
+    if np.any(is_inside):
+        placement_index, _ = np.nonzero(is_inside)
+        used_index, point_index = np.unique(placement_index, return_inverse=True)
+        corners = _inner_corners(placement[used_index], blocks)[point_index]
+        placement_of_point = placement[placement_index]  # one placement for each point inside the circle
+        element[is_inside], radial[is_inside], angular[is_inside] = _locate_inside(
+            placement_of_point, blocks, points[is_inside], corners
+        )
+
+    # Convert the coordinates from the range from 0 to 1 to the range from -1 to 1.
+    xi = 2.0 * radial - 1.0
+    eta = 2.0 * angular - 1.0
+    return element, xi, eta
+
+
+def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Complexes) -> tuple[Integers, Array, Array]:
+    """Find the elements that contain points between the innermost circle and the rim.
+
+    Args:
+        placement: k placements, one for each row of points.
+        blocks: The elements.
+        template_points: Points x + iy of the template plane, shape (k, n).
+
+    Returns:
+        Index of the element, and radial and angular coordinate in the element from 0 to 1, each of shape (k, n).
+    """
+    # Depth of each point, from 0 on the innermost circle to 1 on the rim. At the origin, the logarithm is infinite, and
+    # the depth is clipped to 0.
+    with np.errstate(divide="ignore"):
+        log_ratio = np.log(np.abs(template_points)) / np.log(placement.template_radius)[:, None]
+    depth = np.clip(1.0 - log_ratio, 0.0, 1.0)
+
+    # The index of the ring is the number of edges between rings that lie inside of the point.
+    edges_between_rings = placement.ring_depths[:, None, 1:-1]  # shape (k, 1, n_ring - 1)
+    ring = np.sum(edges_between_rings <= depth[..., None], axis=-1)
+    inner_edge = np.take_along_axis(placement.ring_depths, ring, axis=1)
+    outer_edge = np.take_along_axis(placement.ring_depths, ring + 1, axis=1)
+    radial = (depth - inner_edge) / (outer_edge - inner_edge)
+
+    sector, angular = _locate_in_sectors(placement, blocks, np.angle(template_points), depth)
+    element = blocks.n_inner + ring * blocks.n_sector + sector
+    return element, radial, angular
+
+
+def _locate_in_sectors(placement: Placement, blocks: Blocks, angle: Array, depth: Array) -> tuple[Integers, Array]:
+    """Find the sectors that contain points between the innermost circle and the rim.
+
+    Args:
+        placement: k placements, one for each row of points.
+        blocks: The elements.
+        angle: Angles of the points in the template plane, shape (k, n), rad.
+        depth: Depths of the points, from 0 on the innermost circle to 1 on the rim, shape (k, n).
+
+    Returns:
+        Index of the sector, and angular coordinate in the sector from 0 to 1, each of shape (k, n).
+    """
+    # If the whole film is meshed, add full turns such that each angle lies within one turn after the first side.
+    if not blocks.half:
+        first_side = np.zeros(depth.shape, dtype=np.intp)
+        angle_of_first_side = _side_angles(placement, first_side, depth)
+        angle = angle_of_first_side + np.mod(angle - angle_of_first_side, 2.0 * np.pi)
+
+    # The index of the sector is the number of sides between sectors whose angles do not exceed the angle of the point.
+    circle_angles = placement.circle_angles[:, None, 1:-1]  # shape (k, 1, n_sector - 1)
+    rim_angles = placement.rim_angles[:, None, 1:-1]
+    side_angles = circle_angles + depth[..., None] * (rim_angles - circle_angles)
+    sector: Integers = np.sum(side_angles <= angle[..., None], axis=-1)
+
+    angle_of_side_before = _side_angles(placement, sector, depth)
+    angle_of_side_after = _side_angles(placement, sector + 1, depth)
+    angular = (angle - angle_of_side_before) / (angle_of_side_after - angle_of_side_before)
+    return sector, angular
+
+
+def _side_angles(placement: Placement, side: Integers, depth: Array) -> Array:
+    """Compute the angles of sides of the sectors at given depths between the innermost circle and the rim.
+
+    Args:
+        placement: k placements, one for each row of points.
+        side: Index of the side for each point, shape (k, n).
+        depth: Depth of each point, from 0 on the innermost circle to 1 on the rim, shape (k, n).
+
+    Returns:
+        Angles in the template plane, shape (k, n), rad.
+    """
+    circle_angle = np.take_along_axis(placement.circle_angles, side, axis=1)
+    rim_angle = np.take_along_axis(placement.rim_angles, side, axis=1)
+    return np.asarray(circle_angle + depth * (rim_angle - circle_angle))
+
+
+def _locate_inside(
+    placement: Placement, blocks: Blocks, points: Complexes, corners: Complexes, tolerance: float = 1e-9
+) -> tuple[Integers, Array, Array]:
+    """Find the elements that contain points inside the innermost circle.
+
+    A straight line is drawn through each side of an element. The signed distance of a point from the line is positive
+    if the point and the element lie on the same side of the line. Therefore the smallest of the four distances is
+    positive for points inside an element with straight sides. The elements are tried in the order of this distance,
+    beginning with the largest. Most points lie in the first element that is tried. Near curved sides, a further element
+    may be needed.
+
+    Args:
+        placement: n placements, one for each point.
+        blocks: The elements.
+        points: Film points x + iy, shape (n,), in film radii.
+        corners: Corners of all elements for each point, shape (n, n_inner, 4); see `_inner_corners`.
+        tolerance: Distance of a local coordinate from the range from 0 to 1 above which another element is tried.
+
+    Returns:
+        Index of the element, and radial and angular coordinate in the element from 0 to 1, each of shape (n,).
+    """
+    inner_first, inner_last, outer_first, outer_last = np.moveaxis(corners, -1, 0)
+    sides = ((inner_first, outer_first), (outer_last, inner_last), (inner_last, inner_first), (outer_first, outer_last))
+    distances = [_distance_to_left(start, end, points[:, None]) for start, end in sides]
+    candidates = np.argsort(-np.min(distances, axis=0), axis=1)  # shape (n, n_inner)
+
+    element = candidates[:, 0]
+    radial = np.full(points.shape, np.inf)
+    angular = np.full(points.shape, np.inf)
+    for candidate in candidates.T:
+        # Select the points whose element has not been found yet.
+        selected = np.flatnonzero(_overshoot(radial, angular) > tolerance)
+        if selected.size == 0:
+            break
+        tried = candidate[selected]
+        new_radial, new_angular = _local_coordinates(placement[selected], blocks, points[selected], tried)
+        is_better = _overshoot(new_radial, new_angular) < _overshoot(radial[selected], angular[selected])
+        improved = selected[is_better]
+        element[improved] = tried[is_better]
+        radial[improved] = new_radial[is_better]
+        angular[improved] = new_angular[is_better]
+    return element, radial, angular
+
+
+def _inner_corners(placement: Placement, blocks: Blocks) -> Complexes:
+    """Return the corners of all elements inside the innermost circle.
+
+    Args:
+        placement: n placements.
+        blocks: The elements.
+
+    Returns:
+        Corners x + iy, shape (n, n_inner, 4), in film radii. They are the first and the last corner of the inner side,
+        and the first and the last corner of the outer side of each element.
+    """
+    n_placement = len(placement.template_radius)
+    index, element = np.divmod(np.arange(n_placement * blocks.n_inner), blocks.n_inner)
+    sides = placement[index].sides(blocks, element, np.array([[0.0, 1.0]]))
+    return np.concatenate(sides, axis=1).reshape(n_placement, blocks.n_inner, 4)
+
+
+def _local_coordinates(
+    placement: Placement,
+    blocks: Blocks,
+    points: Complexes,
+    element: Integers,
+    max_steps: int = 20,
+    negligible_step: float = 1e-13,
+    max_overshoot: float = 0.1,
+    difference_step: float = 1e-5,
+) -> tuple[Array, Array]:
+    """Compute the local coordinates of points in given elements inside the innermost circle by Newton's method.
+
+    A point with the radial coordinate r lies on the straight line between two points with the same angular coordinate:
+    the point I of the inner side and the point O of the outer side. Its position is (1 - r) I + r O.
+
+    Args:
+        placement: n placements, one for each point.
+        blocks: The elements.
+        points: Film points x + iy, shape (n,), in film radii.
+        element: Index of the element that contains each point, shape (n,).
+        max_steps: Largest number of Newton steps with which a point inside the innermost circle is located.
+        negligible_step: Change of the local coordinates below which Newton's method ends, dimensionless.
+        max_overshoot: Largest distance of the local coordinates of a point from the range from 0 to 1 in Newton's
+            method.
+        difference_step: Step of the angular coordinate for the derivative of the sides of an element by central
+            differences.
+
+    Returns:
+        Radial coordinate and angular coordinate, each of shape (n,). They are between 0 and 1 for points inside the
+        element.
+    """
+    radial = np.full(points.shape, 0.5)
+    angular = np.full(points.shape, 0.5)
+    for _ in range(max_steps):
+        # Evaluate the sides at the angular coordinate, and before and after it for the central differences.
+        shifted_angular = angular[:, None] + np.array([0.0, -difference_step, difference_step])
+        inner, outer = placement.sides(blocks, element, shifted_angular)
+        shifted_points = inner + radial[:, None] * (outer - inner)
+        current, before, after = shifted_points.T
+        residual = current - points
+        radial_derivative = outer[:, 0] - inner[:, 0]
+        angular_derivative = (after - before) / (2.0 * difference_step)
+
+        # Newton step for two unknowns by Cramer's rule. The determinant of two plane vectors is the imaginary part of
+        # the product of the conjugate of the first vector and the second vector.
+        determinant = (np.conj(radial_derivative) * angular_derivative).imag
+        radial_step = -(np.conj(residual) * angular_derivative).imag / determinant
+        angular_step = -(np.conj(radial_derivative) * residual).imag / determinant
+        new_radial = np.clip(radial + radial_step, -max_overshoot, 1.0 + max_overshoot)
+        new_angular = np.clip(angular + angular_step, -max_overshoot, 1.0 + max_overshoot)
+        largest_step = max(np.abs(new_radial - radial).max(), np.abs(new_angular - angular).max())
+        radial = new_radial
+        angular = new_angular
+        if largest_step < negligible_step:
+            break
+    return radial, angular
+
+
+def _overshoot(radial: Array, angular: Array) -> Array:
+    """Compute by how much local coordinates exceed the range from 0 to 1.
+
+    Args:
+        radial: Radial coordinates, shape (n,).
+        angular: Angular coordinates, shape (n,).
+
+    Returns:
+        Larger excess of the two coordinates, shape (n,). It is negative if both coordinates lie within the range.
+    """
+    distance_from_middle = np.maximum(np.abs(radial - 0.5), np.abs(angular - 0.5))
+    return np.asarray(distance_from_middle - 0.5)
+
+
+def _distance_to_left(start: Complexes, end: Complexes, points: Complexes) -> Array:
+    """Compute the signed distances of points from directed lines. The distance is positive to the left of a line.
+
+    Args:
+        start: Points x + iy at which the lines start, any shape.
+        end: Points x + iy at which the lines end, same shape.
+        points: Points x + iy, of a shape that can be broadcast with the shape of the lines.
+    """
+    direction = end - start
+    length = np.maximum(np.abs(direction), 1e-300)  # the limit avoids a division by zero
+    cross_product = ((points - start) * np.conj(direction)).imag
+    return np.asarray(cross_product / length)
