@@ -43,28 +43,6 @@ MODE_SHARE_WEIGHT = 0.1
 """Ratio of the relative error of a charge to the share of the highest modes in the slopes, dimensionless."""
 
 
-def shape_error(mesh: PlacedMesh) -> float:
-    """Predict the relative error of a charge from the shapes of the elements.
-
-    The elements approximate the conformal map by polynomials, so the area of the mesh differs slightly from the area of
-    the film. The predicted error is the square root of the relative difference between the area of the mesh and the
-    area of the film. The largest error of a charge of random presses is about a third of the predicted error.
-
-    Args:
-        mesh: Mesh of the press.
-
-    Returns:
-        Predicted error, which is infinite if an element is folded.
-    """
-    geometry = mesh.geometry
-    is_folded = geometry.weights.min() <= 0.0 or geometry.mass.min() <= 0.0
-    if is_folded:
-        return np.inf
-    film_area = np.pi * (1.0 + 0.5 * abs(mesh.oval) ** 2)  # in squared film radii
-    mesh_area = mesh.template.copies * geometry.weights.sum()
-    return float(np.sqrt(abs(mesh_area / film_area - 1.0)))
-
-
 def highest_mode_share(mesh: PlacedMesh, slope: Array) -> float:
     """Compute the share of the highest polynomial modes in the slopes of the deflection.
 
@@ -118,7 +96,7 @@ def mesh_error(equilibrium: Equilibrium) -> float:
     mesh = equilibrium.mesh
     slope_of_deflection = node_slopes(equilibrium)[..., 2]
     mode_error = MODE_SHARE_WEIGHT * highest_mode_share(mesh, slope_of_deflection)
-    return max(MIN_MESH_ERROR, MESH_ERROR_SAFETY * shape_error(mesh), MESH_ERROR_SAFETY * mode_error)
+    return max(MIN_MESH_ERROR, MESH_ERROR_SAFETY * mesh.shape_error, MESH_ERROR_SAFETY * mode_error)
 
 
 def estimated_error(equilibrium: Equilibrium) -> float:

@@ -23,7 +23,6 @@ from isocharge.simulate.mesh.placed_mesh import PlacedMesh, distance_on_circular
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.footprint import Probe
-from isocharge.simulate.solver.error_estimate import shape_error
 
 TOLERANCE = 1e-7
 """Ratio of the out-of-balance force to the load at which a solve has converged, dimensionless.
@@ -254,7 +253,7 @@ def choose_mesh(case: LoadCase) -> PlacedMesh:
     """
     for resolution in _candidate_resolutions(case):
         mesh = case.place(resolution)
-        error = shape_error(mesh)
+        error = mesh.shape_error
         if error <= 0.5 * case.settings.accuracy:  # the other half is for the omitted terms of the theory
             return mesh
 

@@ -22,7 +22,7 @@ from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.solver.assembly import Assembly, assembly
 from isocharge.simulate.solver.equilibrium import Equilibrium, principal_stress
-from isocharge.simulate.solver.error_estimate import relative_difference, shape_error
+from isocharge.simulate.solver.error_estimate import relative_difference
 from isocharge.simulate.solver.load_case import (
     LoadCase,
     SolveSettings,
@@ -182,7 +182,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
     Raises:
         SceneError: If an element of the mesh is folded.
     """
-    has_folded_element = np.isinf(shape_error(mesh))
+    has_folded_element = np.isinf(mesh.shape_error)
     if has_folded_element:
         raise too_near_the_rim(case, mesh.resolution)
     elastic = _elastic_film(case, mesh.geometry, case.force)
