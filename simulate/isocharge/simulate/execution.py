@@ -4,7 +4,7 @@ The caller divides the work into jobs, and the results are returned in the order
 not depend on the executor, on the number of workers, or on the order in which the workers finish.
 
 The functions `local_workers` and `dask_workers` provide executors. A worker refuses a job if it has another version of
-the code. In a worker, BLAS uses only one thread (`single_threaded_blas`).
+the code. In a worker, BLAS uses only one thread.
 """
 
 import multiprocessing
@@ -15,12 +15,12 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from functools import lru_cache, partial
 from importlib.metadata import version
 from typing import Any, TypeVar
 
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import threadpool_limits
 
 from isocharge.common.errors import InputError, WorkersLost, require
 
@@ -137,24 +137,8 @@ def run_same_code(versions: str, function: Callable[[Job], Result], job: Job) ->
         raise WorkersLost(
             f"a worker runs {code_versions()}, expected {versions}; install the same versions on all workers"
         )
-    with single_threaded_blas():
+    with threadpool_limits(limits=1, user_api="blas"):
         return function(job)
-
-
-def single_threaded_blas() -> AbstractContextManager[object]:
-    """Return a context manager within which BLAS uses only one thread.
-
-    Operations on many small matrices are faster with one thread. Several threads would often wait for each other in
-    busy loops. Such waits are long if other processes use the remaining cores.
-    """
-    limiter: AbstractContextManager[object] = _blas_libraries().limit(limits=1, user_api="blas")
-    return limiter
-
-
-@lru_cache
-def _blas_libraries() -> ThreadpoolController:
-    """Return the controller of all libraries that are loaded when this function is called first: NumPy and SciPy."""
-    return ThreadpoolController()
 
 
 def cores() -> int:

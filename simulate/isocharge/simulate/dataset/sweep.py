@@ -27,12 +27,13 @@ from isocharge.simulate.dataset.shards import (
     write_dataset,
     write_files,
 )
-from isocharge.simulate.execution import in_order, single_threaded_blas
+from isocharge.simulate.execution import in_order
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.solver.assembly import single_threaded_blas
 from isocharge.simulate.solver.load_case import SolveSettings
 from isocharge.simulate.solver.stress_limit import yield_force
 

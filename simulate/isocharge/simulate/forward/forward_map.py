@@ -21,7 +21,7 @@ from isocharge.common.arrays import Array, Booleans, Complexes
 from isocharge.common.contact_domain import Domain, as_contacts
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SolveError
-from isocharge.simulate.execution import in_order, single_threaded_blas
+from isocharge.simulate.execution import in_order
 from isocharge.simulate.forward.charge_map import STEPS, differences
 from isocharge.simulate.forward.family import (
     Family,
@@ -52,6 +52,7 @@ from isocharge.simulate.numerics.interpolation import lagrange_values
 from isocharge.simulate.numerics.polygon import to_complex
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.solver.assembly import single_threaded_blas
 from isocharge.simulate.solver.load_case import SolveSettings
 
 CHUNK_SIZE = 256

@@ -18,15 +18,19 @@ can be solved with the factorisation of the sparse matrix K (Sherman and Morriso
     x = K^-1 b - y c (v' K^-1 b) / (1 + c v' y),   y = K^-1 v.
 
 Fields that are odd about the line of symmetry do not change the volume of the air. For these fields, the matrix is K.
+
+The dense matrices are small. `single_threaded_blas` limits the threads of all computations with such matrices.
 """
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from scipy.sparse import csc_matrix, eye_array
 from scipy.sparse.linalg import SuperLU, splu
+from threadpoolctl import ThreadpoolController
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.mechanics.energy import ElasticFilm
@@ -329,3 +333,19 @@ def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, added
         return np.asarray(field_without_air - pressure_per_volume * volume * response)
 
     return solve_with_air
+
+
+def single_threaded_blas() -> AbstractContextManager[object]:
+    """Return a context manager within which BLAS uses only one thread.
+
+    Operations on many small matrices are faster with one thread. Several threads would often wait for each other in
+    busy loops. Such waits are long if other processes use the remaining cores.
+    """
+    limiter: AbstractContextManager[object] = _blas_libraries().limit(limits=1, user_api="blas")
+    return limiter
+
+
+@lru_cache
+def _blas_libraries() -> ThreadpoolController:
+    """Return the controller of all libraries that are loaded when this function is called first: NumPy and SciPy."""
+    return ThreadpoolController()

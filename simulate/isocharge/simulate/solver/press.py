@@ -11,7 +11,6 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SolveError
-from isocharge.simulate.execution import single_threaded_blas
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import DimensionlessGroups
 from isocharge.simulate.mesh.blocks import Resolution
@@ -20,7 +19,7 @@ from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.footprint import Probe
-from isocharge.simulate.solver.assembly import Assembly, assembly
+from isocharge.simulate.solver.assembly import Assembly, assembly, single_threaded_blas
 from isocharge.simulate.solver.equilibrium import Equilibrium, principal_stress
 from isocharge.simulate.solver.error_estimate import relative_difference
 from isocharge.simulate.solver.load_case import (

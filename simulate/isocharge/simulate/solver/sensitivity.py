@@ -43,13 +43,12 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError
-from isocharge.simulate.execution import single_threaded_blas
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.scaling import Anisotropy, press_frame_anisotropy, side_force_unit
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, from_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Surface, increased
-from isocharge.simulate.solver.assembly import SolveTangent, assembly, factor_tangent
+from isocharge.simulate.solver.assembly import SolveTangent, assembly, factor_tangent, single_threaded_blas
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
 
 STEP = 1e-3

@@ -44,8 +44,8 @@ from isocharge.serve.presses.csv_table import csv_text
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.serve.presses.std_factor import FEWEST_HELD_OUT, StdFactor
 from isocharge.simulate import Domain, NoiseModel
-from isocharge.simulate.execution import single_threaded_blas
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict, sensor_to_toml
+from isocharge.simulate.solver.assembly import single_threaded_blas
 from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.film_network import compact_charges, training_data
 from isocharge.train.calibration.problem import CalibrationProblem
