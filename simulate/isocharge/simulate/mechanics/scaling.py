@@ -19,7 +19,8 @@ the tension force per length. If the pretension and the induced tension are smal
 load.
 
 The scales of a press also show where a theory is valid. The bending length determines the error of a theory without
-bending, and the amplitude determines whether the strains are small enough for Saint-Venant-Kirchhoff elasticity.
+bending (`error_estimate.modelling_error`), and the amplitude determines whether the strains are small enough for
+Saint-Venant-Kirchhoff elasticity (`load_case.check_strains`).
 """
 
 from dataclasses import dataclass, replace
@@ -31,7 +32,6 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.stress import orthotropic_moduli, rotate_stress, stress, stress_rotation
 from isocharge.simulate.sensor.film import Film
-from isocharge.simulate.sensor.footprint import Probe
 
 MEMBRANE_STIFFNESS = 1.6
 """Ratio of force to deflection of a membrane with a large pretension, in units of pretension times thickness.
@@ -306,25 +306,6 @@ def _root(linear_factor: float, right_side: Array | float) -> Any:
 ACCURACY = 1e-3
 """Default target of the relative error of a charge, dimensionless."""
 
-MAX_AMPLITUDE2 = 0.1
-"""Largest squared amplitude A^2 for which Saint-Venant-Kirchhoff elasticity is valid, dimensionless.
-
-The strains are of the order A^2.
-"""
-
-MIN_FORCE_N = 1e-12
-"""Smallest force of a press, N. The dimensionless groups of a press with a far smaller force are not finite numbers."""
-
-BENDING_WEIGHT = 1.5
-"""Factor in the estimate of the relative error of a charge that is computed without bending.
-
-The factor multiplies the ratio of the bending length to the film radius. The largest factor in the reference cases of
-tests/data is 1.41.
-"""
-
-MAX_MEMBRANE_BENDING_LENGTH = 0.3
-"""Bending length, in film radii, above which a membrane does not describe the film. The error is then infinite."""
-
 INDUCED_STRAIN = 0.44
 """Radial strain at the rim of a membrane without pretension, in units of the squared amplitude A^2."""
 
@@ -339,58 +320,6 @@ def bending_length(film: Film, force: float) -> float:
     groups = DimensionlessGroups.of(film, force, bending=True)
     tension = max(groups.tension, 0.0) + INDUCED_STRAIN * groups.height**2
     return float(np.sqrt(groups.bending / tension))
-
-
-def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> float:
-    """Estimate the relative error that omitted bending causes in a charge.
-
-    The error has two parts. The first part is proportional to the bending length at the clamp. The second part is
-    proportional to the squared ratio of the bending length at the footprint to the reach R of the footprint, and is
-    larger if most of the tension at the footprint is pretension. The slope w' of the film at the footprint follows from
-    the vertical force 2 pi R h S w' = F and the induced stress S = E w'^2 / 2, so that w'^3 = F / (pi R h E).
-
-    Args:
-        film: The film, with Young's modulus E and thickness h.
-        probe: The probe, whose footprint has the reach R.
-        force: Force F of the press, N.
-        theory: The theory.
-
-    Returns:
-        The error; zero with bending, and infinite for a thick film without bending.
-    """
-    if theory.bending:
-        return 0.0
-    length = bending_length(film, force)
-    if length > MAX_MEMBRANE_BENDING_LENGTH:
-        return np.inf
-    slope = np.cbrt(force / (np.pi * probe.reach * film.thickness * film.young))
-    pretension_strain = max(film.pretension, 0.0) / film.young
-    strain = pretension_strain + 0.5 * slope**2
-    squared_length_ratio = slenderness(film) / strain * (film.radius / probe.reach) ** 2
-    probe_weight = 0.5 + 5.0 * pretension_strain / strain  # empirical, for an electrode beside the footprint
-    return float(BENDING_WEIGHT * length + probe_weight * squared_length_ratio)
-
-
-def check_strains(film: Film, force: float) -> None:
-    """Raise an error if a force is too small to be computed, or too large for Saint-Venant-Kirchhoff elasticity.
-
-    Args:
-        film: The film.
-        force: Force of the press, N.
-
-    Raises:
-        SceneError: If the force is smaller than `MIN_FORCE_N`, or if the squared amplitude exceeds `MAX_AMPLITUDE2` or
-            is not finite.
-    """
-    if force < MIN_FORCE_N:
-        raise SceneError(f"force: expected at least {MIN_FORCE_N:g} N, got {force:.4g} N")
-    with np.errstate(over="ignore"):  # the amplitude of a huge force is infinite, and is refused
-        squared_amplitude = amplitude_squared(film, force)
-    if not squared_amplitude <= MAX_AMPLITUDE2:
-        raise SceneError(
-            f"force {force:.4g} N stretches a film of {film.thickness:.4g} mm beyond small strains: expected "
-            f"(F / (E h a))^(2/3) up to {MAX_AMPLITUDE2:g}, got {squared_amplitude:.3g}"
-        )
 
 
 def theory_by_name(name: str) -> Theory:

@@ -18,13 +18,12 @@ import numpy as np
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.structs import finite_or_none
-from isocharge.simulate.mechanics.scaling import (
-    bending_length,
-    modelling_error,
-)
+from isocharge.simulate.mechanics.scaling import Theory, bending_length, slenderness
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.numerics.interpolation import gauss_reference_square, modal_matrix
 from isocharge.simulate.numerics.polygon import to_corners
+from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.solver.equilibrium import Equilibrium, deflection, node_slopes, principal_stress, touch_stress
 
 MESH_ERROR_SAFETY = 2.0
@@ -41,6 +40,16 @@ The thin rings and the integration over the electrodes cause an error of this or
 
 MODE_SHARE_WEIGHT = 0.1
 """Ratio of the relative error of a charge to the share of the highest modes in the slopes, dimensionless."""
+
+BENDING_WEIGHT = 1.5
+"""Factor in the estimate of the relative error of a charge that is computed without bending.
+
+The factor multiplies the ratio of the bending length to the film radius. The largest factor in the reference cases of
+tests/data is 1.41.
+"""
+
+MAX_MEMBRANE_BENDING_LENGTH = 0.3
+"""Bending length, in film radii, above which a membrane does not describe the film. The error is then infinite."""
 
 
 def highest_mode_share(mesh: PlacedMesh, slope: Array) -> float:
@@ -97,6 +106,36 @@ def mesh_error(equilibrium: Equilibrium) -> float:
     slope_of_deflection = node_slopes(equilibrium)[..., 2]
     mode_error = MODE_SHARE_WEIGHT * highest_mode_share(mesh, slope_of_deflection)
     return max(MIN_MESH_ERROR, MESH_ERROR_SAFETY * mesh.shape_error, MESH_ERROR_SAFETY * mode_error)
+
+
+def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> float:
+    """Estimate the relative error that omitted bending causes in a charge.
+
+    The error has two parts. The first part is proportional to the bending length at the clamp. The second part is
+    proportional to the squared ratio of the bending length at the footprint to the reach R of the footprint, and is
+    larger if most of the tension at the footprint is pretension. The slope w' of the film at the footprint follows from
+    the vertical force 2 pi R h S w' = F and the induced stress S = E w'^2 / 2, so that w'^3 = F / (pi R h E).
+
+    Args:
+        film: The film, with Young's modulus E and thickness h.
+        probe: The probe, whose footprint has the reach R.
+        force: Force F of the press, N.
+        theory: The theory.
+
+    Returns:
+        The error; zero with bending, and infinite for a thick film without bending.
+    """
+    if theory.bending:
+        return 0.0
+    length = bending_length(film, force)
+    if length > MAX_MEMBRANE_BENDING_LENGTH:
+        return np.inf
+    slope = np.cbrt(force / (np.pi * probe.reach * film.thickness * film.young))
+    pretension_strain = max(film.pretension, 0.0) / film.young
+    strain = pretension_strain + 0.5 * slope**2
+    squared_length_ratio = slenderness(film) / strain * (film.radius / probe.reach) ** 2
+    probe_weight = 0.5 + 5.0 * pretension_strain / strain  # empirical, for an electrode beside the footprint
+    return float(BENDING_WEIGHT * length + probe_weight * squared_length_ratio)
 
 
 def estimated_error(equilibrium: Equilibrium) -> float:

@@ -15,7 +15,6 @@ from isocharge.simulate.mechanics.scaling import (
     Theory,
     amplitude_squared,
     bending_length,
-    check_strains,
 )
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import CLEARANCE
@@ -32,6 +31,15 @@ The ratio is far below the error of the mesh, and well above rounding errors.
 
 Auto = Literal["auto"]
 """Value of a setting that is chosen automatically for a press, or for all presses of a forward map."""
+
+MAX_AMPLITUDE2 = 0.1
+"""Largest squared amplitude A^2 for which Saint-Venant-Kirchhoff elasticity is valid, dimensionless.
+
+The strains are of the order A^2.
+"""
+
+MIN_FORCE_N = 1e-12
+"""Smallest force of a press, N. The dimensionless groups of a press with a far smaller force are not finite numbers."""
 
 LAYER_WIDTH = 6.0
 """Total width of the thin rings at the rim, in bending lengths. Widths from 4 to 14 change a charge by at most 1e-4."""
@@ -145,6 +153,28 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
         )
 
     check_strains(film, force)
+
+
+def check_strains(film: Film, force: float) -> None:
+    """Raise an error if a force is too small to be computed, or too large for Saint-Venant-Kirchhoff elasticity.
+
+    Args:
+        film: The film.
+        force: Force of the press, N.
+
+    Raises:
+        SceneError: If the force is smaller than `MIN_FORCE_N`, or if the squared amplitude exceeds `MAX_AMPLITUDE2` or
+            is not finite.
+    """
+    if force < MIN_FORCE_N:
+        raise SceneError(f"force: expected at least {MIN_FORCE_N:g} N, got {force:.4g} N")
+    with np.errstate(over="ignore"):  # the amplitude of a huge force is infinite, and is refused
+        squared_amplitude = amplitude_squared(film, force)
+    if not squared_amplitude <= MAX_AMPLITUDE2:
+        raise SceneError(
+            f"force {force:.4g} N stretches a film of {film.thickness:.4g} mm beyond small strains: expected "
+            f"(F / (E h a))^(2/3) up to {MAX_AMPLITUDE2:g}, got {squared_amplitude:.3g}"
+        )
 
 
 def farthest_distance(film: Film, probe: Probe, at: tuple[float, float]) -> float:
