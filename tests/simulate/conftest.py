@@ -21,7 +21,7 @@ from isocharge.simulate import (
 )
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.simulate.forward.derivative_maps import SideForceMap
-from isocharge.simulate.mechanics.scaling import DimensionlessGroups
+from isocharge.simulate.mechanics.theory import DimensionlessGroups
 from isocharge.simulate.mesh.placed_mesh import Geometry, place
 from isocharge.simulate.mesh.template import Template
 from kept import kept

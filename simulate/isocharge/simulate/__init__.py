@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from isocharge.simulate.layout.case import DesignCase
     from isocharge.simulate.layout.design import design
     from isocharge.simulate.measuring_chain import Amplifier, load_amplifier, noise_model
-    from isocharge.simulate.mechanics.scaling import Theory
+    from isocharge.simulate.mechanics.theory import Theory
     from isocharge.simulate.mesh.blocks import Resolution
     from isocharge.simulate.noise import NoiseModel
     from isocharge.simulate.sensor.film import Film, Piezo

@@ -9,8 +9,7 @@ import pytest
 from tests.simulate.conftest import assembled
 
 from isocharge.simulate.mechanics.energy import ElasticFilm
-from isocharge.simulate.mechanics.scaling import DimensionlessGroups
-from isocharge.simulate.mechanics.stress import stress
+from isocharge.simulate.mechanics.theory import DimensionlessGroups, stress
 
 GROUPS = {
     "membrane": DimensionlessGroups(squared_amplitude=0.02, load=1.0, tension=0.0, bending=0.0, poisson=0.34),

@@ -7,7 +7,7 @@ import pytest
 
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Film, Polygon, SolveSettings, Theory, load_sensor, press, touch_charge
-from isocharge.simulate.mechanics.scaling import theory_by_name
+from isocharge.simulate.mechanics.theory import theory_by_name
 from isocharge.simulate.solver.error_estimate import estimated_error, modelling_error
 
 MEMBRANE = Theory(bending=False)

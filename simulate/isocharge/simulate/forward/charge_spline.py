@@ -2,7 +2,7 @@
 
 The splines compute charges and their derivatives about two hundred times faster than the forward map.
 
-Each charge is divided by the squared amplitude of the press, which the module `mechanics.scaling` computes from the
+Each charge is divided by the squared amplitude of the press, which the module `mechanics.theory` computes from the
 force. The scaled charges depend only weakly on the force. At each of a few forces, a cubic spline in (x, y)
 approximates the scaled charges. The spline is fitted by least squares to presses on a disk around the centre of the
 film. For all other forces, the scaled charges are interpolated by Lagrange polynomials in ln F. A forward map
@@ -24,7 +24,7 @@ from isocharge.common.contact_domain import Domain
 from isocharge.simulate.forward.charge_map import ChargeMap, check_radius
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.readout import contact_charges
-from isocharge.simulate.mechanics.scaling import amplitude_squared
+from isocharge.simulate.mechanics.theory import amplitude_squared
 from isocharge.simulate.numerics.disk import contacts_at, sunflower
 from isocharge.simulate.numerics.interpolation import chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Film

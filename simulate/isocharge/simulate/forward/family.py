@@ -23,7 +23,7 @@ from isocharge.common.progress import track
 from isocharge.simulate.execution import in_order
 from isocharge.simulate.forward.readout import touch_charge
 from isocharge.simulate.forward.turns import Turns
-from isocharge.simulate.mechanics.stress import rotate_stress
+from isocharge.simulate.mechanics.theory import rotate_stress
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import distance_coordinate
 from isocharge.simulate.mesh.template import Template

@@ -42,7 +42,7 @@ from isocharge.simulate.forward.readout import (
     PressMeshes,
     contact_charges,
 )
-from isocharge.simulate.mechanics.scaling import Theory, amplitude_squared
+from isocharge.simulate.mechanics.theory import Theory, amplitude_squared
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.placed_mesh import distance_on_circular_film, film_oval
 from isocharge.simulate.mesh.placement import Placement

@@ -17,7 +17,7 @@ from isocharge.common.contact_domain import Domain
 from isocharge.simulate.forward.family import NodeCount
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.readout import ElectrodePieces, PressMeshes
-from isocharge.simulate.mechanics.stress import rotate_stress
+from isocharge.simulate.mechanics.theory import rotate_stress
 from isocharge.simulate.numerics.polygon import to_complex, to_corners
 from isocharge.simulate.sensor.film import Surface
 from isocharge.simulate.sensor.footprint import Probe

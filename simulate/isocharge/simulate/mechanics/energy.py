@@ -13,13 +13,13 @@ of the film radius a. The displacements w and u, and the Green-Lagrange strain E
 
     w = a A W,   u = a A^2 U,   E = A^2 [ sym grad U + grad W (x) grad W / 2 + A^2 (grad U)^T grad U / 2 ],
 
-where A is the amplitude of the press, which the module `mechanics.scaling` computes. The expression in brackets is the
+where A is the amplitude of the press, which the module `mechanics.theory` computes. The expression in brackets is the
 scaled strain E'. The scaled strain is of order one for every force.
 
 The stress follows from Saint-Venant-Kirchhoff elasticity in plane stress as S = E_young A^2 (C : E' + tau I). Here, C
 is the elasticity matrix divided by Young's modulus, tau is the scaled pretension, and I is the unit tensor. Energies
 are in units of E_young h a^2 A^4, where h is the thickness of the film. For an anisotropic film, a matrix is added to
-C, and a deviator is added to tau I (`scaling.Anisotropy`). The bending stiffness is always computed for an isotropic
+C, and a deviator is added to tau I (`theory.Anisotropy`). The bending stiffness is always computed for an isotropic
 film.
 """
 
@@ -29,8 +29,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.mechanics.scaling import DimensionlessGroups, scaled_stress
-from isocharge.simulate.mechanics.stress import strain
+from isocharge.simulate.mechanics.theory import DimensionlessGroups, scaled_stress, strain
 from isocharge.simulate.mesh.placed_mesh import Geometry
 
 
@@ -459,7 +458,7 @@ class BackPressure:
     (Boyle's law). The energy of the trapped air is -p0 V0 (ln(1 - V / V0) + V / V0).
 
     As in the theory of plates, the static pressure and the pressure of the air act perpendicular to the undeformed
-    film, and on its undeformed area. In the units of `mechanics.scaling`, the ratio V / V0 is the integral of the
+    film, and on its undeformed area. In the units of `mechanics.theory`, the ratio V / V0 is the integral of the
     deflection W over the film, multiplied by the dimensionless group `compression`.
 
     Attributes:

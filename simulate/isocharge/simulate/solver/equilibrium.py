@@ -14,12 +14,14 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import SceneError
-from isocharge.simulate.mechanics.scaling import (
+from isocharge.simulate.mechanics.theory import (
     DimensionlessGroups,
     Theory,
+    principal_stresses,
+    rotate_stress,
     scaled_stress,
+    strain,
 )
-from isocharge.simulate.mechanics.stress import principal_stresses, rotate_stress, strain
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.numerics.polygon import to_complex

@@ -18,7 +18,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.structs import finite_or_none
-from isocharge.simulate.mechanics.scaling import Theory, bending_length, slenderness
+from isocharge.simulate.mechanics.theory import Theory, bending_length, slenderness
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.numerics.interpolation import gauss_reference_square, modal_matrix
 from isocharge.simulate.numerics.polygon import to_corners

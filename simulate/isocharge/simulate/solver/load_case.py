@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate.mechanics.scaling import (
+from isocharge.simulate.mechanics.theory import (
     ACCURACY,
     WITH_BENDING,
     Theory,

@@ -18,7 +18,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes
 from isocharge.simulate.mechanics.energy import ElasticFilm
-from isocharge.simulate.mechanics.scaling import DimensionlessGroups
+from isocharge.simulate.mechanics.theory import DimensionlessGroups
 from isocharge.simulate.solver.assembly import Assembly, SolveTangent, factor_tangent
 
 STABILISING_TENSION = 0.4

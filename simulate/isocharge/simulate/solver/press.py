@@ -12,7 +12,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SolveError
 from isocharge.simulate.mechanics.energy import ElasticFilm
-from isocharge.simulate.mechanics.scaling import DimensionlessGroups
+from isocharge.simulate.mechanics.theory import DimensionlessGroups
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.placed_mesh import Geometry, PlacedMesh, from_oval
 from isocharge.simulate.mesh.template import Template

@@ -44,7 +44,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.energy import ElasticFilm
-from isocharge.simulate.mechanics.scaling import Anisotropy, press_frame_anisotropy, side_force_unit
+from isocharge.simulate.mechanics.theory import Anisotropy, press_frame_anisotropy, side_force_unit
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, from_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Surface, increased
@@ -184,7 +184,7 @@ def stress_changes(solved: Equilibrium, surface: Surface, fields: Sequence[Stres
     The film is rotated such that the press lies on the positive x axis. The changes refer to fixed points of the
     rotated film. The unit of a
     tension is the sum of E A^2 and the mean pretension, where E is Young's modulus and A is the amplitude of the press.
-    The function `scaling.side_force_unit` returns the unit of a side force.
+    The function `theory.side_force_unit` returns the unit of a side force.
 
     Args:
         solved: Press with a circular probe.
