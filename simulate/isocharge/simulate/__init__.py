@@ -20,9 +20,8 @@ with require("simulate"):
 
 if TYPE_CHECKING:
     from isocharge.common.contact_domain import Domain
-    from isocharge.simulate.dataset.sampling import Sweep
     from isocharge.simulate.dataset.shards import Dataset, Samples, read_dataset, write_dataset
-    from isocharge.simulate.dataset.sweep import run_sweep
+    from isocharge.simulate.dataset.sweep import Sweep, run_sweep
     from isocharge.simulate.execution import dask_workers, local_workers
     from isocharge.simulate.forward.charge_map import ChargeMap, FunctionMap
     from isocharge.simulate.forward.charge_spline import ChargeSpline

@@ -13,7 +13,7 @@ from isocharge.cli.shared.options import parse_radius_mm, worker_count
 from isocharge.cli.shared.terminal import say
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT, FEW_ELECTRODES
 from isocharge.common.errors import InputError, IsochargeError
-from isocharge.simulate import Dataset, Film, Probe, Sensor, Sweep, read_dataset, working_area
+from isocharge.simulate import Dataset, Film, Probe, Sensor, read_dataset, working_area
 from isocharge.simulate.execution import dask_workers, local_workers
 from isocharge.simulate.sensor.probe import PROBE_HELP
 
@@ -89,7 +89,7 @@ def warn_of_stress(film: Film, probes: Iterable[Probe], max_force: float, limit:
         max_force: Largest force, N.
         limit: Limit of the stress, MPa.
     """
-    from isocharge.simulate.solver.stress_limit import stress_caution
+    from isocharge.simulate.solver.press import stress_caution
 
     for probe in probes:
         with suppress(IsochargeError):  # the caller computes the same press later, and then reports the error
@@ -117,7 +117,7 @@ def simulated_presses(sensor: Sensor, probes: Sequence[Probe], radius: float, fo
         radius: Largest distance of a press from the centre, mm.
         force: Smallest and largest force, N.
     """
-    from isocharge.simulate import run_sweep  # imports the solver
+    from isocharge.simulate import Sweep, run_sweep  # imports the solver
 
     has_few_electrodes = len(sensor.electrodes) <= FEW_ELECTRODES
     n_press = N_SIMULATED_PRESSES if has_few_electrodes else MANY_SIMULATED_PRESSES
