@@ -22,12 +22,12 @@ from isocharge.common.errors import SceneError
 from isocharge.common.progress import track
 from isocharge.simulate.execution import in_order
 from isocharge.simulate.forward.readout import touch_charge
-from isocharge.simulate.forward.turns import Turns
 from isocharge.simulate.mechanics.theory import rotate_stress
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import distance_coordinate
 from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import (
+    Turns,
     chebyshev_nodes,
     lagrange_values,
 )
@@ -150,7 +150,7 @@ class Family:
         else:
             force = np.array([domain.force_range[0]])
 
-        turns = Turns.spread(film, probe, count.largest_harmonics)
+        turns = Turns.spread(count.largest_harmonics, probe.period, is_axisymmetric=film.is_axisymmetric)
         return cls(domain, film.radius, distance, force, turns)
 
     def weights(self, position: Complexes, force: Array, rotation: Array) -> Array:
