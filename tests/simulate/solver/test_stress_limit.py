@@ -8,7 +8,7 @@ import pytest
 
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, load_sensor, press
-from isocharge.simulate.solver.press import force_within_stress, largest_stress, stress_caution, yield_force
+from isocharge.simulate.solver.stress_limit import force_within_stress, largest_stress, stress_caution, yield_force
 
 FILM = load_sensor("four-25um-biaxial").film
 TIP = Circle(1.0)

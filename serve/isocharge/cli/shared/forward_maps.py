@@ -13,7 +13,7 @@ from isocharge.cli.shared.options import parse_radius_mm, worker_count
 from isocharge.cli.shared.terminal import say
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT, FEW_ELECTRODES
 from isocharge.common.errors import InputError, IsochargeError
-from isocharge.simulate import Dataset, Film, Probe, Sensor, read_dataset, working_area
+from isocharge.simulate import Dataset, Film, Probe, Sensor, read_dataset
 from isocharge.simulate.execution import dask_workers, local_workers
 from isocharge.simulate.sensor.probe import PROBE_HELP
 
@@ -62,7 +62,7 @@ def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tupl
     if text != "auto":
         return parse_radius_mm(text)
     # imported late, because these imports load the solver and the noise levels
-    from isocharge.simulate import noise_model
+    from isocharge.simulate import noise_model, working_area
     from isocharge.simulate.identifiability.identification import map_to_search
 
     radii = []
@@ -89,7 +89,7 @@ def warn_of_stress(film: Film, probes: Iterable[Probe], max_force: float, limit:
         max_force: Largest force, N.
         limit: Limit of the stress, MPa.
     """
-    from isocharge.simulate.solver.press import stress_caution
+    from isocharge.simulate.solver.stress_limit import stress_caution
 
     for probe in probes:
         with suppress(IsochargeError):  # the caller computes the same press later, and then reports the error

@@ -42,7 +42,7 @@ from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.assembly import single_threaded_blas
 from isocharge.simulate.solver.load_case import SolveSettings
-from isocharge.simulate.solver.press import yield_force
+from isocharge.simulate.solver.stress_limit import yield_force
 
 MAX_SAMPLES = 10_000_000
 """Largest number of presses of a sweep. The files of a dataset with so many presses occupy about 600 MB."""

@@ -23,7 +23,7 @@ from isocharge.common.arrays import Array
 from isocharge.serve.presses.measured_presses import FORCE_STD, POSITION_STD_MM
 from isocharge.simulate import Domain, Sweep
 from isocharge.simulate.numerics.disk import sunflower
-from isocharge.simulate.solver.press import force_within_stress
+from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.calibration.estimator import PLANNED
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import FilmEstimate

@@ -22,7 +22,7 @@ from isocharge.simulate import Domain, ForwardMap, NoiseModel, Sweep
 from isocharge.simulate.forward.derivative_maps import few_nodes
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.film_properties import PRETENSION
-from isocharge.simulate.solver.press import yield_force
+from isocharge.simulate.solver.stress_limit import yield_force
 from isocharge.train.calibration.film_charges import FilmCharges, axisymmetric, round_probe
 from isocharge.train.calibration.film_estimate import FilmEstimate, discrepancy_jacobian
 from isocharge.train.calibration.problem import CalibrationProblem
