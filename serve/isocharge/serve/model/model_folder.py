@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import ModelError, OutputExists, error_prefix
 from isocharge.common.files import new_folder, read_needed, refuse_existing, sha256_of, write_whole
+from isocharge.serve.model.contact import as_batch
 from isocharge.serve.model.golden import (
     Golden,
     check_outputs,
@@ -31,7 +32,7 @@ from isocharge.serve.model.golden import (
 )
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_search import NAME
-from isocharge.serve.model.session import INPUT, OUTPUTS, as_batch, check_interface, open_session, run
+from isocharge.serve.model.session import INPUT, OUTPUTS, check_interface, open_session, run
 
 
 @dataclass(frozen=True)

@@ -8,18 +8,16 @@ press, because its memory for input and output is bound to the session only once
 Charges must be finite numbers in the order of the electrodes. `write_finite` is a fast check for plain numbers.
 """
 
-import math
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
 import onnxruntime as ort
-from numpy.typing import ArrayLike, NDArray
 
 from isocharge.common.arrays import Singles
-from isocharge.common.errors import ChargeError, ModelError, cut
+from isocharge.common.errors import ModelError, cut
 
 INPUT = "charge_pC"
 """Name of the input."""
@@ -188,99 +186,3 @@ class BoundPress:
         self.run()  # reads the charges from their memory, and writes the outputs into the memory of `_value_view`
         target: Any = out.data
         target[:] = self._value_view
-
-
-def write_finite(write: Callable[..., object], values: Iterable[float]) -> bool:
-    """Write the charges of one press as float32 numbers, and check that they are finite.
-
-    Args:
-        write: Function that takes the numbers as separate arguments and raises the exceptions of `struct.pack_into`.
-        values: The numbers, as many as `write` takes.
-
-    Returns:
-        True if all numbers were written and are finite. If False, the memory does not contain valid charges.
-    """
-    try:
-        numbers = tuple(values)
-        write(*numbers)
-        # The sum is not finite if a number is NaN or infinite. Otherwise, the sum is finite, because `write` has
-        # refused numbers beyond the range of float32, and their sum is computed in float64.
-        return math.isfinite(sum(numbers))
-    except (struct.error, TypeError, ValueError, OverflowError):
-        return False
-
-
-def as_press(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
-    """Convert the charges of one press to an array of shape (electrodes,), float32, pC.
-
-    Args:
-        charge_pC: Charges, pC, in the order of the electrodes.
-        electrodes: Names of the electrodes.
-
-    Raises:
-        ChargeError: If the number of charges is wrong, or a charge is not finite. The message names the electrode.
-    """
-    expected = f"{len(electrodes)} charges {electrodes}"
-    charges = _as_numbers(charge_pC, expected, (len(electrodes),))
-    return np.asarray(as_float32(charges[np.newaxis], electrodes)[0])
-
-
-def as_batch(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
-    """Convert the charges of n presses to a contiguous array of shape (n, electrodes), float32, pC.
-
-    Args:
-        charge_pC: Charges, shape (n, electrodes), pC, with the columns in the order of the electrodes.
-        electrodes: Names of the electrodes.
-
-    Raises:
-        ChargeError: If the shape is wrong, or a charge is not finite. The message names the electrode and the row.
-    """
-    n_electrode = len(electrodes)
-    expected = f"rows of {n_electrode} charges {electrodes}, shape (n, {n_electrode})"
-    return as_float32(_as_numbers(charge_pC, expected, ("n", n_electrode)), electrodes)
-
-
-def _as_numbers(charge_pC: ArrayLike, expected: str, shape: tuple[str | int, ...]) -> NDArray[np.number]:
-    """Convert charges to an array of numbers.
-
-    Args:
-        charge_pC: Charges of one press or of several presses, pC.
-        expected: Description of the required charges, for error messages.
-        shape: Required shape, in which a name stands for any length.
-
-    Raises:
-        ChargeError: If the charges are not numbers, or their array has another shape.
-    """
-    try:
-        charges = np.asarray(charge_pC)
-    except ValueError as error:  # rows of different lengths
-        raise ChargeError(f"expected {expected} in each row, got {charge_pC!r:.200} ({error})") from error
-    # Numbers are floats, signed or unsigned integers. The array has lost the mask of a masked array.
-    if charges.dtype.kind not in "fiu" or np.ma.is_masked(charge_pC):
-        raise ChargeError(f"expected {expected} as numbers (pC), got {charge_pC!r:.200}")
-    if charges.ndim != len(shape) or charges.shape[-1] != shape[-1]:
-        raise ChargeError(f"expected {expected}, got an array of shape {charges.shape}")
-    return charges
-
-
-def as_float32(charges: NDArray[Any], electrodes: tuple[str, ...]) -> Singles:
-    """Convert charges of any number type to a contiguous float32 array.
-
-    Args:
-        charges: Charges, shape (n, electrodes), pC.
-        electrodes: Names of the electrodes, for the error message.
-
-    Raises:
-        ChargeError: If a charge is not finite or beyond the range of float32. The message names the electrodes of all
-            such charges in the first row that contains one.
-    """
-    with np.errstate(over="ignore"):  # charges beyond the range of float32 become infinite and are refused below
-        converted = np.ascontiguousarray(charges, dtype=np.float32)
-    is_finite = np.isfinite(converted)
-    if is_finite.all():
-        return converted
-    row = int(np.argmin(is_finite.all(axis=1)))  # index of the first row that is not finite
-    bad_columns = np.flatnonzero(~is_finite[row])
-    bad_charges = [f"{electrodes[column]!r} ({charges[row, column]})" for column in bad_columns]
-    where = f" in row {row} (rows count from 0)" if len(charges) > 1 else ""
-    raise ChargeError(f"expected finite float32 charges (pC), got{where} for electrode {', '.join(bad_charges)}")

@@ -19,8 +19,8 @@ from msgspec import Meta, Struct
 from isocharge.common.arrays import Singles
 from isocharge.common.errors import RequestError, TooLarge
 from isocharge.common.structs import parse_json
-from isocharge.serve.model.contact import Contacts
-from isocharge.serve.model.session import COLUMNS, INPUT, OUTPUTS, as_float32, run
+from isocharge.serve.model.contact import Contacts, as_float32
+from isocharge.serve.model.session import COLUMNS, INPUT, OUTPUTS, run
 from isocharge.serve.network.model_store import LoadedVersion
 
 Unsupported = Annotated[None, Meta(description="nothing, as this server does not support it")]
