@@ -25,7 +25,7 @@ from isocharge.serve import (
 from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.model_search import find_model
+from isocharge.serve.model.model_folder import find_model
 from isocharge.serve.record.formats import csv_header
 
 HARMFUL_CATEGORIES = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}

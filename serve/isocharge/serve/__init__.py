@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from isocharge.serve.live.device import device_from_table, load_device
     from isocharge.serve.live.steady_press import PressWatch
     from isocharge.serve.live.stream import ReadingStream, TouchStream, stream
-    from isocharge.serve.model.contact import Contact, Contacts
+    from isocharge.serve.model.contact import Contact, Contacts, Validity
     from isocharge.serve.model.metadata import ModelMetadata
     from isocharge.serve.model.model_folder import (
         Model,
         check_golden,
+        find_labelled_model,
+        find_model,
         load_checked_model,
         load_model,
         write_model,
     )
-    from isocharge.serve.model.model_search import find_labelled_model, find_model
     from isocharge.serve.model.predictor import Predictor
-    from isocharge.serve.model.validity import Validity
     from isocharge.serve.network.protocol.handler import asgi_app
     from isocharge.serve.port.file_source import Chunk
     from isocharge.serve.port.recording import Recorder, Recording

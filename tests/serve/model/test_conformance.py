@@ -9,7 +9,7 @@ from google.protobuf import text_format
 from tritonclient.grpc.model_config_pb2 import TYPE_FP32, ModelConfig
 
 from isocharge.serve import Predictor, check_golden, find_model, load_model
-from isocharge.serve.model.model_search import model_names
+from isocharge.serve.model.model_folder import model_names
 from isocharge.serve.model.session import OUTPUTS
 
 MODELS = Path(__file__).parents[3] / "models"

@@ -14,7 +14,7 @@ import pytest
 
 from isocharge.common.errors import ChargeError, ModelError, OutputExists
 from isocharge.serve import ModelMetadata, check_golden, find_labelled_model, find_model, load_model, write_model
-from isocharge.serve.model.golden import make_golden
+from isocharge.serve.model.session import make_golden
 from model_files import golden_json, put_graph
 
 
@@ -182,7 +182,7 @@ def roots(tmp_path, monkeypatch):
     current.mkdir(parents=True)
     given.mkdir()
     monkeypatch.chdir(current.parent)
-    monkeypatch.setattr("isocharge.serve.model.model_search._released_models", lambda: tmp_path / "shipped")
+    monkeypatch.setattr("isocharge.serve.model.model_folder._released_models", lambda: tmp_path / "shipped")
     return {"given": given, "variable": variable, "current": current, "shipped": tmp_path / "shipped"}
 
 

@@ -7,8 +7,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from infer_requests import BODY, INFER, infer_request
 from isocharge.serve import Predictor, find_model
 from isocharge.serve.flags import MISFIT
+from isocharge.serve.model.contact import Validity
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.validity import Validity
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler

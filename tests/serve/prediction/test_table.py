@@ -13,7 +13,7 @@ import pytest
 
 from isocharge.common.errors import ChargeError
 from isocharge.serve import Contact, Contacts, Predictor, Validity, read_charges, table_records, write_contacts
-from isocharge.serve.model.validity import MISFIT_LIMIT, inside_polygon
+from isocharge.serve.model.contact import MISFIT_LIMIT, inside_polygon
 
 NAMES = ("A", "B", "C")
 

@@ -8,9 +8,8 @@ from msgspec import structs
 from tests.train.random_networks import random_network
 
 from isocharge.serve import find_model, load_model, write_model
-from isocharge.serve.model.contact import Contacts
-from isocharge.serve.model.model_search import model_names
-from isocharge.serve.model.validity import Validity
+from isocharge.serve.model.contact import Contacts, Validity
+from isocharge.serve.model.model_folder import model_names
 from isocharge.train.export_c.folder import export_c
 from isocharge.train.export_c.model_source import FLAG_BITS
 from isocharge.train.model_release.onnx_graph import write_graph

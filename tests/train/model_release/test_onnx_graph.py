@@ -13,7 +13,7 @@ from tests.train.random_networks import random_network
 
 from isocharge.common.errors import ModelError, TrainingError
 from isocharge.serve import find_model
-from isocharge.serve.model.validity import MISFIT_LIMIT
+from isocharge.serve.model.contact import MISFIT_LIMIT
 from isocharge.simulate import noise_model
 from isocharge.train.model_release.onnx_graph import check_graph, read_graph, write_graph
 from isocharge.train.training.config import NetworkConfig

@@ -14,7 +14,7 @@ from isocharge.common.errors import ConfigError
 from isocharge.common.structs import convert
 from isocharge.serve import Predictor, find_model
 from isocharge.serve.model.metadata import ModelNoise
-from isocharge.serve.model.model_search import model_names
+from isocharge.serve.model.model_folder import model_names
 from isocharge.simulate import Circle, Domain, ForwardMap, noise_model, press
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 from isocharge.simulate.solver.equilibrium import principal_stress

@@ -2,8 +2,7 @@
 
 from isocharge.cli.shared.options import JsonOption, ModelArgument, ModelsOption
 from isocharge.cli.shared.terminal import show_result
-from isocharge.serve.model.model_folder import load_checked_model
-from isocharge.serve.model.model_search import find_model
+from isocharge.serve.model.model_folder import find_model, load_checked_model
 
 
 def verify_command(model: ModelArgument, json: JsonOption = False, models: ModelsOption = None) -> None:

@@ -14,8 +14,7 @@ from typing import Any, TypeVar
 
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import GAP, REPEAT, RESTART
-from isocharge.serve.model.contact import Contact
-from isocharge.serve.model.validity import Validity
+from isocharge.serve.model.contact import Contact, Validity
 from isocharge.serve.record.record import FollowedFilm, Tracking
 
 SEQ_MODULUS = 1 << 16

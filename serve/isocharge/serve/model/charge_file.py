@@ -28,7 +28,7 @@ from isocharge.common.arrays import npz_arrays
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError, cut
 from isocharge.serve.model.charge_series import ChargeSeries
-from isocharge.serve.model.golden import read_companion_file
+from isocharge.serve.model.session import read_companion_file
 
 FILE = "charges.npz"
 """Name of the file in a version folder."""

@@ -32,8 +32,8 @@ from numpy.polynomial import chebyshev, polynomial
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.contact_domain import Domain
+from isocharge.serve.model.contact import disk_corners
 from isocharge.serve.model.robust_estimate import ModelValues
-from isocharge.serve.model.validity import disk_corners
 
 CHUNK_SIZE = 4096
 """Number of points at which a series is evaluated at the same time, which limits the memory."""

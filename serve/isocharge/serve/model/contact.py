@@ -1,18 +1,27 @@
-"""Contacts that a model computes from charges.
+"""Charges of presses, the contacts that a model computes from them, and the domain in which these contacts are valid.
 
 A contact consists of ten numbers. Other programs rely on the order of the ten numbers.
+
+Charges must be finite numbers in the order of the electrodes. `write_finite` is a fast check for plain numbers.
+
+The class `Validity` compares contacts with the domain for which a model was trained. The result of the comparison is a
+subset of the flags `outside`, `beyond`, `misfit` and `stress`.
 """
 
 import math
 import struct
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from isocharge.common.arrays import Array, Singles
+from isocharge.common.arrays import Array, Booleans, Reals, Singles
 from isocharge.common.errors import ChargeError
+from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE, STRESS
+from isocharge.serve.model.metadata import ModelMetadata
 
 
 class Contact(NamedTuple):
@@ -232,3 +241,245 @@ def as_float32(charges: NDArray[Any], electrodes: tuple[str, ...]) -> Singles:
     bad_charges = [f"{electrodes[column]!r} ({charges[row, column]})" for column in bad_columns]
     where = f" in row {row} (rows count from 0)" if len(charges) > 1 else ""
     raise ChargeError(f"expected finite float32 charges (pC), got{where} for electrode {', '.join(bad_charges)}")
+
+
+MISFIT_LIMIT = 5.0
+"""Smallest limit of the misfit, in standard deviations of the noise.
+
+The metadata of a model may contain a larger limit, which 0.1 % of good presses exceed.
+"""
+
+TOUCH_LIMIT = 5.0
+"""Charge, in standard deviations of the white noise, above which an electrode indicates a touch."""
+
+IMPLAUSIBLE_FACTOR = 3.0
+"""Factor that gives the limits beyond which an output of the model cannot be a measurement, dimensionless.
+
+The limit of the force is the largest force times this factor. The limit of the distance from the centre of the working
+area is the radius of the circle around the working area times this factor.
+"""
+
+MAX_CENTRE_OFFSET = 0.05
+"""Largest distance between the origin and the centre of a working area that is called centred, dimensionless.
+
+The distance is relative to the radius of the area.
+"""
+
+
+N_CORNERS = 64
+"""Number of corners of the polygon that represents a round working area."""
+
+
+def disk_corners(radius_mm: float) -> Array:
+    """Return the corners (x, y) of a regular polygon around a disk, shape (N_CORNERS, 2), mm.
+
+    The centre of the disk is the origin. The sides of the polygon touch the disk.
+    """
+    angle = 2.0 * np.pi * np.arange(N_CORNERS) / N_CORNERS
+    corner_distance_mm = radius_mm / np.cos(np.pi / N_CORNERS)
+    return np.asarray(corner_distance_mm * np.column_stack([np.cos(angle), np.sin(angle)]))
+
+
+@dataclass(frozen=True)
+class Validity:
+    """The domain in which a model is valid: the working area, the range of forces and the limit of the misfit.
+
+    Attributes:
+        corners_mm: Corners of the polygon that is the working area, shape (n, 2), mm.
+        force_range_N: Smallest and largest force, N.
+        misfit_limit: Misfit above which the charges are not attributed to a single contact, in standard deviations.
+        yield_force_N: Force above which the film yields, N.
+        white_pC: Standard deviation of the white noise, pC: one number for all electrodes, or one number for each
+            electrode.
+    """
+
+    corners_mm: Array
+    force_range_N: tuple[float, float]
+    misfit_limit: float = MISFIT_LIMIT
+    yield_force_N: float = math.inf
+    white_pC: float | tuple[float, ...] = 0.0
+
+    @classmethod
+    def of(cls, metadata: ModelMetadata) -> "Validity":
+        """Return the domain that the metadata of a model describe.
+
+        Args:
+            metadata: Metadata of the model.
+        """
+        measured_limit = metadata.errors.get("misfit_p999", MISFIT_LIMIT)  # 0.1 % of good presses exceed it
+        return cls(
+            corners_mm=np.array(metadata.working_area_mm),
+            force_range_N=metadata.force_range_N,
+            misfit_limit=max(MISFIT_LIMIT, measured_limit),
+            yield_force_N=math.inf if metadata.yield_force_N is None else metadata.yield_force_N,
+            white_pC=metadata.noise.white_pC,
+        )
+
+    @cached_property
+    def radius_mm(self) -> float:
+        """Largest distance of a corner of the working area from the origin, mm."""
+        return float(np.linalg.norm(self.corners_mm, axis=1).max())
+
+    @cached_property
+    def centre_mm(self) -> tuple[float, float]:
+        """Centre (x, y) of the bounding box of the working area, mm."""
+        lowest = self.corners_mm.min(axis=0)
+        highest = self.corners_mm.max(axis=0)
+        x_mm, y_mm = (0.5 * (lowest + highest)).tolist()
+        return x_mm, y_mm
+
+    @cached_property
+    def implausible_limits(self) -> tuple[float, float]:
+        """Limits beyond which an output of the model cannot be a measurement.
+
+        The first limit is a squared distance from `centre_mm`, mm^2. The second limit is a force, N.
+        """
+        circumscribed_radius_mm = np.linalg.norm(self.corners_mm - self.centre_mm, axis=1).max()
+        _min_force_N, max_force_N = self.force_range_N
+        return float(IMPLAUSIBLE_FACTOR * circumscribed_radius_mm) ** 2, IMPLAUSIBLE_FACTOR * max_force_N
+
+    def is_touch(self, charge_pC: Array) -> Booleans:
+        """Compute for each press whether the charge of at least one electrode exceeds the noise.
+
+        A charge exceeds the noise if its magnitude is larger than `TOUCH_LIMIT` standard deviations of the white noise.
+
+        Args:
+            charge_pC: Charges of n presses, shape (n, electrodes), pC.
+
+        Returns:
+            Whether each press is a touch, shape (n,).
+        """
+        limit_pC = TOUCH_LIMIT * np.asarray(self.white_pC)
+        return np.asarray((np.abs(charge_pC) > limit_pC).any(axis=1))
+
+    @property
+    def is_centred(self) -> bool:
+        """Whether the centre of the working area is close to the origin."""
+        return math.hypot(*self.centre_mm) < MAX_CENTRE_OFFSET * self.radius_mm
+
+    @cached_property
+    def area_text(self) -> str:
+        """Description of the working area for messages.
+
+        The text states the radius of the area if its centre is close to the origin, and its bounding box otherwise.
+        """
+        if self.is_centred:
+            return f"up to {self.radius_mm:.3g} mm"
+        # The limits are the corners of the bounding box of the working area.
+        left_mm, bottom_mm = self.corners_mm.min(axis=0)
+        right_mm, top_mm = self.corners_mm.max(axis=0)
+        return f"from ({left_mm:.3g}, {bottom_mm:.3g}) to ({right_mm:.3g}, {top_mm:.3g}) mm"
+
+    @cached_property
+    def inscribed_radius_squared_mm2(self) -> float:
+        """Squared radius of a circle around the origin that lies inside the working area, mm^2.
+
+        The radius is the distance from the origin to the nearest line through an edge of the working area. If the
+        origin is outside the working area, the radius is 0.
+        """
+        origin_coordinate_mm = np.zeros(1)  # x and also y; `inside_polygon` takes arrays of points, here of one point
+        is_origin_inside = inside_polygon(origin_coordinate_mm, origin_coordinate_mm, self.corners_mm)[0]
+        if not is_origin_inside:
+            return 0.0
+
+        # The line through an edge is at most as far away as the edge, so the radius is not too large.
+        x_start, y_start = self.corners_mm.T
+        x_end, y_end = np.roll(self.corners_mm, -1, axis=0).T  # the last edge ends at the first corner
+        with np.errstate(invalid="ignore"):  # if the last corner repeats the first corner, an edge has the length 0
+            distance_mm = np.abs(x_start * y_end - x_end * y_start) / np.hypot(x_end - x_start, y_end - y_start)
+        return float(np.nanmin(distance_mm)) ** 2
+
+    def flags(self, contact: Contact) -> tuple[str, ...]:
+        """Return the flags of one contact, which are the reasons why the contact may be wrong.
+
+        For a contact in the largest circle inside the working area, the method takes one or two microseconds. Every
+        other contact is compared with the polygon of the area, which takes about 50 us.
+
+        Args:
+            contact: Contact that the model computed.
+
+        Returns:
+            The words `outside`, `beyond`, `misfit` and `stress` whose conditions are true; empty if the contact is
+            valid.
+        """
+        min_force_N, max_force_N = self.force_range_N
+        distance_squared_mm2 = contact.x_mm * contact.x_mm + contact.y_mm * contact.y_mm
+        is_in_circle = distance_squared_mm2 < self.inscribed_radius_squared_mm2
+        is_valid = (
+            is_in_circle
+            and min_force_N <= contact.force_N <= max_force_N
+            and contact.misfit <= self.misfit_limit
+            and contact.force_N <= self.yield_force_N
+        )
+        if is_valid:
+            return ()
+        is_in_area = is_in_circle
+        if not is_in_circle:
+            x_mm, y_mm = np.array([contact[:2]]).T
+            is_in_area = inside_polygon(x_mm, y_mm, self.corners_mm)[0]
+        return tuple(word for word, is_flagged in self._conditions(contact, is_in_area).items() if is_flagged)
+
+    def batch_flags(self, contacts: Contacts) -> list[tuple[str, ...]]:
+        """Return the flags of n contacts.
+
+        Args:
+            contacts: Contacts of n presses.
+
+        Returns:
+            A list of length n with the flags of each press, as the method `flags` returns them for a single contact.
+        """
+        with np.errstate(over="ignore"):  # a distance that overflows is infinite and exceeds the limit
+            has_flag = self._conditions(contacts, inside_polygon(contacts.x_mm, contacts.y_mm, self.corners_mm))
+        flags: list[tuple[str, ...]] = [()] * len(contacts.x_mm)
+        for row in np.flatnonzero(np.any(list(has_flag.values()), axis=0)):
+            flags[row] = tuple(word for word, is_flagged in has_flag.items() if is_flagged[row])
+        return flags
+
+    def _conditions(self, contact: Contact | Contacts, is_in_area: Any) -> dict[str, Any]:
+        """Return the condition of each flag for one contact or for n contacts.
+
+        Args:
+            contact: One contact, or n contacts.
+            is_in_area: Whether the contact lies in the working area; an array of shape (n,) for n contacts.
+
+        Returns:
+            For each flag, whether its condition is true. The values have the form of `is_in_area`.
+        """
+        min_force_N, max_force_N = self.force_range_N
+        centre_x_mm, centre_y_mm = self.centre_mm
+        max_distance_squared_mm2, implausible_force_N = self.implausible_limits
+        x_mm = contact.x_mm - centre_x_mm
+        y_mm = contact.y_mm - centre_y_mm
+        return {
+            OUTSIDE: np.logical_not(is_in_area) | (contact.force_N < min_force_N) | (contact.force_N > max_force_N),
+            BEYOND: (x_mm * x_mm + y_mm * y_mm > max_distance_squared_mm2) | (contact.force_N > implausible_force_N),
+            MISFIT: contact.misfit > self.misfit_limit,
+            STRESS: contact.force_N > self.yield_force_N,
+        }
+
+
+def inside_polygon(x: Reals, y: Reals, corners: Array) -> Booleans:
+    """Compute whether points lie inside a polygon.
+
+    A point is inside the polygon if a horizontal ray from the point to the right crosses an odd number of edges. The
+    ray crosses an edge under two conditions. Exactly one end of the edge is above the ray, and the edge intersects the
+    horizontal line to the right of the point.
+
+    Args:
+        x: First coordinates of the points, shape (n,), in the unit of the corners.
+        y: Second coordinates of the points, shape (n,).
+        corners: Corners in their order along the polygon, shape (m, 2). The last corner may repeat the first corner.
+
+    Returns:
+        Whether each point is inside, shape (n,). The result for points on an edge is undefined.
+    """
+    edge_ends = np.roll(corners, -1, axis=0)
+    # Coordinates of shape (m, 1), so that the arrays below have the shape (m edges, n points).
+    x_start, y_start = corners.T[..., np.newaxis]
+    x_end, y_end = edge_ends.T[..., np.newaxis]
+    crosses_height = (y_start > y) != (y_end > y)  # the edge crosses the horizontal line through the point
+    with np.errstate(divide="ignore", invalid="ignore"):  # the division by 0 of a horizontal edge has no effect
+        crossing_x = x_start + (y - y_start) * (x_end - x_start) / (y_end - y_start)
+    is_to_the_right = x < crossing_x
+    crossing_count = np.count_nonzero(crosses_height & is_to_the_right, axis=0)
+    return np.asarray(crossing_count % 2 == 1)

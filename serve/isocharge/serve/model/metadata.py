@@ -6,6 +6,7 @@ reads only the name of the sensor. The name of the sensor is also the name of th
 """
 
 import json
+import re
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -15,10 +16,24 @@ from msgspec import Meta, Struct, to_builtins
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, is_printable, shown
 from isocharge.common.structs import Finite, NotNegative, Positive, Settings, Text, WrongKey, convert, parse_json
-from isocharge.serve.model.model_search import ModelName
 
 FORMAT_VERSION = 1
 """Version of the format of the metadata."""
+
+NAME_PATTERN = r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}"
+"""Regular expression of the name of a model: characters that are safe in paths, URLs, web pages and `config.pbtxt`."""
+
+VERSION_PATTERN = "[1-9][0-9]{0,17}"
+"""Regular expression of the version of a model: a whole number of at most 63 bits."""
+
+NAME = re.compile(NAME_PATTERN)
+VERSION = re.compile(VERSION_PATTERN)
+
+ModelName = Annotated[str, Meta(pattern=rf"\A{NAME_PATTERN}\Z", description="letters, digits, '-', '_' and '.'")]
+
+ModelLabel = Annotated[
+    str, Meta(pattern=rf"\A{NAME_PATTERN}/{VERSION_PATTERN}\Z", description="the label NAME/VERSION of a model")
+]
 
 Names = Annotated[tuple[Text, ...], Meta(min_length=1)]
 

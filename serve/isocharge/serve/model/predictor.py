@@ -22,12 +22,10 @@ from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ChargeError
 from isocharge.common.structs import convert
 from isocharge.serve.flags import BEYOND
-from isocharge.serve.model.contact import Contact, Contacts, as_batch, as_press, write_finite
+from isocharge.serve.model.contact import Contact, Contacts, Validity, as_batch, as_press, write_finite
 from isocharge.serve.model.metadata import ModelNoise
-from isocharge.serve.model.model_folder import load_model
-from isocharge.serve.model.model_search import find_model
+from isocharge.serve.model.model_folder import find_model, load_model
 from isocharge.serve.model.session import COLUMNS, BoundPress, run
-from isocharge.serve.model.validity import Validity
 
 log = logging.getLogger(__name__)
 

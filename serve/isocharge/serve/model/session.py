@@ -1,23 +1,38 @@
-"""Functions that open, check and run the ONNX session of a model, and convert charges to the inputs of the session.
+"""Functions that open, check and run the ONNX session of a model, and the golden vectors that its outputs must equal.
 
 The network of a model takes microseconds to run. A session therefore uses one thread, because a second thread would
 cost more time than it saves. Between two runs, the session sleeps. By default, onnxruntime would wait actively, and a
 stream of 100 frames per second would keep most of a processor core busy. `BoundPress` is the fastest way to compute one
 press, because its memory for input and output is bound to the session only once.
 
-Charges must be finite numbers in the order of the electrodes. `write_finite` is a fast check for plain numbers.
+Golden vectors are input charges and the outputs that the model computed when it was exported. The file `golden.json`
+stores the golden vectors and the checksum of `model.onnx`. The checksum shows whether `model.onnx` is still the
+released file. A comparison with the stored outputs shows whether another machine or another version of onnxruntime computes the
+same outputs. A computed output a agrees with a stored output b if
+
+    |a - b| <= 1e-5 max(|b|, floor),
+
+where the floor is a constant for each column of the output.
 """
 
+import json
+import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import onnxruntime as ort
+from msgspec import Meta, Struct
 
 from isocharge.common.arrays import Singles
 from isocharge.common.errors import ModelError, cut
+from isocharge.common.files import read_needed, sha256_of
+from isocharge.common.structs import Finite, NotNegative, Text, read_json
+from isocharge.serve.model.metadata import ModelMetadata
 
 INPUT = "charge_pC"
 """Name of the input."""
@@ -186,3 +201,227 @@ class BoundPress:
         self.run()  # reads the charges from their memory, and writes the outputs into the memory of `_value_view`
         target: Any = out.data
         target[:] = self._value_view
+
+
+RELATIVE_TOLERANCE = 1e-5
+"""Largest difference of two outputs, relative to max(|output|, floor), dimensionless."""
+
+FLOORS = {
+    "contact": (1.0, 1.0, 0.1),  # mm, mm, N
+    "contact_std": (1.0, 1.0, 0.1),
+    # A correlation is computed from terms that nearly cancel. Versions of onnxruntime differ by 1e-4.
+    CORRELATION: (10.0, 10.0, 10.0),
+    # Near zero, the misfit is computed from terms that nearly cancel. Versions of onnxruntime differ by 1e-4.
+    "misfit": (20.0,),
+}
+"""Floor for each column of an output, in the unit of the column. Below it, differences are compared absolutely."""
+
+RANGE_SHARE = 0.05
+"""Floor of x, y and the force relative to the range of the model, if this is more than the floor in `FLOORS`."""
+
+
+def contact_floors(metadata: ModelMetadata) -> tuple[float, float, float]:
+    """Return the floors of x (mm), y (mm) and the force (N) for the outputs `contact` and `contact_std` of a model.
+
+    A computed output may differ from the stored output by a tolerance, which is proportional to the magnitude of the
+    output. Below the floor, the tolerance is constant. The floors of x and y are at least the rms position error of the
+    model.
+
+    Args:
+        metadata: Metadata of the model.
+    """
+    position_floor_mm, _, force_floor_N = FLOORS["contact"]
+    radius_mm = max(math.hypot(x_mm, y_mm) for x_mm, y_mm in metadata.working_area_mm)
+    position_rms_mm = metadata.errors.get("position_rms_mm", 0.0)
+    _min_force_N, max_force_N = metadata.force_range_N
+    position_floor_mm = max(position_floor_mm, RANGE_SHARE * radius_mm, position_rms_mm)
+    return position_floor_mm, position_floor_mm, max(force_floor_N, RANGE_SHARE * max_force_N)
+
+
+@dataclass(frozen=True)
+class Golden:
+    """Golden vectors of one model.
+
+    Attributes:
+        sha256: Checksum of the model file.
+        charge_pC: Input charges, shape (n, electrodes), pC.
+        outputs: Outputs of the model by name, each of shape (n, width).
+        relative_tolerance: Largest difference of two outputs, relative to max(|output|, floor).
+        floors: Floor for each column of an output, by the name of the output.
+        companion_sha256: Checksums of the files that lie beside the model, such as `charges.npz`, by file name.
+    """
+
+    sha256: str
+    charge_pC: Singles
+    outputs: dict[str, Singles]
+    relative_tolerance: float
+    floors: dict[str, tuple[float, ...]]
+    companion_sha256: Mapping[str, str] = field(default_factory=dict)
+
+    def to_json(self) -> str:
+        """Return the text of `golden.json`."""
+        content = {
+            "sha256": self.sha256,
+            "tolerance": {
+                "rule": "|a - b| <= relative * max(|b|, floor)",
+                "relative": self.relative_tolerance,
+                "floor": self.floors,
+            },
+            "inputs": {INPUT: self.charge_pC.tolist()},
+            "outputs": {name: rows.tolist() for name, rows in self.outputs.items()},
+            "files": dict(self.companion_sha256),
+        }
+        return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+
+def make_golden(
+    session: ort.InferenceSession,
+    onnx_model: bytes,
+    charge_pC: Singles,
+    contact_floor: tuple[float, float, float],
+    companion_files: Mapping[str, bytes],
+) -> Golden:
+    """Compute the golden vectors of a new model, which are the given charges and the outputs for these charges.
+
+    Args:
+        session: Session of the model.
+        onnx_model: Content of `model.onnx`, whose checksum is stored.
+        charge_pC: Input charges, shape (n, electrodes), pC.
+        contact_floor: Floors of x (mm), y (mm) and the force (N) for the comparison of outputs, from `contact_floors`.
+        companion_files: Contents of companion files by file name, whose checksums are stored.
+
+    Raises:
+        ModelError: If an output is not finite.
+    """
+    outputs = run(session, charge_pC)
+    for name, rows in outputs.items():
+        bad_rows = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+        if bad_rows.size:
+            bad_row = bad_rows[0]  # the message shows only the first of the bad rows
+            raise ModelError(
+                f"the new model: {name}: expected finite outputs, got {rows[bad_row]} for the charges "
+                f"{charge_pC[bad_row]} pC"
+            )
+    return Golden(
+        sha256=sha256_of(onnx_model),
+        charge_pC=charge_pC,
+        outputs=outputs,
+        relative_tolerance=RELATIVE_TOLERANCE,
+        floors=FLOORS | {"contact": contact_floor, "contact_std": contact_floor},
+        companion_sha256={name: sha256_of(content) for name, content in companion_files.items()},
+    )
+
+
+Rows = Annotated[list[list[Finite]], Meta(min_length=1)]
+"""Rows of numbers, one for each press."""
+
+
+class _Tolerance(Struct):
+    """The object `tolerance` of `golden.json`."""
+
+    relative: NotNegative
+    floor: dict[str, tuple[Finite, ...]]
+
+
+class _GoldenFile(Struct):
+    """The content of `golden.json`."""
+
+    sha256: Text
+    inputs: dict[str, Rows]
+    outputs: dict[str, Rows]
+    tolerance: _Tolerance
+    files: dict[Text, Text]
+
+
+def read_golden(path: Path) -> Golden:
+    """Read the golden vectors of a model (input charges and stored outputs) from the file `golden.json`.
+
+    Raises:
+        ModelError: If the file is missing or damaged.
+    """
+    if not path.exists():
+        raise ModelError(f"{path}: missing; every model has this file: copy the whole folder of the model again")
+    try:
+        content = read_json(path, "golden vectors", ModelError, _GoldenFile)
+        # Numbers that are too large for float32 become infinite. They differ from every output of a model.
+        with np.errstate(over="ignore"):
+            outputs = {name: np.array(rows, np.float32) for name, rows in content.outputs.items()}
+            charge_pC = np.array(content.inputs[INPUT], np.float32)
+        for name, width in OUTPUTS.items():
+            sizes = (*outputs[name].shape, len(content.tolerance.floor[name]))
+            if sizes != (len(charge_pC), width, width):
+                raise ValueError(
+                    f"{name}: expected {len(charge_pC)} rows of {width} numbers, and {width} floors, got an array of "
+                    f"shape {sizes[:-1]} and {sizes[-1]} floors"
+                )
+    except (ModelError, ValueError, KeyError) as error:  # rows of different lengths, or a missing entry
+        where = "" if isinstance(error, ModelError) else f"{path}: "
+        raise ModelError(f"{where}{error}; the file is damaged: copy or export the model again") from error
+    return Golden(
+        sha256=content.sha256,
+        charge_pC=charge_pC,
+        outputs=outputs,
+        relative_tolerance=content.tolerance.relative,
+        floors=content.tolerance.floor,
+        companion_sha256=content.files,
+    )
+
+
+def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
+    """Read a companion file of a model, such as `charges.npz`, and compare it with its checksum in `golden.json`.
+
+    A companion file belongs to one `model.onnx`. A companion file of another model would have the right format but give
+    wrong contacts.
+
+    Args:
+        version_folder: Folder of the model, which contains `model.onnx`.
+        name: Name of the companion file.
+        advice: What the user can do if the file cannot be read, for the error message.
+
+    Returns:
+        The bytes of the file.
+
+    Raises:
+        ModelError: If the file cannot be read, if its checksum differs from the checksum in `golden.json`, or if
+            `golden.json` is missing or damaged, or does not list the file.
+    """
+    path = version_folder / name
+    data = read_needed(path, ModelError, advice)
+    checksums = read_golden(version_folder / "golden.json").companion_sha256
+    # If `golden.json` does not list the file, the comparison with this text fails, and the message contains the text.
+    expected_sha256 = checksums.get(name, "no such file")
+    actual_sha256 = sha256_of(data)
+    if actual_sha256 != expected_sha256:
+        raise ModelError(
+            f"{path}: expected sha256 {expected_sha256:.12} (golden.json), got {actual_sha256:.12}; the file is "
+            f"damaged or belongs to another model: copy the whole folder of the model again, or {advice}"
+        )
+    return data
+
+
+def check_outputs(golden: Golden, outputs: dict[str, Singles], where: str) -> None:
+    """Check that the outputs that a model has computed from the golden charges agree with the stored outputs.
+
+    Args:
+        golden: Golden vectors with the stored outputs and the tolerances.
+        outputs: Computed outputs by name, each of shape (n, width).
+        where: Name or file of the model, for error messages.
+
+    Raises:
+        ModelError: If an output differs by more than the tolerance. The message names the largest difference of this
+            output.
+    """
+    for name, rows in outputs.items():
+        expected = golden.outputs[name].astype(float)
+        # Below its floor, a value has a constant tolerance, because a relative tolerance would approach 0.
+        tolerance = golden.relative_tolerance * np.maximum(np.abs(expected), golden.floors[name])
+        with np.errstate(invalid="ignore"):
+            excess = np.abs(rows - expected) - tolerance
+        excess[np.isnan(excess)] = np.inf  # a value that is not a number counts as an infinite difference
+        row, column = np.unravel_index(np.argmax(excess), excess.shape)
+        if excess[row, column] > 0.0:
+            raise ModelError(
+                f"{where}: {name}[{row}, {column}]: expected {expected[row, column]:.9g} +- "
+                f"{tolerance[row, column]:.1g} (golden.json), got {rows[row, column]:.9g}; copy or export the model "
+                "again"
+            )

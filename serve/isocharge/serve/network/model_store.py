@@ -17,10 +17,9 @@ from functools import cached_property
 from pathlib import Path
 
 from isocharge.common.errors import ModelError, ModelNotFound
+from isocharge.serve.model.contact import Validity
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.model_folder import Model, load_checked_model
-from isocharge.serve.model.model_search import model_names, repositories, version_folders
-from isocharge.serve.model.validity import Validity
+from isocharge.serve.model.model_folder import Model, load_checked_model, model_names, repositories, version_folders
 from isocharge.serve.network.metrics import ModelMetrics, Statistics
 
 log = logging.getLogger(__name__)

@@ -28,7 +28,7 @@ from isocharge.common.errors import RecordingError, cut, is_printable
 from isocharge.common.files import AtomicWriter, bounded_lines
 from isocharge.common.progress import report
 from isocharge.common.structs import WrongKey, parse_json
-from isocharge.serve.model.model_search import ModelLabel
+from isocharge.serve.model.metadata import ModelLabel
 from isocharge.serve.port.file_source import RECORDING_START, Chunk, Moment, foreign_kind
 
 VERSION = 1

@@ -19,9 +19,9 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.structs import plain_values
+from isocharge.serve.model.contact import Validity
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.predictor import Predictor
-from isocharge.serve.model.validity import Validity
 from isocharge.serve.prediction.press_errors import (
     FORCE,
     NOT_TRAINED,

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.serve.model.contact import Contacts
+from isocharge.serve.model.contact import MISFIT_LIMIT, Contacts, Validity, inside_polygon
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.session import COLUMNS, N_WITHOUT_CORRELATION
-from isocharge.serve.model.validity import MISFIT_LIMIT, Validity, inside_polygon
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 
 CHARGE_UNKNOWN = "a charge is unknown"

@@ -14,9 +14,8 @@ from importlib.resources import as_file, files
 from typing import Any
 
 from isocharge.serve.flags import BEYOND, MEANINGS, MISFIT, OUTSIDE, STRESS
-from isocharge.serve.model.model_folder import load_model
-from isocharge.serve.model.model_search import find_model
-from isocharge.serve.model.validity import Validity
+from isocharge.serve.model.contact import Validity
+from isocharge.serve.model.model_folder import find_model, load_model
 from isocharge.serve.viewer.film_description import describe_film
 
 MODELS = ("three-25um-biaxial", "four-25um-biaxial", "eight-25um-biaxial")

@@ -38,8 +38,7 @@ from isocharge.common.files import as_output_errors, locked, remove_empty, write
 from isocharge.common.structs import Text, plain_values, read_json
 from isocharge.serve.model.charge_file import FILE as CHARGES
 from isocharge.serve.model.charge_file import charge_map_bytes
-from isocharge.serve.model.model_folder import check_target
-from isocharge.serve.model.model_search import version_folders
+from isocharge.serve.model.model_folder import check_target, version_folders
 from isocharge.serve.presses.csv_table import csv_text
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.serve.presses.std_factor import FEWEST_HELD_OUT, StdFactor

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import PressError, shown
-from isocharge.serve.model.validity import inside_polygon
+from isocharge.serve.model.contact import inside_polygon
 from isocharge.serve.presses.measured_presses import CONTACT, MeasuredPresses
 from isocharge.simulate import Domain
 from isocharge.train.data.channel_noise import LEAST_SHARE, usual_size

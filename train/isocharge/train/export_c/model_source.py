@@ -35,11 +35,9 @@ from numpy.typing import NDArray
 
 from isocharge.common.arrays import Array, Singles
 from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE, STRESS
-from isocharge.serve.model.contact import Contact, Contacts
-from isocharge.serve.model.golden import Golden
+from isocharge.serve.model.contact import MISFIT_LIMIT, Contact, Contacts, Validity
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.model.session import COLUMNS
-from isocharge.serve.model.validity import MISFIT_LIMIT, Validity
+from isocharge.serve.model.session import COLUMNS, Golden
 from isocharge.train.data.channel_noise import LARGEST_LOGARITHM
 from isocharge.train.export_c.c_text import c_array, c_comment, c_float, c_string, source_text
 from isocharge.train.training.folded_network import (

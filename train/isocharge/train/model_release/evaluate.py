@@ -7,9 +7,8 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import STRESS
-from isocharge.serve.model.contact import Contacts
+from isocharge.serve.model.contact import Contacts, Validity
 from isocharge.serve.model.metadata import ModelMetadata, UnnoticedPresses
-from isocharge.serve.model.validity import Validity
 from isocharge.train.data.channel_noise import Noise, misfit_noise
 from isocharge.train.data.contact_errors import ContactErrorStatistics, position_error, rounded
 from isocharge.train.data.presses import LabelledPresses

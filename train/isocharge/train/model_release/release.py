@@ -12,10 +12,10 @@ from isocharge.common.contact_domain import Domain
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import ModelError
 from isocharge.common.structs import convert
-from isocharge.serve.model.golden import contact_floors
+from isocharge.serve.model.contact import disk_corners
 from isocharge.serve.model.metadata import ModelMetadata, ModelNoise
 from isocharge.serve.model.model_folder import write_model
-from isocharge.serve.model.validity import disk_corners
+from isocharge.serve.model.session import contact_floors
 from isocharge.train.data.channel_noise import misfit_noise
 from isocharge.train.data.measured_sensor import PressedArea
 from isocharge.train.model_release.evaluate import evaluate, unnoticed_presses

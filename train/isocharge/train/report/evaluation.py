@@ -15,11 +15,10 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, ModelError, TrainingError
 from isocharge.common.progress import track
 from isocharge.serve.benchmark import Contender, take_turns
-from isocharge.serve.model.contact import Contact
+from isocharge.serve.model.contact import Contact, inside_polygon
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.session import COLUMNS
-from isocharge.serve.model.validity import inside_polygon
 from isocharge.simulate import ChargeMap, Dataset, NoiseModel, Triangulation, limits_at, noise_model
 from isocharge.simulate.identifiability.nearest_contact import search
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict

@@ -52,8 +52,8 @@ from scipy.linalg import block_diag
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
+from isocharge.serve.model.contact import MISFIT_LIMIT
 from isocharge.serve.model.session import CORRELATION, INPUT, OUTPUTS
-from isocharge.serve.model.validity import MISFIT_LIMIT
 from isocharge.train.data.channel_noise import LARGEST_LOGARITHM
 
 

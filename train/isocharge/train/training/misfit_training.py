@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from isocharge.common.arrays import Array
-from isocharge.serve.model.validity import MISFIT_LIMIT
+from isocharge.serve.model.contact import MISFIT_LIMIT
 from isocharge.simulate.identifiability.nearest_contact import search
 from isocharge.train.data.channel_noise import ChannelNoise, misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses

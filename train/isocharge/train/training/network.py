@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
-from isocharge.serve.model.validity import MISFIT_LIMIT
+from isocharge.serve.model.contact import MISFIT_LIMIT
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
 from isocharge.train.training.config import NetworkConfig
 from isocharge.train.training.folded_network import (
