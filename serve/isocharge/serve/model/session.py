@@ -7,8 +7,8 @@ press, because its memory for input and output is bound to the session only once
 
 Golden vectors are input charges and the outputs that the model computed when it was exported. The file `golden.json`
 stores the golden vectors and the checksum of `model.onnx`. The checksum shows whether `model.onnx` is still the
-released file. A comparison with the stored outputs shows whether another machine or another version of onnxruntime computes the
-same outputs. A computed output a agrees with a stored output b if
+released file. A comparison with the stored outputs shows whether another machine or another version of onnxruntime
+computes the same outputs. A computed output a agrees with a stored output b if
 
     |a - b| <= 1e-5 max(|b|, floor),
 
