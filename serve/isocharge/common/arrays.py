@@ -32,6 +32,9 @@ Booleans = NDArray[np.bool_]
 Complexes = NDArray[np.complex128]
 """Points of the plane as x + iy."""
 
+LARGEST = float(np.finfo(np.float32).max)
+"""Largest number that the tensors of the models can contain: the largest float32 number."""
+
 NPZ_COMPRESSION_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compression methods that are accepted in npz files. NumPy writes no others."""
 

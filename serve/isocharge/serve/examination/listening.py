@@ -12,14 +12,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import LARGEST, Array
 from isocharge.common.errors import PortLost
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import Frame, Parser
 from isocharge.serve.port.file_source import Chunk
 from isocharge.serve.port.serial_line import UDP_SCHEME, Request
 from isocharge.serve.port.source import Port, has_speed
-from isocharge.serve.presses.number_table import LARGEST
 from isocharge.serve.signal_chain.channels import channel_names
 from isocharge.serve.signal_chain.stage import Device
 

@@ -19,8 +19,7 @@ from isocharge.common.errors import ChargeError
 from isocharge.serve.model.contact import Contact
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.session import N_WITHOUT_CORRELATION
-from isocharge.serve.presses.csv_table import CsvTable
-from isocharge.serve.presses.number_table import CHARGE_RULE, NumberTable, TableSource
+from isocharge.serve.presses.csv_table import CHARGE_RULE, CsvTable, NumberTable, TableSource
 from isocharge.serve.presses.table_file import open_table
 from isocharge.serve.record.record import NO_CONTACT, PredictionRecord
 

@@ -17,8 +17,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, IsochargeError, cut, require, shown
 from isocharge.common.files import as_output_errors, bounded_lines, open_regular, write_whole
-from isocharge.serve.presses.csv_table import CsvTable, csv_text
-from isocharge.serve.presses.number_table import ColumnRule, NumberColumns, NumberTable, TableSource
+from isocharge.serve.presses.csv_table import ColumnRule, CsvTable, NumberColumns, NumberTable, TableSource, csv_text
 
 if TYPE_CHECKING:
     from pyarrow import DataType

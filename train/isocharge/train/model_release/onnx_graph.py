@@ -13,10 +13,9 @@ import onnx.parser
 import onnxruntime as ort
 from onnx import helper, numpy_helper
 
-from isocharge.common.arrays import Array, Booleans, Singles
+from isocharge.common.arrays import LARGEST, Array, Booleans, Singles
 from isocharge.common.errors import ModelError, TrainingError, cut
 from isocharge.serve.model.session import FLOORS, RELATIVE_TOLERANCE, open_session, run
-from isocharge.serve.presses.number_table import LARGEST
 from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
 from isocharge.train.training.folded_network import (
