@@ -137,7 +137,7 @@ TRAINING = "isocharge.train.training"
 WITHOUT = {
     "SOAP, but Adam": patch(f"{TRAINING}.descent.Soap", Adam),
     "sharpened first layer": patch(f"{TRAINING}.network.TrainablePerceptron.sharpen_first_layer"),
-    "linear targets": patch(f"{TRAINING}.fit.LINEAR_TARGET_FRACTION", 0.0),
+    "linear targets": patch(f"{TRAINING}.contact_training.LINEAR_TARGET_FRACTION", 0.0),
 }
 """Changes of the training, each of which removes one part of it, by the name of the part."""
 

@@ -5,6 +5,7 @@ folds of the map, and for distant contacts with the same charges. For a dataset 
 describes the mean of the charges over the probes.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -61,8 +62,8 @@ REFERENCE = noise_model("reference")
 FEWEST_PER_TERM = 8
 """Smallest number of presses per coefficient. Fewer presses would not determine the slopes near the edge."""
 
-RIDGE = 1e-9
-"""Relative weight of the squared coefficients in the fit (ridge regression).
+RIDGE = math.sqrt(np.finfo(float).eps)
+"""Relative weight of the squared coefficients in the fit (ridge regression): the root of the machine precision.
 
 The ridge is needed because the polynomials are defined on a square, whose corners lie outside the disk and contain no
 presses.

@@ -151,9 +151,6 @@ LARGEST_LINEAR_STD = 0.012
 The noise is not enlarged beyond this standard deviation, either.
 """
 
-MAX_NOISE_FACTOR = 5.0
-"""Largest factor by which the noise of a press is enlarged, dimensionless."""
-
 
 @dataclass(frozen=True)
 class LinearTargets:
@@ -198,7 +195,7 @@ class LinearTargets:
         largest_std = np.sqrt(contact_variance.max(axis=1))
         is_linear = largest_std <= LARGEST_LINEAR_STD
         noise_response[~is_linear] = 0.0
-        noise_factor = np.clip(LARGEST_LINEAR_STD / largest_std, 1.0, MAX_NOISE_FACTOR)
+        noise_factor = np.maximum(LARGEST_LINEAR_STD / largest_std, 1.0)
         return cls(
             noise_response=as_tensor(np.asarray(noise_response, dtype=float)),
             noise_factor=as_tensor(np.asarray(noise_factor[:, None], dtype=float)),

@@ -25,16 +25,6 @@ DECAY = 0.95
 BASIS_PERIOD = 10
 """Number of steps between two updates of the eigenvectors."""
 
-EPSILON = 1e-10
-"""Number that is added to each root mean square of the gradient, so that no division by zero occurs."""
-
-MAX_RATIO = 2.0
-"""Largest ratio of the averaged gradient to its root mean square, in the eigenbasis.
-
-With equal decay rates, the ratio is at most 1, except where an update of the eigenvectors has moved a part of the
-averaged gradient to an entry whose mean square is nearly zero. Without the limit, the step would be arbitrarily long.
-"""
-
 
 class Soap:
     """The optimiser SOAP for one parameter. A parameter with one dimension, such as a bias, is trained by Adam.
@@ -69,6 +59,10 @@ class Soap:
         by the root mean square of this entry over the past steps. The result is rotated back and gives the direction of
         the step.
 
+        With equal decay rates, the ratio is at most 1, except where an update of the eigenvectors has moved a part of
+        the averaged gradient to an entry whose mean square is nearly zero. There, the ratio is limited to 1, because
+        the step would be arbitrarily long without a limit.
+
         Args:
             rate: Learning rate, which is approximately the change of each entry.
         """
@@ -87,9 +81,9 @@ class Soap:
 
         # The moving averages begin at zero. They are therefore divided by the total weight of all gradients so far.
         total_weight = 1.0 - DECAY**self.step_count
-        root_mean_square = torch.sqrt(self.mean_square / total_weight) + EPSILON
+        root_mean_square = torch.sqrt(self.mean_square / total_weight) + torch.finfo(gradient.dtype).tiny  # never zero
         ratio = _rotate(self.mean_gradient, self.bases) / (total_weight * root_mean_square)
-        ratio.clamp_(-MAX_RATIO, MAX_RATIO)
+        ratio.clamp_(-1.0, 1.0)
         self.parameter.add_(_rotate(ratio, [basis.T for basis in self.bases]), alpha=-rate)
 
 

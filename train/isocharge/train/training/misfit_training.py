@@ -48,10 +48,6 @@ def draw_charges(rng: np.random.Generator, charge: Array, noise: ChannelNoise, c
     return noise.charge(level + std * rng.standard_normal(level.shape))
 
 
-MISFIT_RATE_FACTOR = 1.5
-"""Learning rate of the misfit network, relative to the learning rate of the contact network. It can be larger, because
-the targets of the misfit network have no noise."""
-
 OUTSIDE_SHARE = 0.25
 """Share of the examples of the misfit network that are presses outside the working area, dimensionless.
 
@@ -117,8 +113,7 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
         return focused_squared_distance(network.misfit_vector(inputs[rows]), targets[rows], focus)
 
     steps = config.sizes(network.features.n_electrode).misfit_steps
-    rate = MISFIT_RATE_FACTOR * config.learning_rate
-    return TrainingStage("misfit", network.misfit_vector, loss, steps, rate, config.seed)
+    return TrainingStage("misfit", network.misfit_vector, loss, steps, config.learning_rate, config.seed)
 
 
 def focused_squared_distance(vector: Tensor, target: Tensor, focus: float) -> Tensor:

@@ -13,7 +13,7 @@ from isocharge.simulate import ChargeMap, Dataset, Domain, NoiseModel, Sensor
 from isocharge.simulate.forward.charge_map import within
 from isocharge.simulate.identifiability.working_area import working_area
 from isocharge.train.data.channel_noise import ChannelNoise, misfit_noise
-from isocharge.train.data.charge_fit import fit_charge_series
+from isocharge.train.data.charge_fit import GOOD_ENOUGH, fit_charge_series
 from isocharge.train.data.presses import (
     YIELD_FORCE,
     LabelledPresses,
@@ -90,7 +90,7 @@ class TrainingData:
         )
 
 
-MAX_ERROR_OF_CERTAIN_FOLD = 3e-4
+MAX_ERROR_OF_CERTAIN_FOLD = 2.0 * GOOD_ENOUGH
 """Largest relative error of the fitted charges at which a fold counts as certain.
 
 A poor fit has spurious folds, in the outer fifth of the domain.
