@@ -147,7 +147,7 @@ def train(case: Case, steps: int | None, change: AbstractContextManager[object] 
     with threads_and_seed(1, 0), change or nullcontext():
         network = case.network()
         linear_targets = None
-        if network.n_electrode > FEW_ELECTRODES:
+        if network.features.n_electrode > FEW_ELECTRODES:
             linear_targets = LinearTargets.compute(case.train, case.charge_map, NOISE)
         contact_stage(network, case.train, NOISE, TrainingConfig(steps=steps), linear_targets=linear_targets).run()
     return predictor(network)

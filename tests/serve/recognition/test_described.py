@@ -12,6 +12,7 @@ from cobs import cobs
 
 from isocharge.serve import Frame, device_from_table
 from isocharge.serve.frames.transmission import CHECKSUMS
+from isocharge.serve.recognition.framing import find_checks
 from isocharge.serve.recognition.recognise import described_frames_section, recognise
 from layout_encoder import encode_layout
 
@@ -132,6 +133,15 @@ def test_channel_that_never_changes_is_kept_beside_the_others(channel, constant)
     data = b"".join(b"\xaa\x55" + struct.pack("<H4h", row, *numbers) for row, numbers in enumerate(values.tolist()))
     table = recognise([data], FRAMES / RATE_HZ)
     assert [field["name"] for field in table["fields"]] == ["seq", "ch1", "ch2", "ch3", "ch4"]
+
+
+def test_checksum_covers_at_least_two_bytes():
+    """Every byte would be its own sum of 16 bits."""
+    value = np.arange(100, dtype=np.uint8)
+    alone = np.column_stack([value, value, np.zeros_like(value)])
+    assert list(find_checks(alone)) == []
+    pair = np.column_stack([value, 2 * value, 3 * value.astype(np.uint16) % 256, 3 * value.astype(np.uint16) // 256])
+    assert next(find_checks(pair.astype(np.uint8))).name == "sum-16"
 
 
 @pytest.mark.parametrize("seed", range(2))

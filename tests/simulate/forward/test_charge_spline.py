@@ -51,6 +51,14 @@ def test_spline_includes_the_charge_of_contact_pressure(near_map):
     np.testing.assert_allclose(with_d33 - without, extra, atol=0.015 * np.abs(extra).max())
 
 
+def test_charges_of_contact_pressure_need_more_forces(near_map):
+    """Their power of the force differs from that of the stress, so the error grows with fewer forces."""
+    piezo = replace(near_map.sensor.piezo, d33=-30.0)
+    pressed = replace(near_map, sensor=replace(near_map.sensor, piezo=piezo))
+    counts = [kept(ChargeSpline.of, each, spacing=0.5).force.size for each in (near_map, pressed)]
+    assert counts[0] == near_map.family.force.size < counts[1]
+
+
 @pytest.mark.parametrize("radius", [0.0, 5.1, np.nan])
 def test_invalid_radius_raises_error(near_map, radius):
     with pytest.raises(SceneError, match=r"radius: expected up to the forward map's 5 mm"):

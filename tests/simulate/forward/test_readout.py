@@ -25,6 +25,7 @@ from isocharge.simulate.forward.readout import (
     NEAR_DISTANCE,
     ElectrodePieces,
     contact_charge,
+    contact_charges,
     stress_charge,
     thermal_charge,
 )
@@ -221,6 +222,21 @@ def test_contact_charge_follows_gain_and_place_of_the_electrodes():
     still = contact_charge(with_d33(), Circle(1.0), (8.5, 0.2), 1.0)
     moved = contact_charge(with_d33(calibration=calibration), Circle(1.0), (10.5, 0.2), 1.0)
     np.testing.assert_allclose(moved, [2.0 * still[0], 0.0, 0.0, 0.0], rtol=1e-9, atol=1e-12)
+
+
+def test_contact_charges_of_many_presses_are_those_of_each_press():
+    """The presses lie beside and below the electrodes, with positive and negative y, and on the film alone."""
+    sensor = with_d33()
+    places = [(8.5, 1.5), (8.5, -1.7), (1.0, 8.0), (-1.3, -8.0), (4.0, 3.0)]
+    contact = np.array([(x, y, force) for (x, y), force in zip(places, (0.3, 0.5, 0.7, 0.9, 1.1), strict=True)])
+    orientation = np.linspace(0.0, 1.0, len(contact))
+    probe = Polygon.triangle(1.0)
+    expected = [
+        contact_charge(sensor, probe.rotated(angle), (x, y), force)
+        for (x, y, force), angle in zip(contact.tolist(), orientation.tolist(), strict=True)
+    ]
+    assert np.count_nonzero(expected) >= 4
+    np.testing.assert_allclose(contact_charges(sensor, probe, contact, orientation), expected)
 
 
 # Charges without a touch

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from isocharge.simulate import Calibration, Circle, Domain, Electrode, FunctionMap, load_sensor, press
-from isocharge.simulate.plots.film import draw_charge_map, draw_electrodes, draw_section
+from isocharge.simulate.plots.film import FELT, INK, draw_charge_map, draw_electrodes, draw_layout, draw_section
 
 
 def test_draw_electrodes_draws_front_and_back_at_their_positions():
@@ -17,11 +17,23 @@ def test_draw_electrodes_draws_front_and_back_at_their_positions():
     sensor = replace(load_sensor("three-25um-biaxial"), electrodes=(electrode,))
     axes = Figure().subplots()
     draw_electrodes(axes, replace(sensor, calibration=Calibration(shift=(1.0, 0.0))))
+    assert {text.get_color() for text in axes.texts} == {INK}
     corners = [patch.get_xy()[:-1] - [1.0, 0.0] for patch in axes.patches]
     for drawn, polygon in zip(corners, (*electrode.front, back), strict=True):
         np.testing.assert_allclose(drawn, polygon)
     assert [patch.get_linestyle() for patch in axes.patches] == ["-", "-", "--"]
     assert [(text.get_text(), *text.xy) for text in axes.texts] == [("A", *np.add(electrode.centre, [1.0, 0.0]))]
+
+
+def test_draw_layout_shows_all_electrodes_and_highlights_one():
+    """The axes show the corners of the electrodes, of which the outermost is 12.8 mm from the centre."""
+    sensor = load_sensor("four-25um-biaxial")
+    axes = Figure().subplots()
+    draw_layout(axes, sensor, 8.0, highlight="B")
+    assert {text.get_text(): text.get_color() for text in axes.texts} == {"A": INK, "B": FELT, "C": INK, "D": INK}
+    corners = np.concatenate([electrode.corners for electrode in sensor.electrodes])
+    low, high = axes.get_xlim()
+    assert -low == high > np.linalg.norm(corners, axis=1).max()
 
 
 def test_draw_charge_map_covers_the_whole_disk():

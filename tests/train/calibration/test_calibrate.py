@@ -28,6 +28,7 @@ def test_errors_become_smaller_and_the_sentences_name_them(problem, synthetic):
     assert after.force_percent < 0.2 * before.force_percent
     assert f"errors of {after.position_mm:.2g} mm and {after.force_percent:.2g} %" in result.summary[0]
     assert result.cautions == ()
+    assert f"noise: about {100.0 * result.film.noise.gain:.2g} % and " in result.summary[-1]
     assert result.properties["pretension"].identified
     assert re.search(r"changes from the sensor file \(.*\): mean pretension .*; ln of d31 ", result.summary[1])
     std = np.array([one.std for one in result.properties.values()])
@@ -35,6 +36,14 @@ def test_errors_become_smaller_and_the_sentences_name_them(problem, synthetic):
     assert (np.abs(estimated - values) < 4.0 * std).all()
     sensor, _ = result.sensor_and_probe
     assert sensor.film.pretension == result.film.value("pretension")
+
+
+def test_film_is_solved_beyond_the_radius_but_not_at_the_clamp(problem):
+    """A probe near the clamp would need a very fine mesh."""
+    film, probe = problem.sensor.film, problem.probe
+    assert problem.solved_domain.radius > problem.radius
+    near_clamp = replace(problem, radius=film.radius - 1.5 * probe.reach)
+    assert near_clamp.radius <= near_clamp.solved_domain.radius < film.radius - 1.2 * probe.reach
 
 
 @pytest.mark.parametrize("offset", [10.0, -12.0])

@@ -328,7 +328,8 @@ def test_presses_of_one_force_or_without_forces_train_x_and_y(
     assert 0.65 <= errors["coverage_68"] <= 0.71
     assert not [name for name in errors if name.startswith("force_")]
     folder = release(fitted, tmp_path / "pad").folder
-    assert "| forces | not estimated: every answer is" in (folder / "card.md").read_text()
+    stated = f"every answer is {stated_N:g} N with a standard deviation of {100.0 * stated_std:g} %"
+    assert f"| forces | not estimated: {stated}" in (folder / "card.md").read_text()
     assert np.isfinite(Predictor(folder).predict(presses.charge_pC[0])[:7]).all()
     assert Predictor(folder).flags(Predictor(folder).predict(presses.charge_pC[0])) == ()
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import itertools
+import json
 import socket
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from isocharge.serve.network.address import ServerLimits, Tls
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.grpc import server
 from isocharge.serve.network.grpc.service import METHODS, SERVICE, Service
+from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.protocol import Handler
 
 PROTO = Path(__file__).parents[4] / "serve/isocharge/serve/network/grpc/inference.proto"
@@ -225,12 +227,15 @@ def test_end_of_a_connection_is_not_logged_as_an_error(store, caplog):
     """If a client ends a call whose responses it does not read, the pending response cannot be sent."""
     context = Mock(read=AsyncMock(return_value=b""), write=AsyncMock(side_effect=grpc.aio.InternalError))
     context.invocation_metadata.return_value = ()
-    service = Service(Handler(store))
+    context.peer.return_value = "ipv4:127.0.0.1:50000"
+    lines = []
+    service = Service(Handler(store, None, Traffic(RequestLog(lines.append))))
     with pytest.raises(asyncio.CancelledError):
         asyncio.run(service._handle("ModelStreamInfer", None, context))
     labels = {"transport": "grpc", "route": "ModelStreamInfer", "status": "CANCELLED"}
     assert service._traffic.registry.get_sample_value("isocharge_requests_total", labels) == 1
     assert not caplog.records
+    assert 0.0 < json.loads(lines[0])["duration_us"] < 1e6
 
 
 def test_new_call_replaces_the_call_that_waits_longest(serve, silent_call):

@@ -118,6 +118,16 @@ def test_optional_fields_may_be_null(ask):
     assert ask("POST", "/v2/repository/models/linear/load", b'{"parameters": null}')[0] == 200
 
 
+def test_index_contains_only_loaded_versions_on_request(ask):
+    def states(body):
+        return [row["state"] for row in orjson.loads(ask("POST", "/v2/repository/index", body)[2])]
+
+    assert states(b'{"ready": true}') == states(b"{}") == ["READY", "READY"]
+    assert ask("POST", "/v2/repository/models/linear/unload")[0] == 200
+    assert states(b'{"ready": true}') == []
+    assert states(b"{}") == ["UNAVAILABLE", "UNAVAILABLE"]
+
+
 @pytest.mark.parametrize(("way", "pack"), [("gzip", gzip.compress), ("deflate", zlib.compress), ("identity", bytes)])
 def test_compressed_request_body(ask, film, way, pack):
     plain = orjson.dumps(infer_request(film.golden_pC()))
