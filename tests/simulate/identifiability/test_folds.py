@@ -107,6 +107,14 @@ def test_find_folds_finds_a_known_fold_line(extra):
     assert np.ptp(points[:, 1]) > 7.0
 
 
+def test_find_folds_finds_a_fold_line_along_x():
+    """Both sides of such a line are compared across the line, along y."""
+    points = folds_of(shaped_charges(lambda x, _: x, lambda _, y: y - y**2 / (2.0 * FOLD_X)))
+    assert len(points) > 50
+    assert points[:, 1] == pytest.approx(FOLD_X, abs=0.1)
+    assert np.ptp(points[:, 0]) > 7.0
+
+
 def test_find_folds_finds_nothing_without_a_fold_line():
     """A fourth charge distinguishes both sides of the fold line, or the fold line is outside the disk."""
     assert len(folds_of(folded_map(0.3))) == len(folds_of(folded_map(radius=2.5))) == 0

@@ -56,6 +56,18 @@ def test_charges_of_a_similar_film_agree_with_direct_solves(solved):
     np.testing.assert_allclose(charge, expected, rtol=0.01)
 
 
+def test_negative_charges_agree_with_direct_solves(problem):
+    """If the wires are swapped, all charges are negative. They have no logarithm, so they change linearly."""
+    sensor = problem.sensor
+    piezo = replace(sensor.piezo, d31=-sensor.piezo.d31, d32=-sensor.piezo.d32)
+    solved = kept(solve_even, replace(problem, sensor=replace(sensor, piezo=piezo)))
+    values = solved.prior.mean + 0.3 * solved.prior.std * (np.array(solved.prior.names) == "pretension")
+    expected = direct(*solved.prior.film(values), CONTACT)
+    change = expected - solved.charges(solved.prior.mean, CONTACT)
+    assert expected.max() < 0.0 < np.abs(change).min()
+    np.testing.assert_allclose(solved.charges(values, CONTACT), expected, atol=0.1 * np.abs(change).max())
+
+
 @pytest.mark.parametrize("finger", [Finger(5.0), pytest.param(GrowingFinger(5.0), marks=pytest.mark.slow)])
 def test_fingertip_is_solved_with_its_own_pressure(problem, finger):
     """A circle of the same area causes charges that differ by up to 1 %."""
