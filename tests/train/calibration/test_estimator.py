@@ -16,7 +16,7 @@ from isocharge.train.calibration import estimator
 from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.estimator import Hypothesis, Prior, estimate, hypotheses
 from isocharge.train.calibration.film_estimate import SESSION, terms
-from isocharge.train.calibration.press_data import PressData, PressErrors
+from isocharge.train.calibration.press_data import Linearised, PressData, PressErrors
 from isocharge.train.data.presses import draw_contacts
 
 ONE = Hypothesis(
@@ -62,6 +62,17 @@ def presses_on(problem, synthetic, unknowns, count, rng):
 
 def film_estimate(problem, synthetic, presses):
     return estimate(synthetic, PressData.of(presses, problem.noise, problem.solved_domain), problem.prior)
+
+
+def test_contacts_follow_a_change_of_the_unknowns_by_least_squares():
+    rng = np.random.default_rng(8)
+    linearised = Linearised(*(rng.standard_normal((4, 7, *columns)) for columns in ((), (5,), (3,))))
+    change = rng.standard_normal(5)
+    parts = zip(linearised.residual, linearised.jacobian, linearised.contact_jacobian, strict=True)
+    expected = [
+        np.linalg.lstsq(by_contact, -(residual + by_film @ change))[0] for residual, by_film, by_contact in parts
+    ]
+    np.testing.assert_allclose(linearised.contact_change(change), expected)
 
 
 @pytest.mark.usefixtures("_one_hypothesis")
