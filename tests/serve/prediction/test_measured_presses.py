@@ -11,8 +11,8 @@ from isocharge.common.arrays import LARGEST
 from isocharge.common.errors import OutputError, PressError
 from isocharge.serve import MeasuredPresses, read_presses, write_presses
 from isocharge.serve.presses import measured_presses
-from isocharge.serve.presses.csv_table import csv_text
 from isocharge.serve.presses.measured_presses import PRESS_RULES, read_press_list
+from isocharge.serve.presses.table_file import csv_text
 
 NAMES = ("A", "B", "C")
 HEADER = "x_mm,y_mm,force_N,A,B,C"

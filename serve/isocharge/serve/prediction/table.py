@@ -19,8 +19,8 @@ from isocharge.common.errors import ChargeError
 from isocharge.serve.model.contact import Contact
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.session import N_WITHOUT_CORRELATION
-from isocharge.serve.presses.csv_table import CHARGE_RULE, CsvTable, NumberTable, TableSource
-from isocharge.serve.presses.table_file import open_table
+from isocharge.serve.presses.number_table import CHARGE_RULE, NumberTable, TableSource
+from isocharge.serve.presses.table_file import CsvTable, open_table
 from isocharge.serve.record.record import NO_CONTACT, PredictionRecord
 
 MAX_CHARGE_ROWS = 10_000_000

@@ -20,13 +20,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import PressError, cut, error_prefix, shown
-from isocharge.serve.presses.csv_table import (
-    CHARGE_RULE,
-    MAX_COLUMNS,
-    ColumnRule,
-    NumberColumns,
-    NumberTable,
-)
+from isocharge.serve.presses.number_table import CHARGE_RULE, MAX_COLUMNS, ColumnRule, NumberColumns, NumberTable
 from isocharge.serve.presses.table_file import open_table, write_columns
 
 POSITION_STD_MM = 0.1

@@ -1,13 +1,27 @@
 """Files with columns of numbers: Parquet if the name of the file ends in `.parquet`, and CSV otherwise.
 
+The columns of CSV text are separated by commas, semicolons, tabs or bars. The header is the first row that contains a
+name with a meaning; rows above it are ignored. The decimal mark is a point or a comma, and the same in the whole file.
+A number such as `1,064` may be 1.064 or 1064. A file in which no number determines the decimal mark is therefore
+refused. A point is always the decimal mark if commas separate the columns.
+
+A row that begins with # is a comment. Blank rows, and a row below the header that has the units mm, N and pC in the
+columns to read, are ignored. Blanks before and after a name or a number are also ignored. The texts `nan` and `inf` are
+not accepted.
+
 Of a Parquet file, only the requested columns are decoded. A requested column may contain integers, floating-point
 numbers or decimal numbers of any width. Null and NaN stand for empty cells. The other columns of the file may have any
 type.
 """
 
+import csv
 import io
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+import math
+import re
+from array import array
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from itertools import chain, islice
 from pathlib import Path
 from pty import STDIN_FILENO
 from typing import TYPE_CHECKING, BinaryIO
@@ -17,7 +31,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, IsochargeError, cut, require, shown
 from isocharge.common.files import as_output_errors, bounded_lines, open_regular, write_whole
-from isocharge.serve.presses.csv_table import ColumnRule, CsvTable, NumberColumns, NumberTable, TableSource, csv_text
+from isocharge.serve.presses.number_table import ColumnRule, NumberColumns, NumberTable, TableSource
 
 if TYPE_CHECKING:
     from pyarrow import DataType
@@ -30,6 +44,250 @@ SUFFIX = ".parquet"
 
 MAX_METADATA_SIZE = 16 << 20
 """Largest size of a text in the metadata, bytes, and largest number of elements of a list in the metadata."""
+
+
+_SEPARATORS = ",;\t|"
+"""Characters that may separate the columns."""
+
+_UNITS = frozenset({"mm", "N", "pC", "1", "-", ""})
+"""Cells of a row of units below the header."""
+
+_MAX_LINES_TO_HEADER = 100
+"""Number of lines at the beginning of a file among which the header is searched."""
+
+_NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:([.,])[0-9]*)?|([.,])[0-9]+)(?:[eE][-+]?[0-9]+)?")
+"""Number with or without a decimal mark, which is a group."""
+
+_THOUSANDS = re.compile(r"[-+]?[1-9][0-9]{0,2}[.,][0-9]{3}")
+"""Number whose mark may be a separator of thousands."""
+
+
+class CsvTable(NumberTable):
+    """Table of numbers that is read from a CSV text."""
+
+    row_noun = "line"
+
+    def __init__(self, lines: Iterable[str], source: TableSource) -> None:
+        """Find and read the header.
+
+        Args:
+            lines: Lines of the text.
+            source: Name of the file, its known columns, and the class of errors.
+
+        Raises:
+            InputError: If the file is empty, is not CSV text in UTF-8, or has too many columns.
+        """
+        checked_lines = _checked_lines(lines, source)
+        first_lines = list(islice(checked_lines, _MAX_LINES_TO_HEADER))
+        lines_above, self._separator = _find_header(first_lines, source.names)
+        lines_below = chain(first_lines[lines_above:], checked_lines)
+        self._rows = _numbered_rows(lines_below, lines_above, self._separator, source)
+        header_row = next(self._rows, None)
+        if header_row is None:
+            raise source.error(f": empty; expected {source.expected}")
+        super().__init__(header_row[1], source)
+        self._mark = ""  # decimal mark; empty until it is known
+        self._is_mark_certain = False
+
+    def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
+        """Convert the cells of the requested columns to numbers, row by row.
+
+        Args:
+            rules: Rules of the requested columns, by the names of the columns. This method uses only their
+                descriptions, for error messages.
+            max_rows: Largest number of rows that is accepted.
+
+        Raises:
+            InputError: If there are too many rows, a row has the wrong number of cells, a cell is not a finite number,
+                or the decimal mark is not clear.
+        """
+        column_indices = {name: self.header.index(name) for name in rules}
+        # The arrays of the module `array` need less memory than lists. "q" are 64-bit integers, "d" are 64-bit floats.
+        line_numbers = array("q")
+        numbers = array("d")  # the numbers of the first row, then the numbers of the second row, and so on
+        for index, (line_number, cells) in enumerate(self._rows):
+            if index == 0 and _is_row_of_units([cells[i] for i in column_indices.values() if i < len(cells)]):
+                continue
+            if len(line_numbers) == max_rows:  # this row is one row too many
+                self._refuse_row_count(max_rows)
+            self._check_cell_count(line_number, cells)
+            line_numbers.append(line_number)
+            for name, column_index in column_indices.items():
+                number = self._number(cells[column_index].strip())
+                if number is None:
+                    cell = cells[column_index].strip()
+                    has_other_mark = self._mark != "" and any(mark in cell for mark in ",." if mark != self._mark)
+                    advice = f"; the decimal mark is {self._mark!r}" if has_other_mark else ""
+                    raise self.source.error(
+                        f", line {line_number}, column {shown(name)}: expected {rules[name].description}, got "
+                        f"{shown(cell)}{advice}"
+                    )
+                numbers.append(number)
+            if not self._is_mark_certain:
+                is_point_between_commas = (self._separator, self._mark) == (",", ".")
+                has_evidence = any(_has_decimal_mark(cell.strip(), self._mark) for cell in cells)
+                self._is_mark_certain = is_point_between_commas or has_evidence
+        if self._mark and not self._is_mark_certain:
+            raise self.source.error(
+                f": every number with the mark {self._mark!r} may have a decimal mark or a separator of thousands; "
+                "write commas between the columns, decimal points and no separators of thousands"
+            )
+        rows = np.asarray(numbers, dtype=np.float64).reshape(len(line_numbers), len(column_indices))
+        values = dict(zip(column_indices, rows.T, strict=True))
+        return NumberColumns(values, np.array(line_numbers, dtype=np.intp), self.row_noun)
+
+    def _number(self, text: str) -> float | None:
+        """Return the number in a cell: NaN for an empty cell, and None for a cell without a finite number.
+
+        The first number with a decimal mark determines the decimal mark of the file.
+
+        Args:
+            text: The cell, without blanks at its ends.
+        """
+        if not text:
+            return math.nan
+        match = _NUMBER.fullmatch(text)
+        if match is None:
+            return None
+        mark = match[1] or match[2]
+        if mark and mark != self._mark:
+            if self._mark:
+                return None
+            self._mark = mark
+        number = float(text.replace(",", "."))
+        return number if math.isfinite(number) else None
+
+    def _check_cell_count(self, line_number: int, cells: list[str]) -> None:
+        """Check that a row has as many cells as the header. Additional blank cells are accepted.
+
+        Args:
+            line_number: Number of the line, for the error message.
+            cells: Cells of the row.
+
+        Raises:
+            InputError: If the row has too few cells, or additional cells that are not blank.
+        """
+        additional_cells = cells[len(self.header) :]
+        if len(cells) < len(self.header) or any(cell.strip() for cell in additional_cells):
+            raise self.source.error(
+                f", line {line_number}: expected {len(self.header)} cells as in the header, got "
+                f"{len(cells)}: {shown(cells)}"
+            )
+
+
+def csv_text(columns: Mapping[str, Array]) -> str:
+    """Return columns of numbers as CSV text. Numbers have all digits, and NaN becomes an empty cell.
+
+    Args:
+        columns: Columns by their names, each of shape (n,).
+    """
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(columns)  # the keys of `columns`, which are the names
+    rows = np.column_stack(list(columns.values()))  # shape (n, n_column)
+    for row in rows.tolist():
+        writer.writerow("" if math.isnan(value) else value for value in row)
+    return buffer.getvalue()
+
+
+def _is_row_of_units(cells: list[str]) -> bool:
+    """Return whether cells are the units of charges and other known columns, with or without brackets."""
+    units = {cell.strip().strip("[]()") for cell in cells}
+    return "pC" in units and units <= _UNITS
+
+
+def _has_decimal_mark(text: str, mark: str) -> bool:
+    """Return whether a text is a number with the given mark, which cannot be a separator of thousands."""
+    is_number_with_mark = mark != "" and mark in text and _NUMBER.fullmatch(text) is not None
+    return is_number_with_mark and _THOUSANDS.fullmatch(text) is None
+
+
+def _checked_lines(lines: Iterable[str], source: TableSource) -> Iterator[str]:
+    """Yield the lines of a text without a byte order mark.
+
+    Args:
+        lines: Lines of the text, each with its line end.
+        source: Name of the file and class of the error, for error messages.
+
+    Raises:
+        InputError: If the lines are not text in UTF-8, or a line is too long.
+    """
+    line_count = 0
+    advice = (
+        "is not text in UTF-8: export the file as CSV in UTF-8; convert other text with: iconv -f UTF-16 (or "
+        "WINDOWS-1252) -t UTF-8 FILE > NEW.csv"
+    )
+    try:
+        for line in lines:
+            if "\0" in line:  # the file is binary, or text in UTF-16
+                raise source.error(f", line {line_count + 1}: the byte 0x00 {advice}")
+            yield line.removeprefix("\ufeff") if line_count == 0 else line
+            line_count += 1
+    except UnicodeDecodeError as cause:
+        # The exception contains the part of the file that was decoded last.
+        line_number = line_count + cause.object[: cause.start].count(b"\n") + 1
+        raise source.error(f", line {line_number}: the byte 0x{cause.object[cause.start]:02x} {advice}") from cause
+    except InputError:  # is a ValueError, too
+        raise
+    except ValueError as cause:  # the next line is too long
+        raise source.error(f", line {line_count + 1}: not CSV text ({cause})") from cause
+
+
+def _numbered_rows(
+    lines: Iterable[str], lines_above: int, separator: str, source: TableSource
+) -> Iterator[tuple[int, list[str]]]:
+    """Yield the line number and the cells of each row that is neither blank nor a comment.
+
+    The first line of the file has the number 1. If a row extends over several lines, the line number is the number of
+    its last line.
+
+    Args:
+        lines: Lines of the text, each with its line end.
+        lines_above: Number of lines above these lines.
+        separator: Character between the columns.
+        source: Name of the file, its known columns, and the class of errors.
+
+    Raises:
+        InputError: If the lines are not CSV text.
+    """
+    reader = csv.reader(lines, delimiter=separator, strict=True)
+    try:
+        for cells in reader:
+            first_cell = cells[0].strip() if cells else ""
+            is_comment = first_cell.startswith("#") and first_cell not in source.names
+            if any(cell.strip() for cell in cells) and not is_comment:
+                yield lines_above + reader.line_num, cells
+    except csv.Error as cause:
+        raise source.error(f", line {lines_above + reader.line_num}: not CSV text ({cause})") from cause
+
+
+def _find_header(lines: list[str], names: Collection[str]) -> tuple[int, str]:
+    """Find the header at the beginning of a text, and the separator of the columns.
+
+    The header is the first line that contains a name and no number. If there is no such line, the result is the first
+    line. The separator is the one with which the header has most names, and then most cells.
+
+    Args:
+        lines: First lines of the text.
+        names: Names of columns that have a meaning.
+
+    Returns:
+        The number of lines above the header, and the separator.
+    """
+    best_score = (0, 0)
+    best = (0, _SEPARATORS[0])
+    for line_index, line in enumerate(lines):
+        for separator in _SEPARATORS:
+            with suppress(csv.Error):  # the error is raised again when the table is read
+                texts = {cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])}
+                has_number = any(map(_NUMBER.fullmatch, texts.difference(names)))
+                score = (0 if has_number else len(texts.intersection(names)), len(texts) if line_index == 0 else 0)
+                if score > best_score:
+                    best_score = score
+                    best = (line_index, separator)
+        if best_score[0] > 0:
+            break
+    return best
 
 
 class ParquetTable(NumberTable):

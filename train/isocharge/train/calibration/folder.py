@@ -39,9 +39,9 @@ from isocharge.common.structs import Text, plain_values, read_json
 from isocharge.serve.model.charge_file import FILE as CHARGES
 from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.model_folder import check_target, version_folders
-from isocharge.serve.presses.csv_table import csv_text
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.serve.presses.std_factor import FEWEST_HELD_OUT, StdFactor
+from isocharge.serve.presses.table_file import csv_text
 from isocharge.simulate import Domain, NoiseModel
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict, sensor_to_toml
 from isocharge.simulate.solver.assembly import single_threaded_blas

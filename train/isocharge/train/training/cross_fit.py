@@ -23,8 +23,8 @@ from torch import Tensor
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import PressError, cut
-from isocharge.serve.presses.csv_table import csv_text
 from isocharge.serve.presses.measured_presses import MeasuredPresses
+from isocharge.serve.presses.table_file import csv_text
 from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes
 from isocharge.train.data.contact_errors import rms, rounded
 from isocharge.train.data.measured_sensor import LEAST_RANGE, PressedArea, check_measured_presses

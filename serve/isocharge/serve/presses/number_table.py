@@ -1,0 +1,249 @@
+"""Named columns of numbers from a file, and the checks that all file formats share.
+
+Each file format is a subclass of `NumberTable`. The subclass reads the header, and converts the requested columns to
+float64 arrays in which NaN stands for an empty cell. All other checks are in this module. The same mistake in a file
+therefore leads to the same message in every format.
+"""
+
+import logging
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, NoReturn
+
+import numpy as np
+
+from isocharge.common.arrays import LARGEST, Array, Booleans, Integers
+from isocharge.common.errors import InputError, shown
+
+log = logging.getLogger(__name__)
+
+MAX_COLUMNS = 1_000
+"""Largest number of columns of a file."""
+
+
+@dataclass(frozen=True)
+class ColumnRule:
+    """Rule that states which numbers a column may contain.
+
+    Attributes:
+        description: Description of a correct cell for messages, such as "a force in N".
+        maximum: Largest number that is accepted.
+        is_positive: Whether only numbers above zero are accepted.
+        may_be_empty: Whether empty cells are accepted.
+    """
+
+    description: str
+    maximum: float = LARGEST
+    is_positive: bool = False
+    may_be_empty: bool = True
+
+    def violations(self, values: Array) -> Booleans:
+        """Compute which values of a column violate the rule.
+
+        Args:
+            values: Values of the column, shape (n,); NaN for an empty cell.
+
+        Returns:
+            Whether each value violates the rule, shape (n,).
+        """
+        # Comparisons with NaN are false, so these comparisons accept empty cells.
+        is_violation = (values < -LARGEST) | (values > self.maximum)
+        if self.is_positive:
+            is_violation |= values <= 0.0
+        if not self.may_be_empty:
+            is_violation |= np.isnan(values)
+        return np.asarray(is_violation)
+
+
+CHARGE_RULE = ColumnRule("a charge in pC")
+"""Rule of the columns of charges."""
+
+
+@dataclass(frozen=True)
+class NumberColumns:
+    """Columns of numbers, and the positions of their rows in the file.
+
+    Attributes:
+        values: The columns by their names, each of shape (n,); NaN for an empty cell.
+        row_numbers: Number of the line or row in the file from which each row was read, shape (n,).
+        row_noun: What the row numbers count: "line" for the lines of a text, or "row" for the rows of a table.
+    """
+
+    values: Mapping[str, Array]
+    row_numbers: Integers
+    row_noun: str
+
+    def check(self, rules: Mapping[str, ColumnRule], where: str, error_class: type[InputError]) -> None:
+        """Check that all values comply with the rules of their columns.
+
+        Args:
+            rules: Rules by the names of the columns.
+            where: Beginning of the error message, such as "presses.csv, "; may be empty.
+            error_class: Class of the error that is raised.
+
+        Raises:
+            error_class: If a value violates its rule. The message names the first wrong row, the column, the rule and
+                the value.
+        """
+        violations_of_columns = [rules[name].violations(column) for name, column in self.values.items()]
+        is_violation = np.column_stack(violations_of_columns)  # shape (n, n_column)
+        positions = np.argwhere(is_violation)  # row and column of each violation, ordered by rows
+        if not positions.size:
+            return
+        row, column_index = positions[0]  # the first violation
+        name = list(self.values)[column_index]
+        value = float(self.values[name][row])
+        text = "an empty cell" if np.isnan(value) else f"{value:.15g}"
+        raise error_class(
+            f"{where}{self.row_noun} {self.row_numbers[row]}, column {shown(name)}: expected "
+            f"{rules[name].description}, got {text}"
+        )
+
+
+@dataclass(frozen=True)
+class TableSource:
+    """File of a table, for its reader and for error messages.
+
+    Attributes:
+        names: Names of columns that have a meaning. These names are kept unchanged.
+        where: Name of the file.
+        error_class: Class of the error that is raised for every mistake in the file.
+        expected: Description of the expected header.
+    """
+
+    names: Collection[str]
+    where: str
+    error_class: type[InputError]
+    expected: str
+
+    def error(self, message: str) -> InputError:
+        """Return an error whose message consists of the name of the file and the given text."""
+        return self.error_class(f"{self.where}{message}")
+
+
+class NumberTable(ABC):
+    """Base class for a file with a header and columns of numbers. The columns can be read only once.
+
+    Every mistake in the file raises the error class of `source`.
+
+    Attributes:
+        header: Names of the columns in the file.
+        source: The file.
+        row_noun: What the row numbers of the format count, for error messages: "line" or "row".
+    """
+
+    row_noun: ClassVar[str]
+
+    def __init__(self, header: Sequence[str], source: TableSource) -> None:
+        """Check the number of columns, and store the names of the columns without blanks at their ends.
+
+        Args:
+            header: Names of the columns in the file.
+            source: The file.
+
+        Raises:
+            InputError: If the file has too many columns.
+        """
+        if len(header) > MAX_COLUMNS:
+            raise source.error(f": expected at most {MAX_COLUMNS:,} columns, got {len(header):,}")
+        self.header = tuple(name if name in source.names else name.strip() for name in header)
+        self.source = source
+
+    def choose_columns(
+        self, required: Mapping[str, ColumnRule], optional: Mapping[str, ColumnRule] | None = None
+    ) -> dict[str, ColumnRule]:
+        """Choose the columns to read: all required columns, and the optional columns that the file contains.
+
+        A warning lists all other columns of the file, which are ignored.
+
+        Args:
+            required: Rules of the required columns, by the names of the columns.
+            optional: Rules of the optional columns, by the names of the columns.
+
+        Returns:
+            The rules of the chosen columns, by the names of the columns.
+
+        Raises:
+            InputError: If a required column is missing, if the file contains a chosen column twice, or if a column has
+                a similar name as a column that the file does not contain.
+        """
+        known_rules = {**required, **(optional or {})}
+        self.refuse_similar_names((name for name in self.header if name not in known_rules), known_rules)
+        missing_names = [name for name in required if name not in self.header]
+        if missing_names:
+            self._refuse_header("missing", missing_names)
+        chosen_rules = {name: rule for name, rule in known_rules.items() if name in self.header}
+        repeated_names = [name for name in chosen_rules if self.header.count(name) > 1]
+        if repeated_names:
+            self._refuse_header("repeated", repeated_names)
+        ignored_names = [name for name in self.header if name not in chosen_rules]
+        if ignored_names:
+            log.warning("%s: ignored columns: %s", self.source.where, shown(ignored_names))
+        return chosen_rules
+
+    def refuse_similar_names(self, columns: Iterable[str], names: Iterable[str]) -> None:
+        """Refuse a column whose name differs from that of a missing column by case, brackets, blanks or the unit pC.
+
+        Args:
+            columns: Names of the columns of the file that are checked.
+            names: Names of columns that have a meaning.
+
+        Raises:
+            InputError: If a column has such a name.
+        """
+        absent_names = {
+            _letters_of(f"{name}{unit}"): name for name in names for unit in ("", "pC") if name not in self.header
+        }
+        for column in columns:
+            if _letters_of(column) in absent_names:
+                name = absent_names[_letters_of(column)]
+                self._refuse_header(f"rename {shown(column)} to {shown(name)}, or remove the column; missing", [name])
+
+    def read(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
+        """Read the chosen columns, and check their values.
+
+        Args:
+            rules: Rules of the columns to read, as `choose_columns` returns them. The columns are returned in the same
+                order.
+            max_rows: Largest number of rows that is accepted.
+
+        Raises:
+            InputError: If the file is damaged or has more than `max_rows` rows, or if a cell violates the rule of its
+                column.
+        """
+        columns = self._read_columns(rules, max_rows)
+        columns.check(rules, f"{self.source.where}, ", self.source.error_class)
+        return columns
+
+    @abstractmethod
+    def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
+        """Convert the requested columns to arrays, without checking the values. `read` describes the arguments."""
+
+    def _refuse_header(self, reason: str, names: Sequence[str]) -> NoReturn:
+        """Raise the error for a wrong header.
+
+        Args:
+            reason: What is wrong with some names, for the error message.
+            names: These names.
+
+        Raises:
+            InputError: Always.
+        """
+        raise self.source.error(
+            f": expected {self.source.expected}, got the header {shown(list(self.header))}; {reason}: {shown(names)}"
+        )
+
+    def _refuse_row_count(self, max_rows: int) -> NoReturn:
+        """Raise the error for a file that has more than `max_rows` rows.
+
+        Raises:
+            InputError: Always.
+        """
+        raise self.source.error(f": expected at most {max_rows:,} presses, got more; split the file")
+
+
+def _letters_of(name: str) -> str:
+    """Return the letters and digits of a name in lower case."""
+    return re.sub(r"[\W_]+", "", name.casefold())
