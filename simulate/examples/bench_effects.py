@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from isocharge.simulate import Circle, Resolution, Sensor, SolveSettings, load_sensor, noise_model, press, touch_charge
-from isocharge.simulate.mechanics.theory import warmed
+from isocharge.simulate.mechanics.warming import warmed
 
 CONTACTS = ((3.0, -2.0, 0.5), (-5.0, 4.0, 0.1), (5.5, 4.5, 0.5))  # x and y in mm, force in N
 # All presses have the same mesh, so that the errors of the mesh cancel in the differences of charges.

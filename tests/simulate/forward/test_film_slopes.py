@@ -16,7 +16,7 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.mechanics.theory import warmed
+from isocharge.simulate.mechanics.warming import warmed
 from isocharge.simulate.solver.equilibrium import nodal_stress
 from isocharge.simulate.solver.sensitivity import FILM_FIELDS, stress_changes
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import load_sensor
-from isocharge.simulate.mechanics.theory import tension_change, warmed
+from isocharge.simulate.mechanics.warming import tension_change, warmed
 
 YOUNG = 3000.0
 POISSON = 0.34

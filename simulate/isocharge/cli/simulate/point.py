@@ -21,7 +21,8 @@ from isocharge.simulate import (
     touch_charge,
 )
 from isocharge.simulate.forward.readout import thermal_charge
-from isocharge.simulate.mechanics.theory import theory_by_name, warmed
+from isocharge.simulate.mechanics.theory import theory_by_name
+from isocharge.simulate.mechanics.warming import warmed
 from isocharge.simulate.solver.error_estimate import summary
 from isocharge.simulate.solver.sensitivity import check_friction, friction_force
 

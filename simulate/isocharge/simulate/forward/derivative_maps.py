@@ -39,7 +39,8 @@ from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import SceneError
 from isocharge.simulate.forward.family import NodeCount, Reading
 from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.mechanics.theory import amplitude_squared, side_force_unit, tension_change
+from isocharge.simulate.mechanics.theory import amplitude_squared, side_force_unit
+from isocharge.simulate.mechanics.warming import tension_change
 from isocharge.simulate.mesh.conformal_map import distance_coordinate
 from isocharge.simulate.numerics.polygon import to_complex, to_corners
 from isocharge.simulate.sensor.film import Film, Surface

@@ -19,7 +19,8 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.common.errors import SensorError
-from isocharge.simulate.mechanics.theory import rotate_stress, tension_change
+from isocharge.simulate.mechanics.theory import rotate_stress
+from isocharge.simulate.mechanics.warming import tension_change
 from isocharge.simulate.mesh.placed_mesh import from_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template, locate_points

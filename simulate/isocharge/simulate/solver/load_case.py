@@ -9,13 +9,7 @@ from typing import Literal
 import numpy as np
 
 from isocharge.common.errors import SceneError
-from isocharge.simulate.mechanics.theory import (
-    ACCURACY,
-    WITH_BENDING,
-    Theory,
-    amplitude_squared,
-    bending_length,
-)
+from isocharge.simulate.mechanics.theory import ACCURACY, WITH_BENDING, Theory, amplitude_squared, bending_length
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import CLEARANCE
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, distance_on_circular_film, place

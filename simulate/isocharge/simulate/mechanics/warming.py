@@ -1,0 +1,69 @@
+"""Change of the pretension by the temperatures of a film and of its ring.
+
+A film that is clamped in a ring cannot expand freely. If the film becomes warmer by dT and the ring by dR, the elastic
+strain along axis i of the film changes by
+
+    strain_i = ring_expansion * dR - expansion_i * dT.
+
+The pretension changes by the stress that this change of the strain causes. The stress follows from the plane-stress
+stiffness of the film. A drawn film expands more across the drawn direction than along the drawn direction. The tension
+of a drawn film therefore becomes uneven. The temperature of a thin film follows the temperature of the air within
+seconds. The ring needs many minutes to reach the temperature of the air.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.simulate.mechanics.theory import orthotropic_moduli, rotate_stress, stress
+from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.sensor.sensor import Sensor
+
+
+def tension_change(film: Film, film_warming_K: float, ring_warming_K: float) -> Array:
+    """Compute by how much the pretension changes if the temperatures of the film and of its ring change.
+
+    The elastic strain of the clamped film is the expansion of the ring minus the free expansion of the film. The change
+    of the pretension is the stress that corresponds to the elastic strain.
+
+    Args:
+        film: The film. If the film has no expansion coefficients, the result is zero.
+        film_warming_K: Increase of the temperature of the film, K.
+        ring_warming_K: Increase of the temperature of the ring, K.
+
+    Returns:
+        Change of the pretension (T11, T22, T12) in the axes x and y, shape (3,), MPa.
+    """
+    if film.expansion is None:
+        return np.zeros(3)
+    free_strain = np.array(film.expansion) * film_warming_K  # along the axes 1 and 2 of the film
+    elastic_strain = np.append(film.ring_expansion * ring_warming_K - free_strain, 0.0)
+    change_in_film_axes = film.young * stress(elastic_strain, film.poisson, orthotropic_moduli(film))
+    return rotate_stress(change_in_film_axes, film.axis)
+
+
+def warmed(sensor: Sensor, film_warming_K: float, ring_warming_K: float = 0.0) -> Sensor:
+    """Return a copy of a sensor whose pretension is the pretension at other temperatures of the film and its ring.
+
+    Args:
+        sensor: The sensor at the temperatures for which it is described.
+        film_warming_K: Temperature of the film minus the temperature for which the film is described, K.
+        ring_warming_K: Temperature of the ring minus the temperature for which the ring is described, K.
+
+    Returns:
+        The copy, which equals the sensor if the film has no expansion coefficients.
+
+    Raises:
+        SensorError: If the film becomes so slack that it is outside the range of the simulator.
+    """
+    film = sensor.film
+    change_11, change_22, change_12 = tension_change(film, film_warming_K, ring_warming_K).tolist()
+    warm_film = replace(film, pretension=film.pretension + 0.5 * (change_11 + change_22))
+    if not film.expands_evenly:  # otherwise only the mean of the pretension changes
+        # The deviator of the pretension consists of half of the difference between the pretensions along x and y, and
+        # of the shear.
+        half_difference, shear = film.deviator
+        deviator = (half_difference + 0.5 * (change_11 - change_22), shear + change_12)
+        warm_film = replace(warm_film, deviator=deviator)
+    return replace(sensor, film=warm_film)
