@@ -62,7 +62,7 @@ def test_targets_are_the_least_squares_estimates_of_the_charges_with_noise(gain)
     estimates = [nonlinear_estimate(charge, std) for charge, std in zip(noisy, noise_std, strict=True)]
     change = np.array(estimates) - DOMAIN.to_unit(CONTACT)
     assert np.abs(change).max() > 1e-3  # the noise changes the estimates clearly
-    np.testing.assert_allclose(0.25 * target_change, change, rtol=0.05, atol=5e-5)
+    np.testing.assert_allclose(0.25 * target_change, change, rtol=0.05, atol=2e-5)
 
 
 def test_the_noise_is_enlarged_until_the_contact_would_be_too_uncertain_for_a_linear_estimate():

@@ -166,8 +166,8 @@ class NumberTable(ABC):
             The rules of the chosen columns, by the names of the columns.
 
         Raises:
-            InputError: If a required column is missing, if the file contains a chosen column twice, or if a column has
-                a similar name as a column that the file does not contain.
+            InputError: If a required column is missing, if the file contains a chosen column twice, or if the name of a
+                column is almost that of a column that the file does not contain, such as `a (pC)` for `A`.
         """
         known_rules = {**required, **(optional or {})}
         self.refuse_similar_names((name for name in self.header if name not in known_rules), known_rules)
@@ -236,7 +236,7 @@ class NumberTable(ABC):
         )
 
     def _refuse_row_count(self, max_rows: int) -> NoReturn:
-        """Raise the error for a file that has more than `max_rows` rows.
+        """Raise the error for a file that has more than `max_rows` rows, which are the most that are accepted.
 
         Raises:
             InputError: Always.

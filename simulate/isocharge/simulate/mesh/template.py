@@ -235,11 +235,13 @@ def _locate_in_sectors(placement: Placement, blocks: Blocks, angle: Array, depth
 
 
 def _side_angles(placement: Placement, side: Integers, depth: Array) -> Array:
-    """Compute the angles of sides of the sectors at given depths between the innermost circle and the rim.
+    """Compute the angles at which sides of the sectors lie at the depths of given points.
+
+    Along a side, the angle changes linearly from its value on the innermost circle to its value on the rim.
 
     Args:
         placement: k placements, one for each row of points.
-        side: Index of the side for each point, shape (k, n).
+        side: Index of a side for each point, shape (k, n).
         depth: Depth of each point, from 0 on the innermost circle to 1 on the rim, shape (k, n).
 
     Returns:

@@ -70,7 +70,7 @@ class Probe(ABC):
     @property
     @abstractmethod
     def notation(self) -> str:
-        """Notation of this probe without its rotation, which `parse_probe` converts back into the probe."""
+        """Notation of this probe without its rotation, as `parse_probe` accepts it."""
 
     @property
     @abstractmethod

@@ -68,7 +68,7 @@ class RoundProbe(CurvedProbe):
 
     @property
     def notation(self) -> str:
-        """Notation of this probe, which `parse_probe` converts back into the probe."""
+        """Notation of this probe, as `parse_probe` accepts it."""
         return f"{self.name}:{tidy(self.radius)}"
 
     @property
@@ -205,7 +205,7 @@ class Ellipse(CurvedProbe):
 
     @property
     def notation(self) -> str:
-        """Notation of this probe without its rotation, which `parse_probe` converts back into the probe."""
+        """Notation of this probe without its rotation, as `parse_probe` accepts it."""
         return f"ellipse:{tidy(self.width)}x{tidy(self.height)}"
 
     @property
@@ -309,7 +309,7 @@ class Polygon(Probe):
 
     @property
     def notation(self) -> str:
-        """Notation of this probe without its rotation, which `parse_probe` converts back into the probe."""
+        """Notation of this probe without its rotation, as `parse_probe` accepts it."""
         corners = ";".join(f"{tidy(x)},{tidy(y)}" for x, y in self.corners)
         return self.shape or f"polygon:{corners}"
 

@@ -103,7 +103,7 @@ def mesh_error(equilibrium: Equilibrium) -> float:
     if equilibrium.proven_error is not None:
         return max(MIN_MESH_ERROR, equilibrium.proven_error)
     mesh = equilibrium.mesh
-    slope_of_deflection = node_slopes(equilibrium)[..., 2]
+    slope_of_deflection = node_slopes(equilibrium)[..., 2]  # derivatives of W, after those of U1 and U2
     mode_error = MODE_SHARE_WEIGHT * highest_mode_share(mesh, slope_of_deflection)
     return max(MIN_MESH_ERROR, MESH_ERROR_SAFETY * mesh.shape_error, MESH_ERROR_SAFETY * mode_error)
 

@@ -93,14 +93,14 @@ def misfit_examples(
 def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfig) -> TrainingStage:
     """Define the training of the misfit perceptron.
 
-    The targets of the perceptron are the residuals with compressed lengths. Examples with misfits far above
-    `FOCUS_MISFIT` have smaller weights than other examples.
+    The targets of the perceptron are the residuals, whose lengths are the misfits. The inverse hyperbolic sine
+    compresses the lengths. Examples with misfits far above `FOCUS_MISFIT` have smaller weights than other examples.
 
     Args:
         network: Network whose misfit perceptron is trained.
         examples: Charges Q, pC, and their residuals (Q - Q(c)) / sigma, shape (2, n, n_electrode), where c is the
             nearest contact and sigma the standard deviation of the noise.
-        config: Number of steps and batch size.
+        config: Number of steps, batch size, learning rate and seed.
     """
     charges, residuals = examples
     inputs = network.inputs(as_tensor(charges))
