@@ -5,7 +5,9 @@ import json
 import pytest
 
 from isocharge.common.errors import OutputError, OutputExists, RecordingError
+from isocharge.common.progress import listening
 from isocharge.serve import Chunk, Recorder, Recording
+from isocharge.serve.port import recording as recording_module
 from isocharge.serve.port.recording import Event
 
 CHUNKS = [
@@ -127,3 +129,13 @@ def test_error_message_contains_the_number_of_a_damaged_line(recorded, line):
     with pytest.raises(RecordingError, match="line 6: damaged") as caught:
         list(Recording(recorded).events())
     assert len(str(caught.value)) < 600
+
+
+def test_reading_reports_progress_after_each_thousand_lines(recorded, monkeypatch):
+    monkeypatch.setattr(recording_module, "PROGRESS_LINES", 3)
+    reports = []
+    with listening(lambda title, done, total, _: reports.append((title, done, total))):
+        list(Recording(recorded).events())
+    size = recorded.stat().st_size
+    lines = recorded.read_text().splitlines(keepends=True)
+    assert reports == [("reading", len("".join(lines[:end])), size) for end in range(2, len(lines) + 1, 3)]

@@ -255,3 +255,10 @@ def test_unknown_values_do_not_count():
     error[:, 2] = 2.0 * np.sqrt(REGION_QUANTILES[0])
     assert StdFactor.from_errors(error, np.ones((30, 3))).factor == pytest.approx(2.0)
     assert "standard deviations that are 2 times as large, the 95 % regions" in StdFactor(2.0, 30).statement
+
+
+def test_standard_error_of_a_common_error_contains_the_scatter_of_the_presses():
+    """The standard error of the mean of known values follows from their scatter if it is larger than expected."""
+    error = np.array([[1.0], [3.0], [np.nan], [8.0]])
+    common = common_error(error, np.full((4, 1), 0.01), np.zeros((4, 1)))
+    assert common.std[0] == pytest.approx(stats.sem([1.0, 3.0, 8.0]))

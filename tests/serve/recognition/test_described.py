@@ -218,3 +218,11 @@ def test_printable_bytes_are_never_a_binary_format(line):
     rng = np.random.default_rng(0)
     data = "".join(line.format(value) + "\r\n" for value in rng.normal(500, 100, 400)).encode()
     assert (recognise([data], 1.0) or {"format": "text"})["format"] == "text"
+
+
+def test_counter_of_one_byte_that_restarts_is_recognised():
+    values = np.random.default_rng(1).normal(0.0, 300.0, (FRAMES, 3)).round().astype(int)
+    rows = enumerate(values.tolist())
+    data = b"".join(b"\xaa\x55" + struct.pack("<B3h", row % 256, *numbers) for row, numbers in rows)
+    first_field = recognise([data], FRAMES / RATE_HZ)["fields"][0]
+    assert (first_field["name"], first_field["type"]) == ("seq", "u8")

@@ -1,6 +1,7 @@
 """Forward maps compared with direct solves."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
+from isocharge.simulate.forward import forward_map as forward_map_module
 from isocharge.simulate.forward.family import NODE_COUNTS, Family, NodeCount
 from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR
 from kept import kept
@@ -213,6 +215,23 @@ def test_unreachable_interpolation_error_raises_solve_error(monkeypatch):
     settings = replace(QUICK_SETTINGS, resolution=Resolution(3, 8, 2))
     with pytest.raises(SolveError, match=r"up to 4 mm and 1 N interpolates to .* only, expected 1e-13"):
         ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1.0), **{**QUICK, "settings": settings})
+
+
+@pytest.mark.parametrize(("error", "tried"), [(0.5, [0, 2]), (1.5 * INTERPOLATION_ERROR, [0, 1])])
+def test_next_number_of_nodes_is_skipped_if_the_error_is_very_large(near_map, monkeypatch, error, tried):
+    counts = [NodeCount(number, number) for number in (2, 3, 4)]
+    built = []
+    build = partial(kept, ForwardMap.build_unchecked)
+
+    def build_unchecked(sensor, probe, domain, count, settings, **_):
+        built.append(counts.index(count))
+        return build(sensor, probe, domain, counts[0], settings)
+
+    monkeypatch.setattr(ForwardMap, "build_unchecked", build_unchecked)
+    monkeypatch.setattr(forward_map_module, "node_counts", lambda _: counts)
+    monkeypatch.setattr(forward_map_module, "relative_error", lambda *_: error if len(built) == 1 else 0.0)
+    ForwardMap.build(near_map.sensor, Circle(1.0), **QUICK)
+    assert built == tried
 
 
 UNEVEN_FILMS = {

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Ellipse, Film, Polygon, Probe, SolveSettings, Theory
+from isocharge.simulate.mesh import template
 from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template, locate_points, template_for
@@ -129,3 +130,10 @@ def test_ellipse_too_near_the_rim_is_refused():
     ellipse = Ellipse(16.0, 16.0 * 0.999, 0.0)
     with pytest.raises(SceneError, match=r"comes within 0\.1\d* mm of the rim: expected at least 1\.6 mm"):
         LoadCase(FILM, ellipse, (36.85, 0.0), 1e-3, SolveSettings(theory=FULL, layer=0.1))
+
+
+def test_distance_from_a_line_is_positive_on_its_left():
+    """The triangle (-1, -3), (2, 1), (-1, 2) has the area 7.5, and its first side has the length 5."""
+    start, end, point = np.array([-1.0 - 3.0j]), np.array([2.0 + 1.0j]), np.array([-1.0 + 2.0j])
+    assert template._distance_to_left(start, end, point) == pytest.approx([3.0])
+    assert template._distance_to_left(end, start, point) == pytest.approx([-3.0])

@@ -5,9 +5,10 @@ import pytest
 from matplotlib.colors import LogNorm
 
 from isocharge.simulate import load_sensor
+from isocharge.simulate.identifiability.mirror_region import MirrorRegion
 from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase, Nuisances
 from isocharge.simulate.layout.design import Design, ErrorMap
-from isocharge.simulate.plots.error_maps import error_maps_picture
+from isocharge.simulate.plots.error_maps import error_maps_picture, mirror_picture
 
 SENSOR = load_sensor("three-25um-biaxial")
 PRESSES = 4.0 * np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [0.5, 1.0], [0.0, 0.0]])
@@ -31,3 +32,13 @@ def test_error_maps_picture_marks_the_position_of_the_largest_error(nuisances, b
         assert axes.get_ylim()[0] < -11.5
         (shades,) = axes.collections
         assert (type(shades.norm), *shades.get_clim()) == (LogNorm, 0.1, 1.0)
+
+
+def test_mirror_picture_divides_the_rings_into_sectors():
+    mirror = MirrorRegion(8.0, 10.0, np.array([0.1, 1.0]), np.array([[0.0, 0.1, 0.2, 0.3], [1.0, 0.5, 0.0, 0.0]]))
+    axes = mirror_picture(SENSOR, mirror).axes[0]
+    shades = axes.collections[0]
+    x, y = np.moveaxis(np.asarray(shades.get_coordinates()), -1, 0)
+    np.testing.assert_allclose(np.hypot(x, y), np.outer([8.0, 9.0, 10.0], np.ones(5)))
+    np.testing.assert_allclose(x + 1j * y, np.hypot(x, y) * [1.0, 1j, -1.0, -1j, 1.0], atol=1e-12)
+    np.testing.assert_array_equal(shades.get_array(), mirror.share)
