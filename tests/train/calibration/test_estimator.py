@@ -12,10 +12,11 @@ from tests.train.calibration.conftest import rig
 
 from isocharge.serve.model.robust_estimate import robust_estimate
 from isocharge.simulate import NoiseModel, noise_model
+from isocharge.simulate.mechanics.warming import warmed
 from isocharge.train.calibration import estimator
 from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.estimator import Hypothesis, Prior, estimate, hypotheses
-from isocharge.train.calibration.film_estimate import SESSION, terms
+from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, terms
 from isocharge.train.calibration.press_data import Linearised, PressData, PressErrors
 from isocharge.train.data.presses import draw_contacts
 
@@ -204,3 +205,17 @@ def test_touches_at_unknown_places_find_a_change_of_the_pretension(problem, synt
     assert abs(found.film.value("pretension") - changed[0]) < 3.0 * std
     assert std < 0.6 * np.sqrt(prior.earlier.covariance[0, 0])
     assert np.median(np.hypot(*(found.contact - contact)[:, :2].T)) < 0.3
+
+
+def test_warming_changes_the_shares_of_the_uneven_tension(problem):
+    """Temperature adds the same tension in all directions, so the difference of the tensions in MPa remains."""
+    layout = problem.prior.layout
+    values = problem.prior.mean.copy()
+    tension, difference = layout.index("pretension"), layout.index("tension_difference")
+    values[[tension, difference]] = 1.2, -0.25
+    drift = FilmEstimate(layout, values, np.zeros((len(values), len(values)))).drifted().covariance
+    sensor, _ = layout.prior.film(values[layout.film])
+    film = replace(sensor.film, expansion=(100e-6, 100e-6), ring_expansion=23e-6)
+    warm = warmed(replace(sensor, film=film), 0.01).film
+    expected_slope = (warm.deviator[0] / warm.pretension + 0.25) / (warm.pretension - 1.2)
+    assert drift[difference, tension] / drift[tension, tension] == pytest.approx(expected_slope, rel=0.01)

@@ -12,7 +12,7 @@ from tests.train.calibration.conftest import rig
 
 from isocharge.common.errors import ModelError, OutputExists, PressError
 from isocharge.serve import Predictor, read_presses
-from isocharge.simulate import ForwardMap, NoiseModel, load_sensor
+from isocharge.simulate import NoiseModel, load_sensor
 from isocharge.train import CalibrationProblem, FitConfig, NetworkConfig, TrainingConfig, calibrate
 from isocharge.train.calibration import calibrate as calibrate_module
 from isocharge.train.calibration import film_network
@@ -33,8 +33,6 @@ def written(problem, synthetic, tmp_path_factory):
         patch.setattr(film_network, "NODES_MPa", (0.0,))
         patch.setattr(film_network, "PRESSES", 6_000)
         patch.setattr(film_network, "_outside_presses", lambda *_: None)
-        build_map = partial(kept, ForwardMap.build_unchecked)  # the film is the same for all folders
-        patch.setattr(film_network, "ForwardMap", SimpleNamespace(build_unchecked=build_map))
         patch.setattr(film_network, "yield_force", partial(kept, film_network.yield_force))
         values, _, presses = rig(problem, synthetic, 20, seed=31)
         result = calibrate(presses, problem, start=synthetic, accurate=False)

@@ -88,6 +88,9 @@ PRETENSION = FilmProperty(
 )
 """The pretension. Its value is the pretension itself."""
 
+UNEVEN_TENSIONS = ("tension_difference", "tension_shear")
+"""Names of the properties that describe the uneven part of the pretension, as shares of the mean pretension."""
+
 FILM_PROPERTIES = (
     PRETENSION,
     FilmProperty("young", "ln of Young's modulus", "1", 0.2, 0.006),

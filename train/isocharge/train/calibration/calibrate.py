@@ -27,7 +27,7 @@ MAX_SOLVED_FILMS = 4
 """Largest number of axisymmetric films that are solved one after the other."""
 
 SAME_FILM_STD = 0.3
-"""Largest change of a mechanical property, in prior standard deviations, for which the film is not solved again."""
+"""Largest change of a mechanical property, in standard deviations of its estimate, for which no film is solved."""
 
 VISIBLE_ASYMMETRY = 0.03
 """Relative root-mean-square effect of the imperfections on the charges above which the uneven film itself is solved.
@@ -146,10 +146,10 @@ def _fit_even_film(
     """Solve axisymmetric films and estimate the properties in turn, until the estimate hardly changes."""
     estimation = estimate(charges, data, problem.prior)
     for _ in range(MAX_SOLVED_FILMS - 1):
-        values = estimation.film.film_values
-        if _solved_distance(estimation.charges, values) < SAME_FILM_STD:
+        if _solved_distance(estimation) < SAME_FILM_STD:
             break
-        estimation = estimate(solve_even(problem, executor, values), data, problem.prior, estimation)
+        charges = solve_even(problem, executor, estimation.film.film_values)
+        estimation = estimate(charges, data, problem.prior, estimation)
     return estimation
 
 
@@ -169,12 +169,13 @@ def _fit_uneven_film(
     return estimation
 
 
-def _solved_distance(charges: FilmCharges, values: Array) -> float:
-    """Return the largest distance of the even properties from those of the solved film, in prior std deviations."""
-    prior = charges.prior
+def _solved_distance(estimation: Estimation) -> float:
+    """Return the largest distance of the even properties from those of the solved film, in standard deviations."""
+    film, charges = estimation.film, estimation.charges
     names = ("pretension", "young", "thickness", "probe_radius")
-    rows = [prior.index(name) for name in names if name in prior.names]
-    return float(np.abs((values - charges.values)[rows] / prior.std[rows]).max())
+    rows = [charges.prior.index(name) for name in names if name in charges.prior.names]
+    std = np.sqrt(np.diagonal(film.covariance)[rows])
+    return float(np.abs((film.film_values - charges.values)[rows] / std).max())
 
 
 def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:

@@ -16,7 +16,7 @@ from isocharge.common.arrays import Array
 from isocharge.simulate import Circle, Domain, FilmPrior, FilmSlopes, ForwardMap, Probe, Sensor, SolveSettings
 from isocharge.simulate.forward.derivative_maps import few_nodes
 from isocharge.simulate.forward.family import nearest_to_clamp
-from isocharge.simulate.sensor.film_properties import PRETENSION, FilmProperty, changed_film
+from isocharge.simulate.sensor.film_properties import PRETENSION, UNEVEN_TENSIONS, FilmProperty, changed_film
 from isocharge.simulate.solver.press import needed_resolution
 
 STEP = 1.0 / 3.0
@@ -28,9 +28,6 @@ PROBE_RADIUS = "probe_radius"
 It is the only property for which a second film is solved. The derivatives with respect to all other properties follow
 from the solved film and from `FilmSlopes`.
 """
-
-UNEVEN_TENSIONS = ("tension_difference", "tension_shear")
-"""Names of the properties that describe the uneven part of the pretension, as shares of the mean pretension."""
 
 MAX_LOG_CHANGE = 1.0
 """Largest change of the logarithm of a charge to which a first-order change is applied."""
@@ -154,7 +151,7 @@ class FilmCharges:
         solved_charge = _read(self.film, sensor).charges(contact)
         stress_derivatives = self._stress_derivatives(sensor, contact, solved_charge)
         charge, factor = self._changed(values, solved_charge, stress_derivatives)
-        jacobian = self._jacobian(sensor, contact, solved_charge, stress_derivatives)
+        jacobian = self._jacobian(values, sensor, contact, solved_charge, stress_derivatives)
         return charge, factor[:, :, None] * jacobian
 
     def _changed(
@@ -173,6 +170,8 @@ class FilmCharges:
             Charges, shape (n, n_electrode), pC, and the factors by which the derivatives change, of the same shape.
         """
         change = dict(zip(self.prior.names, (values - self.values).tolist(), strict=True))
+        solved_MPa = self._tensions(self.values)
+        change |= {name: tension_MPa - solved_MPa[name] for name, tension_MPa in self._tensions(values).items()}
         charge_change = np.zeros_like(solved_charge)
         for name, derivative in stress_derivatives.items():
             charge_change += change[name] * derivative
@@ -200,10 +199,19 @@ class FilmCharges:
         sensor, _ = self.prior.film(np.where(self.prior.changes_stress, self.values, values))
         return sensor
 
-    def _jacobian(self, sensor: Sensor, contact: Array, charge: Array, stress_derivatives: dict[str, Array]) -> Array:
+    def _tensions(self, values: Array) -> dict[str, float]:
+        """Return the mean pretension and its uneven parts, MPa, by the names of their properties."""
+        value = dict(zip(self.prior.names, values.tolist(), strict=True))
+        pretension = value[PRETENSION.name]
+        return {PRETENSION.name: pretension} | {name: value[name] * pretension for name in UNEVEN_TENSIONS}
+
+    def _jacobian(
+        self, values: Array, sensor: Sensor, contact: Array, charge: Array, stress_derivatives: dict[str, Array]
+    ) -> Array:
         """Compute the derivatives of the charges with respect to all properties.
 
         Args:
+            values: Properties of the film, shape (n_property,).
             sensor: Sensor with the electrodes and the coefficients.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
             charge: Charges of the solved film at these contacts, shape (n, n_electrode), pC.
@@ -213,6 +221,10 @@ class FilmCharges:
             Derivatives, shape (n, n_electrode, n_property), pC per unit.
         """
         derivatives = {**stress_derivatives, "crosstalk": charge.sum(axis=1, keepdims=True) - charge}
+        for name in UNEVEN_TENSIONS:  # shares of the pretension
+            share = values[self.prior.index(name)]
+            derivatives[PRETENSION.name] = derivatives[PRETENSION.name] + share * derivatives[name]
+            derivatives[name] = values[self.prior.index(PRETENSION.name)] * derivatives[name]
         for electrode, name in enumerate(sensor.electrode_names):
             own_charge = np.zeros_like(charge)
             own_charge[:, electrode] = charge[:, electrode]
@@ -225,6 +237,8 @@ class FilmCharges:
 
     def _stress_derivatives(self, sensor: Sensor, contact: Array, charge: Array) -> dict[str, Array]:
         """Compute the derivatives with respect to the properties that change the stress, by the name of the property.
+
+        The derivatives with respect to the uneven parts of the pretension are those per MPa.
 
         The stress in units of Young's modulus E depends on E, the thickness h and the force F only through F / (E h)
         and the tensions divided by E. The small effect of the bending is neglected here.
@@ -241,11 +255,8 @@ class FilmCharges:
         derivatives = replace(self.slopes, film=film, fields=fields).jacobian(contact)
         force_slope = _read(self.film, sensor).derivatives(contact)[:, :, 2]
         derivatives["thickness"] = -force_slope
-        values = dict(zip(self.prior.names, self.values.tolist(), strict=True))
-        for name in UNEVEN_TENSIONS:  # shares of the pretension
-            derivatives[PRETENSION.name] = derivatives[PRETENSION.name] + values[name] * derivatives[name]
-            derivatives[name] = values[PRETENSION.name] * derivatives[name]
-        derivatives["young"] = charge - force_slope - values[PRETENSION.name] * derivatives[PRETENSION.name]
+        tension_terms = (tension * derivatives[name] for name, tension in self._tensions(self.values).items())
+        derivatives["young"] = charge - force_slope - sum(tension_terms)
         if self.larger_probe is not None:
             step = STEP * self.prior.std[self.prior.index(PROBE_RADIUS)]
             derivatives[PROBE_RADIUS] = (

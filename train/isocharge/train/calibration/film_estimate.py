@@ -20,6 +20,7 @@ from numpy.polynomial import chebyshev
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.simulate import Domain, FilmPrior, NoiseModel, noise_model
+from isocharge.simulate.sensor.film_properties import PRETENSION, UNEVEN_TENSIONS
 
 DEGREE = 4
 """Largest total degree of a term in x, y and ln F."""
@@ -220,13 +221,18 @@ class FilmEstimate:
         The possible drift of the film since then increases the variances. The offset and the other unknowns of the
         earlier session are removed.
         """
-        prior = self.layout.prior
-        drift = np.zeros(len(self.values))
-        drift[self.layout.film] = [one.drift for one in prior.properties]
-        drift[self.layout.coefficients] = COEFFICIENT_DRIFT
+        layout = self.layout
+        drift_std = np.zeros(len(self.values))
+        drift_std[layout.film] = [one.drift for one in layout.prior.properties]
+        drift_std[layout.coefficients] = COEFFICIENT_DRIFT
+        drift = np.diag(drift_std)
+        # A change of the temperature adds the same tension in all directions. The uneven parts become other shares.
+        pretension = max(self.value(PRETENSION.name), PRETENSION.drift)
+        for name in UNEVEN_TENSIONS:
+            drift[layout.index(name), layout.index(PRETENSION.name)] = -self.value(name) * PRETENSION.drift / pretension
         values = self.values.copy()
-        covariance = self.covariance + np.diag(drift**2)
-        session = self.layout.session
+        covariance = self.covariance + drift @ drift.T
+        session = layout.session
         values[session] = 0.0
         covariance[session] = covariance[:, session] = 0.0
         return replace(self, values=values, covariance=covariance)

@@ -6,7 +6,7 @@ noise. Its standard deviations therefore contain the noise and everything that i
 The posterior distribution has many unknowns, of which only a few linear combinations change the charges. These
 combinations are the directions of the compact charge map (`ChargeSeries`), from which both the training and the live
 follower know what is uncertain. The nodes of the map are films with other pretensions. Their charges are those of the
-calibrated film, times the ratio of the charges of axisymmetric films with both pretensions.
+calibrated film, times the ratio of the charges of nearly axisymmetric films with both pretensions.
 """
 
 import hashlib
@@ -18,12 +18,11 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.model.charge_series import CHUNK_SIZE, ChargeSeries, series_size
 from isocharge.serve.presses.measured_presses import CONTACT
-from isocharge.simulate import Domain, ForwardMap, NoiseModel, Sweep
-from isocharge.simulate.forward.derivative_maps import few_nodes
+from isocharge.simulate import Domain, NoiseModel, Sweep
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
-from isocharge.simulate.sensor.film_properties import PRETENSION
+from isocharge.simulate.sensor.film_properties import PRETENSION, UNEVEN_TENSIONS
 from isocharge.simulate.solver.stress_limit import yield_force
-from isocharge.train.calibration.film_charges import FilmCharges, axisymmetric, round_probe
+from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import FilmEstimate, discrepancy_jacobian
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.data.charge_fit import fit_film_series, fit_series
@@ -101,7 +100,8 @@ def _film_charges(charges: FilmCharges, film: FilmEstimate, contact: Array) -> A
 def _nodes(film: FilmEstimate) -> Array:
     """Return the changes of the pretension at the nodes, of which none makes the film slack, shape (n_node,), MPa."""
     node_MPa = np.array(NODES_MPa)
-    lowest_MPa = -0.95 * film.value(PRETENSION.name)
+    uneven_share = np.linalg.norm([film.value(name) for name in UNEVEN_TENSIONS])
+    lowest_MPa = -0.95 * film.value(PRETENSION.name) * (1.0 - uneven_share)
     reach = min(1.0, lowest_MPa / node_MPa.min()) if node_MPa.min() < 0.0 else 1.0
     return np.unique(np.where(node_MPa < 0.0, reach * node_MPa, node_MPa))
 
@@ -111,8 +111,9 @@ def _tension_factors(
 ) -> Array:
     """Compute the factors by which changes of the pretension multiply the charges.
 
-    The factors are those of an axisymmetric film under a circular probe. A factor is 1 where the charges before and
-    after the change have different signs.
+    The tension changes equally in all directions. The factors are those of an axisymmetric film under a circular probe
+    with first-order changes by the imperfections. A factor is 1 where the charges before and after the change have
+    different signs.
 
     Args:
         charges: Charges of the solved film and of similar films.
@@ -124,23 +125,22 @@ def _tension_factors(
     Returns:
         Factors, shape (n, n_node, n_electrode), dimensionless.
     """
-    sensor, probe = charges.prior.film(film.film_values)
-    sensor, probe = axisymmetric(sensor), round_probe(probe)
-    nodes = few_nodes(sensor.film, charges.domain)
+    uneven = [film.layout.index(name) for name in UNEVEN_TENSIONS]
 
     def charges_after(change_MPa: float) -> Array:
-        """Solve the axisymmetric film after a change of its pretension, and return its charges."""
-        changed_film = replace(sensor.film, pretension=sensor.film.pretension + change_MPa)
-        changed = replace(sensor, film=changed_film)
-        forward_map = ForwardMap.build_unchecked(changed, probe, charges.domain, nodes, executor=executor)
-        return forward_map.charges(contact)
+        """Solve the film after a change of its pretension, and return its charges."""
+        values = film.film_values.copy()
+        values[film.layout.index(PRETENSION.name)] += change_MPa
+        values[uneven] *= film.value(PRETENSION.name) / (film.value(PRETENSION.name) + change_MPa)
+        return FilmCharges.solve_roughly(charges.prior, values, charges.domain, executor).charges(values, contact)
 
-    before = charges_after(0.0)
-    factors = np.ones((len(contact), node_MPa.size, before.shape[1]))
-    for node, change_MPa in enumerate(node_MPa.tolist()):
-        if change_MPa != 0.0:
-            after = charges_after(change_MPa)
-            np.divide(after, before, out=factors[:, node], where=before * after > 0.0)
+    factors = np.ones((len(contact), node_MPa.size, len(charges.prior.sensor.electrodes)))
+    changed_nodes = np.flatnonzero(node_MPa)
+    if changed_nodes.size > 0:
+        before = charges_after(0.0)
+    for node in changed_nodes:
+        after = charges_after(node_MPa[node])
+        np.divide(after, before, out=factors[:, node], where=before * after > 0.0)
     return factors
 
 

@@ -1,0 +1,70 @@
+"""Tests of films whose pretension has changed since their calibration."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.benchmarks.solved_films import solve_charges
+from tests.train.calibration.conftest import rig
+
+from isocharge.train import calibrate
+from isocharge.train.calibration.calibrate import solve_even
+from isocharge.train.calibration.estimator import PLANNED
+from isocharge.train.calibration.film_estimate import FilmEstimate
+from isocharge.train.calibration.film_network import _nodes, _tension_factors
+
+
+def uneven_film(problem):
+    """Return the estimate of a film whose tension is uneven, without uncertainty."""
+    layout = problem.prior.layout
+    values = problem.prior.mean.copy()
+    values[layout.index("pretension")] = 1.2
+    values[layout.index("tension_difference")] = -0.25
+    return FilmEstimate(layout, values, np.zeros((len(values), len(values))))
+
+
+@pytest.mark.slow
+def test_charges_of_an_uneven_film_after_warming_agree_with_full_solves(problem):
+    """Each press is solved before and after the change, with the same difference of the tensions in MPa."""
+    film = uneven_film(problem)
+    sensor, probe = film.layout.prior.film(film.film_values)
+    contact = np.array([[0.0, 0.0, 0.5], [5.0, 1.0, 0.3], [-3.0, 4.0, 1.0], [2.0, -6.0, 0.5], [-6.0, -2.0, 1.5]])
+    before = solve_charges(sensor, probe, contact)
+    later = replace(sensor, film=replace(sensor.film, pretension=sensor.film.pretension - 0.4))
+    after = solve_charges(later, probe, contact)
+
+    charges = solve_even(problem, values=film.film_values)
+    factors = _tension_factors(charges, film, contact, np.array([0.0, -0.4]), None)
+    np.testing.assert_array_equal(factors[:, 0], 1.0)
+    np.testing.assert_allclose(factors[:, 1], after / before, rtol=1e-3)
+
+
+def test_no_node_makes_a_film_slack_in_one_direction(problem):
+    film = uneven_film(problem)
+    values = film.values.copy()
+    values[film.layout.index("pretension")] = 0.6
+    lowest = 0.6 + _nodes(replace(film, values=values)).min()
+    assert 0.0 < lowest - 0.25 * 0.6 < 0.05
+
+
+@pytest.mark.slow
+def test_estimate_does_not_depend_on_the_film_that_is_solved_first(problem):
+    """Touches at unknown places show the pretension, although the first solved film is far from the real film."""
+    layout = problem.prior.layout
+    tension, difference = layout.index("pretension"), layout.index("tension_difference")
+    values = problem.prior.mean.copy()
+    values[[tension, difference]] = 1.2, -0.25
+    earlier = FilmEstimate(layout, values, 0.01 * problem.prior.covariance(PLANNED))
+    later = earlier.film_values.copy()
+    later[[tension, difference]] = 0.8, -0.25 * 1.2 / 0.8
+    film = solve_even(problem, values=later)
+    _, _, touches = rig(problem, film, 60, seed=23, values=later)
+    touches.contact[:] = np.nan
+    continued = replace(problem, earlier=earlier.drifted())
+    found = []
+    for first_MPa in (1.0, 0.6):
+        later[tension] = first_MPa
+        found.append(calibrate(touches, continued, start=solve_even(problem, values=later), accurate=False).film)
+    std = found[0].std("pretension")
+    assert abs(found[0].value("pretension") - found[1].value("pretension")) < 0.4 * std
+    assert abs(found[0].value("pretension") - 0.8) < 2.0 * std
