@@ -103,6 +103,17 @@ def test_derivatives_are_those_of_direct_solves(solved, name):
     np.testing.assert_allclose(jacobian[:, :, index], expected, atol=tolerance * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("name", ["pretension", "tension_difference", "tension_shear", "young", "oval_x"])
+def test_derivatives_at_a_changed_uneven_film_are_differences_of_the_charges(solved, name):
+    prior = solved.prior
+    values = prior.mean.copy()
+    values[[prior.index(one) for one in ("pretension", "tension_difference", "tension_shear")]] = 1.1, 0.2, -0.1
+    _, jacobian = solved.linearised(values, CONTACT)
+    step = 1e-5 * (np.array(prior.names) == name)
+    expected = (solved.charges(values + step, CONTACT) - solved.charges(values - step, CONTACT)) / 2e-5
+    np.testing.assert_allclose(jacobian[:, :, prior.index(name)], expected, rtol=1e-6)
+
+
 def test_contact_slopes_are_differences_of_the_charges(solved):
     values = solved.prior.mean
     slopes = solved.contact_slopes(values, CONTACT)
