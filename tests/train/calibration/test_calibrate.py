@@ -28,7 +28,8 @@ def test_errors_become_smaller_and_the_sentences_name_them(problem, synthetic):
     assert after.force_percent < 0.2 * before.force_percent
     assert f"errors of {after.position_mm:.2g} mm and {after.force_percent:.2g} %" in result.summary[0]
     assert result.cautions == ()
-    assert f"noise: about {100.0 * result.film.noise.gain:.2g} % and " in result.summary[-1]
+    shares = [100.0 * share for share in (result.estimation.hypothesis.discrepancy, result.film.noise.gain)]
+    assert "about {:.2g} % of a charge; noise: about {:.2g} % and ".format(*shares) in result.summary[-1]
     assert result.properties["pretension"].identified
     assert re.search(r"changes from the sensor file \(.*\): mean pretension .*; ln of d31 ", result.summary[1])
     std = np.array([one.std for one in result.properties.values()])
