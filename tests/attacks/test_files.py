@@ -1,6 +1,5 @@
 """Every file that is read, truncated at each byte, with faults, with junk in its tables, and with what is no file."""
 
-import io
 import json
 import re
 import shutil
@@ -9,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from attacks.companions import ELECTRODES, charge_arrays
 from attacks.faults import mutated, with_junk
+from isocharge.common.contact_domain import Domain
 from isocharge.common.files import sha256_of
 from isocharge.serve import (
     Chunk,
@@ -25,7 +24,8 @@ from isocharge.serve import (
     read_charges,
 )
 from isocharge.serve.live.device import create_stages
-from isocharge.serve.model.charge_file import FILE, read_charge_map
+from isocharge.serve.model.charge_file import FILE, charge_map_bytes, read_charge_map
+from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.signal_chain.stage import Setup
@@ -36,8 +36,10 @@ from isocharge.train import CalibrationProblem, FilmEstimate, read_earlier
 from isocharge.train.calibration.estimator import PLANNED
 from isocharge.train.calibration.folder import film_table, json_text
 from isocharge.train.training.config import load_config
+from model_files import put_charge_map, put_graph
 
 ROOT = Path(__file__).parents[2]
+MODEL = "three-25um-biaxial"
 
 DEVICE = """
 name = "bench"
@@ -69,12 +71,8 @@ NOISE = 'like = "bench"\nwhite_pC = 0.5\ntau_s = 1.0\nlimit_pC = inf\nbits = 0\n
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """A folder of good files, by kind: (path, function that reads it)."""
+    """A folder of good files, which the functions of KINDS read."""
     folder = tmp_path_factory.mktemp("files")
-    return {name: (folder / file, read) for name, (file, read) in _write(folder).items()}
-
-
-def _write(folder):
     sensors = ROOT / "simulate/isocharge/simulate/sensors"
     shutil.copy(sensors / "three-25um-biaxial.toml", folder / "sensor.toml")
     (folder / "device.toml").write_text(DEVICE)
@@ -86,15 +84,7 @@ def _write(folder):
         for k in range(3):
             recorder.chunk(Chunk(bytes(9), 1e9 + k, k, 0.0), ['{"timestamp": 1.0, "latency_us": 9.0}'])
             recorder.event(tare=True)
-    return {
-        "sensor": ("sensor.toml", load_sensor),
-        "device": ("device.toml", _load_device),
-        "noise": ("noise.toml", lambda path: load_amplifier(str(path))),
-        "configuration": ("config.toml", load_config),
-        "script": ("script.toml", load_script),
-        "charges": ("charges.csv", _read_charges),
-        "recording": ("touch.rec", lambda path: list(Recording(path).events())),
-    }
+    return folder
 
 
 def _load_device(path):
@@ -108,7 +98,16 @@ def _read_charges(path):
         assert np.isfinite(read_charges(lines, ("A", "B", "C"), "charges")).all()
 
 
-KINDS = ("sensor", "device", "noise", "configuration", "script", "charges", "recording")
+KINDS = {
+    "sensor": ("sensor.toml", load_sensor),
+    "device": ("device.toml", _load_device),
+    "noise": ("noise.toml", lambda path: load_amplifier(str(path))),
+    "configuration": ("config.toml", load_config),
+    "script": ("script.toml", load_script),
+    "charges": ("charges.csv", _read_charges),
+    "recording": ("touch.rec", lambda path: list(Recording(path).events())),
+}
+"""Name of the file, and the function that reads it, by the kind of the file."""
 
 
 def number_bomb(rng, text):
@@ -147,7 +146,8 @@ FAULTS = {
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("faults", FAULTS)
 def test_settings_and_recordings(kind, faults, files, attack):
-    path, read = files[kind]
+    file, read = KINDS[kind]
+    path = files / file
     good, (count, make) = path.read_bytes(), FAULTS[faults]
     read(path)
 
@@ -190,22 +190,25 @@ def read_device(value, where):
 
 
 @pytest.fixture
-def model(tmp_path):
-    """A copy of a released model."""
-    folder = tmp_path / "three-25um-biaxial"
-    shutil.copytree(find_model("three-25um-biaxial").parent, folder)
-    return folder / "1"
+def repository(tmp_path):
+    """A repository with a copy of a released model."""
+    shutil.copytree(find_model(MODEL).parent, tmp_path / "models" / MODEL)
+    return tmp_path / "models"
 
 
-LABEL_PARTS = ("three-25um-biaxial", "1", "outside", "..", ".", "/", "//", "~", "\\", "\n", "\0", "%2e", "")
+@pytest.fixture
+def model(repository):
+    """The version folder of the model in the repository."""
+    return repository / MODEL / "1"
 
 
-def test_labels_of_recordings_choose_no_path(tmp_path, attack):
+LABEL_PARTS = (MODEL, "1", "outside", "..", ".", "/", "//", "~", "\\", "\n", "\0", "%2e", "")
+
+
+def test_labels_of_recordings_choose_no_path(tmp_path, repository, attack):
     """Whatever a recording names as its model, a folder outside the repositories is never found."""
-    repository = tmp_path / "models"
-    shutil.copytree(find_model("three-25um-biaxial").parent, repository / "three-25um-biaxial")
-    shutil.copytree(repository / "three-25um-biaxial", tmp_path / "outside")
-    shutil.copytree(repository / "three-25um-biaxial", tmp_path / "outside" / "outside")
+    for outside in ("outside", "outside/outside"):
+        shutil.copytree(repository / MODEL, tmp_path / outside)
 
     def random_label(rng):
         parts = [rng.choice(LABEL_PARTS) for _ in range(rng.choice((1, 2, 3, 4)))]
@@ -214,18 +217,16 @@ def test_labels_of_recordings_choose_no_path(tmp_path, attack):
     def find(label):
         assert find_labelled_model(label, repository).is_relative_to(repository)
 
-    find("three-25um-biaxial/1")
+    find(f"{MODEL}/1")
     attack("labels of recordings", find, random_label, 20_000)
 
 
 def test_a_model_with_faults(model, attack):
     """The checksum fits: what is refused is refused by the graph, its interface or its answers."""
-    graph, golden = model / "model.onnx", json.loads((model / "golden.json").read_text())
-    good = graph.read_bytes()
+    good = (model / "model.onnx").read_bytes()
 
     def read(data):
-        graph.write_bytes(data)
-        (model / "golden.json").write_text(json.dumps(golden | {"sha256": sha256_of(data)}))
+        put_graph(model, data)
         check_golden(load_model(model))
 
     head = 4000  # nodes and metadata; most of the rest is numbers
@@ -263,14 +264,12 @@ def test_calibrations_with_faults(tmp_path, attack):
     attack("calibration numbers", read, lambda rng: number_bomb(rng, text).encode(), 500)
 
 
-def test_loads_of_half_copied_versions(tmp_path, attack):
+def test_loads_of_half_copied_versions(repository, model, attack):
     """Whatever lies in the folder of a newer version, the old version of a model goes on serving after a load."""
-    folder = tmp_path / "models" / "three-25um-biaxial"
-    shutil.copytree(find_model("three-25um-biaxial").parent, folder)
-    store = open_model_store(folder.parent)
+    store = open_model_store(repository)
     charge_pC = np.full((1, 3), 500.0, np.float32)
     names = ("model.onnx", "golden.json", "card.md")
-    contents = {name: (folder / "1" / name).read_bytes() for name in names}
+    contents = {name: (model / name).read_bytes() for name in names}
 
     def half_copied(rng):
         """Some files of a version, cut or with faults."""
@@ -278,15 +277,15 @@ def test_loads_of_half_copied_versions(tmp_path, attack):
         return {name: contents[name][: rng.randrange(len(contents[name]))] for name in chosen}
 
     def load(files):
-        newer = folder / "2"
+        newer = repository / MODEL / "2"
         newer.mkdir()
         for name, data in files.items():
             (newer / name).write_bytes(data)
         try:
-            store.load("three-25um-biaxial")
+            store.load(MODEL)
         finally:
             shutil.rmtree(newer)
-            outputs = store.get("three-25um-biaxial").model.session.run(None, {"charge_pC": charge_pC})
+            outputs = store.get(MODEL).model.session.run(None, {"charge_pC": charge_pC})
             assert np.isfinite(outputs[0]).all()
 
     attack("half-copied versions", load, half_copied, 1_000)
@@ -294,16 +293,15 @@ def test_loads_of_half_copied_versions(tmp_path, attack):
 
 def test_charge_maps_with_faults(model, attack):
     """A file is accepted only with the checksum that `golden.json` contains."""
-    file = io.BytesIO()
-    np.savez_compressed(file, **charge_arrays())
-    good = file.getvalue()
-    golden = json.loads((model / "golden.json").read_text("utf-8"))
-    golden["files"] = {FILE: sha256_of(good)}
-    (model / "golden.json").write_text(json.dumps(golden), "utf-8")
+    series = ChargeSeries(
+        domain=Domain(8.0, (0.05, 2.0)), electrodes=("A", "B", "C"), coefficients=np.ones((1, 2, 2, 2, 3))
+    )
+    good = charge_map_bytes(series)
+    put_charge_map(model, good)
 
     def read(data):
         (model / FILE).write_bytes(data)
-        read_charge_map(model, ELECTRODES)
+        read_charge_map(model, series.electrodes)
         assert data == good
 
     read(good)

@@ -13,6 +13,7 @@ import grpc
 import pytest
 
 from attacks.faults import mutated, with_junk
+from infer_requests import infer_request
 from isocharge.serve.network.grpc.service import METHODS, SERVICE
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
@@ -20,13 +21,8 @@ from isocharge.serve.network.protocol import Handler
 NAME = "three-25um-biaxial"
 MODELS = Path(__file__).parents[2] / "models"
 PATH = f"/v2/models/{NAME}/infer"
-BODY = json.dumps(
-    {
-        "id": "a",
-        "inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [800.5, 700.0, 900.0]}],
-        "outputs": [{"name": "contact", "parameters": {"binary_data": False}}],
-    }
-).encode()
+OUTPUTS = [{"name": "contact", "parameters": {"binary_data": False}}]
+BODY = json.dumps(infer_request([800.5, 700.0, 900.0], id="a", outputs=OUTPUTS)).encode()
 REQUEST = b"POST %s HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: %d\r\n\r\n%s" % (
     PATH.encode(),
     len(BODY),

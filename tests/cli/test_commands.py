@@ -4,6 +4,7 @@ import io
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -184,84 +185,72 @@ def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
 
 
 BAD = [
-    (("simulate", "point", SENSOR, "--force", "-1"), 2, "SceneError: force: expected a positive number of newtons"),
-    (("simulate", "point", SENSOR, "--side-force", "0.1"), 2, "InputError: --side-force: expected two numbers in N"),
+    ("simulate point SENSOR --force -1", "SceneError: force: expected a positive number of newtons"),
+    ("simulate point SENSOR --side-force 0.1", "InputError: --side-force: expected two numbers in N"),
     (
-        ("simulate", "point", SENSOR, "--friction", "0.1", "--side-force", "0.1,0"),
-        2,
+        "simulate point SENSOR --friction 0.1 --side-force 0.1,0",
         "InputError: --side-force and --friction: expected one of them",
     ),
-    (("simulate", "point", SENSOR, "--at", "3"), 2, "InputError: --at: expected two numbers in mm"),
-    (("simulate", "point", SENSOR, "--probe", "cube:1"), 2, "SceneError: probe 'cube:1'"),
-    (("simulate", "point", SENSOR, "--accuracy", "0"), 2, "InputError: --accuracy: expected"),
-    (("simulate", "sweep", SENSOR, "--radius", "44.5", "-o", "OUT"), 2, "leave the film of radius 45 mm"),
+    ("simulate point SENSOR --at 3", "InputError: --at: expected two numbers in mm"),
+    ("simulate point SENSOR --probe cube:1", "SceneError: probe 'cube:1'"),
+    ("simulate point SENSOR --accuracy 0", "InputError: --accuracy: expected"),
+    ("simulate point SENSOR --force 1e308", "beyond small strains"),
+    ("simulate sweep SENSOR --radius 44.5 -o OUT", "leave the film of radius 45 mm"),
     (
-        ("simulate", "sweep", SENSOR, "--workers", "2", "--cluster", "tcp://127.0.0.1:9", "-o", "OUT"),
-        2,
+        "simulate sweep SENSOR --workers 2 --cluster tcp://127.0.0.1:9 -o OUT",
         "InputError: expected either --workers or --cluster, got both",
     ),
-    (("train", "fit", "-o", "OUT"), 2, "InputError: expected either a DATASET folder or a SENSOR"),
-    (("train", "fit", SENSOR, "--sensor", SENSOR, "-o", "OUT"), 2, f"expected one sensor, got {SENSOR} and"),
-    (("simulate", "identify", SENSOR, "--noise", "clean"), 2, "expected white noise above 0 pC, got that of 'clean'"),
+    ("simulate sweep SENSOR --radius all -o OUT", "expected a number of mm or 'auto', got 'all'"),
+    ("simulate identify SENSOR --noise clean", "expected white noise above 0 pC, got that of 'clean'"),
     *(
-        (("simulate", "identify", SENSOR, "--error", error), 2, "--error: expected a positive number")
+        (f"simulate identify SENSOR --error {error}", "--error: expected a positive number")
         for error in ("nan", "0", "inf")
     ),
+    ("simulate design SENSOR --electrodes 2 --radius 8 -o OUT", "three unknowns"),
+    ("simulate design SENSOR --electrodes 3 --probe triangle:3 --radius 8 -o OUT", "expected circle:RADIUS"),
+    ("train fit -o OUT", "InputError: expected either a DATASET folder or a SENSOR"),
+    ("train fit SENSOR --sensor SENSOR -o OUT", f"expected one sensor, got {SENSOR} and"),
+    ("train fit FILE --radius 5 -o OUT", "--radius: belongs to --sensor"),
+    ("train fit --sensor SENSOR --force-std 0.1 -o OUT", "--force-std: belongs to a file of measured presses"),
     (
-        ("simulate", "sweep", SENSOR, "--radius", "all", "-o", "OUT"),
-        2,
-        "expected a number of mm or 'auto', got 'all'",
+        "train fit . --probe circle:1.0 -o OUT",
+        "--probe: is contained in the dataset folder; leave the option out",
     ),
-    *(
-        (("simulate", "design", SENSOR, "--electrodes", *words.split(), "--radius", "8", "-o", "OUT"), 2, message)
-        for words, message in [
-            ("2", "three unknowns"),
-            ("3 --probe triangle:3", "expected circle:RADIUS"),
-        ]
-    ),
-    (("serve", "bench", "nowhere"), 2, "ModelError: "),
-    (("serve", "bench", "--seconds", "inf"), 2, "--seconds"),
-    (("serve", "stream", SENSOR, "--port", "-", "--follow"), 2, "expected at least four electrodes, got A, B, C"),
+    ("train fit FILE --sensor SENSOR -o OUT", "calibrate its film; use `isocharge train calibrate"),
     (
-        ("serve", "stream", "four-25um-biaxial", "--port", "-", "--follow"),
-        2,
+        "train fit none.csv --sensor SENSOR -o OUT",
+        "none.csv: expected a dataset folder or a file of measured presses",
+    ),
+    ("train fit --sensor SENSOR --config none.toml -o OUT", "ConfigError: none.toml: cannot be"),
+    ("train fit --sensor SENSOR -o 'a b'", "ModelError: model name 'a b'"),
+    ("serve bench nowhere", "ModelError: "),
+    ("serve bench --seconds inf", "--seconds"),
+    ("serve stream SENSOR --port - --follow", "expected at least four electrodes, got A, B, C"),
+    (
+        "serve stream four-25um-biaxial --port - --follow",
         "a film is followed from a model that `isocharge train calibrate` made",
     ),
-    *(
-        (("train", "fit", *words.split(), "-o", "OUT"), 2, message)
-        for words, message in [
-            (f"{__file__} --radius 5", "--radius: belongs to --sensor"),
-            (f"--sensor {SENSOR} --force-std 0.1", "--force-std: belongs to a file of measured presses"),
-            (". --probe circle:1.0", "--probe: is contained in the dataset folder; leave the option out"),
-            (f"{__file__} --sensor {SENSOR}", "calibrate its film; use `isocharge train calibrate"),
-            (f"none.csv --sensor {SENSOR}", "none.csv: expected a dataset folder or a file of measured presses"),
-        ]
-    ),
-    (
-        ("train", "fit", "--sensor", SENSOR, "--config", "none.toml", "-o", "OUT"),
-        2,
-        "ConfigError: none.toml: cannot be",
-    ),
-    (("simulate", "point", SENSOR, "--force", "1e308"), 2, "beyond small strains"),
-    (("train", "fit", "--sensor", SENSOR, "-o", "a b"), 2, "ModelError: model name 'a b'"),
-    (
-        ("simulate", "sweep", SENSOR, "--samples", "50", "-o", "/proc/x"),
-        1,
-        "OutputError: /proc/x cannot be written",
-    ),
-    (("serve", "predict", SENSOR, "x.csv", "--models", "nope"), 2, "ModelError: nope: expected a folder of models"),
-    (("serve", "predict", SENSOR, "none.csv"), 2, "ChargeError: none.csv: cannot be read"),
-    (("serve", "predict", SENSOR, "-"), 2, "stdin"),
-    (("serve", "stream", SENSOR, "--port", "/dev/none"), 1, "PortError"),
-    (("demo", "--sensor", "no-such-sensor"), 2, "no-such-sensor"),
+    ("serve predict SENSOR x.csv --models nope", "ModelError: nope: expected a folder of models"),
+    ("serve predict SENSOR none.csv", "ChargeError: none.csv: cannot be read"),
+    ("serve predict SENSOR -", "stdin"),
+    ("demo --sensor no-such-sensor", "no-such-sensor"),
 ]
+"""Command lines and the messages with which they end with the exit code 2."""
+
+
+FAILING = [
+    ("simulate sweep SENSOR --samples 50 -o /proc/x", "OutputError: /proc/x cannot be written"),
+    ("serve stream SENSOR --port /dev/none", "PortError"),
+]
+"""Command lines and the messages with which they end with the exit code 1."""
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "message"), BAD, ids=lambda value: " ".join(value) if isinstance(value, tuple) else ""
+    ("line", "message", "code"), [*((*case, 2) for case in BAD), *((*case, 1) for case in FAILING)]
 )
-def test_bad_input_is_one_clear_line_and_leaves_nothing(refused, tmp_path, monkeypatch, words, code, message):
+def test_bad_input_is_one_clear_line_and_leaves_nothing(refused, tmp_path, monkeypatch, line, message, code):
     monkeypatch.chdir(tmp_path)
+    words = shlex.split(line.replace("SENSOR", SENSOR).replace("FILE", __file__))
     refused(*words, message=message, code=code)
     assert list(Path().iterdir()) == []
 

@@ -8,9 +8,7 @@ with the contacts that were pressed.
 
 import errno
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from threading import Thread
 
 import numpy as np
@@ -51,26 +49,26 @@ class LinearFilm:
     directions: np.ndarray
 
     @classmethod
-    def with_electrodes(cls, n: int) -> "LinearFilm":
+    def with_electrodes(cls, n):
         """Return the film with n electrodes, which are evenly distributed on a circle."""
         angle = 2 * np.pi * np.arange(n) / n - np.pi / 2
         return cls(np.column_stack([np.cos(angle), np.sin(angle)]))
 
     @property
-    def electrodes(self) -> tuple[str, ...]:
+    def electrodes(self):
         """Names of the electrodes."""
         return NAMES[: len(self.directions)]
 
-    def charge_pC(self, x_mm: np.ndarray, y_mm: np.ndarray, force_N: np.ndarray) -> np.ndarray:
+    def charge_pC(self, x_mm, y_mm, force_N):
         """Compute the charges of n contacts, shape (n, n_electrode), pC, from arrays of shape (n,)."""
         relative_change = np.column_stack([x_mm, y_mm]) @ self.directions.T / LEVER_MM
         return PC_PER_N * np.asarray(force_N)[:, None] * (1.0 + relative_change)
 
-    def charges(self, contact: np.ndarray) -> np.ndarray:
+    def charges(self, contact):
         """Compute the charges of contacts (x, y, F), shape (n, 3)."""
         return self.charge_pC(*contact.T)
 
-    def metadata(self, **changes: object) -> ModelMetadata:
+    def metadata(self, **changes):
         """Return the metadata of the model with some changed values."""
         angle = 2 * np.pi * np.arange(64) / 64
         values = {
@@ -88,7 +86,7 @@ class LinearFilm:
         }
         return ModelMetadata(**(values | changes))
 
-    def onnx(self, props: dict[str, str], *, renamed: dict[str, str] | None = None, batch: int | str = "n") -> bytes:
+    def onnx(self, props, *, renamed=None, batch="n"):
         """Return the ONNX graph of the model.
 
         Args:
@@ -131,12 +129,12 @@ class LinearFilm:
         helper.set_model_props(model, props)
         return model.SerializeToString()
 
-    def golden_pC(self) -> np.ndarray:
+    def golden_pC(self):
         """Return the charges of the golden vectors, shape (8, n_electrode), pC."""
         rng = np.random.default_rng(0)
         return self.charge_pC(rng.uniform(-5, 5, 8), rng.uniform(-5, 5, 8), rng.uniform(0.1, 2, 8)).astype(np.float32)
 
-    def write(self, models: Path, **changes: object) -> Path:
+    def write(self, models, **changes):
         """Write the model into a repository, and return the version folder.
 
         Args:
@@ -149,19 +147,13 @@ class LinearFilm:
 
 
 @pytest.fixture(scope="session")
-def film() -> LinearFilm:
+def film():
     """The linear film with three electrodes."""
     return LinearFilm.with_electrodes(3)
 
 
 @pytest.fixture(scope="session")
-def make_film() -> Callable[[int], LinearFilm]:
-    """Return a function that creates a linear film with a given number of electrodes."""
-    return LinearFilm.with_electrodes
-
-
-@pytest.fixture(scope="session")
-def models(film: LinearFilm, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def models(film, tmp_path_factory):
     """A model repository that contains `linear/1`. Tests must not write to it."""
     root = tmp_path_factory.mktemp("models")
     film.write(root)
@@ -169,7 +161,7 @@ def models(film: LinearFilm, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def predictor(models: Path) -> Predictor:
+def predictor(models):
     """The model of the linear film with three electrodes."""
     return Predictor("linear", models=models)
 

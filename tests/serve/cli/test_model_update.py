@@ -51,7 +51,7 @@ BAD = {
 """What is said, and what has been done to the folder of a model with a version 2."""
 
 
-def test_a_new_version_serves_without_losing_a_frame(film, make_film, repository, stream, caplog, tmp_path, run):
+def test_a_new_version_serves_without_losing_a_frame(film, repository, stream, caplog, tmp_path, run):
     """After bad ones, of which each is refused while the old one serves on."""
     folder = repository / "linear"
 
@@ -69,7 +69,7 @@ def test_a_new_version_serves_without_losing_a_frame(film, make_film, repository
             spoil(folder)
             yield from refused(tapping, message)
             shutil.rmtree(folder, ignore_errors=True)
-        make_film(4).write(repository, version=2)
+        film.with_electrodes(4).write(repository, version=2)
         yield from refused(tapping, "expected the electrodes ('A', 'B', 'C') of linear/1, got ('A', 'B', 'C', ")
         shutil.rmtree(folder)
         film.write(repository, version=3)

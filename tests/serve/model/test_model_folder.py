@@ -100,10 +100,10 @@ def test_model_in_a_folder_with_another_name_is_refused(film, tmp_path):
         write(film, tmp_path / "other")
 
 
-def test_version_with_other_electrodes_in_the_same_model_folder_is_refused(film, make_film, tmp_path):
+def test_version_with_other_electrodes_in_the_same_model_folder_is_refused(film, tmp_path):
     film.write(tmp_path)
     with pytest.raises(ModelError, match=r"config.pbtxt: describes a model other than .*'D'"):
-        make_film(4).write(tmp_path, version=2)
+        film.with_electrodes(4).write(tmp_path, version=2)
 
 
 @pytest.mark.parametrize(
@@ -186,7 +186,7 @@ def roots(tmp_path, monkeypatch):
     return {"given": given, "variable": variable, "current": current, "shipped": tmp_path / "shipped"}
 
 
-def put(root: Path, name: str = "m", version: str = "1") -> Path:
+def put(root, name="m", version="1"):
     """Create a version folder with an empty model file in a repository."""
     folder = root / name / version
     folder.mkdir(parents=True)

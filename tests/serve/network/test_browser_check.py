@@ -4,12 +4,12 @@ import http.server
 import json
 import threading
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from headless_chromium import start_chromium
+from infer_requests import INFER, infer_request
 from isocharge.common.errors import InputError, OriginError
 from isocharge.serve.network.browser_check import AccessCheck, host_name
 from isocharge.serve.network.protocol import Handler
@@ -19,7 +19,6 @@ CHROMIUM_ARGUMENTS = (
     # The browser's own protection of local addresses must not hide what the server does.
     "--disable-features=LocalNetworkAccessChecks,BlockInsecurePrivateNetworkRequests,PrivateNetworkAccessSendPreflights",
 )
-INFER = "/v2/models/linear/infer"
 UNLOAD = "/v2/repository/models/linear/unload"
 
 
@@ -188,8 +187,7 @@ def test_no_page_of_another_origin_operates_the_server_in_chromium(store, start_
         statuses = (
             "fetch('/v2/models/linear/infer', { method: 'POST', body: arguments }).then((answer) => answer.status)"
         )
-        tensor = {"name": "charge_pC", "datatype": "FP32", "shape": [1, 3], "data": [1.0, 2.0, 3.0]}
-        body = json.dumps(json.dumps({"inputs": [tensor]}))
+        body = json.dumps(json.dumps(infer_request()))
         assert page.evaluate(statuses.replace("arguments", body)) == 200
 
     (requests, *_) = handler.traffic.registry.collect()
@@ -198,7 +196,7 @@ def test_no_page_of_another_origin_operates_the_server_in_chromium(store, start_
     assert not any("unload" in sample.labels["route"] and sample.labels["status"] == "200" for sample in counts)
     statistics = store.get("linear", "").statistics.to_json()
     assert statistics["inference_count"] == 1  # the press of the server's own page
-    np.testing.assert_equal(len(store.loaded_versions()), 2)
+    assert len(store.loaded_versions()) == 2
 
 
 def test_page_on_another_port_of_an_allowed_host_is_refused():
