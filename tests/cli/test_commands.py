@@ -90,7 +90,7 @@ def test_a_stopped_sweep_leaves_no_file_and_no_process(tmp_path):
         ends(lambda: os.killpg(process.pid, 0) is None)  # no process of the session is left
 
 
-def ends(is_so) -> bool:
+def ends(is_so):
     """Return whether a condition becomes false within two minutes."""
     for _ in range(6000):
         if not is_so():

@@ -3,7 +3,6 @@
 import os
 import re
 import threading
-from collections.abc import Iterator
 from functools import partial
 from types import SimpleNamespace
 
@@ -176,7 +175,7 @@ def places(problem, synthetic):
     return np.array([press.contact for press in next_presses(problem, synthetic, 3)])
 
 
-def board(charges, places, seed=0) -> Iterator[bytes]:
+def board(charges, places, seed=0):
     """Return the frames that a board sends while a machine presses each position for 1.2 s."""
     t = np.arange(round(1.2 * RATE_HZ)) / RATE_HZ
     rise = np.clip(np.minimum(t, 1.2 - t) / 0.1, 0.0, 1.0)[:, None] ** (2 / 3)

@@ -32,16 +32,6 @@ ENVIRONMENTS = Path(os.environ.get("ISOCHARGE_BENCH_ENVIRONMENTS", ROOT / "build
 MODELS = find_model("three-25um-biaxial").parents[1]
 
 
-def status_of(url, token=None):
-    request = urllib.request.Request(url, headers={"Authorization": f"Bearer {token}"} if token else {})
-    try:
-        with urllib.request.urlopen(request, timeout=20) as answer:
-            return answer.status
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code
-
-
 # Hosts
 
 
@@ -288,7 +278,7 @@ def test_git_ignores_the_token():
 
 
 def test_dashboard_and_alerts_ask_for_metrics_that_there_are(start_http):
-    """Every metric that they name is one of a server that has answered a press and refused one."""
+    """Every metric that they name is one of a server that has answered a request."""
     files = DEPLOY / "monitoring"
     services = yaml.safe_load((files / "compose.yaml").read_text())["services"]
     mounts = [mount.split(":")[0] for service in services.values() for mount in service.get("volumes", ())]
@@ -297,7 +287,7 @@ def test_dashboard_and_alerts_ask_for_metrics_that_there_are(start_http):
     panels = json.loads((files / "grafana/isocharge.json").read_text())["panels"]
     queries = " ".join(rules + [target["expr"] for panel in panels for target in panel["targets"]])
     url = start_http(Handler(open_model_store(MODELS))).url
-    assert status_of(f"{url}/v2/health/ready") == 200
+    urllib.request.urlopen(f"{url}/v2/health/ready", timeout=20).close()
     with urllib.request.urlopen(f"{url}/metrics", timeout=20) as answer:
         families = text_string_to_metric_families(answer.read().decode())
     served = {sample.name for family in families for sample in family.samples}

@@ -6,11 +6,14 @@ import pytest
 from isocharge.serve.examination.press_detector import block_medians, find_touch
 from isocharge.simulate import load_amplifier
 
+RATE_HZ = 200.0
+"""Number of frames per second, Hz."""
+
 PRESS_PC = np.array([150.0, 90.0, 110.0])
 """Charges of a press of 0.05 N, pC."""
 
 
-def measured(level, seed, press, seconds=5.0, rate_Hz=200.0):
+def measured(level, seed, press, seconds=5.0):
     """Simulate the output of an amplifier during a press.
 
     Args:
@@ -18,14 +21,13 @@ def measured(level, seed, press, seconds=5.0, rate_Hz=200.0):
         seed: Seed of the noise.
         press: Function that returns the force at some times, s, relative to the force of `PRESS_PC`.
         seconds: Length, s.
-        rate_Hz: Number of frames per second, Hz.
 
     Returns:
         The output, shape (n, 3), pC, and the times, s.
     """
-    times_s = np.arange(round(seconds * rate_Hz)) / rate_Hz
+    times_s = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
     charges = np.multiply.outer(press(times_s), PRESS_PC)
-    measure = load_amplifier(level).start(3, rate_Hz, np.random.default_rng(seed))
+    measure = load_amplifier(level).start(3, RATE_HZ, np.random.default_rng(seed))
     blocks = np.array_split(charges, max(1, round(2.0 * seconds)))
     return np.concatenate([measure(block) for block in blocks]), times_s
 

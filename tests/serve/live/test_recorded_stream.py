@@ -23,17 +23,17 @@ from isocharge.serve.port.recording import Marker
 DEVICE = {"tare": {"frames": 10}, "leak": {"tau_s": 10.0}, "hum": {"frequency_Hz": 50.0}}
 """Content of the device file."""
 
+CHUNK_BYTES = 37
+"""Size of a chunk."""
+
 CHUNK_INTERVAL_S = 0.0063
 """Time between two chunks, s."""
 
 
-def chunks_of_presses(film, chunk_bytes=37, outage_number=40):
-    """Return the chunks of a stream with two presses, and an outage between the presses.
+def chunks_of_presses(film):
+    """Return the chunks of a stream with two presses, and an outage before chunk 40, between the presses.
 
-    Args:
-        film: The film that is pressed.
-        chunk_bytes: Size of a chunk. The chunks do not end at the ends of frames.
-        outage_number: Number of the chunk after the outage.
+    The chunks do not end at the ends of frames.
     """
     rng = np.random.default_rng(3)
     press_pC = film.charge_pC([2.0], [1.0], [0.5])[0]
@@ -45,11 +45,11 @@ def chunks_of_presses(film, chunk_bytes=37, outage_number=40):
         data += encode_frame(Frame(number, 5000 * number, tuple(row_pC)))
 
     chunks = []
-    for number, begin in enumerate(range(0, len(data), chunk_bytes)):
-        outage_s = 1.5 if number == outage_number else 0.0
+    for number, begin in enumerate(range(0, len(data), CHUNK_BYTES)):
+        outage_s = 1.5 if number == 40 else 0.0
         timestamp = 1e9 + CHUNK_INTERVAL_S * number
         clock_ns = round(1e9 * CHUNK_INTERVAL_S * number)
-        chunks.append(Chunk(data[begin : begin + chunk_bytes], timestamp, clock_ns, outage_s))
+        chunks.append(Chunk(data[begin : begin + CHUNK_BYTES], timestamp, clock_ns, outage_s))
     return chunks
 
 

@@ -20,9 +20,9 @@ PRESS = np.array([800.0, 400.0, 300.0, 500.0])
 NAMES = ("A", "B", "C", "D")
 
 
-def noise_std(charge_pC, noise_pC=1.0):
+def noise_std(charge_pC):
     """Return the standard deviations of noisy charges, shape (4,), pC."""
-    return np.hypot(noise_pC, 0.002 * charge_pC)
+    return np.hypot(1.0, 0.002 * charge_pC)
 
 
 def readings(charge_pC, *, flags=None):

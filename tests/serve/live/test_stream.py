@@ -44,14 +44,14 @@ def records_after_rest(predictor):
     return process
 
 
-def press_charges(film, x_mm=2.0, y_mm=-3.0, force_N=0.5):
-    """Return the touch charges of a press, shape (3,), pC."""
-    return film.charge_pC(np.array([x_mm]), np.array([y_mm]), np.array([force_N]))[0]
+def press_charges(film):
+    """Return the touch charges of a press of 0.5 N at (2, -3) mm, shape (3,), pC."""
+    return film.charge_pC([2.0], [-3.0], [0.5])[0]
 
 
-def raw_press(film, **contact):
-    """Return the charges of a press as the board sends them, with the charges at rest."""
-    return tuple((press_charges(film, **contact) + OFFSET).tolist())
+def raw_press(film):
+    """Return the charges of this press as the board sends them, with the charges at rest."""
+    return tuple((press_charges(film) + OFFSET).tolist())
 
 
 def test_timestamps_of_a_file_follow_the_clock_of_the_board(predictor, tmp_path):

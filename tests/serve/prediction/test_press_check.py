@@ -27,9 +27,9 @@ RIG_FORCE_STD = 0.004
 def measure(film):
     """Return a function that measures presses with noise of the charges, errors of the rig and errors of the model."""
 
-    def measure(n, *, seed=0, force_scale=1.0, shift_mm=(0.0, 0.0), known=(True, True), noise=1.0, radius_mm=5.0):
+    def measure(n, *, seed=0, force_scale=1.0, shift_mm=(0.0, 0.0), known=(True, True), noise=1.0):
         rng = np.random.default_rng(seed)
-        contact = np.column_stack([rng.uniform(-radius_mm, radius_mm, (2, n)).T, rng.uniform(0.1, 1.8, n)])
+        contact = np.column_stack([rng.uniform(-5.0, 5.0, (2, n)).T, rng.uniform(0.1, 1.8, n)])
         contact[:, :2] /= np.sqrt(2.0)
         std = 50.0 / (2400.0 * contact[:, 2])  # of the model, from the sum of the charges
         moved = contact + noise * rng.normal(size=(n, 3)) * np.column_stack([std, std, np.full(n, 7e-4)])

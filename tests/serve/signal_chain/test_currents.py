@@ -22,10 +22,10 @@ FORCE = np.interp(T_S, [0.0, 3.0, 3.4, 6.0, 8.0, 8.2, 11.0, 11.1, 14.0, 14.2], [
 """Force of two presses, shape (n,), relative to the largest force."""
 
 
-def currents(charge_pC, tau_s=math.inf, noise_pC=0.2):
+def currents(charge_pC, tau_s=math.inf):
     """Return the currents of charges, pC in a sampling interval, with an offset, noise and the leak of the film."""
     leak_pC = charge_pC / (tau_s * RATE_HZ)
-    noise = noise_pC * np.random.default_rng(5).standard_normal(charge_pC.shape)
+    noise = 0.2 * np.random.default_rng(5).standard_normal(charge_pC.shape)
     return np.diff(charge_pC, axis=0, prepend=0.0) + leak_pC + noise + np.array([180.0, -300.0, 20.0])
 
 

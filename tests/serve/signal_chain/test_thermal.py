@@ -43,18 +43,17 @@ def warming_stage(misfit):
     return Warming(Setup(tuple("ABCD"), Device(rules={ThermalRule: ThermalRule()}), predictor=predictor))
 
 
-def follow_warming(film, common_charges_pC, seed=0):
+def follow_warming(film, common_charges_pC):
     """Estimate a common charge that changes in steps of 50 ms during a press.
 
     Args:
         film: Matrix of the film.
         common_charges_pC: Common charge in each step, shape (n,), pC.
-        seed: Seed of the noise.
 
     Returns:
         The estimates, shape (n,), pC, and the last state.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     press_pC = film @ [850.0, 3.0, -2.0]
     warming = warming_stage(misfit_of(film))
     estimates = []

@@ -28,7 +28,7 @@ GOLDEN = Path(__file__).parents[3] / "models" / "four-25um-biaxial" / "1" / "gol
 
 
 @pytest.fixture(scope="module")
-def series() -> ChargeSeries:
+def series():
     """Charge map of degree 2 whose charges fall with the pretension, most for small forces and near the centre."""
     rng = np.random.default_rng(0)
     base = np.zeros((3, 3, 2, 4))
@@ -52,7 +52,7 @@ def series() -> ChargeSeries:
     )
 
 
-def model_in(folder, series: ChargeSeries, noise=NOISE) -> SimpleNamespace:
+def model_in(folder, series, noise=NOISE):
     """Return a model of the calibrated film that searches for the nearest contact, and write its charge map.
 
     Args:
@@ -64,7 +64,7 @@ def model_in(folder, series: ChargeSeries, noise=NOISE) -> SimpleNamespace:
     put_charge_map(folder, charge_map_bytes(series))
     calibrated = series.at_state(series.calibrated_state)
 
-    def predict(charge_pC) -> Contact:
+    def predict(charge_pC):
         contact = np.array([0.0, 0.0, np.log(0.5)])
         for _ in range(6):
             place = np.array([[contact[0], contact[1], np.exp(contact[2])]])
@@ -88,12 +88,12 @@ def touches(series, state, gains, rng, count):
     return contact, series.changes(contact, state).charge_pC * gains
 
 
-def followed(model, charge, rng, frames=4) -> FilmFollower:
-    """Return a follower that has observed touches of several frames each."""
+def followed(model, charge, rng):
+    """Return a follower that has observed touches of four frames each."""
     follower = FilmFollower(model)
     clock_s = 0.0
     for row in charge:
-        for frame in NOISE.add(np.repeat(row[None], frames, axis=0), rng):
+        for frame in NOISE.add(np.repeat(row[None], 4, axis=0), rng):
             follower.observe_frame(frame, model.predict(frame), (), clock_s)
             clock_s += 0.01
         follower.observe_frame(None, None, (), clock_s)

@@ -6,9 +6,9 @@ from isocharge.serve.model.contact import Contact
 from isocharge.serve.tracking.film_follower import TouchPeak
 
 
-def contact(force_N, x_mm=1.0):
-    """Return a contact with a force and a position; the other values do not matter."""
-    return Contact(x_mm, 0.0, force_N, x_std_mm=0.1, y_std_mm=0.1, force_std_N=0.01, misfit=0.5)
+def contact(force_N):
+    """Return a contact with a force; the other values do not matter."""
+    return Contact(1.0, 0.0, force_N, x_std_mm=0.1, y_std_mm=0.1, force_std_N=0.01, misfit=0.5)
 
 
 def peak_of(contacts, charges):

@@ -33,11 +33,11 @@ X, Y, FORCE, X_STD, Y_STD = range(5)
 """Columns of an array of tracked contacts."""
 
 
-def noisy_contacts(path, std=STD, correlation=0.6, force=1.0):
+def noisy_contacts(path, std=STD, correlation=0.6):
     """Yield noisy contacts along a path of positions x + iy, shape (n,), mm."""
     root = np.linalg.cholesky([[1.0, correlation], [correlation, 1.0]])
     noise = root @ RNG.standard_normal((2, len(path))) * std
-    forces = force * np.exp(LOG_FORCE_STD * RNG.standard_normal(len(path)))
+    forces = np.exp(LOG_FORCE_STD * RNG.standard_normal(len(path)))
     for position, (x_error, y_error), force_N in zip(path, noise.T, forces, strict=True):
         yield Contact(
             x_mm=float(position.real + x_error),

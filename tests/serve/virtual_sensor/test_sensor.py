@@ -14,8 +14,8 @@ from isocharge.common.errors import PortError, SceneError
 from isocharge.serve import BinaryParser, Port, Script, VirtualSensor, encode_frame, wander
 
 
-def steady(n=10, rate_Hz=200.0, force_N=1.0):
-    return Script(np.zeros(n), np.zeros(n), np.full(n, force_N), rate_Hz)
+def steady(n=10, rate_Hz=200.0):
+    return Script(np.zeros(n), np.zeros(n), np.ones(n), rate_Hz)
 
 
 def sent(sensor, count):
