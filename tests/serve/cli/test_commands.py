@@ -84,16 +84,14 @@ def test_check_of_many_presses_shows_the_worst(measured, models, command):
 
 
 @pytest.mark.parametrize(
-    ("text", "words", "message"),
+    ("option", "value", "message"),
     [
-        ("force_N,A,B,C\n1,2,3,4\n", ["--force-std", "0"], "force_std: expected a positive share"),
-        ("force_N,A,B,C\n1,2,3,4\n", ["--position-std", "nan"], "position_std_mm: expected"),
+        ("--force-std", "0", "force_std: expected a positive share"),
+        ("--position-std", "nan", "position_std_mm: expected"),
     ],
 )
-def test_check_refuses_with_the_reason(tmp_path, models, refused, text, words, message):
-    path = tmp_path / "measured.csv"
-    path.write_text(text)
-    refused("serve", "check", "linear", path, "--models", models, *words, message=message)
+def test_check_refuses_with_the_reason(measured, models, refused, option, value, message):
+    refused("serve", "check", "linear", measured(), "--models", models, option, value, message=message)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -237,12 +235,11 @@ def test_doctor_refuses_with_the_reason(resting, run, words, message):
         run("doctor", "--port", sensor.url, "--seconds", 0.5, *words)
 
 
-def test_doctor_refuses_a_gain_beside_a_device_file(command, tmp_path):
+def test_doctor_refuses_a_gain_beside_a_device_file(refused, tmp_path):
     board = tmp_path / "board.toml"
     board.write_text("[gain]\npC_per_unit = 2.0\n")
-    code, _, err = command("serve", "doctor", "--port", "/dev/ttyNone", "--device", board, "--pc-per-unit", 1000)
-    assert code == 2
-    assert "--pc-per-unit: expected no gain beside --device" in err
+    words = ("serve", "doctor", "--port", "/dev/ttyNone", "--device", board, "--pc-per-unit", 1000)
+    refused(*words, message="--pc-per-unit: expected no gain beside --device")
 
 
 def test_doctor_writes_no_file_of_which_the_unit_is_missing(command, tmp_path):

@@ -49,11 +49,6 @@ def missing(report):
     return " / ".join(report.missing)
 
 
-def missing_for_held_presses(report):
-    """Return all sentences about settings that only held presses need as one text."""
-    return " / ".join(report.missing_for_held_presses)
-
-
 def test_of_a_touched_film_only_the_touch_is_reported():
     """The offset, the noise and the drift of a pressed film would lead to wrong advice."""
 
@@ -125,7 +120,11 @@ def test_missing_clock_is_reported_only_with_leak():
         examine_received(lines),
         examine_received(received(charges()), device=AT_REST),
     )
-    assert ["a device clock" in missing_for_held_presses(report) for report in reports] == [True, False, False]
+    assert ["a device clock" in " / ".join(report.missing_for_held_presses) for report in reports] == [
+        True,
+        False,
+        False,
+    ]
 
 
 def test_unused_inputs_are_ignored():

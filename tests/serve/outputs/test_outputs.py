@@ -89,13 +89,13 @@ def test_close_waits_for_a_slow_consumer():
 
 def test_datagrams_without_a_receiver_are_dropped(record):
     """The system reports a refused datagram as an error of the next datagram, which is dropped. Later ones arrive."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as temporary:
+    with socket.socket(type=socket.SOCK_DGRAM) as temporary:
         temporary.bind(("127.0.0.1", 0))
         address = temporary.getsockname()
     with closing(UdpOutput(f"udp://127.0.0.1:{address[1]}")) as output:
         for number in range(3):
             output.write(record(seq=number))
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        with socket.socket(type=socket.SOCK_DGRAM) as listener:
             listener.bind(address)
             listener.settimeout(5.0)
             output.write(record(seq=3))

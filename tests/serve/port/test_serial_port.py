@@ -6,7 +6,7 @@ import termios
 import threading
 import time
 import tty
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from itertools import pairwise
 from types import SimpleNamespace
 from unittest import mock
@@ -151,9 +151,7 @@ def test_bytes_that_waited_during_a_stall_are_few_chunks(board, address):
             lengths.append(len(next(chunks).data))
         assert len(lengths) <= 5
         assert sent_frames > 20
-    with Port(f"udp://127.0.0.1:{address[1]}") as port, socket.socket(type=socket.SOCK_DGRAM) as sender:
-        for _ in range(20):
-            sender.sendto(b"1,2,3\n", address)
+    with udp_port(address, *[b"1,2,3\n"] * 20) as port:
         assert next(iter(port)).data == b"1,2,3\n" * 20
 
 
@@ -245,27 +243,29 @@ def test_source_of_a_dash_is_stdin(monkeypatch):
 @pytest.fixture
 def address():
     """Return a UDP address that is not in use."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+    with socket.socket(type=socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()
 
 
-def received(address, *datagrams):
-    """Return the chunks that a port reads from datagrams of a board."""
-    with (
-        Port(f"udp://127.0.0.1:{address[1]}", silence_s=10.0) as port,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board,
-    ):
+@contextmanager
+def udp_port(address, *datagrams):
+    """Open a port to which a board then sends datagrams."""
+    with Port(f"udp://127.0.0.1:{address[1]}") as port, socket.socket(type=socket.SOCK_DGRAM) as board:
         for datagram in datagrams:
             board.sendto(datagram, address)
+        yield port
+
+
+def received(address, *datagrams):
+    """Return the chunks that a port reads from datagrams of a board."""
+    with udp_port(address, *datagrams) as port:
         return [port.read(10.0).data for datagram in datagrams if datagram]
 
 
 def test_binary_datagrams_that_waited_are_not_joined(address):
     """A datagram of another length would otherwise make the frames of the other datagrams unreadable."""
-    with Port(f"udp://127.0.0.1:{address[1]}") as port, socket.socket(type=socket.SOCK_DGRAM) as board:
-        for data in (b"\0" * 12, b"\0" * 5, b"\0" * 12):
-            board.sendto(data, address)
+    with udp_port(address, b"\0" * 12, b"\0" * 5, b"\0" * 12) as port:
         chunks = iter(port)
         assert [len(next(chunks).data) for _ in range(3)] == [12, 5, 12]
 
@@ -289,8 +289,7 @@ def test_datagrams_are_chunks(address, sent, chunks):
 
 def test_empty_datagram_is_ignored(address):
     assert received(address, b"\x01", b"", b"\x02") == [b"\x01", b"\x02"]
-    with Port(f"udp://127.0.0.1:{address[1]}", silence_s=0.05) as port, socket.socket(type=socket.SOCK_DGRAM) as board:
-        board.sendto(b"", address)
+    with udp_port(address, b"") as port:
         assert port.read(0.01) is None
 
 
@@ -299,23 +298,9 @@ def test_udp_address_in_use_is_refused(address):
         Port(f"udp://127.0.0.1:{address[1]}").__enter__()
 
 
-class Clock:
-    """A clock whose time the test sets."""
-
-    def __init__(self):
-        self.now_s = 100.0
-
-    def __call__(self):
-        return self.now_s
-
-
-def requester_at(clock, **settings):
-    return Requester(Request(b"?\n", **settings), clock)
-
-
 def test_the_next_request_waits_for_the_answer_and_for_the_rate():
-    clock = Clock()
-    requester = requester_at(clock, rate_Hz=100.0)
+    clock = SimpleNamespace(now_s=100.0)
+    requester = Requester(Request(b"?\n", 100.0), lambda: clock.now_s)
     assert requester.wait_s() == 0.0
     assert requester.next_request() == b"?\n"
     assert requester.wait_s() == pytest.approx(REPEAT_TIME_s)
@@ -328,8 +313,8 @@ def test_the_next_request_waits_for_the_answer_and_for_the_rate():
 
 
 def test_a_request_without_an_answer_is_repeated():
-    clock = Clock()
-    requester = requester_at(clock)
+    clock = SimpleNamespace(now_s=100.0)
+    requester = Requester(Request(b"?\n"), lambda: clock.now_s)
     requester.next_request()
     clock.now_s += 0.5 * REPEAT_TIME_s
     assert requester.wait_s() == pytest.approx(0.5 * REPEAT_TIME_s)

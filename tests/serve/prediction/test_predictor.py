@@ -48,14 +48,6 @@ def test_predict_equals_a_plain_session(plain_session, predictor, charge_pC):
         np.int64,
         lambda q: [Decimal(v) for v in q],
     ],
-    ids=[
-        "list",
-        "tuple",
-        "float32",
-        "float64",
-        "int64",
-        "decimal",
-    ],
 )
 def test_predict_takes_any_kind_of_numbers(predictor, kind):
     assert predictor.predict(kind([100, 100, 100])) == predictor.predict([100.0, 100.0, 100.0])
