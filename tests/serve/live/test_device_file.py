@@ -153,50 +153,58 @@ def test_device_file_that_is_refused(device, text, message):
 @pytest.mark.parametrize(
     ("names", "channels", "picked"),
     [
-        ((), {}, [1, 2, 3]),
-        (("C", "A", "B"), {}, [2, 3, 1]),
-        (("C_pC", "A_pC", "B_pC"), {}, [2, 3, 1]),
-        (("x", "y", "z"), {}, [1, 2, 3]),
-        (("C [pC]", "a_pC", "charge.b"), {}, [2, 3, 1]),
-        (("ch0", "ch1", "ch2"), {}, [1, 2, 3]),
-        (("Q_C", "Q_A", "Q_B"), {}, [2, 3, 1]),
-        (("electrode B", "electrode C", "electrode A"), {}, [3, 1, 2]),
-        (("chC", "chA", "chB"), {}, [2, 3, 1]),
-        (("qc_pC", "qa_pC", "qb_pC"), {}, [2, 3, 1]),
-        (("A0", "A1", "A2"), {}, [1, 2, 3]),
-        (("x", "y", "z"), {"A": "z", "B": "y", "C": "x"}, [3, 2, 1]),
-        ((), {"A": "3", "B": "ch2", "C": "ch1"}, [3, 2, 1]),
-        (("ch3", "2", "z"), {"A": "2", "B": "ch3", "C": "3"}, [2, 1, 3]),
+        ("", {}, "123"),
+        ("C,A,B", {}, "231"),
+        ("C_pC,A_pC,B_pC", {}, "231"),
+        ("x,y,z", {}, "123"),
+        ("C [pC],a_pC,charge.b", {}, "231"),
+        ("ch0,ch1,ch2", {}, "123"),
+        ("Q_C,Q_A,Q_B", {}, "231"),
+        ("electrode B,electrode C,electrode A", {}, "312"),
+        ("chC,chA,chB", {}, "231"),
+        ("qc_pC,qa_pC,qb_pC", {}, "231"),
+        ("A0,A1,A2", {}, "123"),
+        ("x,y,z", {"A": "z", "B": "y", "C": "x"}, "321"),
+        ("", {"A": "3", "B": "ch2", "C": "ch1"}, "321"),
+        ("ch3,2,z", {"A": "2", "B": "ch3", "C": "3"}, "213"),
+        ("bat_V,A,B,C", {}, "234"),  # the unit of a channel that is no electrode does not matter
+        ("C,B,A,t_mV", {}, "321"),
     ],
 )
 def test_channel_of_each_electrode(names, channels, picked):
-    frame = Frame(0, 0, (1.0, 2.0, 3.0), names=names)
+    values = (1.0, 2.0, 3.0, 4.0) if names.count(",") == 3 else (1.0, 2.0, 3.0)
+    frame = Frame(0, 0, values, names=header(names))
     Channels(Setup(ELECTRODES, Device(channels=channels))).step(frame)
-    assert frame.sent.tolist() == picked
+    assert frame.sent.tolist() == [float(number) for number in picked]
+
+
+def header(names):
+    """Return the names of the channels in a header; none for an empty header."""
+    return tuple(names.split(",")) if names else ()
 
 
 @pytest.mark.parametrize(
     ("names", "channels", "message"),
     [
-        (("x", "y"), {}, r"\[channels\] A = "),
-        (("A_nC", "B_nC", "C_nC"), {}, "A_nC' is in nC: convert it to pC"),
-        (("AnC", "BnC", "CnC"), {}, "AnC' is in nC: convert it to pC"),
-        (("A_coulomb", "B_coulomb", "C_coulomb"), {}, "A_coulomb' is in coulomb: convert it to pC"),
-        (("A_mean", "A_std", "B_mean", "B_std", "C_mean", "C_std"), {}, r"\[channels\] A = "),
-        (("A", "B", "z"), {}, r"\[channels\] A = "),
-        (("ch3", "ch2", "ch1"), {}, r"ch3'.*\[channels\] A = "),
-        (("ch3_v1", "ch2_v1", "ch1_v1"), {}, r"\[channels\] A = "),
-        (("adc1 in2", "adc1 in10", "adc1 in1"), {}, r"\[channels\] A = "),
-        (("x", "y", "z"), {"A": "zz"}, r'^board\.toml: \[channels\] A = "zz": no channel .* have x, y, z, or 1 to'),
-        *(((), {"A": name}, "no channel is called that") for name in ("0", "4", "ch0", "ch4", "ch", "", "-1")),
-        *(((), {"A": name}, "no channel is called that") for name in ("1.0", "99999", "²")),
+        ("x,y", {}, r"\[channels\] A = "),
+        ("A_nC,B_nC,C_nC", {}, "A_nC' is in nC: convert it to pC"),
+        ("AnC,BnC,CnC", {}, "AnC' is in nC: convert it to pC"),
+        ("A_coulomb,B_coulomb,C_coulomb", {}, "A_coulomb' is in coulomb: convert it to pC"),
+        ("A_mean,A_std,B_mean,B_std,C_mean,C_std", {}, r"\[channels\] A = "),
+        ("A,B,z", {}, r"\[channels\] A = "),
+        ("ch3,ch2,ch1", {}, r"ch3'.*\[channels\] A = "),
+        ("ch3_v1,ch2_v1,ch1_v1", {}, r"\[channels\] A = "),
+        ("adc1 in2,adc1 in10,adc1 in1", {}, r"\[channels\] A = "),
+        ("x,y,z", {"A": "zz"}, r'^board\.toml: \[channels\] A = "zz": no channel .* have x, y, z, or 1 to'),
+        *(("", {"A": name}, "no channel is called that") for name in ("0", "4", "ch0", "ch4", "ch", "", "-1")),
+        *(("", {"A": name}, "no channel is called that") for name in ("1.0", "99999", "²")),
     ],
 )
 def test_unknown_channels_are_refused(names, channels, message):
     assigned = {"A": "1", "B": "2", "C": "3"} | channels if channels else {}
     stage = Channels(Setup(ELECTRODES, Device(channels=assigned, where="board.toml")))
     with pytest.raises(ChargeError, match=message):
-        stage.step(Frame(0, 0, (1.0,) * (len(names) or 3), names=names))
+        stage.step(Frame(0, 0, (1.0,) * (len(header(names)) or 3), names=header(names)))
 
 
 def test_advice_for_the_channels_is_a_valid_device_file():
@@ -205,13 +213,6 @@ def test_advice_for_the_channels_is_a_valid_device_file():
         Channels(Setup(electrodes)).step(Frame(0, 0, (1.0, 2.0)))
     advice = str(error.value).partition("[channels] ")[2]
     assert tuple(tomllib.loads(advice.replace(", ", "\n"))) == electrodes
-
-
-@pytest.mark.parametrize("names", [("bat_V", "A", "B", "C"), ("C", "B", "A", "t_mV")])
-def test_units_of_channels_that_are_no_electrodes_do_not_matter(names):
-    frame = Frame(0, 0, (1.0, 2.0, 3.0, 4.0), names=names)
-    Channels(Setup(ELECTRODES)).step(frame)
-    assert frame.sent.tolist() == [names.index(electrode) + 1 for electrode in ELECTRODES]
 
 
 @pytest.mark.parametrize(
