@@ -40,6 +40,10 @@ class StageRunner:
         frame.flags = in_order(frame.flags)
         return frame
 
+    def run(self, rows, rate_Hz):
+        """Process rows of charges, shape (n, n_electrode), pC, that arrive at a rate, and return the frames."""
+        return [self.advance(row, number / rate_Hz, 1.0 / rate_Hz) for number, row in enumerate(rows)]
+
     def reset_tare(self):
         """Measure the tare again."""
         for stage in self.stages:

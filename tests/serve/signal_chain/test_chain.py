@@ -28,8 +28,7 @@ def rest(n, seed=0, std_pC=1.0):
 
 def run(frames_pC, **sections):
     """Return the readings of frames with charges of shape (n, 3), pC."""
-    chain = StageRunner(**sections)
-    return [chain.advance(raw_pC, number / RATE_HZ, 1 / RATE_HZ) for number, raw_pC in enumerate(frames_pC)]
+    return StageRunner(**sections).run(frames_pC, RATE_HZ)
 
 
 def test_tare_under_a_resting_weight_is_refused():
@@ -64,14 +63,10 @@ def test_tare_gives_up_with_the_reason():
 def test_second_tare_never_gives_up():
     """A finger that rests on the film does not stop a live stream."""
     chain = StageRunner(tare={"frames": 20, "patience": 50})
-    for number, raw_pC in enumerate(rest(60)):
-        chain.advance(raw_pC, number / RATE_HZ, 1 / RATE_HZ)
+    chain.run(rest(60), RATE_HZ)
     chain.reset_tare()
-    has_tare = []
-    for number, raw_pC in enumerate(np.concatenate([rest(200, std_pC=100.0), rest(30)])):
-        reading = chain.advance(raw_pC, number / RATE_HZ, 1 / RATE_HZ)
-        has_tare.append(reading.tare_pC is not None)
-    assert has_tare.index(True) == 220
+    readings = chain.run(np.concatenate([rest(200, std_pC=100.0), rest(30)]), RATE_HZ)
+    assert [reading.tare_pC is not None for reading in readings].index(True) == 220
 
 
 THRESHOLD_PC = np.sqrt(3.0) + 6.0 / np.sqrt(2.0) + 10.0 / np.sqrt(3.0)
@@ -80,7 +75,7 @@ THRESHOLD_PC = np.sqrt(3.0) + 6.0 / np.sqrt(2.0) + 10.0 / np.sqrt(3.0)
 
 def touch_stage(*, has_any_sign=False):
     """Return a stage that detects touches, with its default settings."""
-    return Touch(Setup(("A", "B", "C"), Device(rules={TouchRule: TouchRule()}), has_any_sign=has_any_sign))
+    return Touch(Setup(tuple("ABC"), Device(rules={TouchRule: TouchRule()}), has_any_sign=has_any_sign))
 
 
 def detect(touch, charge_pC, noise_pC=ONE_PC, dt_s=1.0, **settings):
@@ -144,14 +139,13 @@ def test_end_of_a_long_press_with_a_leak_is_no_touch(has_any_sign):
     """A press of 5 s loses 39 % of its charge (tau = 10 s), and the release leaves the lost charge with a minus."""
     touch = touch_stage(has_any_sign=has_any_sign)
     dt_s = 1.0 / RATE_HZ
+    is_pressed = (np.arange(4000) >= 200) & (np.arange(4000) < 1200)
     output_pC = np.zeros(3)
     frames = []
-    for number in range(4000):
-        charge = np.array([900.0, 300.0, 100.0]) if 200 <= number < 1200 else np.zeros(3)
-        previous = np.array([900.0, 300.0, 100.0]) if 200 < number <= 1200 else np.zeros(3)
-        output_pC = output_pC * np.exp(-dt_s / 10.0) + charge - previous
+    for change in np.diff(is_pressed.astype(int), prepend=0):
+        output_pC = output_pC * np.exp(-dt_s / 10.0) + change * np.array([900.0, 300.0, 100.0])
         frames.append(detect(touch, output_pC, dt_s=dt_s, base_relax_s=2.0, is_base_held=True))
-    assert contacts_of(frames) == [200 <= number < 1200 for number in range(4000)]
+    assert contacts_of(frames) == is_pressed.tolist()
     assert frames[1300].flags == ["negative"]
 
 
@@ -180,9 +174,8 @@ def test_invalid_frame_passes_no_stage(value, gain):
         sections["gain"] = {"pC_per_unit": gain}
     chain = StageRunner(**sections)
     undisturbed_chain = StageRunner(**sections)
-    for number, raw_pC in enumerate(rest(150)):
-        chain.advance(raw_pC, number / RATE_HZ, 1 / RATE_HZ)
-        undisturbed_chain.advance(raw_pC, number / RATE_HZ, 1 / RATE_HZ)
+    for runner in (chain, undisturbed_chain):
+        runner.run(rest(150), RATE_HZ)
 
     invalid_s = 0.25
     invalid_values = np.array([1.0, value / (gain or 1.0), 2.0])
@@ -190,12 +183,11 @@ def test_invalid_frame_passes_no_stage(value, gain):
     assert (invalid.charge_pC, invalid.tare_pC, invalid.is_contact) == (None, None, False)
     assert invalid.flags == ("gap", "invalid")
 
-    for number, raw_pC in enumerate(rest(20, seed=1)):
-        dt_s = 1 / RATE_HZ
-        dt_with_invalid_s = dt_s + invalid_s if number == 0 else dt_s
-        reading = chain.advance(raw_pC, 151 / RATE_HZ, dt_s)
-        expected = undisturbed_chain.advance(raw_pC, 151 / RATE_HZ, dt_with_invalid_s)
+    for raw_pC in rest(20, seed=1):
+        reading = chain.advance(raw_pC, 151 / RATE_HZ, 1 / RATE_HZ)
+        expected = undisturbed_chain.advance(raw_pC, 151 / RATE_HZ, 1 / RATE_HZ + invalid_s)
         np.testing.assert_array_equal(reading.charge_pC, expected.charge_pC)
+        invalid_s = 0.0
 
 
 @pytest.mark.parametrize("drift_pC_per_s", [0.3, -0.3, 1.0])
@@ -203,8 +195,8 @@ def test_tare_follows_a_slow_drift_of_an_untouched_film(drift_pC_per_s):
     """Without a leak, the zero of a board drifts for half a minute. A press after that has nearly no offset."""
     chain = StageRunner()
     frames_pC = rest(6000) + drift_pC_per_s * np.arange(6000)[:, None] / RATE_HZ
-    readings = [chain.advance(row, number / RATE_HZ, 1 / RATE_HZ) for number, row in enumerate(frames_pC)]
-    assert not any(reading.is_contact for reading in readings)
+    readings = chain.run(frames_pC, RATE_HZ)
+    assert not any(contacts_of(readings))
     np.testing.assert_allclose(readings[-1].raw_pC - readings[-1].tare_pC, readings[-1].charge_pC)
     pressed = chain.advance(frames_pC[-1] + 500.0, 30.0, 1 / RATE_HZ)
     assert pressed.is_contact
@@ -217,7 +209,7 @@ def test_contact_that_a_fast_drift_begins_has_the_flag_drift(drift_pC_per_s):
     drifting_pC = rest(2000) + drift_pC_per_s * np.arange(2000)[:, None] / RATE_HZ
     readings = run(drifting_pC)
     assert readings[-1].is_contact
-    assert all(reading.is_contact == ("drift" in reading.flags) for reading in readings)
+    assert contacts_of(readings) == ["drift" in reading.flags for reading in readings]
 
     press_pC = 1000.0 * np.interp(np.arange(800), [400, 800], [0.0, 1.0])  # 1.5 pC in a frame, 1500 pC/s in total
     pressed = run(rest(1600) + np.tile(press_pC, 2)[:, None])
@@ -227,10 +219,9 @@ def test_contact_that_a_fast_drift_begins_has_the_flag_drift(drift_pC_per_s):
 
 def test_tare_does_not_follow_a_finger():
     """A held press keeps its charge. A finger that is below the release threshold is not absorbed by the tare."""
-    chain = StageRunner()
     run_pC = [(400, 0.0), (2000, 1000.0), (400, 30.0), (200, 1000.0)]
     frames_pC = np.concatenate([rest(count) + press_pC for count, press_pC in run_pC])
-    readings = [chain.advance(row, number / RATE_HZ, 1 / RATE_HZ) for number, row in enumerate(frames_pC)]
+    readings = run(frames_pC)
     offset_pC = readings[399].tare_pC
     assert readings[2399].charge_pC == pytest.approx(frames_pC[2399] - offset_pC, abs=0.1)
     assert not readings[2799].is_contact

@@ -31,8 +31,7 @@ def currents(charge_pC, tau_s=math.inf):
 
 def run(values, **sections):
     """Return the frames of a board that sends currents."""
-    chain = StageRunner(device=device_from_table({"front_end": "current", **sections}, "b"))
-    return [chain.advance(row, t_s, 1.0 / RATE_HZ) for row, t_s in zip(values, T_S, strict=False)]
+    return StageRunner(device=device_from_table({"front_end": "current", **sections}, "b")).run(values, RATE_HZ)
 
 
 @pytest.mark.parametrize("tau_s", [math.inf, 5.0])

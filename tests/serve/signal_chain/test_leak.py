@@ -24,18 +24,17 @@ def amplifier_output(charge_pC):
     return np.convolve(np.diff(charge_pC, prepend=0.0), impulse_response)[: len(n)]
 
 
-def touch_charge(*presses, seconds=20.0):
-    """Compute the touch charge of presses whose charge rises and falls within 50 ms, shape (n,), pC.
+def touch_charge(begin_s=3.0, duration_s=8.0, height_pC=400.0, seconds=20.0):
+    """Compute the touch charge of a press whose charge rises and falls within 50 ms, shape (n,), pC.
 
     Args:
-        presses: Begin, s, duration, s, and charge, pC, of each press.
+        begin_s: Begin of the press, s.
+        duration_s: Duration of the press, s.
+        height_pC: Charge of the press, pC.
         seconds: Length of the simulation, s.
     """
     t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
-    charge_pC = np.zeros_like(t)
-    for begin_s, duration_s, height_pC in presses:
-        charge_pC += height_pC * np.clip(np.minimum(t - begin_s, begin_s + duration_s - t) / 0.05, 0.0, 1.0)
-    return charge_pC
+    return height_pC * np.clip(np.minimum(t - begin_s, begin_s + duration_s - t) / 0.05, 0.0, 1.0)
 
 
 def correct_leak(output_pC, every=1, tau_s=TAU_S, **settings):
@@ -51,20 +50,13 @@ def correct_leak(output_pC, every=1, tau_s=TAU_S, **settings):
         Touch charges, shape (m, 3), pC, NaN before the tare; and whether something touches, shape (m,).
     """
     chain = StageRunner(tare={"frames": 20}, leak={"tau_s": tau_s} | settings)
-    charges = []
-    contact = []
-    previous_s = 0.0
-    for number in range(0, len(output_pC), every):
-        t_s = number / RATE_HZ
-        reading = chain.advance(np.full(3, output_pC[number]), t_s, t_s - previous_s)
-        previous_s = t_s
-        charges.append(np.full(3, np.nan) if reading.charge_pC is None else reading.charge_pC)
-        contact.append(reading.is_contact)
-    return np.array(charges), np.array(contact)
+    readings = chain.run(np.tile(output_pC[::every, None], 3), RATE_HZ / every)
+    charges = [np.full(3, np.nan) if reading.charge_pC is None else reading.charge_pC for reading in readings]
+    return np.array(charges), np.array([reading.is_contact for reading in readings])
 
 
 def test_held_press_keeps_its_charge_despite_the_leak():
-    output_pC = amplifier_output(touch_charge((3.0, 8.0, 400.0)))
+    output_pC = amplifier_output(touch_charge())
     assert output_pC[2150] < 20.0  # the output of the amplifier at the end of the press
     charge_pC, contact = correct_leak(output_pC)
     held = slice(700, 2180)
@@ -90,8 +82,7 @@ def test_press_has_its_charge_at_any_rate(rate_Hz, tau_s):
         decay = np.exp(-np.maximum(t - begin_s - rise_s, 0.0) / tau_s)
         output_pC = 400.0 / rise_s * tau_s * -np.expm1(-charging_s / tau_s) * decay
         chain = StageRunner(tare={"frames": 10}, leak={"tau_s": tau_s})
-        for t_s, row_pC in zip(t, output_pC, strict=True):
-            reading = chain.advance(np.full(3, row_pC), t_s, min(t_s, 1.0 / rate_Hz))
+        (*_, reading) = chain.run(np.tile(output_pC[:, None], 3), rate_Hz)
         charges.append(reading.charge_pC[0])
     assert np.mean(charges) == pytest.approx(400.0, rel=3e-3 if rate_Hz * tau_s < 50.0 else 5e-4)
 
@@ -99,7 +90,7 @@ def test_press_has_its_charge_at_any_rate(rate_Hz, tau_s):
 def test_inflow_is_learned_out_of_contact():
     """The inflow is 5 pC/s after the tare. Without its estimate, it adds 50 pC to each electrode in a press of 10 s."""
     inflow_pC_per_s = 5.0
-    charge_pC = touch_charge((8.0, 10.0, 300.0), seconds=22.0)
+    charge_pC = touch_charge(8.0, 10.0, 300.0, seconds=22.0)
     since_tare_s = np.maximum(0.0, np.arange(charge_pC.size) / RATE_HZ - 0.5)
     inflow_output_pC = inflow_pC_per_s * TAU_S * (1.0 - np.exp(-since_tare_s / TAU_S))
     output_pC = amplifier_output(charge_pC) + inflow_output_pC
@@ -110,18 +101,9 @@ def test_inflow_is_learned_out_of_contact():
     assert without_estimate[end_of_press, 0] > 340.0
 
 
-def test_two_presses_in_a_row_do_not_spoil_each_other():
-    charge_pC, contact = correct_leak(amplifier_output(touch_charge((3.0, 4.0, 400.0), (7.3, 4.0, 200.0))))
-    np.testing.assert_allclose(charge_pC[1300, 0], 400.0, atol=0.5)
-    # The charge before the detection of the second touch decays with the base, so the tolerance is larger.
-    np.testing.assert_allclose(charge_pC[2200, 0], 200.0, atol=4.0)
-    touch_count = np.count_nonzero(np.diff(contact.astype(int)) == 1)
-    assert touch_count == 2
-
-
 def test_lost_frames_hardly_change_the_charge():
     """Every second frame is lost. The correction uses the time since the previous frame that has arrived."""
-    charge_pC, _ = correct_leak(amplifier_output(touch_charge((3.0, 8.0, 400.0))), every=2)
+    charge_pC, _ = correct_leak(amplifier_output(touch_charge()), every=2)
     np.testing.assert_allclose(charge_pC[1000, 0], 400.0, atol=3.0)
 
 
@@ -131,7 +113,7 @@ def test_error_of_tau_has_the_theoretical_effect(error):
 
     Here tau' is the assumed time constant. The formula holds in the limit of short steps.
     """
-    charge_pC, _ = correct_leak(amplifier_output(touch_charge((3.0, 8.0, 400.0))), tau_s=TAU_S * (1 + error))
+    charge_pC, _ = correct_leak(amplifier_output(touch_charge()), tau_s=TAU_S * (1 + error))
     expected_pC = 400.0 * (1 + (1 / (1 + error) - 1) * (1 - np.exp(-7.0 / TAU_S)))
     assert charge_pC[2000, 0] == pytest.approx(expected_pC, abs=1.0)
 
