@@ -8,17 +8,18 @@ with the contacts that were pressed.
 
 import errno
 import os
+import re
 from dataclasses import dataclass
 from threading import Thread
 
 import numpy as np
+import onnx.parser
 import pytest
-from onnx import TensorProto, helper, numpy_helper
+from onnx import helper, numpy_helper
 
 from boards import TcpBoard, taps
 from isocharge.serve import ModelMetadata, PredictionRecord, Predictor, write_model
 from isocharge.serve.model.metadata import ModelNoise
-from isocharge.serve.model.session import OUTPUTS
 from isocharge.serve.network.address import Address
 from isocharge.serve.network.http import HttpServer
 from isocharge.serve.network.model_store import open_model_store
@@ -36,6 +37,36 @@ LEVER_MM = 20.0
 
 RADIUS_MM = 8.0
 """Radius of the working area, mm."""
+
+
+GRAPH = """
+<ir_version: 9, opset_import: ["": 17]>
+linear_film (float[BATCH, ELECTRODES] charge_pC) => (
+    float[BATCH, 3] contact, float[BATCH, 3] contact_std, float[BATCH, 3] contact_correlation, float[BATCH, 1] misfit
+)
+<
+    int64[1] axes = {1},
+    float[ELECTRODES, 2] lever = {LEVER},
+    float[1, 1] pC_per_N = {PC_PER_N},
+    float[1, 3] std_scale = {50.0, 50.0, 0.0},
+    float[1, 3] std_floor = {0.0, 0.0, 0.0007},
+    float[1, 3] no_correlation = {0.0, 0.0, 0.0}
+>
+{
+    sum = ReduceSum <keepdims = 1> (charge_pC, axes)
+    moment = MatMul (charge_pC, lever)
+    position = Div (moment, sum)
+    force = Div (sum, pC_per_N)
+    contact = Concat <axis = 1> (position, force)
+    std_position = Div (std_scale, sum)
+    contact_std = Add (std_position, std_floor)
+    contact_correlation = Mul (contact_std, no_correlation)
+    negated = Neg (charge_pC)
+    negative = Relu (negated)
+    misfit = ReduceSum <keepdims = 1> (negative, axes)
+}
+"""
+"""Graph of the model in the text format of ONNX. Words in capitals stand for numbers."""
 
 
 @dataclass(frozen=True)
@@ -94,38 +125,14 @@ class LinearFilm:
             renamed: Wrong names of inputs and outputs by their right names, for tests of wrong interfaces.
             batch: Size of the batch. A number makes the interface wrong.
         """
-        n = len(self.directions)
-        constants = {
-            "lever": 2.0 * LEVER_MM * self.directions,
-            "pC_per_N": [[PC_PER_N * n]],
-            "std_scale": [[50.0, 50.0, 0.0]],
-            "std_floor": [[0.0, 0.0, 7e-4]],
-            "no_correlation": [[0.0, 0.0, 0.0]],
-        }
-        names = {name: name for name in ("charge_pC", *OUTPUTS)}
-        names |= renamed or {}
-        node = helper.make_node
-        nodes = [
-            node("ReduceSum", [names["charge_pC"], "axes"], ["sum"], keepdims=1),
-            node("MatMul", [names["charge_pC"], "lever"], ["moment"]),
-            node("Div", ["moment", "sum"], ["position"]),
-            node("Div", ["sum", "pC_per_N"], ["force"]),
-            node("Concat", ["position", "force"], [names["contact"]], axis=1),
-            node("Div", ["std_scale", "sum"], ["std_position"]),
-            node("Add", ["std_position", "std_floor"], [names["contact_std"]]),
-            node("Mul", [names["contact_std"], "no_correlation"], [names["contact_correlation"]]),
-            node("Neg", [names["charge_pC"]], ["negated"]),
-            node("Relu", ["negated"], ["negative"]),
-            node("ReduceSum", ["negative", "axes"], [names["misfit"]], keepdims=1),
-        ]
-        tensor_info = helper.make_tensor_value_info
-        inputs = [tensor_info(names["charge_pC"], TensorProto.FLOAT, [batch, n])]
-        outputs = [tensor_info(names[name], TensorProto.FLOAT, [batch, width]) for name, width in OUTPUTS.items()]
-        initializers = [numpy_helper.from_array(np.array([1], dtype=np.int64), "axes")]
-        for name, values in constants.items():
-            initializers.append(numpy_helper.from_array(np.array(values, dtype=np.float32), name))
-        graph = helper.make_graph(nodes, "linear film", inputs, outputs, initializers)
-        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+        lever = (2.0 * LEVER_MM * self.directions).ravel()
+        values = {"BATCH": batch, "ELECTRODES": len(self.directions), "LEVER": ", ".join(map(str, lever.tolist()))}
+        text = GRAPH
+        for name, value in (values | {"PC_PER_N": PC_PER_N * len(self.directions)} | (renamed or {})).items():
+            text = re.sub(rf"\b{name}\b", str(value), text)
+        model = onnx.parser.parse_model(text)
+        for tensor in model.graph.initializer:
+            tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor), tensor.name))
         helper.set_model_props(model, props)
         return model.SerializeToString()
 

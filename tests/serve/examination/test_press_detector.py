@@ -71,12 +71,6 @@ def test_press_of_0_05_N_is_found(level, press):
             assert touch.time_s == pytest.approx(2.5, abs=0.3)
 
 
-def test_press_that_is_held_all_the_time_is_not_found():
-    """Constant charges may also be the rest level of an amplifier."""
-    charges, times_s = measured("reference", 0, np.ones_like)
-    assert find_touch(charges, times_s, unit_is_pC=True) is None
-
-
 def test_damaged_value_is_not_taken_for_a_touch():
     charges, times_s = measured("reference", 0, no_press)
     charges[300] = 1e6

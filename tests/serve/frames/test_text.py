@@ -264,12 +264,6 @@ def test_time_of_day_is_the_clock_which_wraps_at_midnight():
     assert parser.t_us_modulus == 86_400_000_000
 
 
-def test_clock_of_another_name_beside_channels_without_names():
-    parser = TextParser(meanings={"t": "t_us"})
-    frames = feed(*(f'{{"t": {1000 * n}, "q": [3.5, -3.4, {n}]}}' for n in range(4)), parser=parser)
-    assert [(frame.t_us, frame.values) for frame in frames] == [(1000 * n, (3.5, -3.4, n)) for n in range(4)]
-
-
 def test_units_are_no_words_of_a_message():
     assert len(feed(*["850 pC 3 pC 5 pC"] * 3)) == 3
 

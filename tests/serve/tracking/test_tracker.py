@@ -182,13 +182,6 @@ def test_contact_that_is_lifted_and_pressed_elsewhere_is_tracked_within_three_fr
     assert np.abs(position_errors(tracked[102:], second)).max() < 4.0 * STD
 
 
-def test_fast_slide_at_a_low_frame_rate_is_no_outlier():
-    """At 200 mm/s and 200 Hz the contact moves by a millimetre in a frame."""
-    path, _ = slide(200.0, rate_Hz=200.0)
-    tracked, _ = track_path(path, rate_Hz=200.0)
-    assert np.abs(position_errors(tracked, path)).max() < 5.0 * STD
-
-
 def test_single_outlier_is_ignored():
     tracked, _ = track_path(np.where(np.arange(200) == 100, 3.0, 0.0))
     assert np.abs(tracked[50:, [X, Y]]).max() < 2.0 * STD
@@ -264,26 +257,22 @@ def test_saturated_frames_have_a_small_weight():
     assert max(tracked.x_mm for tracked, _ in moved) < 0.1
 
 
-def test_records_with_track_only_add_fields_and_are_repeated_bit_for_bit(film, predictor):
+def test_records_with_track_only_add_fields(film, predictor):
     rest = np.zeros((10, 3))
     noise = np.random.default_rng(0).standard_normal((30, 3))
     pressed = film.charge_pC(np.full(30, 2.0), np.full(30, -3.0), np.full(30, 0.5)) + noise
     rows = np.concatenate([rest, pressed, rest])
 
     plain_lines = recorded_lines(predictor, rows, {})
-    lines = recorded_lines(predictor, rows, {"track": {}})
-    assert lines == recorded_lines(predictor, rows, {"track": {}})
-    records = [json.loads(line) for line in lines]
+    records = [json.loads(line) for line in recorded_lines(predictor, rows, {"track": {}})]
     assert [record["event"] for record in records].count("press") == 1
     assert records[40]["event"] == "tap"
     assert abs(records[39]["tracked"]["x_mm"] - 2.0) < 0.05
     for record, plain_line in zip(records, plain_lines, strict=True):
-        tracked = record.pop("tracked")
-        other = record.pop("other")
-        record.pop("event")
-        assert record == json.loads(plain_line)
-        assert (tracked is None) == (not record["contact"])
-        assert other is None
+        assert (record["tracked"] is None) == (not record["contact"])
+        assert record["other"] is None
+        added = {name: record[name] for name in ("tracked", "event", "other")}
+        assert record == json.loads(plain_line) | added
 
 
 def test_option_track_adds_a_section_to_the_device_file():

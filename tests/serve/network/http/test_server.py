@@ -239,24 +239,6 @@ def test_client_that_fills_the_buffers_at_once_is_disconnected(limited, monkeypa
         assert everything(client) == b""
 
 
-def test_response_that_ends_after_a_refusal_does_not_extend_the_deadline(limited):
-    server = limited(header_seconds=10.0, idle_seconds=1000.0)
-    with connect(server) as client:
-        client.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
-        client.recv(1000)
-        (connection,) = server._server.server_state.connections
-        has_ended = Event()
-
-        def refuse_and_end_response():
-            connection.refuse(408, "waited too long")
-            connection.on_response_complete()
-            has_ended.set()
-
-        connection.loop.call_soon_threadsafe(refuse_and_end_response)
-        assert has_ended.wait(60)
-        assert connection.deadline < connection.loop.time() + 100.0
-
-
 @pytest.mark.parametrize("protocol", ["h2c", "websocket"])
 def test_upgrade_of_a_request_without_body_is_ignored(server, protocol):
     """HTTP allows a server to ignore the header (RFC 9110, 7.8). With a body, the error states what to do."""
