@@ -14,6 +14,12 @@ BATCH = 20
 """Frames that are sent at once."""
 
 
+def encoded_frames(rows, rate_Hz=200.0):
+    """Yield the bytes of each frame of a board that sends rows of charges, pC, at a rate."""
+    for number, row in enumerate(rows):
+        yield encode_frame(Frame(number % 65536, round(1e6 * number / rate_Hz), tuple(row)))
+
+
 class TcpBoard:
     """Sends rows of charges, pC, as frames to whoever connects; a context manager.
 
@@ -59,8 +65,8 @@ class TcpBoard:
 
     def _send(self, connection):
         waiting = []
-        for number, row in enumerate(self._rows):
-            waiting.append(encode_frame(Frame(number % 65536, round(1e6 * number / self._rate_Hz), tuple(row))))
+        for data in encoded_frames(self._rows, self._rate_Hz):
+            waiting.append(data)
             if len(waiting) == BATCH:
                 connection.sendall(b"".join(waiting))
                 waiting.clear()

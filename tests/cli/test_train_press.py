@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from tests.train.calibration.synthetic_film import SyntheticFilm
 
+from boards import encoded_frames
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents, SessionEnd
 from isocharge.common.errors import PortLost
-from isocharge.serve import Chunk, Frame, PressWatch, ReadingStream, encode_frame, read_presses
+from isocharge.serve import Chunk, PressWatch, ReadingStream, read_presses
 from isocharge.serve.live.steady_press import (
     PORT_LOST,
     Phase,
@@ -184,8 +185,7 @@ def board(charges, places, seed=0):
     for charge in charges(places):
         pieces += [rise * charge, pause]
     measure = load_amplifier("reference").start(4, RATE_HZ, np.random.default_rng(seed))
-    for number, row in enumerate(measure(np.concatenate(pieces))):
-        yield encode_frame(Frame(number, round(1e6 * number / RATE_HZ), tuple(row + 12.0)))
+    yield from encoded_frames(measure(np.concatenate(pieces)) + 12.0, RATE_HZ)
 
 
 @pytest.fixture

@@ -7,13 +7,11 @@ from functools import partial
 from itertools import chain, islice
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
-from boards import TcpBoard, interrupt, taps
+from boards import TcpBoard, encoded_frames, interrupt, taps
 from isocharge.cli.main import app
 from isocharge.cli.shared.terminal import warnings_to_stderr
-from isocharge.serve import Frame, encode_frame
 
 
 @pytest.fixture
@@ -28,10 +26,9 @@ def presses(tmp_path, film):
 @pytest.fixture(scope="session")
 def frames(tmp_path_factory, film):
     """A file of bytes: rest, a press, rest, 300 frames in all."""
-    rng, path = np.random.default_rng(5), tmp_path_factory.mktemp("frames") / "frames.bin"
-    press = film.charge_pC([2.0], [1.0], [0.5])[0]
-    rows = [rng.normal(0, 1, 3) + (press if 150 <= k < 250 else 0.0) for k in range(300)]
-    path.write_bytes(b"".join(encode_frame(Frame(k, 5000 * k, tuple(row))) for k, row in enumerate(rows)))
+    path = tmp_path_factory.mktemp("frames") / "frames.bin"
+    rows = taps(film, at=(2.0, 1.0), force_N=0.5, rest=150, press=100)
+    path.write_bytes(b"".join(encoded_frames(islice(rows, 300))))
     return path
 
 

@@ -6,6 +6,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
+from boards import encoded_frames
 from isocharge.common.errors import ChargeError, DeviceError, TareError
 from isocharge.serve import (
     AutoParser,
@@ -13,7 +14,6 @@ from isocharge.serve import (
     Frame,
     ReadingStream,
     device_from_table,
-    encode_frame,
     load_device,
 )
 from isocharge.serve.frames.formats import Frames
@@ -238,8 +238,7 @@ def test_names_in_a_line_of_text_are_not_ignored(notation):
 
 def test_tare_error_states_the_offset_for_the_device_file():
     stream = ReadingStream(ELECTRODES, device_from_table({"tare": {"frames": 5, "patience": 10}}, "board.toml"))
-    frames = [Frame(number, 5000 * number, (2048.0, 2050.5, 2047.0)) for number in range(20)]
-    data = b"".join(map(encode_frame, frames))
+    data = b"".join(encoded_frames([(2048.0, 2050.5, 2047.0)] * 20))
     with pytest.raises(TareError, match=r"\[gain\] offset = \{A = 2048, B = 2050.5, C = 2047\}"):
         list(stream.frames(Chunk(data, 1e9, 0)))
 

@@ -3,19 +3,17 @@
 import json
 import os
 import time
-from itertools import count
+from itertools import count, islice
 
-import numpy as np
 import pytest
 
+from boards import encoded_frames, taps
 from isocharge.serve import (
     Chunk,
-    Frame,
     Recorder,
     Recording,
     TouchStream,
     device_from_table,
-    encode_frame,
 )
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
 from isocharge.serve.port.recording import Marker
@@ -35,15 +33,7 @@ def chunks_of_presses(film):
 
     The chunks do not end at the ends of frames.
     """
-    rng = np.random.default_rng(3)
-    press_pC = film.charge_pC([2.0], [1.0], [0.5])[0]
-    data = b""
-    for number in range(80):
-        row_pC = rng.normal(0, 1, 3)
-        if number % 40 > 20:
-            row_pC += press_pC
-        data += encode_frame(Frame(number, 5000 * number, tuple(row_pC)))
-
+    data = b"".join(encoded_frames(islice(taps(film, rest=21, press=19), 80)))
     chunks = []
     for number, begin in enumerate(range(0, len(data), CHUNK_BYTES)):
         outage_s = 1.5 if number == 40 else 0.0

@@ -33,7 +33,7 @@ from isocharge.serve.outputs.output import OutputContext
 from isocharge.serve.outputs.ros_messages import DEFINITIONS, STRING
 from isocharge.serve.outputs.targets import Outputs
 from isocharge.serve.record.formats import record_schema
-from isocharge.serve.record.record import FollowedFilm, TrackedContact, Tracking, selected_fields
+from isocharge.serve.record.record import FollowedFilm, TrackedContact, Tracking
 
 ELECTRODES = ("A", "B", "C")
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -72,24 +72,16 @@ def records(draw):
     )
 
 
-def press(number, **changes):
-    """A plain record."""
-    values = dict.fromkeys(field.name for field in selected_fields()) | {
-        "timestamp": 1763600000.0 + 0.005 * number,
-        "x_mm": 3.0 + 1e-3 * number,
-        "y_mm": -2.0,
-        "force_N": 0.5,
-        "x_std_mm": 0.03,
-        "y_std_mm": 0.04,
-        "force_std_N": 0.002,
-        "misfit": 1.0,
-        "contact": True,
-        "flags": (),
-        "model": "linear/1",
-        "frame_id": "linear-film",
-        "charge_pC": {"A": 1.0, "B": None, "C": 2.0},
-    }
-    return PredictionRecord(**(values | changes))
+@pytest.fixture
+def press(record):
+    """Return a function that makes the record of a press with a number."""
+
+    def make(number, **changes):
+        numbered = {"timestamp": 1763600000.0 + 0.005 * number, "x_mm": 3.0 + 1e-3 * number}
+        plain = {"y_mm": -2.0, "force_N": 0.5, "x_std_mm": 0.03, "y_std_mm": 0.04, "misfit": 1.0, "flags": ()}
+        return record(**(numbered | plain | {"charge_pC": {"A": 1.0, "B": None, "C": 2.0}} | changes))
+
+    return make
 
 
 def write(path, records, *, is_ros2=False):
@@ -182,7 +174,7 @@ def test_message_definitions_equal_those_of_ros2(name):
         assert fields == ROS.fielddefs[kind], kind
 
 
-def test_mcap_reader_finds_schemas_index_and_checksums(tmp_path):
+def test_mcap_reader_finds_schemas_index_and_checksums(tmp_path, press):
     """What Foxglove, Lichtblick and PlotJuggler need to open a file at any time in it."""
     written = [press(number) for number in range(5000)]
     lines = [record.to_json() for record in written]
@@ -218,15 +210,15 @@ def test_every_record_is_valid_under_its_schema(record):
     jsonschema_rs.Draft7Validator(record_schema(ELECTRODES)).validate(json.loads(record.to_json()))
 
 
-def test_schema_refuses_json_that_is_not_a_record():
+def test_schema_refuses_json_that_is_not_a_record(press, contract):
     valid, record = jsonschema_rs.Draft7Validator(record_schema(ELECTRODES)).is_valid, json.loads(press(0).to_json())
     assert valid(record)
-    for name in (field.name for field in selected_fields()):
+    for name in contract:
         assert not valid({key: value for key, value in record.items() if key != name}), name
         assert not valid(record | {name: [1.0] if name != "contact" else None}), name
 
 
-def test_wrench_and_pose_describe_the_tracked_contact(tmp_path):
+def test_wrench_and_pose_describe_the_tracked_contact(tmp_path, press):
     tracked = TrackedContact(1.0, -4.0, 0.25, 0.01, 0.02, 0.001, 5.0, 0.0, 0.9)
     film = FollowedFilm(0.7, 0.05, 12)
     records = [
@@ -250,7 +242,7 @@ def whole_messages(data):
     return [each.data.decode() for each in messages if isinstance(each, Message) and each.data.startswith(b"{")]
 
 
-def test_killed_process_leaves_a_file_with_all_but_the_last_second(tmp_path):
+def test_killed_process_leaves_a_file_with_all_but_the_last_second(tmp_path, press):
     path = tmp_path / "touch.mcap"
     code = f"""
 import os, pickle, signal, sys, time
@@ -273,7 +265,7 @@ os.kill(os.getpid(), signal.SIGKILL)
     assert 69 <= len(recovered) < 120  # of 2.4 s, written every second
 
 
-def test_full_disk_ends_the_mcap_file_but_not_the_stream(tmp_path, fill_disk, caplog, monkeypatch):
+def test_full_disk_ends_the_mcap_file_but_not_the_stream(tmp_path, press, fill_disk, caplog, monkeypatch):
     path = tmp_path / "touch.mcap"
     monkeypatch.setattr("isocharge.serve.outputs.mcap_file.FLUSH_INTERVAL_S", 0.01)
     fill_disk(12000)
@@ -293,7 +285,7 @@ def test_full_disk_ends_the_mcap_file_but_not_the_stream(tmp_path, fill_disk, ca
 
 
 @pytest.mark.parametrize("timestamp", [None, -1.0, 2.0**31, 1e11])
-def test_timestamp_outside_the_range_of_ros2_is_refused(tmp_path, timestamp):
+def test_timestamp_outside_the_range_of_ros2_is_refused(tmp_path, press, timestamp):
     with closing(McapFile(tmp_path / "touch.mcap", ELECTRODES, is_ros2=False, is_live=True)) as file:
         with pytest.raises(InputError, match=r"timestamp .*: expected unix seconds from 1970 to 2038"):
             file.write(press(0, timestamp=timestamp))

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from boards import taps
-from isocharge.serve import Frame, encode_frame
+from boards import encoded_frames, taps
 
 
 @pytest.fixture
@@ -80,8 +79,7 @@ def test_live_page_shows_a_press_and_carries_out_requests(board, start, tmp_path
 def test_replay_page_shows_any_position_of_the_recording(film, models, start, command, tmp_path):
     """Ctrl-C is the only end of such a replay: its MCAP file is whole before."""
     path, mcap = tmp_path / "touch.rec", tmp_path / "touch.mcap"
-    rows = [encode_frame(Frame(k, 5000 * k, tuple(row))) for k, row in enumerate(islice(taps(film), 600))]
-    (tmp_path / "frames").write_bytes(b"".join(rows))
+    (tmp_path / "frames").write_bytes(b"".join(encoded_frames(islice(taps(film), 600))))
     command("serve", "stream", "linear", "--models", models, "--port", tmp_path / "frames", "--record", path)
     process, url = start("replay", path, "--output", "none", "--output", mcap)
 
