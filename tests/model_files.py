@@ -16,6 +16,16 @@ def golden_json(folder):
     path.write_text(json.dumps(content), "utf-8")
 
 
+def golden_fault(change):
+    """Return a function that changes the content of `golden.json` of a version folder."""
+
+    def spoil(folder):
+        with golden_json(folder) as content:
+            change(content)
+
+    return spoil
+
+
 def put_graph(folder, data):
     """Replace the graph of a version, and its checksum."""
     (folder / "model.onnx").write_bytes(data)

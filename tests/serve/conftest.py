@@ -9,12 +9,14 @@ with the contacts that were pressed.
 import errno
 import os
 import re
+import ssl
 from dataclasses import dataclass
 from threading import Thread
 
 import numpy as np
 import onnx.parser
 import pytest
+import trustme
 from onnx import helper, numpy_helper
 
 from boards import TcpBoard, taps
@@ -171,6 +173,19 @@ def models(film, tmp_path_factory):
 def predictor(models):
     """The model of the linear film with three electrodes."""
     return Predictor("linear", models=models)
+
+
+@pytest.fixture(scope="session")
+def authority():
+    return trustme.CA()
+
+
+@pytest.fixture
+def trusted(authority):
+    """Return the TLS context of a client that trusts the authority of the tests."""
+    context = ssl.create_default_context()
+    authority.configure_trust(context)
+    return context
 
 
 @pytest.fixture

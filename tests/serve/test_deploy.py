@@ -6,7 +6,6 @@ import re
 import runpy
 import shlex
 import shutil
-import ssl
 import subprocess
 import sys
 import tomllib
@@ -18,7 +17,6 @@ import jsonschema_rs
 import numpy as np
 import pytest
 import tritonclient.http as triton
-import trustme
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
@@ -182,9 +180,10 @@ SERVICES = [
 
 
 @pytest.mark.parametrize(("words", "secrets"), SERVICES, ids=["unit", "stream unit", "container", "stream container"])
-def test_the_command_of_a_service_listens_with_tls_and_needs_the_token(words, secrets, tmp_path, monkeypatch):
+def test_the_command_of_a_service_listens_with_tls_and_needs_the_token(
+    words, secrets, tmp_path, monkeypatch, authority, trusted
+):
     """On a free port of this machine; the stream reads frames from a pipe in place of the port."""
-    authority = trustme.CA()
     issued = authority.issue_cert("127.0.0.1")
     issued.cert_chain_pems[0].write_to_path(tmp_path / "fullchain.pem")
     issued.private_key_pem.write_to_path(tmp_path / "privkey.pem")
@@ -198,8 +197,6 @@ def test_the_command_of_a_service_listens_with_tls_and_needs_the_token(words, se
     )
     try:
         url = next(found[0] for text in process.stdout if (found := re.search(r"https://127\.0\.0\.1:\d+", text)))
-        trusted = ssl.create_default_context()
-        authority.configure_trust(trusted)
         path = "/session.json" if "stream" in words else "/v2/models/three-25um-biaxial"
         with pytest.raises(urllib.error.HTTPError, match="401"):
             urllib.request.urlopen(url + path, timeout=20, context=trusted)

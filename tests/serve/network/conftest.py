@@ -1,20 +1,13 @@
 """Fixtures with certificates for servers and clients on this machine."""
 
 import asyncio
-import ssl
 from contextlib import contextmanager
 from threading import Thread
 
 import pytest
-import trustme
 import uvloop
 
 from isocharge.serve.network.grpc import grpc_server
-
-
-@pytest.fixture(scope="session")
-def authority():
-    return trustme.CA()
 
 
 @pytest.fixture(scope="session")
@@ -26,14 +19,6 @@ def tls_files(authority, tmp_path_factory):
     issued.private_key_pem.write_to_path(folder / "key.pem")
     issued.private_key_and_cert_chain_pem.write_to_path(folder / "both.pem")
     return folder
-
-
-@pytest.fixture
-def trusted(authority):
-    """Return the TLS context of a client that trusts the authority of the tests."""
-    context = ssl.create_default_context()
-    authority.configure_trust(context)
-    return context
 
 
 @pytest.fixture(scope="session")

@@ -1,8 +1,6 @@
 """Check of Host, Origin and Sec-Fetch-Site, which refuses requests of browsers for pages of other sites."""
 
-import http.server
 import json
-import threading
 
 import pytest
 from hypothesis import given
@@ -136,42 +134,17 @@ async function attack() {{
 </script>"""
 
 
-@pytest.fixture
-def attacking_page():
-    """Serve a page of another origin that sends requests to `target`, and yield its port and its settings."""
-    page = {"target": ""}
-
-    class Page(http.server.BaseHTTPRequestHandler):
-        def do_GET(self):
-            body = ATTACK.format(infer=INFER, unload=UNLOAD, **page).encode()
-            self.send_response(200)
-            self.send_header("Content-Type", "text/html")
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
-
-        def log_message(self, *_arguments):
-            """Write nothing."""
-
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Page) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield server.server_address[1], page
-        server.shutdown()
-        thread.join()
-
-
-def test_no_page_of_another_origin_operates_the_server_in_chromium(store, start_http, attacking_page):
+def test_no_page_of_another_origin_operates_the_server_in_chromium(store, start_http):
     handler = Handler(store)
     url = start_http(handler).url
     port = url.rpartition(":")[2]
-    page_port, settings = attacking_page
+    attack = ATTACK.format(target=url, infer=INFER, unload=UNLOAD)
     with start_chromium(*CHROMIUM_ARGUMENTS) as browser:
         page = browser.new_page()
 
         # A page of another origin: a form, and fetches that may not read the answers.
-        settings["target"] = url
-        page.goto(f"http://evil.example:{page_port}/")
+        page.route("http://evil.example/", lambda route: route.fulfill(body=attack, content_type="text/html"))
+        page.goto("http://evil.example/")
         page.evaluate("attack()")
         page.evaluate("document.getElementById('form').submit()")
         page.wait_for_timeout(500)

@@ -24,7 +24,7 @@ from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.protocol.routes import ROUTES
-from model_files import golden_json, put_graph
+from model_files import golden_fault, put_graph
 
 
 @pytest.fixture
@@ -52,16 +52,6 @@ def a_failing_graph(version):
     put_graph(version, model.SerializeToString())
 
 
-def golden(change):
-    """Return a function that changes the golden contacts of a version."""
-
-    def spoil(version):
-        with golden_json(version) as content:
-            change(content["outputs"]["contact"])
-
-    return spoil
-
-
 def a_pipe(version):
     (version / "model.onnx").unlink()
     os.mkfifo(version / "model.onnx")
@@ -70,8 +60,14 @@ def a_pipe(version):
 FAULTS = {
     "cut": (lambda version: os.truncate(version / "model.onnx", 1000), "the file is damaged or changed"),
     "half copied": (lambda version: (version / "golden.json").unlink(), "golden.json: missing; every model has"),
-    "answers": (golden(lambda rows: rows[0].__setitem__(0, 9.0)), r"contact\[0, 0\]: expected .*golden.json"),
-    "unequal": (golden(lambda rows: rows.pop()), r"contact: expected 8 rows .* of shape \(7, 3\)"),
+    "answers": (
+        golden_fault(lambda content: content["outputs"]["contact"][0].__setitem__(0, 9.0)),
+        r"contact\[0, 0\]: expected .*golden.json",
+    ),
+    "unequal": (
+        golden_fault(lambda content: content["outputs"]["contact"].pop()),
+        r"contact: expected 8 rows .* of shape \(7, 3\)",
+    ),
     "failing graph": (a_failing_graph, "the model's graph fails when it is run"),
     "pipe": (a_pipe, "cannot be read .not a regular file"),
 }

@@ -25,7 +25,7 @@ class Client:
     """A client of a page: the page as the stream sees it, its address, and requests to it.
 
     Attributes:
-        page: The page.
+        page: The page; None if another process serves it.
         place: Address of the page.
     """
 
@@ -42,6 +42,10 @@ class Client:
         result = answer.status, answer.headers, answer.read()
         connection.close()
         return result
+
+    def session(self):
+        """Return the description of the film and of the samples."""
+        return json.loads(self.send("GET", "/session.json")[2])
 
     def ask(self, do, **content):
         """Send a request of the page, and return the content of the response."""

@@ -1,11 +1,9 @@
 """`serve stream --live` and `serve replay --live` as a person starts them."""
 
-import json
 import os
 import re
 import signal
 import time
-import urllib.request
 from itertools import islice
 
 import numpy as np
@@ -13,31 +11,30 @@ import pytest
 from mcap.reader import make_reader
 
 from boards import encoded_frames, taps
+from serve.viewer.conftest import Client
 
 
 @pytest.fixture
 def start(models, start_command):
-    """Start a command with a page: the process, and the page's address."""
+    """Start a command with a page: the process, and a client of the page."""
 
     def start(*words):
         process = start_command("serve", *words, "--models", models, "--live", "127.0.0.1:0")
         while line := process.stderr.readline():
             if match := re.search(r"page: (http\S+?);?\s", line):
-                return process, match[1]
+                return process, Client(None, match[1])
         raise AssertionError(process.communicate())
 
     return start
 
 
-def follow(url, until, *requests, **read):
-    """Send requests, and then read samples and the state until there are enough. Return the samples by column."""
-    for content in requests:
-        post(url, content)
-    columns = json.load(urllib.request.urlopen(url + "/session.json", timeout=20))["columns"]
+def follow(client, until, **read):
+    """Read samples and the state until there are enough. Return the samples by column."""
+    columns = client.session()["columns"]
     rows, state, answer = [], {}, {"first": None}
     end_s = time.monotonic() + 60.0
     while True:
-        answer = post(url, {"do": "read", "first": answer["first"]} | read)
+        answer = client.ask("read", first=answer["first"], **read)
         state |= answer.get("state", {})
         rows += answer["samples"]
         samples = dict(zip(columns, np.array(rows, float).reshape(-1, len(columns)).T, strict=True))
@@ -47,28 +44,26 @@ def follow(url, until, *requests, **read):
         time.sleep(0.02)
 
 
-def post(url, content):
-    """Send a request to the page, and return the content of the response."""
-    return json.load(urllib.request.urlopen(url + "/request", json.dumps(content).encode(), timeout=20))
-
-
 def touched(samples, _):
     return samples["contact"].sum() > 10
 
 
 def test_live_page_shows_a_press_and_carries_out_requests(board, start, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    process, url = start("stream", "linear", "--port", board.url, "--output", "none")
-    samples, state = follow(url, lambda samples, state: touched(samples, state) and state.get("rate_Hz"))
+    process, client = start("stream", "linear", "--port", board.url, "--output", "none")
+    samples, state = follow(client, lambda samples, state: touched(samples, state) and state.get("rate_Hz"))
     is_contact = samples["contact"] == 1.0
     assert [np.median(samples[name][is_contact]) for name in ("x_mm", "force_N")] == pytest.approx([3.0, 1.0], abs=0.01)
     assert state["counters"]["lost"] == 0
     assert 1000.0 < state["rate_Hz"] < 3000.0 or os.getloadavg()[0] > 2.0
-    assert json.load(urllib.request.urlopen(url + "/session.json"))["film"]["model"] == "linear/1"
+    assert client.session()["film"]["model"] == "linear/1"
 
-    follow(url, lambda _, state: str(state.get("recording", "")).endswith(".rec"), {"do": "record", "on": True})
-    follow(url, lambda _, state: state.get("markers"), {"do": "marker", "text": "here"})
-    follow(url, lambda _, state: state.get("recording") is None, {"do": "record", "on": False})
+    client.ask("record", on=True)
+    follow(client, lambda _, state: str(state.get("recording", "")).endswith(".rec"))
+    client.ask("marker", text="here")
+    follow(client, lambda _, state: state.get("markers"))
+    client.ask("record", on=False)
+    follow(client, lambda _, state: state.get("recording") is None)
     (path,) = tmp_path.glob("linear-1-*.rec")
     assert '"here"' in path.read_text()
     process.send_signal(signal.SIGINT)
@@ -81,13 +76,13 @@ def test_replay_page_shows_any_position_of_the_recording(film, models, start, co
     path, mcap = tmp_path / "touch.rec", tmp_path / "touch.mcap"
     (tmp_path / "frames").write_bytes(b"".join(encoded_frames(islice(taps(film), 600))))
     command("serve", "stream", "linear", "--models", models, "--port", tmp_path / "frames", "--record", path)
-    process, url = start("replay", path, "--output", "none", "--output", mcap)
+    process, client = start("replay", path, "--output", "none", "--output", mcap)
 
-    samples, state = follow(url, lambda _, state: state.get("is_complete") and state.get("samples") == 600)
+    samples, state = follow(client, lambda _, state: state.get("is_complete") and state.get("samples") == 600)
     assert state["counters"]["frames"] == 600  # also if the recording is read faster than counters are shown
     assert samples["records"].sum() == 600
     assert max(state["overview"]) == pytest.approx(1.0, abs=0.05)
-    samples, _ = follow(url, lambda samples, _: len(samples["records"]) > 0, until_s=2.5)
+    samples, _ = follow(client, lambda samples, _: len(samples["records"]) > 0, until_s=2.5)
     assert 480 < samples["records"].sum() < 520
     process.send_signal(signal.SIGINT)
     assert process.wait(60) == 0
@@ -97,12 +92,9 @@ def test_replay_page_shows_any_position_of_the_recording(film, models, start, co
 
 def test_page_behind_a_proxy_has_the_host_name_of_allow_host(board, start):
     """The proxy keeps the name in Host, or replaces it by the address of the page."""
-    _, url = start("stream", "linear", "--port", board.url, "--output", "none", "--allow-host", "proxy.example")
-    for host in ("proxy.example", url.removeprefix("http://")):
-        request = urllib.request.Request(
-            url + "/session.json", headers={"Host": host, "Origin": "http://proxy.example"}
-        )
-        assert urllib.request.urlopen(request, timeout=20).status == 200
+    _, client = start("stream", "linear", "--port", board.url, "--output", "none", "--allow-host", "proxy.example")
+    for host in ("proxy.example", client.place.netloc):
+        assert client.send("GET", "/session.json", Host=host, Origin="http://proxy.example")[0] == 200
 
 
 @pytest.mark.parametrize(

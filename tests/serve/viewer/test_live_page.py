@@ -20,7 +20,7 @@ def put(client, record, count, **changes):
 
 def record_count(client, answer):
     """Return the number of records that the samples of an answer represent."""
-    columns = json.loads(client.send("GET", "/session.json")[2])["columns"]
+    columns = client.session()["columns"]
     return sum(sample[columns.index("records")] for sample in answer["samples"])
 
 
@@ -148,6 +148,6 @@ def test_files_of_the_page_are_served(client):
     assert "script-src 'self'" in policy
     for name in re.findall(rb'(?:href|src)="([^"]+)"', body):
         assert client.send("GET", f"/{name.decode()}")[0] == 200
-    session = json.loads(client.send("GET", "/session.json")[2])
+    session = client.session()
     assert session["film"]["electrodes"] == ["A", "B", "C"]
     assert not session["is_replay"]
