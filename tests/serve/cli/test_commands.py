@@ -242,22 +242,15 @@ def test_doctor_refuses_a_gain_beside_a_device_file(refused, tmp_path):
     refused(*words, message="--pc-per-unit: expected no gain beside --device")
 
 
-def test_doctor_writes_no_file_of_which_the_unit_is_missing(command, tmp_path):
+def test_doctor_writes_no_file_of_which_the_unit_is_missing(resting, command, tmp_path):
     """The command that is completed with the unit can then write the file, and the file is valid."""
     path = tmp_path / "board.toml"
-    port = PseudoPort()
-    stop = threading.Event()
 
-    def send():
-        number = 0
-        while not stop.wait(0.005):
-            number += 1
-            port.write_whole(b"%d,%d,%d\n" % (300 + number % 5, 300 + number % 3, 300 + number % 7))
+    def line_of_counts(frame):
+        return b"%d,%d,%d\n" % (300 + frame.seq % 5, 300 + frame.seq % 3, 300 + frame.seq % 7)
 
-    sender = threading.Thread(target=send)
-    sender.start()
-    try:
-        words = ("serve", "doctor", "--port", port.url, "--seconds", 0.6, "--write", path)
+    with resting(encode=line_of_counts) as sensor:
+        words = ("serve", "doctor", "--port", sensor.url, "--seconds", 0.6, "--write", path)
         code, out, err = command(*words)
         assert (code, path.exists()) == (1, False)
         assert "--pc-per-unit NUMBER" in out
@@ -265,10 +258,6 @@ def test_doctor_writes_no_file_of_which_the_unit_is_missing(command, tmp_path):
         assert json.loads(command(*words, "--json")[1])["unit"] == "counts"
         code, _, err = command(*words, "--pc-per-unit", 0.1)
         assert code == 0, err
-    finally:
-        stop.set()
-        sender.join()
-        port.close()
     assert load_device(path).rule(GainRule).pC_per_unit == 0.1
 
 

@@ -208,7 +208,7 @@ fields = [{name = "seq", type = "u8"}, {type = "pad", value = "02"}, {name = "A"
     assert encode_layout(described, Frame(1, 0, (16.0,))) == bytes.fromhex("7E 01 02 10 00")
 
 
-ROBOTIQ = (Path(__file__).parents[2] / "data" / "frames" / "robotiq_ft300.toml").read_text("utf-8")
+ROBOTIQ = (FOLDER / "robotiq_ft300.toml").read_text("utf-8")
 
 
 WRONG = [

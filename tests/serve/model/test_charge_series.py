@@ -16,6 +16,7 @@ ELECTRODES = ("A", "B", "C", "D")
 DOMAIN = Domain(8.0, (0.05, 2.0))
 NODES = np.array([-0.5, 0.0, 0.25])
 OFFSET_pC = 3.5
+CONTACTS = draw_contacts(1, 20, 7.5, (0.055, 1.8))
 
 
 def random_series(*, is_signed=False):
@@ -56,23 +57,22 @@ def polynomial_values(series, contact, state):
 @pytest.mark.parametrize("is_signed", [False, True])
 def test_charges_at_any_state_are_those_of_numpy_polynomials(is_signed):
     series = random_series(is_signed=is_signed)
-    contact = draw_contacts(1, 20, 7.5, (0.055, 1.8))
     state = np.array([0.13, 0.7, -1.2])
-    value = polynomial_values(series, contact, state)
-    unit_log_force = series.domain.to_unit(contact)[:, 2]
+    value = polynomial_values(series, CONTACTS, state)
+    unit_log_force = series.domain.to_unit(CONTACTS)[:, 2]
     expected = np.exp(value)
     if is_signed:
         expected = value * np.exp(np.polynomial.chebyshev.chebval(unit_log_force, series.log_size))[:, None]
     expected += OFFSET_pC
-    np.testing.assert_allclose(series.changes(contact, state).charge_pC, expected, rtol=1e-10)
-    np.testing.assert_allclose(series.at_state(state).charges(contact), expected, rtol=1e-10)
-    np.testing.assert_allclose(series.changes(contact, np.zeros(3)).charge_pC, series.charges(contact), rtol=1e-12)
+    np.testing.assert_allclose(series.changes(CONTACTS, state).charge_pC, expected, rtol=1e-10)
+    np.testing.assert_allclose(series.at_state(state).charges(CONTACTS), expected, rtol=1e-10)
+    np.testing.assert_allclose(series.changes(CONTACTS, np.zeros(3)).charge_pC, series.charges(CONTACTS), rtol=1e-12)
 
 
 @pytest.mark.parametrize("is_signed", [False, True])
 def test_derivatives_are_finite_differences_also_outside_the_range_of_forces(is_signed):
     series = random_series(is_signed=is_signed)
-    contact = draw_contacts(1, 20, 7.5, (0.055, 1.8))
+    contact = CONTACTS.copy()
     contact[:3, 2] = [1e-3, 0.02, 7.0]
     state = np.array([-0.2, 0.5, 1.0])
     changes = series.changes(contact, state)
@@ -100,9 +100,8 @@ def test_charges_beyond_the_domain_continue_linearly_in_position_and_as_a_power_
 def test_file_is_read_as_it_was_written(is_signed):
     written = random_series(is_signed=is_signed)
     read = charge_map_from_bytes(charge_map_bytes(written), ELECTRODES)
-    contact = draw_contacts(1, 20, 7.5, (0.055, 1.8))
     state = np.array([0.1, 1.0, -1.0])
-    np.testing.assert_array_equal(read.changes(contact, state).charge_pC, written.changes(contact, state).charge_pC)
+    np.testing.assert_array_equal(read.changes(CONTACTS, state).charge_pC, written.changes(CONTACTS, state).charge_pC)
     for name in ("domain", "electrodes", "is_folded", "charge_std", "offset_pC", "pretension_MPa", "tension_std_MPa"):
         assert getattr(read, name) == getattr(written, name)
 

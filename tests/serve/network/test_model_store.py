@@ -154,9 +154,14 @@ def released(models):
     return open_model_store(models)
 
 
+def logging_handler(store, lines):
+    """Return a handler that needs the token SECRET, and appends the lines of its log to a list."""
+    return Handler(store, None, Traffic(RequestLog(lines.append)), AccessCheck(token=SECRET))
+
+
 @pytest.fixture
 def app(released, lines):
-    return Handler(released, None, Traffic(RequestLog(lines.append)), AccessCheck(token=SECRET))
+    return logging_handler(released, lines)
 
 
 def bearer(token=SECRET):
@@ -191,7 +196,7 @@ any_bytes = st.binary(max_size=60) | any_text.map(lambda text: text.encode("utf-
 @given(any_text, any_text, st.lists(st.tuples(any_bytes, any_bytes)), any_bytes, st.booleans())
 def test_client_cannot_forge_a_log_line_or_log_a_secret(released, method, path, headers, body, knows):
     lines = []
-    handler = Handler(released, None, Traffic(RequestLog(lines.append)), AccessCheck(token=SECRET))
+    handler = logging_handler(released, lines)
     handler.answer(method, path, [*headers, *bearer()] if knows else headers, body, ("::1", 1))
     (line,) = lines
     assert len(line) < 500
@@ -220,10 +225,9 @@ def test_log_has_the_messages_of_python_loggers(lines):
 
 
 def test_log_has_a_line_for_each_grpc_call(store, lines, start_grpc):
-    app = Handler(store, None, Traffic(RequestLog(lines.append)), AccessCheck(token=SECRET))
     with_secret = [("authorization", f"Bearer {SECRET}")]
     with (
-        start_grpc(app) as url,
+        start_grpc(logging_handler(store, lines)) as url,
         grpc.insecure_channel(url.removeprefix("grpc://")) as channel,
     ):
         ask = {name: channel.unary_unary(f"/{SERVICE}/{name}") for name in ("ModelReady", "ModelInfer")}

@@ -135,6 +135,13 @@ def test_press_file_with_too_many_presses_is_refused(monkeypatch, read):
         read(HEADER + "\n1,2,3,4,5,6" * 4)
 
 
+def presses_of(charge_pC, names):
+    """Return presses of 1 N at (1, 1) mm with some charges."""
+    count = len(charge_pC)
+    ones = np.ones(count)
+    return MeasuredPresses(np.ones((count, 3)), charge_pC, ones, ones, names, tuple(range(1, count + 1)))
+
+
 @pytest.mark.parametrize(
     "names",
     [
@@ -149,9 +156,8 @@ def test_press_file_with_too_many_presses_is_refused(monkeypatch, read):
     ],
 )
 def test_electrodes_that_cannot_be_columns(names):
-    one = np.ones(1)
     with pytest.raises(PressError, match=r"^electrodes: expected 1 to 995 different names"):
-        MeasuredPresses(np.ones((1, 3)), np.ones((1, len(names))), one, one, names, (1,))
+        presses_of(np.ones((1, len(names))), names)
 
 
 @pytest.mark.parametrize("name", ["nowhere.csv", "."])
@@ -207,7 +213,7 @@ def test_written_presses_are_read_back(suffix, presses, tmp_path_factory):
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 def test_presses_that_would_not_be_read_are_not_written(suffix, tmp_path, monkeypatch):
-    presses = MeasuredPresses(np.ones((2, 3)), np.ones((2, 3)), np.ones(2), np.ones(2), NAMES, (1, 2))
+    presses = presses_of(np.ones((2, 3)), NAMES)
     path = tmp_path / f"p.{suffix}"
     with pytest.raises(PressError, match=r"expected 1 to 1,000,000 presses to write, got 0"):
         write_presses(path, presses[:0])
@@ -220,9 +226,8 @@ def test_presses_that_would_not_be_read_are_not_written(suffix, tmp_path, monkey
 
 
 def test_a_charge_that_would_not_be_read_is_refused():
-    ones = np.ones(1)
     with pytest.raises(PressError, match=r"^line 1, column 'A': expected a charge in pC, got 1e\+39$"):
-        MeasuredPresses(np.ones((1, 3)), np.array([[1e39]]), ones, ones, ("A",), (1,))
+        presses_of(np.array([[1e39]]), ("A",))
 
 
 def test_a_written_file_is_plain_csv(read):

@@ -19,6 +19,9 @@ from kept import kept
 
 NAME = "four-25um-biaxial"
 
+PRESS_pC = np.array([1200.0, 800.0, 700.0, 900.0])
+"""Charges of a press, pC."""
+
 
 @pytest.fixture(scope="module")
 def released():
@@ -46,14 +49,13 @@ def test_intervals_for_a_stated_noise_hold_as_often_as_they_state(released, pres
 
 def test_covariance_for_a_stated_noise_is_that_of_the_linearised_problem(released):
     """The Jacobian J comes from small changes of the charges: the added covariance is J diag(s'^2 - s^2) J^T."""
-    charge_pC = np.array([1200.0, 800.0, 700.0, 900.0])
-    plain = np.asarray(released.predict_batch([charge_pC]), float)[0]
-    stated = np.asarray(released.with_noise(2.0, 0.005).predict_batch([charge_pC]), float)[0]
+    plain = np.asarray(released.predict_batch([PRESS_pC]), float)[0]
+    stated = np.asarray(released.with_noise(2.0, 0.005).predict_batch([PRESS_pC]), float)[0]
     steps = 2.0 * np.eye(4)
-    difference = np.asarray(released.predict_batch(charge_pC + steps), float)[:, :3]
-    difference = difference - np.asarray(released.predict_batch(charge_pC - steps), float)[:, :3]
+    difference = np.asarray(released.predict_batch(PRESS_pC + steps), float)[:, :3]
+    difference = difference - np.asarray(released.predict_batch(PRESS_pC - steps), float)[:, :3]
     jacobian = difference.T / 4.0
-    extra = 4.0 - 1.0 + (0.005**2 - 0.002**2) * charge_pC**2
+    extra = 4.0 - 1.0 + (0.005**2 - 0.002**2) * PRESS_pC**2
     added = jacobian @ np.diag(extra) @ jacobian.T
     x, y, force = stated[3:6]
     np.testing.assert_allclose(stated[3:6] ** 2 - plain[3:6] ** 2, np.diag(added), rtol=0.02)
@@ -63,21 +65,19 @@ def test_covariance_for_a_stated_noise_is_that_of_the_linearised_problem(release
 
 
 def test_smaller_noise_than_in_the_training_changes_nothing(released):
-    charge_pC = [1200.0, 800.0, 700.0, 900.0]
-    assert released.with_noise(0.5, 0.001).predict(charge_pC) == pytest.approx(released.predict(charge_pC), rel=1e-6)
+    assert released.with_noise(0.5, 0.001).predict(PRESS_pC) == pytest.approx(released.predict(PRESS_pC), rel=1e-6)
 
 
 def test_device_file_with_noise_widens_the_contacts_of_a_stream_and_of_predict(released, tmp_path):
-    charge_pC = np.array([1200.0, 800.0, 700.0, 900.0])
     device = device_from_table({"noise": {"gain": 0.015}}, "b")
     setup = Setup(released.metadata.electrodes, device, released)
     (prediction,) = create_stages(setup, needs_contact=True)
-    frame = Frame(None, None, (), charge_pC=charge_pC, is_contact=True)
+    frame = Frame(None, None, (), charge_pC=PRESS_pC, is_contact=True)
     prediction.step(frame)
-    expected = released.with_noise(1.0, 0.015).predict(charge_pC)
+    expected = released.with_noise(1.0, 0.015).predict(PRESS_pC)
     assert frame.contact == expected
-    assert expected.x_std_mm > 4.0 * released.predict(charge_pC).x_std_mm
-    assert pickle.loads(pickle.dumps(setup.predictor)).predict(charge_pC) == expected
+    assert expected.x_std_mm > 4.0 * released.predict(PRESS_pC).x_std_mm
+    assert pickle.loads(pickle.dumps(setup.predictor)).predict(PRESS_pC) == expected
 
     presses, board = tmp_path / "presses.csv", tmp_path / "board.toml"
     presses.write_text("A,B,C,D\n1200,800,700,900\n")

@@ -59,12 +59,17 @@ class RandomBoard:
         type_name = kind.split()[0]
         fields = self.head + [{"name": name, "type": type_name} for name in "ABCD"[:electrodes]]
         sizes = [int(field.get("type", "pad8").strip("iufpad") or 8) // 8 for field in fields]
-        self.table = {"format": "described", "byte_order": order, "checksum": checksum, "fields": fields}
-        self.table |= {"checksum_order": pick((order, "little"))}
-        self.table |= {"framing": "cobs"} if is_stuffed else {"sync": sync}
         sync_size = 0 if is_stuffed else len(bytes.fromhex(sync))
-        self.table |= {"length": sync_size + sum(sizes) + CHECKSUMS[checksum].size}
-        self.table |= {"checksum_from": sync_size if skips_sync else 0}
+        self.table = {
+            "format": "described",
+            "byte_order": order,
+            "checksum": checksum,
+            "fields": fields,
+            "checksum_order": pick((order, "little")),
+            "length": sync_size + sum(sizes) + CHECKSUMS[checksum].size,
+            "checksum_from": sync_size if skips_sync else 0,
+        }
+        self.table |= {"framing": "cobs"} if is_stuffed else {"sync": sync}
 
         bits = 0 if kind[0] == "f" else int(kind[1:])
         is_count = kind != "f32"

@@ -82,10 +82,16 @@ def model_in(folder, series, noise=NOISE):
     )
 
 
-def touches(series, state, gains, rng, count):
+@pytest.fixture
+def model(tmp_path, series):
+    """The model of the calibrated film with the noise of its training."""
+    return model_in(tmp_path, series)
+
+
+def touches(series, state, rng, count):
     """Contacts and charges of a changed film."""
     contact = draw_contacts(rng, count, 6.5, (0.1, 1.5))
-    return contact, series.changes(contact, state).charge_pC * gains
+    return contact, series.changes(contact, np.array(state)).charge_pC
 
 
 def followed(model, charge, rng):
@@ -112,11 +118,10 @@ def force_errors(follower, model, contact, charge):
 @pytest.mark.parametrize(
     ("change_MPa", "gain", "largest_error"), [(0.3, 1.0, 0.03), (-0.4, 1.0, 0.03), (0.0, 1.0, 0.01), (0.0, 1.03, 0.03)]
 )
-def test_changes_of_the_film_and_of_a_gain_are_followed(series, tmp_path, change_MPa, gain, largest_error):
+def test_changes_of_the_film_and_of_a_gain_are_followed(series, model, change_MPa, gain, largest_error):
     rng = np.random.default_rng(4)
-    model = model_in(tmp_path, series)
-    state = np.array([change_MPa, 0.7, -0.8])
-    contact, charge = touches(series, state, np.array([gain, 1.0, 1.0, 1.0]), rng, 80)
+    contact, charge = touches(series, [change_MPa, 0.7, -0.8], rng, 80)
+    charge[:, 0] *= gain
     follower = followed(model, charge[:50], rng)
     assert not follower.is_lost
     assert abs(follower.film.pretension_MPa - 1.0 - change_MPa) < 3.0 * follower.film.pretension_std_MPa + 0.01
@@ -136,7 +141,7 @@ def test_film_is_followed_with_the_noise_that_the_device_file_states(series, tmp
     rng = np.random.default_rng(4)
     noise = NoiseModel("bench", 5.0, 0.02)
     model = model_in(tmp_path, series, noise)
-    _, charge = touches(series, np.array([0.3, 0.7, -0.8]), np.ones(4), rng, 80)
+    _, charge = touches(series, [0.3, 0.7, -0.8], rng, 80)
     follower = FilmFollower(model)
     for number, row in enumerate(noise.add(charge, rng)):
         follower.observe_frame(row, model.predict(row), (), float(number))
@@ -147,24 +152,21 @@ def test_film_is_followed_with_the_noise_that_the_device_file_states(series, tmp
 
 
 @pytest.mark.parametrize("change_MPa", [0.3, -0.3])
-def test_a_sudden_change_is_followed_after_twenty_touches(series, tmp_path, change_MPa):
+def test_a_sudden_change_is_followed_after_twenty_touches(series, model, change_MPa):
     """The forty touches before the change must not determine the pretension too well."""
     rng = np.random.default_rng(1)
-    model = model_in(tmp_path, series)
-    directions = np.array([0.7, -0.8])
-    _, charge_before = touches(series, np.array([0.0, *directions]), np.ones(4), rng, 40)
-    contact, charge = touches(series, np.array([change_MPa, *directions]), np.ones(4), rng, 60)
+    _, charge_before = touches(series, [0.0, 0.7, -0.8], rng, 40)
+    contact, charge = touches(series, [change_MPa, 0.7, -0.8], rng, 60)
     follower = followed(model, np.concatenate([charge_before, charge[:20]]), rng)
     relative, normalised = force_errors(follower, model, contact[20:], NOISE.add(charge[20:], rng))
     assert np.sqrt(np.mean(relative**2)) < 0.05
     assert np.mean(np.abs(normalised) < 2.0) > 0.85
 
 
-def test_touches_that_agree_determine_the_pretension_better_than_touches_of_warm_fingers(series, tmp_path):
+def test_touches_that_agree_determine_the_pretension_better_than_touches_of_warm_fingers(series, model):
     """The assumed errors of a touch are an upper limit. The touches themselves show how large the errors are."""
     rng = np.random.default_rng(3)
-    model = model_in(tmp_path, series)
-    contact, charge = touches(series, np.array([0.3, 0.7, -0.8]), np.ones(4), rng, 100)
+    contact, charge = touches(series, [0.3, 0.7, -0.8], rng, 100)
     warmth_pC = 10.0 * rng.standard_normal((60, 1))
     agreeing, warm = followed(model, charge[:60], rng), followed(model, charge[:60] + warmth_pC, rng)
     assert agreeing.film.pretension_std_MPa < 0.85 * warm.film.pretension_std_MPa
@@ -173,10 +175,9 @@ def test_touches_that_agree_determine_the_pretension_better_than_touches_of_warm
         assert np.mean(np.abs(normalised) < 2.0) > 0.85
 
 
-def test_stage_counts_a_touch_with_invalid_frames_once_and_flags_the_corrected_contact(series, tmp_path):
+def test_stage_counts_a_touch_with_invalid_frames_once_and_flags_the_corrected_contact(series, model):
     rng = np.random.default_rng(1)
-    model = model_in(tmp_path, series)
-    _, charge = touches(series, np.array([0.3, 0.0, 0.0]), np.ones(4), rng, 21)
+    _, charge = touches(series, [0.3, 0.0, 0.0], rng, 21)
     raw = model.predict(charge[20])
     model.validity = SimpleNamespace(flags=lambda contact: () if contact == raw else ("misfit",))
     stage = FollowFilm(Setup(ELECTRODES, Device(), model))
@@ -191,10 +192,9 @@ def test_stage_counts_a_touch_with_invalid_frames_once_and_flags_the_corrected_c
     assert stage._follower.film.touches == 21
 
 
-def test_film_that_is_lost_again_keeps_the_state_of_the_latest_touches(series, tmp_path):
+def test_film_that_is_lost_again_keeps_the_state_of_the_latest_touches(series, model):
     rng = np.random.default_rng(5)
-    model = model_in(tmp_path, series)
-    _, charge = touches(series, np.array([0.4, 0.0, 0.0]), np.ones(4), rng, 40)
+    _, charge = touches(series, [0.4, 0.0, 0.0], rng, 40)
     wrong = charge[:2] * rng.uniform(0.7, 1.4, (2, 4))
     follower = followed(model, np.concatenate([charge, wrong, charge[:10], wrong]), rng)
     assert follower.is_lost
@@ -215,10 +215,9 @@ def test_models_that_cannot_be_followed_are_refused(series, tmp_path):
         FilmFollower(model_in(tmp_path, three))
 
 
-def test_contacts_are_corrected_from_the_first_touch(series, tmp_path):
+def test_contacts_are_corrected_from_the_first_touch(series, model):
     rng = np.random.default_rng(8)
-    model = model_in(tmp_path, series)
-    contact, charge = touches(series, np.array([-0.4, 0.0, 0.0]), np.ones(4), rng, 31)
+    contact, charge = touches(series, [-0.4, 0.0, 0.0], rng, 31)
     before, normalised_before = force_errors(FilmFollower(model), model, contact[1:], charge[1:])
     after, normalised_after = force_errors(followed(model, charge[:1], rng), model, contact[1:], charge[1:])
     assert np.mean(after**2) < np.mean(before**2)
@@ -226,9 +225,8 @@ def test_contacts_are_corrected_from_the_first_touch(series, tmp_path):
     assert np.mean(np.abs(normalised_after) < 2.0) > 0.85
 
 
-def test_touches_that_no_film_explains_make_the_film_lost(series, tmp_path):
+def test_touches_that_no_film_explains_make_the_film_lost(series, model):
     rng = np.random.default_rng(5)
-    model = model_in(tmp_path, series)
-    _, charge = touches(series, series.calibrated_state, np.ones(4), rng, 40)
+    _, charge = touches(series, series.calibrated_state, rng, 40)
     assert followed(model, charge * rng.uniform(0.7, 1.4, charge.shape), rng).is_lost
     assert not followed(model, charge, rng).is_lost
