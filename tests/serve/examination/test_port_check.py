@@ -19,10 +19,15 @@ FOUR = ("A", "B", "C", "D")
 AT_REST = device_from_table({"leak": {"tau_s": 10.0}}, "test")
 
 
-def received(encode, n=400, **options):
+def received(encode):
     """Return the bytes of a board that sends `encode(number)` 200 times per second."""
-    chunks = [Chunk(encode(number), 1.7e9 + number / RATE_HZ, 0) for number in range(n)]
-    return ReceivedData("/dev/ttyACM0", 115200, chunks=chunks, seconds=n / RATE_HZ, **options)
+    chunks = [Chunk(encode(number), 1.7e9 + number / RATE_HZ, 0) for number in range(400)]
+    return ReceivedData("/dev/ttyACM0", 115200, chunks=chunks, seconds=400 / RATE_HZ)
+
+
+def examined(encode, **settings):
+    """Return the report about a board that sends `encode(number)`."""
+    return examine_received(received(encode), **settings)
 
 
 def charges(*, offset=(5.0, -6.0, 7.0), noise=0.3, hum=0.0, drift=0.0, encode=encode_frame):
@@ -56,13 +61,13 @@ def test_of_a_touched_film_only_the_touch_is_reported():
         press = 400.0 if number > 150 else 0.0
         return encode_frame(Frame(number, 5000 * number, (5.0 + press, 2.0 * press - 6.0, 7.0)))
 
-    report = examine_received(received(pressed_frame), device=AT_REST, electrodes=FOUR[:3])
+    report = examined(pressed_frame, device=AT_REST, electrodes=FOUR[:3])
     assert "as under a touch; take the finger away" in report.touch
     assert report.missing == (report.touch,)
 
 
 def test_check_of_a_healthy_board():
-    report = examine_received(received(charges()), device=AT_REST, electrodes=("A", "B", "C"))
+    report = examined(charges(), device=AT_REST, electrodes=("A", "B", "C"))
     assert (report.baud, report.format, report.missing) == (115200, "binary frames of isocharge", ())
     assert report.missing_for_held_presses == ()
     assert (report.good, report.bad, report.lost, report.repeated, report.device_clock) == (400, 0, 0, 0, True)
@@ -72,7 +77,7 @@ def test_check_of_a_healthy_board():
 
 def test_check_of_a_channel_without_a_number():
     """A board sends `nan` for a missing amplifier. The other channels are reported as usual, also as valid JSON."""
-    report = examine_received(received(lambda _: b"A:nan,B:1.5,C:2.5\n"))
+    report = examined(lambda _: b"A:nan,B:1.5,C:2.5\n")
     assert [(c.name, c.offset_pC) for c in report.channels] == [("A", None), ("B", 1.5), ("C", 2.5)]
     assert report.channels[0].unusable == report.good == 400
     assert "channel A is nan in 400 frames" in missing(report)
@@ -82,7 +87,7 @@ def test_check_of_a_channel_without_a_number():
 
 
 def test_a_board_that_only_sends_nan_is_not_taken_for_counts():
-    report = examine_received(received(lambda _: b"A:nan,B:nan,C:nan\n"))
+    report = examined(lambda _: b"A:nan,B:nan,C:nan\n")
     assert "channel A is nan in 400 frames" in missing(report)
     assert "counts" not in missing(report)
 
@@ -110,7 +115,7 @@ def test_a_board_that_only_sends_nan_is_not_taken_for_counts():
     ],
 )
 def test_check_reports_missing_settings(board, message):
-    assert message in missing(examine_received(received(board), electrodes=FOUR))
+    assert message in missing(examined(board, electrodes=FOUR))
 
 
 def test_missing_clock_is_reported_only_with_leak():
@@ -118,7 +123,7 @@ def test_missing_clock_is_reported_only_with_leak():
     reports = (
         examine_received(lines, device=AT_REST),
         examine_received(lines),
-        examine_received(received(charges()), device=AT_REST),
+        examined(charges(), device=AT_REST),
     )
     assert ["a device clock" in " / ".join(report.missing_for_held_presses) for report in reports] == [
         True,
@@ -128,7 +133,7 @@ def test_missing_clock_is_reported_only_with_leak():
 
 
 def test_unused_inputs_are_ignored():
-    report = examine_received(received(row), electrodes=FOUR)
+    report = examined(row, electrodes=FOUR)
     assert report.device["channels"] == {"A": "1", "B": "3", "C": "4", "D": "6"}
     assert (report.unused, report.unit) == (("2", "5"), "counts")
     assert "dead" not in missing(report)
@@ -141,14 +146,14 @@ def test_unused_inputs_are_ignored():
 def test_proposed_device_file_reads_the_same_charges():
     """A check with the proposed file gives the same result as the check that has proposed the file."""
     gain = {"pC_per_unit": {"A": 0.5, "B": -0.5, "C": 0.5, "D": 0.5}}
-    first = examine_received(received(row), electrodes=FOUR, gain=gain)
+    first = examined(row, electrodes=FOUR, gain=gain)
     assert first.device["gain"]["offset"] == pytest.approx(dict.fromkeys("ABCD", 305), abs=10)
-    again = examine_received(received(row), device=device_from_table(first.device, "test"))
+    again = examined(row, device=device_from_table(first.device, "test"))
     assert [channel.name for channel in again.channels] == [channel.name for channel in first.channels]
     assert all(abs(channel.offset_pC) < 5 for channel in again.channels)
     assert (again.unit, again.unused) == ("pC", ("2", "5"))
     with pytest.raises(DeviceError, match=r"gain\.pC_per_unit: expected a number, or one for each"):
-        examine_received(received(row), electrodes=FOUR, gain={"pC_per_unit": {"A": 0.5}})
+        examined(row, electrodes=FOUR, gain={"pC_per_unit": {"A": 0.5}})
 
 
 @pytest.mark.parametrize(
@@ -162,13 +167,13 @@ def test_proposed_device_file_reads_the_same_charges():
 )
 def test_level_at_rest_is_proposed_as_offset(gain, rests, offset):
     board = lambda k: b"%d,%d\n" % tuple(rest + (k * 7) % 5 - 2 for rest in rests)  # noqa: E731
-    proposed = examine_received(received(board), electrodes=("A", "B"), gain=gain).device["gain"]
+    proposed = examined(board, electrodes=("A", "B"), gain=gain).device["gain"]
     assert proposed == gain | ({} if offset is None else {"offset": offset})
 
 
 def test_line_that_is_not_read_is_shown():
     board = lambda k: b'{"A":%s,"B":%d}\n' % (b"null" if k % 20 == 7 else b"3", k % 7)  # noqa: E731
-    assert """the line '{"A":null,"B":""" in missing(examine_received(received(board)))
+    assert """the line '{"A":null,"B":""" in missing(examined(board))
 
 
 @pytest.mark.parametrize(
@@ -193,7 +198,7 @@ def test_channels_are_proposed_by_their_names(names, channels, message):
     def board(_):
         return ",".join(f"{name}{mark}{rng.normal():.3f}" for name in names.split()).encode() + b"\n"
 
-    report = examine_received(received(board), electrodes=("A", "B", "C"))
+    report = examined(board, electrodes=("A", "B", "C"))
     assert (report.device.get("channels"), not report.missing) == (channels, not message)
     assert message in missing(report)
 

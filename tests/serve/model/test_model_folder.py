@@ -251,9 +251,13 @@ def test_invalid_label_is_refused(roots, label):
 WHERE = "models/linear/1/model.onnx"
 
 
+def read_metadata(film, **changed_props):
+    """Read the metadata of a model with some changed texts."""
+    return ModelMetadata.from_props(film.metadata().to_props() | changed_props, WHERE)
+
+
 def test_metadata_props_round_trip_ignores_unknown_keys(film):
-    props = film.metadata().to_props() | {"author": "not JSON"}
-    assert ModelMetadata.from_props(props, WHERE) == film.metadata()
+    assert read_metadata(film, author="not JSON") == film.metadata()
 
 
 def test_unsupported_format_version_of_metadata_is_refused(film):
@@ -261,7 +265,7 @@ def test_unsupported_format_version_of_metadata_is_refused(film):
         rf"^{WHERE}: metadata format 2 is not supported \(this version reads 1\); export it again or upgrade isocharge$"
     )
     with pytest.raises(ModelError, match=message):
-        ModelMetadata.from_props(film.metadata().to_props() | {"format_version": "2"}, WHERE)
+        read_metadata(film, format_version="2")
 
 
 @pytest.mark.parametrize(
@@ -281,14 +285,13 @@ def test_unsupported_format_version_of_metadata_is_refused(film):
 )
 def test_wrong_metadata_value_is_shown(film, key, text, message):
     with pytest.raises(ModelError, match=rf"^{WHERE}: metadata: (?=.*{key}).*{message}.*; export the model again$"):
-        ModelMetadata.from_props(film.metadata().to_props() | {key: text}, WHERE)
+        read_metadata(film, **{key: text})
 
 
 @pytest.mark.parametrize("extra", ["", ', "tau_s": 3.0'], ids=["present keys", "additional key of an older model"])
 def test_noise_of_each_electrode_and_of_older_models_is_read(film, extra):
     text = f'{{"name": "rig", "white_pC": [1, 2, 3], "gain": 0.002{extra}}}'
-    noise = ModelMetadata.from_props(film.metadata().to_props() | {"noise": text}, WHERE).noise
-    variance = noise.variance(np.array([[100.0, 0.0, -50.0]]))
+    variance = read_metadata(film, noise=text).noise.variance(np.array([[100.0, 0.0, -50.0]]))
     np.testing.assert_allclose(variance, [[1.0 + 0.04, 4.0, 9.0 + 0.01]])
 
 

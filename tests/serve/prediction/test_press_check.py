@@ -44,6 +44,12 @@ def measure(film):
     return measure
 
 
+@pytest.fixture
+def checked(predictor, measure):
+    """Return a function that measures presses and compares the model with them."""
+    return lambda n, **conditions: check_presses(predictor, measure(n, **conditions))
+
+
 def test_errors_of_single_presses_equal_their_displacements(film, predictor):
     contact = np.array([[1.0, 2.0, 0.5], [-3.0, 0.5, 1.0], [np.nan, np.nan, 1.0], [0.0, 1.0, np.nan]])
     pressed = np.array([[1.3, 1.6, 0.55], [-3.0, 0.5, 0.98], [0.0, 0.0, 1.02], [0.0, 1.5, 1.0]])
@@ -60,8 +66,8 @@ def test_errors_of_single_presses_equal_their_displacements(film, predictor):
     np.testing.assert_array_equal(errors.rig_std[:, 2], [0.01, 0.01, 0.01, nan])
 
 
-def test_model_that_fits_has_no_unexplained_error(predictor, measure):
-    check = check_presses(predictor, measure(400, seed=3))
+def test_model_that_fits_has_no_unexplained_error(checked):
+    check = checked(400, seed=3)
     assert (check.fits, check.verdict, check.notes) == (True, "fits: noise explains the errors", ())
     assert check.agreement.degrees == 1200
     assert check.agreement.chi_squared / 1200 == pytest.approx(1.0, abs=3 * (2 / 1200) ** 0.5)
@@ -71,21 +77,21 @@ def test_model_that_fits_has_no_unexplained_error(predictor, measure):
         assert part.beyond < 0.45 * part.rms
 
 
-def test_p_values_are_uniform_and_verdicts_rarely_wrong_for_a_model_that_fits(predictor, measure):
-    checks = [check_presses(predictor, measure(12, seed=seed)) for seed in range(150)]
+def test_p_values_are_uniform_and_verdicts_rarely_wrong_for_a_model_that_fits(checked):
+    checks = [checked(12, seed=seed) for seed in range(150)]
     assert stats.kstest([check.agreement.p_value for check in checks], "uniform").pvalue > 0.01
     assert sum(not check.fits for check in checks) <= 5  # 1 % of 150, plus three standard deviations
 
 
-def test_chi_squared_up_to_ten_percent_too_large_is_accepted_whatever_the_p_value(predictor, measure):
-    agreement = check_presses(predictor, measure(12)).agreement
+def test_chi_squared_up_to_ten_percent_too_large_is_accepted_whatever_the_p_value(checked):
+    agreement = checked(12).agreement
     larger = [replace(agreement, p_value=1e-9, chi_squared=share * agreement.degrees) for share in (1.05, 1.2)]
     assert [each.acceptable for each in larger] == [True, False]
     assert replace(larger[1], p_value=0.2).acceptable
 
 
-def test_common_shift_is_detected_with_a_smaller_p_value_than_chi_squared(predictor, measure):
-    check = check_presses(predictor, measure(40, seed=1, shift_mm=(0.06, 0.0)))
+def test_common_shift_is_detected_with_a_smaller_p_value_than_chi_squared(checked):
+    check = checked(40, seed=1, shift_mm=(0.06, 0.0))
     assert check.fits is False
     assert check.agreement.p_value > check.agreement.common_p_value
     assert check.agreement.common.mean[0] == pytest.approx(0.06, abs=4 * check.agreement.common.std[0])
@@ -95,22 +101,22 @@ def test_common_shift_is_detected_with_a_smaller_p_value_than_chi_squared(predic
 @pytest.mark.parametrize(
     ("known", "degrees"), [((True, False), 40), ((False, True), 20)], ids=["positions only", "forces only"]
 )
-def test_presses_with_only_positions_or_only_forces(predictor, measure, known, degrees):
-    check = check_presses(predictor, measure(20, known=known))
+def test_presses_with_only_positions_or_only_forces(checked, known, degrees):
+    check = checked(20, known=known)
     assert (check.fits, check.agreement.degrees) == (True, degrees)
     assert (check.position_mm is None, check.force_percent is None) == (not known[0], not known[1])
-    wrong = check_presses(predictor, measure(20, known=known, noise=8.0, force_scale=1.1))
+    wrong = checked(20, known=known, noise=8.0, force_scale=1.1)
     assert wrong.fits is False
     assert ("mm" in wrong.verdict, "%" in wrong.verdict) == known
     assert any(note.startswith("forces are 1.") for note in wrong.notes) == known[1], wrong.notes
 
 
 @pytest.mark.parametrize(("count", "fits"), [(1, None), (2, None), (3, True)])
-def test_verdict_needs_three_presses(predictor, measure, count, fits):
-    check = check_presses(predictor, measure(count, seed=4))
+def test_verdict_needs_three_presses(checked, count, fits):
+    check = checked(count, seed=4)
     assert check.fits is fits
     assert fits or check.verdict == f"too few presses to say: {count} can be compared, 3 are needed"
-    far = check_presses(predictor, measure(count, seed=4, shift_mm=(1.0, 0.0)))
+    far = checked(count, seed=4, shift_mm=(1.0, 0.0))
     assert any("shifted" in note for note in far.notes) == (count >= 3)  # one wrong press is no common shift
 
 
@@ -155,8 +161,8 @@ def test_note_for_a_film_that_does_not_fit_states_the_explaining_rig_std(predict
 
 
 @pytest.mark.parametrize(("shift_mm", "force_scale"), [((1.0, 0.0), 1.0), ((0.0, 0.0), 3.0)])
-def test_no_rig_std_is_proposed_that_does_not_explain_the_errors(predictor, measure, shift_mm, force_scale):
-    check = check_presses(predictor, measure(30, seed=1, shift_mm=shift_mm, force_scale=force_scale))
+def test_no_rig_std_is_proposed_that_does_not_explain_the_errors(checked, shift_mm, force_scale):
+    check = checked(30, seed=1, shift_mm=shift_mm, force_scale=force_scale)
     assert check.fits is False
     assert not any("-std" in note for note in check.notes)
 
@@ -241,9 +247,9 @@ def test_fewest_presses_are_those_of_the_binomial_distribution():
     assert stats.binom.cdf(FEWEST_HELD_OUT - 2, FEWEST_HELD_OUT - 1, 0.9) < 0.9
 
 
-def test_check_states_a_factor_from_the_fewest_presses(predictor, measure):
-    assert check_presses(predictor, measure(FEWEST_HELD_OUT - 1)).std_factor is None
-    assert check_presses(predictor, measure(FEWEST_HELD_OUT)).std_factor.presses == FEWEST_HELD_OUT
+def test_check_states_a_factor_from_the_fewest_presses(checked):
+    assert checked(FEWEST_HELD_OUT - 1).std_factor is None
+    assert checked(FEWEST_HELD_OUT).std_factor.presses == FEWEST_HELD_OUT
 
 
 def test_unknown_values_do_not_count():
