@@ -27,7 +27,6 @@ from isocharge.serve.live.device import create_stages
 from isocharge.serve.model.charge_file import FILE, charge_map_bytes, read_charge_map
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.model.metadata import ModelMetadata
-from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.virtual_sensor.script import load_script
 from isocharge.simulate import Circle, Samples, load_amplifier, load_sensor, parse_probe, read_dataset, write_dataset
@@ -262,33 +261,6 @@ def test_calibrations_with_faults(tmp_path, attack):
     attack("calibration bytes", read, lambda rng: mutated(rng, text[:4000].encode()) + text[4000:].encode(), 2_000)
     attack("calibration", read, lambda rng: json.dumps(with_junk(rng, plain)).encode(), 1_000)
     attack("calibration numbers", read, lambda rng: number_bomb(rng, text).encode(), 500)
-
-
-def test_loads_of_half_copied_versions(repository, model, attack):
-    """Whatever lies in the folder of a newer version, the old version of a model goes on serving after a load."""
-    store = open_model_store(repository)
-    charge_pC = np.full((1, 3), 500.0, np.float32)
-    names = ("model.onnx", "golden.json", "card.md")
-    contents = {name: (model / name).read_bytes() for name in names}
-
-    def half_copied(rng):
-        """Some files of a version, cut or with faults."""
-        chosen = rng.sample(names, rng.randrange(len(names) + 1))
-        return {name: contents[name][: rng.randrange(len(contents[name]))] for name in chosen}
-
-    def load(files):
-        newer = repository / MODEL / "2"
-        newer.mkdir()
-        for name, data in files.items():
-            (newer / name).write_bytes(data)
-        try:
-            store.load(MODEL)
-        finally:
-            shutil.rmtree(newer)
-            outputs = store.get(MODEL).model.session.run(None, {"charge_pC": charge_pC})
-            assert np.isfinite(outputs[0]).all()
-
-    attack("half-copied versions", load, half_copied, 1_000)
 
 
 def test_charge_maps_with_faults(model, attack):

@@ -152,37 +152,38 @@ def test_names_of_a_board_through_the_stream(notation, attack):
     attack(f"stream {notation}", read, foreign_names, 2_000)
 
 
-def test_device_files_with_foreign_keys(attack):
+def read_device_file(names):
+    device_from_table({"name": names[0], names[1]: {names[2]: names[0]}, "frames": {"format": names[2]}}, "f")
+
+
+def read_csv_header(names):
+    header = ",".join(["A", "B", "C", *names])
+    read_charges([header, "1,2,3,4,5,6"], ("A", "B", "C"), names[0])
+
+
+GOOD_PROPS = load_model(find_model("three-25um-biaxial")).metadata.to_props()
+
+
+def read_metadata(names):
+    key = ("electrodes", "sensor", "probes", "name", "noise")[len(names[0]) % 5]
+    content = {"electrodes": names, "sensor": {"name": names[0]}, "probes": names, "noise": {names[0]: names[1]}}
+    props = GOOD_PROPS | {key: json.dumps(content.get(key, names[0]))}
+    metadata = ModelMetadata.from_props(props, names[2])
+    show(metadata.label)
+    print(csv_header(metadata.electrodes))
+    print(metadata.frame_id)
+
+
+READERS = {"device file": read_device_file, "csv": read_csv_header, "metadata": read_metadata}
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_names_in_files(kind, attack):
     def read(names):
         with checked_terminal():
-            device_from_table({"name": names[0], names[1]: {names[2]: names[0]}, "frames": {"format": names[2]}}, "f")
+            READERS[kind](names)
 
-    attack("foreign device file", read, foreign_names, 2_000)
-
-
-def test_metadata_of_models(attack):
-    good = load_model(find_model("three-25um-biaxial")).metadata.to_props()
-
-    def read(names):
-        key = ("electrodes", "sensor", "probes", "name", "noise")[len(names[0]) % 5]
-        content = {"electrodes": names, "sensor": {"name": names[0]}, "probes": names, "noise": {names[0]: names[1]}}
-        with checked_terminal():
-            props = good | {key: json.dumps(content.get(key, names[0]))}
-            metadata = ModelMetadata.from_props(props, names[2])
-            show(metadata.label)
-            print(csv_header(metadata.electrodes))
-            print(metadata.frame_id)
-
-    attack("foreign metadata", read, foreign_names, 2_000)
-
-
-def test_headers_of_csv_files(attack):
-    def read(names):
-        with checked_terminal(), warnings_to_stderr():
-            header = ",".join(["A", "B", "C", *names])
-            read_charges([header, "1,2,3,4,5,6"], ("A", "B", "C"), names[0])
-
-    attack("foreign csv", read, foreign_names, 2_000)
+    attack(f"foreign {kind}", read, foreign_names, 2_000)
 
 
 def test_recordings(attack, tmp_path):

@@ -115,7 +115,7 @@ class Kind:
         request: Request to which the board answers; None if it sends by itself.
     """
 
-    encode: Callable[[int, np.ndarray], bytes]
+    encode: Callable
     gain: dict = field(default_factory=dict)
     model: str = FOUR
     url: str = "/dev/ttyACM0"

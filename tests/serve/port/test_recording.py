@@ -61,6 +61,7 @@ HEADER = '"model": "m/1", "device": {}'
         None,
         "",
         "hello",
+        "\x89HDF",
         "{}",
         "[1]",
         '{"isocharge_recording": 1}',

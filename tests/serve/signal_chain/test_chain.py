@@ -45,16 +45,6 @@ def test_tare_takes_the_first_hundred_frames():
     np.testing.assert_allclose(mean_charge_pC, 0.0, atol=0.5)
 
 
-def test_tare_waits_for_quiet():
-    """A finger leaves the film after 220 frames."""
-    frames_pC = rest(400)
-    frames_pC[:220] += np.linspace(900.0, 300.0, 220)[:, None]
-    readings = run(frames_pC)
-    has_tare = [reading.tare_pC is not None for reading in readings]
-    assert 300 < has_tare.index(True) <= 321
-    np.testing.assert_allclose(readings[-1].tare_pC, OFFSET, atol=2.0)
-
-
 def test_tare_gives_up_with_the_reason():
     with pytest.raises(TareError, match="varies by"):
         run(rest(300, std_pC=50.0), tare={"patience": 250})
