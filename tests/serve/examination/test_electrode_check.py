@@ -20,6 +20,7 @@ from isocharge.serve.examination.electrode_check import (
     check_electrodes,
     corrected_table,
 )
+from isocharge.serve.virtual_sensor.script import VirtualScript
 from isocharge.simulate import Circle, ForwardMap, load_sensor
 from kept import kept
 
@@ -51,18 +52,13 @@ class SimulatedPort:
 
 def press_script(directions, rest_s=REST_S, first_rest_s=REST_S, end_s=END_S):
     """Return a script of presses of 0.3 N, 8 mm from the centre in some directions, with a rest before each press."""
-    seconds, points = [0.0], [(0.0, 0.0, 0.0)]
+    rows = [(0.0, 0.0, 0.0, 0.0)]
     for number, (x, y) in enumerate(directions):
-        begin_s = seconds[-1] + (rest_s if number else first_rest_s)
-        place = (8.0 * x, 8.0 * y)
-        seconds += [begin_s, begin_s + 0.1, begin_s + PRESS_S, begin_s + PRESS_S + 0.1]
-        points += [(*place, 0.0), (*place, 0.3), (*place, 0.3), (*place, 0.0)]
-    seconds.append(seconds[-1] + end_s)
-    points.append((0.0, 0.0, 0.0))
-    times_s = np.arange(0.0, seconds[-1], 1.0 / RATE_HZ)
-    x, y, force = (np.interp(times_s, seconds, column) for column in np.array(points).T)
-    is_pressed = force > 0.0
-    return Script(np.where(is_pressed, x, np.nan), np.where(is_pressed, y, np.nan), force, RATE_HZ)
+        begin_s = rows[-1][0] + (rest_s if number else first_rest_s)
+        for since_begin_s, force_N in ((0.0, 0.0), (0.1, 0.3), (PRESS_S, 0.3), (PRESS_S + 0.1, 0.0)):
+            rows.append((begin_s + since_begin_s, 8.0 * x, 8.0 * y, force_N))
+    rows.append((rows[-1][0] + end_s, 0.0, 0.0, 0.0))
+    return VirtualScript(presses=tuple(rows)).script(RATE_HZ)
 
 
 def noise(charge_pC, rng):
@@ -200,7 +196,7 @@ def test_doctor_writes_the_order_of_the_channels_found_by_presses(film, models, 
 
 def test_doctor_does_not_write_a_file_from_a_touched_film(film, command, tmp_path):
     path = tmp_path / "board.toml"
-    for first_rest_s in (0.5, 0.0):  # the press begins while doctor listens; it ends then
+    for first_rest_s in (0.5, 0.001):  # the press begins while doctor listens; it ends then
         with sensor_with_wiring(film.charges, film.directions, (0, 1, 2), first_rest_s=first_rest_s) as sensor:
             code, out, err = command("serve", "doctor", "--port", sensor.url, "--seconds", 3, "--write", path)
         assert code == 1
