@@ -33,22 +33,18 @@ def pytest_addoption(parser):
     parser.addoption("--all-attacks", action="store_true", help="send every input, not one in a hundred")
 
 
-@pytest.fixture
-def share(request):
-    """Share of the inputs that are sent."""
-    return 1.0 if request.config.getoption("--all-attacks") else FAST_SHARE
-
-
 def peak_bytes():
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 @pytest.fixture
-def attack(share):
+def attack(request):
     """Function that sends inputs to a reader, `attack(name, read, inputs, count)`.
 
     `inputs(rng)` returns one input, and `read(data)` reads it.
     """
+
+    share = 1.0 if request.config.getoption("--all-attacks") else FAST_SHARE
 
     def send(name, read, inputs, count, longest_s=LONGEST_S):
         rng, before = random.Random(name), None

@@ -123,9 +123,9 @@ def installed_unit(folder, names):
     return folder / names[0]
 
 
-def verified(unit):
-    """Exit code and messages of `systemd-analyze verify`."""
-    done = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True, timeout=60, check=False)
+def analyze(*words):
+    """Exit code and messages of `systemd-analyze`."""
+    done = subprocess.run(["systemd-analyze", *words], capture_output=True, text=True, timeout=60, check=False)
     return done.returncode, done.stdout + done.stderr
 
 
@@ -140,10 +140,10 @@ def verified(unit):
 )
 def test_systemd_analyze_accepts_the_units(tmp_path, names):
     unit = installed_unit(tmp_path, names)
-    assert verified(unit) == (0, "")
+    assert analyze("verify", unit) == (0, "")
     last = tmp_path / names[-1]
     last.write_text(last.read_text().replace(PROGRAM, "/nowhere/isocharge"))
-    assert "/nowhere/isocharge" in verified(unit)[1]  # so verify has read this file
+    assert "/nowhere/isocharge" in analyze("verify", unit)[1]  # so verify has read this file
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze")
@@ -153,8 +153,7 @@ def test_the_page_states_the_exposure_of_the_units(tmp_path):
     for number, names in enumerate((tls, tls[:1], ["isocharge-stream.service"])):
         folder = tmp_path / str(number)
         folder.mkdir()
-        words = ["systemd-analyze", "security", "--offline=true", installed_unit(folder, names)]
-        report = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False).stdout
+        _, report = analyze("security", "--offline=true", installed_unit(folder, names))
         exposure, word = re.findall(r"exposure level for .*: ([\d.]+) (\w+)", report)[0]
         assert re.search(rf"as {re.escape(exposure)}( of 10)? \({word}\)", page)
 

@@ -7,6 +7,7 @@ from functools import partial
 from itertools import chain, islice
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from boards import TcpBoard, encoded_frames, interrupt, taps
@@ -18,8 +19,8 @@ from isocharge.cli.shared.terminal import warnings_to_stderr
 def presses(tmp_path, film):
     """A CSV of two presses, columns not in the model's order."""
     path = tmp_path / "presses.csv"
-    a, b, c = film.charge_pC([1.0, -2.0], [0.5, 3.0], [1.0, 0.25]).T
-    path.write_text("C,A,B\n" + "".join(f"{k:.9g},{i:.9g},{j:.9g}\n" for i, j, k in zip(a, b, c, strict=True)))
+    charge_pC = film.charge_pC([1.0, -2.0], [0.5, 3.0], [1.0, 0.25])
+    np.savetxt(path, np.roll(charge_pC, 1, axis=1), delimiter=",", header="C,A,B", comments="")
     return path
 
 

@@ -50,9 +50,10 @@ def measured(tmp_path, film):
         rng = np.random.default_rng(1)
         x, y, force = rng.uniform(-4, 4, count), rng.uniform(-4, 4, count), rng.uniform(0.2, 1.5, count)
         values = dict(zip(("x_mm", "y_mm", "force_N"), (x, y, scale * force), strict=True))
-        table = np.column_stack([*(values[name] for name in known.split(",")), film.charge_pC(x, y, force)])
+        contact = [values[name] for name in known.split(",")]
+        table = np.column_stack([*contact, film.charge_pC(x, y, force), np.ones(count)])
         path = tmp_path / "measured.csv"
-        path.write_text(f"{known},A,B,C,day\n" + "".join(",".join(map(repr, row)) + ",1\n" for row in table.tolist()))
+        np.savetxt(path, table, delimiter=",", header=f"{known},A,B,C,day", comments="")
         return path
 
     return write

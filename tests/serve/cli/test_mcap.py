@@ -18,16 +18,10 @@ from isocharge.cli.serve import plot
 from isocharge.serve import Recorder
 
 
-def messages(path):
-    with path.open("rb") as file:
-        topics = {}
-        for _, channel, message in make_reader(file, validate_crcs=True).iter_messages():
-            topics.setdefault(channel.topic, []).append(message)
-    return topics
-
-
 def lines_in(path):
-    return [message.data.decode() for message in messages(path)["/isocharge/record"]]
+    with path.open("rb") as file:
+        messages = make_reader(file, validate_crcs=True).iter_messages("/isocharge/record")
+        return [message.data.decode() for _, _, message in messages]
 
 
 @pytest.mark.parametrize("name", ["touch.mcap", "touch.ros2.mcap"])

@@ -21,6 +21,14 @@ def chromium():
         yield browser
 
 
+def errors_of(page):
+    """Return a list to which the errors of a page are appended."""
+    errors = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    return errors
+
+
 class Client:
     """A client of a page: the page as the stream sees it, its address, and requests to it.
 

@@ -5,11 +5,13 @@ import re
 import signal
 import socket
 import time
+from itertools import chain
 
 import numpy as np
 import pytest
 
 from isocharge.serve import Script, VirtualSensor
+from serve.viewer.conftest import errors_of
 
 RATE_HZ, PRESS_S, PAUSE_S = 200.0, 1.5, 0.9
 PRESSES = [(0.0, 0.0, 1.0), (6.0, 2.0, 0.5), (-5.0, 3.0, 2.0), (2.0, -6.0, 0.2), (5.0, -3.5, 0.1)]
@@ -76,8 +78,7 @@ def open_page(chromium, free_port):
     def start():
         contexts.append(chromium.new_context(viewport={"width": 1280, "height": 820}))
         page = contexts[-1].new_page()
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+        complaints.append(errors_of(page))
         page.goto(f"http://127.0.0.1:{free_port}/", timeout=120_000)
         wait_for(page, "isocharge.page.film?.history.latest != null")
         return page
@@ -85,7 +86,9 @@ def open_page(chromium, free_port):
     yield start
     for context in contexts:
         context.close()
-    assert [text for text in complaints if not re.search(r"ERR_CONNECTION|WebSocket|Failed to load", text)] == []
+    assert [
+        text for text in chain(*complaints) if not re.search(r"ERR_CONNECTION|WebSocket|Failed to load", text)
+    ] == []
 
 
 def wait_for(page, expression, timeout_s=40.0):

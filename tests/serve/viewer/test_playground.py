@@ -12,6 +12,7 @@ from isocharge.serve.viewer.playground_page import MODELS, playground_html
 from isocharge.simulate import Circle, load_sensor, press, touch_charge
 from kept import ROOT
 from playground_film import FORCE_RANGE_N, coefficients, stress_series
+from serve.viewer.conftest import errors_of
 
 MAX_SIZE_BYTES = 1_000_000
 SERIES = ROOT / "serve/isocharge/serve/viewer/playground/film-25um.json"
@@ -59,9 +60,7 @@ def open_page(chromium, file):
         viewport = {"width": width, "height": height}
         context = chromium.new_context(viewport=viewport, offline=True, bypass_csp=bypass_csp, **options)
         page = context.new_page()
-        page.errors, page.requests = [], []
-        page.on("pageerror", lambda error: page.errors.append(str(error)))
-        page.on("console", lambda message: page.errors.append(message.text) if message.type == "error" else None)
+        page.errors, page.requests = errors_of(page), []
         page.on("request", lambda request: page.requests.append(request.url))
         page.goto(file.as_uri())
         page.locator("#verdict .text:not(:empty)").wait_for()
