@@ -57,15 +57,22 @@ def run(capfd):
 
 
 @pytest.fixture
-def recorded(frames, models, run, tmp_path):
-    """A recording of these frames, and the lines that were printed."""
-    path = tmp_path / "touch.rec"
-    return path, run("stream", "linear", "--port", frames, "--models", models, "--record", path).stdout
+def stream(run, models):
+    """A function that runs `serve stream` with the linear model and a port."""
+    return lambda port, *words: run("stream", "linear", "--port", port, "--models", models, *words)
 
 
 @pytest.fixture
-def start(start_command):
-    return partial(start_command, "serve")
+def recorded(frames, stream, tmp_path):
+    """A recording of these frames, and the lines that were printed."""
+    path = tmp_path / "touch.rec"
+    return path, stream(frames, "--record", path).stdout
+
+
+@pytest.fixture
+def start_stream(start_command, models):
+    """A function that starts `serve stream` with the linear model and a port in a new process."""
+    return partial(start_command, "serve", "stream", "linear", "--models", models, "--port")
 
 
 @pytest.fixture

@@ -96,15 +96,15 @@ def test_check_refuses_with_the_reason(measured, models, refused, option, value,
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_stream_ends_cleanly_at_sigint_and_sigterm(board_until, models, run, number):
+def test_stream_ends_cleanly_at_sigint_and_sigterm(board_until, stream, number):
     with board_until(400, lambda: interrupt(number)) as board:
-        result = run("stream", "linear", "--port", board.url, "--models", models)
+        result = stream(board.url)
     assert len(records_of(result.stdout)) > 0
     assert " frames, 0 lost" in result.stderr.splitlines()[-1]
 
 
-def test_stream_ends_cleanly_when_the_pipe_closes(board, models, start):
-    process = start("stream", "linear", "--port", board.url, "--models", models)
+def test_stream_ends_cleanly_when_the_pipe_closes(board, start_stream):
+    process = start_stream(board.url)
     process.stdout.readline()
     process.stdout.close()
     assert process.wait(timeout=60) == 0
@@ -114,23 +114,23 @@ def test_stream_ends_cleanly_when_the_pipe_closes(board, models, start):
 @pytest.mark.parametrize(
     ("stop", "exit_code"), [(("--seconds", 0.2), 1), ((), 0)], ids=["option --seconds", "Ctrl-C or SIGTERM"]
 )
-def test_stream_that_waits_for_its_port_can_be_stopped(models, tmp_path, run, stop, exit_code):
+def test_stream_that_waits_for_its_port_can_be_stopped(tmp_path, stream, stop, exit_code):
     ctrl_c = threading.Timer(0.3, interrupt)
     if not stop:
         ctrl_c.start()
     start_s = time.monotonic()
-    words = ("--output", tmp_path / "x.csv", "--wait", 30, *stop)
-    result = run("stream", "linear", "--port", tmp_path / "film", "--models", models, *words)
+    result = stream(tmp_path / "film", "--output", tmp_path / "x.csv", "--wait", 30, *stop)
     assert result.exit_code == exit_code
     assert f"{tmp_path / 'film'}: the command was stopped before the port was open" in result.stderr
     assert time.monotonic() - start_s < 10.0
     assert list(tmp_path.iterdir()) == []
 
 
-def test_stream_writes_a_record_for_each_frame_and_replay_repeats_them_at_their_pace(board, models, tmp_path, run):
-    path, words = tmp_path / "touch.rec", ["--name", "left, \u00fc"]
-    words += ["--count", 1000, "--models", models]
-    streamed = run("stream", "linear", "--port", board.url, "--record", path, *words)
+def test_stream_writes_a_record_for_each_frame_and_replay_repeats_them_at_their_pace(
+    board, models, tmp_path, stream, run
+):
+    path = tmp_path / "touch.rec"
+    streamed = stream(board.url, "--record", path, "--name", "left, \u00fc", "--count", 1000)
     records = records_of(streamed.stdout)
     assert {record["frame_id"] for record in records} == {"left, \u00fc"}
     assert [record["seq"] - records[0]["seq"] for record in records] == list(range(1000))
@@ -143,25 +143,25 @@ def test_stream_writes_a_record_for_each_frame_and_replay_repeats_them_at_their_
     assert time.monotonic() - began > 0.2  # 50 chunks of 10 ms
 
 
-def test_stream_that_ends_without_a_tare_says_why(models, tmp_path, run):
+def test_stream_that_ends_without_a_tare_says_why(tmp_path, stream):
     path = tmp_path / "offset.txt"
     path.write_text("A,B,C\n" + "300.0,1.0,2.0\n" * 150)
-    streamed = run("stream", "linear", "--port", path, "--models", models)
+    streamed = stream(path)
     assert {tuple(record["flags"]) for record in records_of(streamed.stdout)} == {("tare",)}
     assert "caution: no tare" in streamed.stderr
     assert "A 300.00 pC, B 1.00 pC, C 2.00 pC" in streamed.stderr
 
 
 @pytest.mark.parametrize("name", ["", "a\nb"])
-def test_option_name_refuses_empty_and_unprintable_names(models, run, name):
+def test_option_name_refuses_empty_and_unprintable_names(stream, name):
     with pytest.raises(InputError, match="--name: expected printable characters"):
-        run("stream", "linear", "--port", "p", "--models", models, "--name", name)
+        stream("p", "--name", name)
 
 
-def test_a_recording_that_was_killed_is_readable(board, models, start, tmp_path, run):
+def test_a_recording_that_was_killed_is_readable(board, models, start_stream, tmp_path, run):
     """It lacks at most the records of the chunk that was being made."""
     path = tmp_path / "touch.rec"
-    process = start("stream", "linear", "--port", board.url, "--record", path, "--models", models)
+    process = start_stream(board.url, "--record", path)
     lines = [process.stdout.readline() for _ in range(1000)]
     process.kill()
     process.wait()
@@ -170,13 +170,12 @@ def test_a_recording_that_was_killed_is_readable(board, models, start, tmp_path,
     assert replayed[:1000] == lines[: len(replayed)]
 
 
-def test_sigusr1_requests_a_new_tare(models, run):
+def test_sigusr1_requests_a_new_tare(stream):
     rest = lambda level, count: [(level, level + 1.0, level + 2.0)] * count  # noqa: E731
     signals = (interrupt(signal.SIGUSR1) for _ in range(1))
     rows = chain(rest(0.0, 400), filter(None, signals), rest(5.0, 400))
     with TcpBoard(rows) as board:
-        words = ["--count", 680, "--models", models]
-        records = records_of(run("stream", "linear", "--port", board.url, *words).stdout)
+        records = records_of(stream(board.url, "--count", 680).stdout)
     assert records[150]["tare_pC"] == {"A": 0.0, "B": 1.0, "C": 2.0}
     assert records[-1]["tare_pC"]["A"] > 3.0
 
@@ -302,13 +301,11 @@ def test_stream_continues_with_closed_stderr(models, presses):
     assert (done.returncode, done.stdout.count("\n")) == (0, 3)
 
 
-def test_a_slow_reader_stops_neither_chain_nor_recording(models, film, tmp_path, start):
+def test_a_slow_reader_stops_neither_chain_nor_recording(film, tmp_path, start_stream):
     """It takes nothing at first: what it missed is counted, and the recording has everything."""
     recording, count = tmp_path / "touch.rec", 16_000
     with TcpBoard(taps(film), rate_Hz=5000.0) as board:
-        process = start(
-            *("stream", "linear", "--port", board.url, "--models", models, "--record", recording, "--count", count)
-        )
+        process = start_stream(board.url, "--record", recording, "--count", count)
         lines, end = [process.stdout.readline()], time.monotonic() + 120
         while recording.read_bytes().count(b'"seq"') < 11_500 and time.monotonic() < end:
             time.sleep(0.1)  # more than the queue and the pipe hold
@@ -323,8 +320,8 @@ def test_a_slow_reader_stops_neither_chain_nor_recording(models, film, tmp_path,
     assert lines[-1]["seq"] == recorded[-1]  # the newest are there, the oldest are not
 
 
-def test_stream_ends_if_its_stdout_is_never_read(models, board, start):
-    process = start("stream", "linear", "--port", board.url, "--models", models, "--seconds", 1)
+def test_stream_ends_if_its_stdout_is_never_read(board, start_stream):
+    process = start_stream(board.url, "--seconds", 1)
     assert process.wait(60) == 0
     assert "records not written, the oldest" in process.stderr.read()
 

@@ -125,12 +125,6 @@ def test_reason_of_a_press_is_not_its_release():
     assert re.search(r"released after .* the charge of . changes by -\d+ pC per second", reason)
 
 
-def test_press_of_a_trembling_hand_is_taken():
-    """The charge varies by 1 % at 9 Hz, and its mean is nevertheless correct."""
-    (press,) = taken_presses(watch_presses(rest(1), held(4, lambda t: 1 + 0.014 * math.sin(56.0 * t))))
-    np.testing.assert_allclose(press.charge_pC, PRESS, rtol=0.005)
-
-
 def test_press_without_a_rest_before_it_is_refused():
     """The charge at rest before the touch is unknown, so the touch charge could have any error."""
     results = watch_presses(rest(1), held(2), rest(0.05), held(2), rest(1))
