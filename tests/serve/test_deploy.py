@@ -111,6 +111,12 @@ def test_triton_is_started_with_the_backend_for_onnx_beside_its_own(monkeypatch,
 
 SYSTEMD = DEPLOY / "systemd"
 PROGRAM = str(Path(sys.executable).with_name("isocharge"))
+UNITS = [
+    ["isocharge.service"],
+    ["isocharge.service", "isocharge.service.d/tls.conf"],
+    ["isocharge-stream.service"],
+]
+"""Units, with their drop-ins."""
 
 
 def installed_unit(folder, names):
@@ -130,14 +136,7 @@ def analyze(*words):
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze")
-@pytest.mark.parametrize(
-    "names",
-    [
-        ["isocharge.service"],
-        ["isocharge.service", "isocharge.service.d/tls.conf"],
-        ["isocharge-stream.service"],
-    ],
-)
+@pytest.mark.parametrize("names", UNITS)
 def test_systemd_analyze_accepts_the_units(tmp_path, names):
     unit = installed_unit(tmp_path, names)
     assert analyze("verify", unit) == (0, "")
@@ -149,8 +148,7 @@ def test_systemd_analyze_accepts_the_units(tmp_path, names):
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze")
 def test_the_page_states_the_exposure_of_the_units(tmp_path):
     page = (ROOT / "serve/docs/systemd.md").read_text("utf-8")
-    tls = ["isocharge.service", "isocharge.service.d/tls.conf"]
-    for number, names in enumerate((tls, tls[:1], ["isocharge-stream.service"])):
+    for number, names in enumerate(UNITS):
         folder = tmp_path / str(number)
         folder.mkdir()
         _, report = analyze("security", "--offline=true", installed_unit(folder, names))

@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from isocharge.simulate import Circle, Film, deflection, press
 from isocharge.simulate.sensor.sensor_file import film_to_dict
 
 VIEWER = Path(str(files("isocharge.serve.viewer")))
+FILM = Film(radius=45.0, thickness=0.025, young=3000.0, poisson=0.34)
 
 
 def test_electrode_polygons_include_the_calibration(film):
@@ -83,16 +85,17 @@ def test_page_decodes_the_samples_of_the_server(record):
 
 
 @pytest.mark.parametrize(
-    ("film", "largest_error"),
+    ("changes", "largest_error"),
     [
-        (Film(radius=45.0, thickness=0.025, young=3000.0, poisson=0.34), 0.1),
-        (Film(radius=45.0, thickness=0.025, young=3000.0, poisson=0.34, pretension=1.5), 0.13),
-        (Film(radius=45.0, thickness=0.11, young=3000.0, poisson=0.34), 0.15),
-        (Film(radius=45.0, thickness=1.0, young=3000.0, poisson=0.34), 0.3),
+        ({}, 0.1),
+        ({"pretension": 1.5}, 0.13),
+        ({"thickness": 0.11}, 0.15),
+        ({"thickness": 1.0}, 0.3),
     ],
 )
-def test_deflection_that_the_page_draws_is_near_that_of_the_solver(film, largest_error):
+def test_deflection_that_the_page_draws_is_near_that_of_the_solver(changes, largest_error):
     """The error is compared with the largest deflection of each press."""
+    film = replace(FILM, **changes)
     rng = np.random.default_rng(0)
     for distance_mm, force_N in ((0.0, 0.3), (12.0, 2.0), (20.0, 0.05)):
         radius_mm = 44.0 * np.sqrt(rng.random(200))
@@ -110,13 +113,7 @@ def test_deflection_that_the_page_draws_is_near_that_of_the_solver(film, largest
 
 
 def test_sheet_of_the_page_has_the_deflection_of_its_places():
-    film = {
-        "radius_mm": 45.0,
-        "thickness_um": 25.0,
-        "young_GPa": 3.0,
-        "poisson": 0.34,
-        "pretension_MPa": [1.0, 2.0, 0.1],
-    }
+    film = film_to_dict(FILM) | {"pretension_MPa": [1.0, 2.0, 0.1]}
     got = node(
         f"""import {{ Deflection }} from "{(VIEWER / "page/deflection.js").as_uri()}";
         const field = new Deflection({json.dumps(film)}, 1.0, 2.0), flat = field.at(1, 1);
