@@ -2,12 +2,12 @@
 
 import json
 import re
-import signal
 import socket
 import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import grpc
 import pytest
@@ -30,44 +30,34 @@ REQUEST = b"POST %s HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/jso
 )
 
 
-class Server:
-    """A server process, its ports, and what it says on stderr."""
-
-    def __init__(self, folder):
-        self.errors = (folder / "stderr").open("w+")
-        command = [sys.executable, "-m", "isocharge.cli", "serve", "http", "--models", MODELS, "--port", "0"]
-        self.process = subprocess.Popen(
-            [*map(str, command), "--grpc-port", "0"], stdout=subprocess.PIPE, stderr=self.errors, text=True
-        )
-        urls = [self.process.stdout.readline().strip() for _ in range(2)]
-        self.http, self.grpc = (("127.0.0.1", int(url.rpartition(":")[2])) for url in urls)
-
-    def resident_bytes(self):
-        return int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1]) * 4096
-
-    def end(self):
-        self.process.send_signal(signal.SIGTERM)
-        code = self.process.wait(30)
-        self.process.stdout.close()
-        self.errors.seek(0)
-        message = self.errors.read()
-        self.errors.close()
-        assert (code, "Traceback" in message) == (0, False), message
-
-
 @pytest.fixture(scope="module")
 def server(tmp_path_factory):
-    server = Server(tmp_path_factory.mktemp("wire"))
-    yield server
-    server.end()
+    """The ports and the process of a server, which ends cleanly and writes no traceback."""
+    command = [sys.executable, "-m", "isocharge.cli", "serve", "http", "--port", "0", "--grpc-port", "0"]
+    with (
+        (tmp_path_factory.mktemp("wire") / "stderr").open("w+") as errors,
+        subprocess.Popen([*command, "--models", MODELS], stdout=subprocess.PIPE, stderr=errors, text=True) as process,
+    ):
+        urls = [process.stdout.readline().strip() for _ in range(2)]
+        http_place, grpc_place = (("127.0.0.1", int(url.rpartition(":")[2])) for url in urls)
+        yield SimpleNamespace(http=http_place, grpc=grpc_place, pid=process.pid)
+        process.terminate()
+        code = process.wait(30)
+        errors.seek(0)
+        message = errors.read()
+    assert (code, "Traceback" in message) == (0, False), message
+
+
+def resident_bytes(server):
+    return int(Path(f"/proc/{server.pid}/statm").read_text().split()[1]) * 4096
 
 
 @pytest.fixture(autouse=True)
 def bounded_memory(server):
     """No attack of this part may cost the server more than 200 MB."""
-    before = server.resident_bytes()
+    before = resident_bytes(server)
     yield
-    assert server.resident_bytes() - before < 200e6
+    assert resident_bytes(server) - before < 200e6
 
 
 def send(place, data, timeout=60.0):
