@@ -221,8 +221,9 @@ def start_http(stopping):
     """
     started = []
 
-    def start(handler, *, tls=None, uds=None):
-        server = HttpServer(handler, Address(uds=uds), handler.limits, handler.traffic, tls=tls)
+    def start(app, *, tls=None, uds=None):
+        settings = (app.limits, app.traffic) if isinstance(app, Handler) else ()
+        server = HttpServer(app, Address(uds=uds), *settings, tls=tls)
         thread = Thread(target=server.run)
         thread.start()
         started.append((server, thread))

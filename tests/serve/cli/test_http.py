@@ -10,6 +10,7 @@ import pytest
 import tritonclient.grpc
 
 from infer_requests import BODY, INFER
+from one_request import send
 
 
 @pytest.fixture
@@ -18,15 +19,6 @@ def start(models, start_command):
         return start_command("serve", "http", "--models", folder, *words)
 
     return start
-
-
-def ask(url):
-    client = http.client.HTTPConnection(url.removeprefix("http://"), timeout=20)
-    client.request("POST", INFER, BODY)
-    answer = client.getresponse()
-    content = json.loads(answer.read())
-    client.close()
-    return answer.status, content
 
 
 def test_sighup_loads_all_models_again(start, film, tmp_path):
@@ -42,7 +34,7 @@ def test_sighup_loads_all_models_again(start, film, tmp_path):
     assert lines[0] == "serving linear/1; Ctrl-C stops\n"
     assert lines[1].startswith(f"refused: {tmp_path}/broken/1/golden.json: missing")
     assert lines[2] == "serving linear/1, linear/2, other/1; Ctrl-C stops\n"
-    assert ask(url)[1]["model_version"] == "2"
+    assert json.loads(send(url, "POST", INFER, BODY)[2])["model_version"] == "2"
     process.send_signal(signal.SIGTERM)
     assert process.wait(timeout=30) == 0
 
@@ -62,7 +54,7 @@ def test_stderr_of_log_json_has_only_lines_of_json(start, film, tmp_path):
 def test_server_answers_until_sigterm(start, number):
     process = start("--port", 0, "--grpc-port", 0)
     url, grpc_url = process.stdout.readline().strip(), process.stdout.readline().strip()
-    assert ask(url)[0] == 200
+    assert send(url, "POST", INFER, BODY)[0] == 200
     client = tritonclient.grpc.InferenceServerClient(grpc_url.removeprefix("grpc://"))
     assert client.is_model_ready("linear")
     client.close()
@@ -82,7 +74,7 @@ def test_killed_server_can_be_started_again_on_the_same_port(start):
         process.wait()
         again = start("--port", url.rpartition(":")[2])
         assert again.stdout.readline().strip() == url
-    assert ask(url)[0] == 200
+    assert send(url, "POST", INFER, BODY)[0] == 200
 
 
 def test_http_command_refuses_wrong_options_and_models(command, models, tmp_path):

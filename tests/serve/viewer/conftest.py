@@ -1,9 +1,7 @@
 """Fixtures that serve a live page, and send requests to it."""
 
-import http.client
 import json
 from contextlib import ExitStack
-from urllib.parse import urlsplit
 
 import pytest
 
@@ -12,6 +10,7 @@ from isocharge.serve.network.address import Address
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.viewer.film_description import describe_film
 from isocharge.serve.viewer.live_page import LivePage, serve_page
+from one_request import send
 
 
 @pytest.fixture(scope="module")
@@ -34,22 +33,16 @@ class Client:
 
     Attributes:
         page: The page; None if another process serves it.
-        place: Address of the page.
+        url: Address of the page.
     """
 
     def __init__(self, page, url):
         self.page = page
-        self.place = urlsplit(url)
+        self.url = url
 
     def send(self, method, path, content=None, **headers):
         """Send a request, and return the status, the headers and the body of the response."""
-        connection = http.client.HTTPConnection(self.place.netloc, timeout=20)
-        body = content if isinstance(content, str | bytes | None) else json.dumps(content)
-        connection.request(method, path, body, headers)
-        answer = connection.getresponse()
-        result = answer.status, answer.headers, answer.read()
-        connection.close()
-        return result
+        return send(self.url, method, path, content, **headers)
 
     def session(self):
         """Return the description of the film and of the samples."""

@@ -1,8 +1,7 @@
 """The ASGI application in a program of Starlette, as a user mounts it."""
 
-import http.client
 import json
-from threading import Thread
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,12 +11,11 @@ from starlette.routing import Mount, Route
 
 from infer_requests import BODY, INFER
 from isocharge.serve import asgi_app
-from isocharge.serve.network.address import Address
-from isocharge.serve.network.http import HttpServer
+from one_request import send
 
 
 @pytest.fixture
-def ask(models):
+def ask(models, start_http):
     """Return a function that sends a request to a program that mounts the models under `/touch`."""
     program = Starlette(
         routes=[
@@ -25,28 +23,14 @@ def ask(models):
             Mount("/touch", asgi_app(models, token="sesame")),
         ]
     )
-    server = HttpServer(program, Address())
-    thread = Thread(target=server.run)
-    thread.start()
-
-    def ask(method, path, body=None, **headers):
-        client = http.client.HTTPConnection(server.url.removeprefix("http://"), timeout=20)
-        client.request(method, path, body, headers)
-        answer = client.getresponse()
-        content = answer.read()
-        client.close()
-        return answer.status, content
-
-    yield ask
-    server.stop()
-    thread.join(20)
-    server.close()
+    return partial(send, start_http(program).url)
 
 
 def test_asgi_app_mounted_in_starlette_answers_under_its_path(ask, predictor):
-    assert ask("GET", "/") == (200, b"the program")
+    status, _, content = ask("GET", "/")
+    assert (status, content) == (200, b"the program")
     bearer = {"Authorization": "Bearer sesame"}
-    status, content = ask("POST", "/touch" + INFER, BODY, **bearer)
+    status, _, content = ask("POST", "/touch" + INFER, BODY, **bearer)
     assert status == 200
     contact = np.float32(json.loads(content)["outputs"][0]["data"])
     np.testing.assert_array_equal(contact, np.float32(predictor.predict([100.0, 200.0, 300.0])[:3]))
