@@ -32,24 +32,9 @@ def layout(keys):
 LAYOUTS = {path.stem: layout(path.read_text("utf-8")) for path in FOLDER.glob("*.toml")}
 
 
-def modbus_crc(data):
-    """Compute the CRC bit by bit, as described in the Modbus over serial line specification (V1.02, 6.2.2)."""
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ 0xA001 if crc & 1 else crc >> 1
-    return struct.pack("<H", crc)
-
-
-def x_25(data):
-    """Compute CRC-16/X-25 by the standard library.
-
-    The checksum is the CRC-16/CCITT-FALSE of the bytes in reversed bit order, in reversed bit order and inverted.
-    """
-    reversed_bytes = bytes(int(f"{byte:08b}"[::-1], 2) for byte in data)
-    crc = binascii.crc_hqx(reversed_bytes, 0xFFFF)
-    return int(f"{crc:016b}"[::-1], 2) ^ 0xFFFF
+def with_crc(name, body):
+    """Return a body and its checksum of 16 bits, which crcmod computes."""
+    return body + struct.pack("<H", mkPredefinedCrcFun(name)(body))
 
 
 ROBOTIQ_BODY = bytes.fromhex("20 4E") + struct.pack("<6h", 1234, -567, 89, 1000, -2000, 3)
@@ -60,7 +45,7 @@ BOTA_BODY = struct.pack("<H6fIf", 0, 1.5, -2.5, 3.5, 0.125, 0.25, -0.5, 123456, 
 @pytest.mark.parametrize(
     ("name", "data", "seq", "t_us", "values"),
     [
-        ("robotiq_ft300", ROBOTIQ_BODY + modbus_crc(ROBOTIQ_BODY), None, None, (12.34, -5.67, 0.89, 1.0, -2.0, 0.003)),
+        ("robotiq_ft300", with_crc("modbus", ROBOTIQ_BODY), None, None, (12.34, -5.67, 0.89, 1.0, -2.0, 0.003)),
         (
             "optoforce_omd",
             OPTOFORCE_BODY + struct.pack(">H", sum(OPTOFORCE_BODY) & 0xFFFF),
@@ -70,7 +55,7 @@ BOTA_BODY = struct.pack("<H6fIf", 0, 1.5, -2.5, 3.5, 0.125, 0.25, -0.5, 123456, 
         ),
         (
             "bota_sensone",
-            b"\xaa" + BOTA_BODY + struct.pack("<H", x_25(BOTA_BODY)),
+            b"\xaa" + with_crc("x-25", BOTA_BODY),
             None,
             123456,
             (1.5, -2.5, 3.5, 0.125, 0.25, -0.5, 23.5),
@@ -144,7 +129,7 @@ def test_numbers_of_three_bytes(a, b, c, order):
     """The checksum does not cover the sync, and has another byte order than the numbers."""
     described = layout(TRIPLES.format(order=order))
     body = a.to_bytes(3, order, signed=True) + b.to_bytes(3, order) + c.to_bytes(3, order, signed=True)
-    data = b"\xa5\x5a" + body + struct.pack("<H", mkPredefinedCrcFun("xmodem")(body))
+    data = b"\xa5\x5a" + with_crc("xmodem", body)
     (frame,) = SyncParser(described).feed(data)
     assert frame.values == (a, b / 2, c)
     assert encode_layout(described, frame) == data
