@@ -117,19 +117,25 @@ def number_bomb(rng, text):
 
 NUMBERS = ("1" * 23, "1" * 400, "1" * 5000, "1_0", "nan", "inf", "-inf", "1e999", "0x10", "true", "[]", "{}", "-0")
 
+
+def repeated(piece, before=b"", after=b""):
+    """Return a function that repeats a piece a given number of times between other bytes."""
+    return lambda count: before + piece * count + after
+
+
 BOMBS = (
-    lambda n: b"a = " + b"[" * n,
-    lambda n: b"a = " + b"{a = " * n,
-    lambda n: b"a." * n + b"a = 1",
-    lambda n: b"'a' . " * n + b"a = 1",
+    repeated(b"[", before=b"a = "),
+    repeated(b"{a = ", before=b"a = "),
+    repeated(b"a.", after=b"a = 1"),
+    repeated(b"'a' . ", after=b"a = 1"),
     lambda n: b"".join(b"[s%d]\n" % k for k in range(n)),
     lambda n: b"[electrodes]\nside_mm = 3\n" + b"".join(b"e%d = [0, 0]\n" % k for k in range(n)),
-    lambda n: b'{"a":' * n,
+    repeated(b'{"a":'),
     lambda n: b"[" * n + b"]" * n,
-    lambda n: b"c," * n + b"\n",
+    repeated(b"c,", after=b"\n"),
     lambda n: b"A,B,C\n" + b"1,2,3\n" * (n // 10) + b"x\n",
-    lambda n: b'"' * n,
-    lambda n: b"\n" * n,
+    repeated(b'"'),
+    repeated(b"\n"),
     bytes,
 )
 

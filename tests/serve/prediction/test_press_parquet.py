@@ -30,11 +30,9 @@ CSV = "x_mm,y_mm,force_N,A,B,C\n1,3,0.5,100.5,-1,1\n2,4,1,,2,2\n,,2,3,3,3\n"
 def write(tmp_path):
     """Write columns, with some of them replaced, as `p.parquet`, and return the path."""
 
-    def write(changes=None, *, names=None, **options):
-        path = tmp_path / "p.parquet"
-        columns = COLUMNS | (changes or {})
-        write_table(pyarrow.table(list(columns.values()), names=names or list(columns)), path, **options)
-        return path
+    def write(**changes):
+        write_table(pyarrow.table(COLUMNS | changes), tmp_path / "p.parquet")
+        return tmp_path / "p.parquet"
 
     return write
 
@@ -59,13 +57,13 @@ def expected(tmp_path):
 )
 def test_numbers_of_every_type_are_exact(write, column):
     """Python rounds an integer and a decimal to the nearest float64."""
-    charge = read_presses(write({"A": column}), NAMES).charge_pC[:, 0]
+    charge = read_presses(write(A=column), NAMES).charge_pC[:, 0]
     given = [np.nan if value is None else float(value) for value in column.to_pylist()]
     np.testing.assert_array_equal(charge, given)
 
 
 def test_ignored_columns_may_have_any_type(write, expected):
-    presses = read_presses(write({"more": pyarrow.array([{"A": 1, "B": None}, None, {}])}), NAMES)
+    presses = read_presses(write(more=pyarrow.array([{"A": 1, "B": None}, None, {}])), NAMES)
     np.testing.assert_equal(presses.columns, expected.columns)
     assert (presses.ignored, presses.lines, presses.row_noun) == (("more",), (1, 2, 3), "row")
 
@@ -81,11 +79,11 @@ def test_ignored_columns_may_have_any_type(write, expected):
 )
 def test_a_column_of_another_type_is_refused(write, column, message):
     with pytest.raises(PressError, match=rf"p\.parquet, {message}"):
-        read_presses(write({"B": column}), NAMES)
+        read_presses(write(B=column), NAMES)
 
 
 def test_charges_and_lists_of_presses(write, caplog):
-    path = write({"A": [1.0, 2.0, 3.0]})
+    path = write(A=[1.0, 2.0, 3.0])
     np.testing.assert_array_equal(read_charge_file(path, ("B", "A")), [[-1, 1], [2, 2], [3, 3]])
     assert caplog.messages == [f"{path}: ignored columns: ['x_mm', 'y_mm', 'force_N', 'C']"]
     with pytest.raises(ChargeError, match=r"p\.parquet, row 2, column 'A': expected a charge in pC, got an empty cell"):
