@@ -43,10 +43,10 @@ def noise_text(white_pC="1", gain="0.002"):
     return f'{{"name": "mine", "white_pC": {white_pC}, "gain": {gain}}}'
 
 
-def write(film, folder, *, onnx=None, metadata=None, golden=None):
-    metadata = metadata or film.metadata()
-    onnx = film.onnx(film.metadata().to_props()) if onnx is None else onnx
-    return write_model(folder, onnx, metadata, film.golden_pC() if golden is None else golden, "card")
+def write(film, folder, **changes):
+    metadata = film.metadata()
+    arguments = {"onnx": film.onnx(metadata.to_props()), "metadata": metadata, "golden": film.golden_pC()} | changes
+    return write_model(folder, *arguments.values(), "card")
 
 
 def wrong_arguments(film):
