@@ -11,6 +11,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
+from drawn_contacts import draw_contacts
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve import Predictor
 from isocharge.serve.flags import STRESS
@@ -48,47 +49,31 @@ SECOND_FINGER_FORCE_N = (0.1, 1.0)
 """Range of the force of the second finger, N."""
 
 
-@dataclass(frozen=True)
-class FilmCharges:
-    """Charges of presses on the film that is built in, and on films and with probes that differ from it.
+def film_map(probe_radius_mm: float = 1.0, **changes: float) -> ForwardMap:
+    """Build the forward map of the built-in film under a round probe; by default, that of the released models.
 
-    Attributes:
-        nominal: Forward map of the film and the probe of the released models.
-        variants: Forward maps of another probe or film, by the name of the fault.
+    Args:
+        probe_radius_mm: Radius of the probe, mm.
+        changes: Other values of attributes of the film.
     """
-
-    nominal: ForwardMap
-    variants: dict[str, ForwardMap]
-
-    def for_sensor(self, sensor: Sensor) -> "FilmCharges":
-        """Return the charges that another sensor collects on the same films."""
-
-        def with_electrodes(forward_map: ForwardMap) -> ForwardMap:
-            film = forward_map.sensor.film
-            return replace(forward_map, sensor=replace(sensor, film=film))
-
-        variants = {name: with_electrodes(forward_map) for name, forward_map in self.variants.items()}
-        return FilmCharges(with_electrodes(self.nominal), variants)
-
-
-def nominal_map(radius: float = FILM_RADIUS_mm) -> ForwardMap:
-    """Build the forward map of the built-in film under the probe of the released models."""
-    return ForwardMap.build(load_sensor(FILM_SENSOR), Circle(1.0), radius, FORCE_RANGE_N)
-
-
-def film_charges() -> FilmCharges:
-    """Build the forward maps of the nominal film and of every variant."""
     sensor = load_sensor(FILM_SENSOR)
-    film = sensor.film
-    thicker = replace(sensor, film=replace(film, thickness=1.1 * film.thickness))
-    taut = replace(sensor, film=replace(film, pretension=0.5))
-    variants = {
-        "probe of 2 mm radius": ForwardMap.build(sensor, Circle(2.0), FILM_RADIUS_mm, FORCE_RANGE_N),
-        "probe of 4 mm radius": ForwardMap.build(sensor, Circle(4.0), FILM_RADIUS_mm, FORCE_RANGE_N),
-        "film 10 % thicker": ForwardMap.build(thicker, Circle(1.0), FILM_RADIUS_mm, FORCE_RANGE_N),
-        "pretension of 0.5 MPa": ForwardMap.build(taut, Circle(1.0), FILM_RADIUS_mm, FORCE_RANGE_N),
+    changed = replace(sensor, film=replace(sensor.film, **changes))
+    return ForwardMap.build(changed, Circle(probe_radius_mm), FILM_RADIUS_mm, FORCE_RANGE_N)
+
+
+def film_variants() -> dict[str, ForwardMap]:
+    """Build the forward maps of another probe or film, by the name of the fault."""
+    return {
+        "probe of 2 mm radius": film_map(2.0),
+        "probe of 4 mm radius": film_map(4.0),
+        "film 10 % thicker": film_map(thickness=1.1 * load_sensor(FILM_SENSOR).film.thickness),
+        "pretension of 0.5 MPa": film_map(pretension=0.5),
     }
-    return FilmCharges(nominal_map(), variants)
+
+
+def with_electrodes(forward_map: ForwardMap, sensor: Sensor) -> ForwardMap:
+    """Return the charges that another sensor collects on the same film."""
+    return replace(forward_map, sensor=replace(sensor, film=forward_map.sensor.film))
 
 
 @dataclass(frozen=True)
@@ -138,22 +123,23 @@ class FaultStudy:
 
     Args:
         model: Name of the released model, which is also the name of its sensor.
-        charges: Charges of the nominal film and of its variants.
+        nominal: Forward map of the film and the probe of the released models.
+        variants: Forward maps of another probe or film, by the name of the fault.
         presses: Number of presses.
         seed: Seed of the presses, the noise and the faults.
     """
 
-    def __init__(self, model: str, charges: FilmCharges, presses: int, seed: int) -> None:
+    def __init__(
+        self, model: str, nominal: ForwardMap, variants: dict[str, ForwardMap], presses: int, seed: int
+    ) -> None:
         self.predictor = Predictor(model)
-        self.charges = charges.for_sensor(load_sensor(model))
+        sensor = load_sensor(model)
+        self.nominal = with_electrodes(nominal, sensor)
+        self.variants = {name: with_electrodes(variant, sensor) for name, variant in variants.items()}
         self.rng = np.random.default_rng(seed)
         self.radius_mm = math.sqrt(self.predictor.validity.inscribed_radius_squared_mm2)
-        self.contact = self.presses_between(0.0, self.radius_mm, presses)
-        self.clean_charge = self.charges.nominal.charges(self.contact)
-
-    def presses_between(self, inner_mm: float, outer_mm: float, count: int) -> Array:
-        """Draw contacts uniform over a ring with log-uniform forces, shape (count, 3), mm and N."""
-        return contacts_between(self.rng, inner_mm, outer_mm, count, FORCE_RANGE_N)
+        self.contact = draw_contacts(self.rng, presses, self.radius_mm, FORCE_RANGE_N)
+        self.clean_charge = self.nominal.charges(self.contact)
 
     def shares(self, contact: Array, charge: Array) -> Shares:
         """Add noise, predict, and count.
@@ -193,12 +179,10 @@ class FaultStudy:
 
         The charges of two presses are added, which is exact for a taut film and approximate for a slack one.
         """
-        second = self.presses_between(0.0, self.radius_mm, len(self.contact))
-        low, high = np.log(SECOND_FINGER_FORCE_N)
-        second[:, 2] = np.exp(self.rng.uniform(low, high, len(second)))
+        second = draw_contacts(self.rng, len(self.contact), self.radius_mm, SECOND_FINGER_FORCE_N)
         distance = np.hypot(second[:, 0] - self.contact[:, 0], second[:, 1] - self.contact[:, 1])
         apart = distance > SECOND_FINGER_DISTANCE_mm
-        charge = self.clean_charge[apart] + self.charges.nominal.charges(second[apart])
+        charge = self.clean_charge[apart] + self.nominal.charges(second[apart])
         return self.contact[apart], charge
 
     def results(self) -> dict[str, Shares]:
@@ -221,7 +205,7 @@ class FaultStudy:
         for offset_pC in (10.0, 30.0):
             results[f"warmth of {offset_pC:g} pC"] = self.average([clean + offset_pC, clean - offset_pC])
         results["two fingers"] = self.shares(*self.of_two_fingers())
-        for name, forward_map in self.charges.variants.items():
+        for name, forward_map in self.variants.items():
             results[name] = self.shares(contact, forward_map.charges(contact))
         return results
 

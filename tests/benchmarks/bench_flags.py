@@ -15,7 +15,7 @@ from shared import arguments, markdown_table, print_results
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from press_faults import FaultStudy, Shares, film_charges
+from press_faults import FaultStudy, Shares, film_map, film_variants
 
 RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial"
 
@@ -35,8 +35,11 @@ def percent(share: float) -> str:
 def main() -> None:
     requested = arguments(__doc__, models=RELEASED, presses=4000, seed=1, json=False)
     models = requested.models.split(",")
-    charges = film_charges()
-    inside = {model: FaultStudy(model, charges, requested.presses, requested.seed).results() for model in models}
+    nominal = film_map()
+    variants = film_variants()
+    inside = {
+        model: FaultStudy(model, nominal, variants, requested.presses, requested.seed).results() for model in models
+    }
     if requested.json:
         results = {model: {fault: asdict(shares) for fault, shares in rows.items()} for model, rows in inside.items()}
         print_results("flags", requested, results)

@@ -7,14 +7,14 @@ import time
 from pathlib import Path
 
 import pytest
+from tests.simulate.conftest import COARSE
 
 from isocharge.common.errors import OutputExists
 from isocharge.common.progress import listening
-from isocharge.simulate import Circle, Resolution, SolveSettings, Sweep, Theory, load_sensor, run_sweep
+from isocharge.simulate import Circle, Sweep, load_sensor, run_sweep
 from isocharge.simulate.forward import forward_map
 
 SENSOR = load_sensor("three-25um-biaxial")
-QUICK = SolveSettings(theory=Theory(bending=False), resolution=Resolution(4, 8, 4))
 SWEEP = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7, outside=15)
 
 
@@ -29,13 +29,13 @@ def test_interrupted_sweep_leaves_no_files(tmp_path, phase, count):
             raise Stopped
 
     with pytest.raises(Stopped), listening(listener):
-        run_sweep(tmp_path / "new" / "presses", SENSOR, (Circle(1.0),), SWEEP, QUICK, shard=10)
+        run_sweep(tmp_path / "new" / "presses", SENSOR, (Circle(1.0),), SWEEP, COARSE, shard=10)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_existing_folder_is_refused_before_the_computation(tmp_path):
     with pytest.raises(OutputExists, match="is already there"), listening(pytest.fail):
-        run_sweep(tmp_path, SENSOR, (Circle(1.0),), SWEEP, QUICK)
+        run_sweep(tmp_path, SENSOR, (Circle(1.0),), SWEEP, COARSE)
 
 
 DRIVER = """

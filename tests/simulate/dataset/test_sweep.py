@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.simulate.conftest import COARSE
 
 from isocharge.common.progress import listening
 from isocharge.simulate import (
@@ -13,7 +14,6 @@ from isocharge.simulate import (
     Polygon,
     Resolution,
     Sensor,
-    SolveSettings,
     Sweep,
     Theory,
     load_sensor,
@@ -27,9 +27,6 @@ from isocharge.simulate.dataset import sweep as sweep_module
 from isocharge.simulate.dataset.sweep import outside_map, write_sweep
 
 SENSOR = load_sensor("three-25um-biaxial")
-MEMBRANE = Theory(bending=False)
-QUICK = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
-"""Membrane theory on a coarse mesh. A small family is solved in half a second."""
 
 
 def small(samples: int = 60, **changes) -> Sweep:
@@ -43,8 +40,8 @@ class Spy:
 
     probe: Circle | Polygon
     sensor: Sensor = SENSOR
-    theory: Theory = MEMBRANE
-    resolution: Resolution = QUICK.resolution
+    theory: Theory = COARSE.theory
+    resolution: Resolution = COARSE.resolution
     solves: int = 3
     error: float = 1e-4
 
@@ -117,8 +114,8 @@ def test_run_sweep_writes_the_same_bytes_as_write_sweep_and_reports_progress(tmp
     """`run_sweep` stores its parts in a draft, and `write_sweep` does not. The datasets are equal."""
     reports: dict[str, list] = {}
     with listening(lambda title, done, total, _: reports.setdefault(title, []).append((done, total))):
-        drafted = run_sweep(tmp_path / "b" / "presses", SENSOR, (Circle(1.0),), small(), QUICK)
-    maps = [ForwardMap.build(SENSOR, Circle(1.0), 3.0, (1.0, 1.0), QUICK)]
+        drafted = run_sweep(tmp_path / "b" / "presses", SENSOR, (Circle(1.0),), small(), COARSE)
+    maps = [ForwardMap.build(SENSOR, Circle(1.0), 3.0, (1.0, 1.0), COARSE)]
     assert len(read_dataset(drafted).outside) == 50
     assert files(drafted) == files(write_sweep(tmp_path / "a" / "presses", maps, small()))
     assert [path.name for path in drafted.parent.iterdir()] == ["presses"]

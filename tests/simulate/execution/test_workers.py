@@ -13,21 +13,21 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from tests.simulate.conftest import COARSE
 
 from isocharge.common.errors import InputError, WorkersLost
 from isocharge.common.progress import listening
-from isocharge.simulate import Circle, Resolution, SolveSettings, Sweep, Theory, load_sensor, run_sweep
+from isocharge.simulate import Circle, Sweep, load_sensor, run_sweep
 from isocharge.simulate import execution as module
 from isocharge.simulate.execution import dask_workers, in_order, local_workers
 
 SENSOR = load_sensor("three-25um-biaxial")
-QUICK = SolveSettings(theory=Theory(bending=False), resolution=Resolution(4, 8, 4))
 SWEEP = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7, orientation="random", outside=15)
 
 
 def sweep_with(executor: Executor | None, target: Path) -> dict[str, bytes]:
     """The files of a small sweep of two probes in shards of ten."""
-    run_sweep(target, SENSOR, (Circle(1.0), Circle(2.0)), SWEEP, QUICK, executor=executor, shard=10)
+    run_sweep(target, SENSOR, (Circle(1.0), Circle(2.0)), SWEEP, COARSE, executor=executor, shard=10)
     return {path.name: path.read_bytes() for path in target.iterdir()}
 
 

@@ -3,15 +3,13 @@
 from dataclasses import replace
 
 import pytest
+from tests.simulate.conftest import COARSE
 
 from isocharge.simulate import (
     ChargeSpline,
     Circle,
     ForwardMap,
-    Resolution,
     Sensor,
-    SolveSettings,
-    Theory,
     load_sensor,
 )
 from kept import kept
@@ -31,9 +29,7 @@ def near_electrodes() -> Sensor:
 @pytest.fixture(scope="session")
 def near_map(near_electrodes: Sensor) -> ForwardMap:
     """A forward map of a membrane with few solves. The probe can lie on the electrodes."""
-    theory = Theory(bending=False)
-    settings = SolveSettings(theory=theory, resolution=Resolution(4, 8, 4))
-    return kept(ForwardMap.build, near_electrodes, Circle(1.0), 5.0, (0.3, 1.0), settings)
+    return kept(ForwardMap.build, near_electrodes, Circle(1.0), 5.0, (0.3, 1.0), COARSE)
 
 
 @pytest.fixture(scope="session")

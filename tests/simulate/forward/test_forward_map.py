@@ -5,6 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from tests.simulate.conftest import COARSE
 
 from drawn_contacts import draw_contacts
 from isocharge.common.errors import SceneError, SolveError
@@ -30,9 +31,7 @@ from isocharge.simulate.forward.family import NODE_COUNTS, Family, NodeCount
 from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR
 from kept import kept
 
-MEMBRANE = Theory(bending=False)
-QUICK_SETTINGS = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
-QUICK = {"radius": 4.0, "force_range": (0.7, 1.0), "settings": QUICK_SETTINGS}
+QUICK = {"radius": 4.0, "force_range": (0.7, 1.0), "settings": COARSE}
 """A small family without bending: few and cheap solves."""
 TRACED = Electrode.of_square("A", (5.0, 0.0), 3.0).with_trace(((5.0, 0.0), (-2.0, -1.0), (-9.0, -30.0)), 0.5)
 """An electrode whose trace crosses the positions of the presses."""
@@ -212,7 +211,7 @@ def test_invalid_domains_raise_error(arguments, message):
 def test_unreachable_interpolation_error_raises_solve_error(monkeypatch):
     monkeypatch.setattr("isocharge.simulate.forward.forward_map.INTERPOLATION_ERROR", 1e-13)
     monkeypatch.setattr("isocharge.simulate.forward.family.NODE_COUNTS", NODE_COUNTS[:2])
-    settings = replace(QUICK_SETTINGS, resolution=Resolution(3, 8, 2))
+    settings = replace(COARSE, resolution=Resolution(3, 8, 2))
     with pytest.raises(SolveError, match=r"up to 4 mm and 1 N interpolates to .* only, expected 1e-13"):
         ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1.0), **{**QUICK, "settings": settings})
 

@@ -67,15 +67,15 @@ def test_holding_force_and_slip_are_reciprocal_to_the_deflection():
     film = taut("four-25um-biaxial", 0.8).film
     at = (6.0, 0.0)
 
+    def mean_under_probe(solved: Equilibrium, component: int) -> float:
+        mesh = solved.mesh
+        return float(film.radius * mesh.template.copies * mesh.geometry.load @ solved.field[:, component])
+
     def along_film(solved: Equilibrium) -> float:
-        geometry = solved.mesh.geometry
-        mean = solved.mesh.template.copies * geometry.load @ solved.field[:, 0]
-        return float(film.radius * solved.groups.squared_amplitude * mean)
+        return solved.groups.squared_amplitude * mean_under_probe(solved, 0)
 
     def into_film(solved: Equilibrium) -> float:
-        geometry = solved.mesh.geometry
-        mean = solved.mesh.template.copies * geometry.load @ solved.field[:, 2]
-        return float(film.radius * np.sqrt(solved.groups.squared_amplitude) * mean)
+        return np.sqrt(solved.groups.squared_amplitude) * mean_under_probe(solved, 2)
 
     step = 0.01
     by_force = [along_film(press(film, PROBE, at, 0.5 + sign * step, FULL)) for sign in (1.0, -1.0)]

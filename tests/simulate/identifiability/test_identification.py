@@ -5,15 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.simulate.conftest import COARSE
 
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate import (
     Circle,
     Electrode,
     ForwardMap,
-    Resolution,
-    SolveSettings,
-    Theory,
     identify,
     limits_at,
     load_sensor,
@@ -24,13 +22,11 @@ from kept import kept
 
 REFERENCE = noise_model("reference")
 SENSOR = load_sensor("three-25um-biaxial")
-MEMBRANE = Theory(bending=False)
 
 
 @pytest.fixture(scope="module")
 def film() -> ForwardMap:
-    settings = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 4))
-    return kept(ForwardMap.build, load_sensor("four-25um-uniaxial"), Circle(2.0), 5.0, (0.05, 2.0), settings)
+    return kept(ForwardMap.build, load_sensor("four-25um-uniaxial"), Circle(2.0), 5.0, (0.05, 2.0), COARSE)
 
 
 @pytest.fixture(scope="module")

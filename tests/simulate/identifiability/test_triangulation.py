@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from tests.simulate.conftest import COARSE
 
 from drawn_contacts import draw_contacts
 from isocharge.common.errors import SceneError
@@ -13,9 +14,6 @@ from isocharge.simulate import (
     ForwardMap,
     FunctionMap,
     Polygon,
-    Resolution,
-    SolveSettings,
-    Theory,
     Triangulation,
     load_sensor,
     noise_model,
@@ -24,7 +22,6 @@ from kept import kept
 
 RADIUS = 8.0
 FORCES = (0.2, 2.0)
-QUICK = SolveSettings(theory=Theory(bending=False), resolution=Resolution(4, 8, 4))
 LAYOUTS = {name: load_sensor(f"{name}-25um-biaxial") for name in ("three", "four")}
 CENTRES = {name: np.array([electrode.centre for electrode in sensor.electrodes]) for name, sensor in LAYOUTS.items()}
 
@@ -62,7 +59,7 @@ def test_triangulation_agrees_with_least_squares_of_scipy():
 
 @pytest.fixture(scope="module")
 def triangle_map() -> ForwardMap:
-    return kept(ForwardMap.build, LAYOUTS["three"], Polygon.triangle(4.0), 8.0, (1.0, 1.0), QUICK)
+    return kept(ForwardMap.build, LAYOUTS["three"], Polygon.triangle(4.0), 8.0, (1.0, 1.0), COARSE)
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +101,7 @@ def test_contours_that_meet_twice_have_no_contact():
 
 def test_charge_map_with_folds_has_two_positions():
     """On a uniaxial film with three electrodes, two contacts with different forces may have the same charges."""
-    charge_map = kept(ForwardMap.build, load_sensor("three-25um-uniaxial"), Circle(1.0), 8.0, FORCES, QUICK)
+    charge_map = kept(ForwardMap.build, load_sensor("three-25um-uniaxial"), Circle(1.0), 8.0, FORCES, COARSE)
     contact = draw_contacts(8, 100, 7.0, FORCES)
     triangulation = Triangulation(ChargeSpline.of(charge_map, spacing=0.5))
     fix = triangulation.locate(charge_map.charges(contact))

@@ -59,8 +59,8 @@ def test_too_small_probe_raises_scene_error(film):
 
 
 @pytest.mark.parametrize("read", [deflection, touch_stress])
-def test_points_off_the_film_raise_scene_error(made_up, read):
-    solved = made_up(lambda x: np.zeros((len(x), 3)))
+def test_points_off_the_film_raise_scene_error(film, read):
+    solved = press(film, Circle(1.0), (0.0, 0.0), 1.0)
     for point in ((-40.0, 30.0), (np.nan, 0.0)):
         with pytest.raises(SceneError, match=rf"point \({point[0]:.4g}, .*\) mm is off the film of radius 45 mm"):
             read(solved, np.array([(0.0, 45.0), point]))
