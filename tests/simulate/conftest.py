@@ -1,6 +1,5 @@
 """Settings and fixtures that the tests of the simulator share: a film, forward maps and a dataset."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +8,7 @@ from isocharge.simulate import Circle, Film, ForwardMap, Resolution, SolveSettin
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.simulate.forward.derivative_maps import SideForceMap
 from kept import kept
+from solved_charges import with_film
 
 COARSE = SolveSettings(theory=Theory(bending=False), resolution=Resolution(4, 8, 4))
 """Membrane theory on a coarse mesh. A small family is solved in half a second."""
@@ -32,10 +32,8 @@ def taut_map() -> ForwardMap:
 
     The solution does not depend on the electrodes, so a test may replace the sensor by one with the same film.
     """
-    sensor = load_sensor("four-25um-biaxial")
-    return kept(
-        ForwardMap.build, replace(sensor, film=replace(sensor.film, pretension=0.8)), Circle(1.0), 8.0, (0.2, 1.0)
-    )
+    sensor = with_film(load_sensor("four-25um-biaxial"), pretension=0.8)
+    return kept(ForwardMap.build, sensor, Circle(1.0), 8.0, (0.2, 1.0))
 
 
 @pytest.fixture(scope="session")

@@ -21,6 +21,7 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
+from solved_charges import relative_error
 
 ORDERS = (3, 4, 5, 6)
 RECTANGLE = Polygon.rectangle(4.0, 2.0, 0.5)
@@ -65,7 +66,7 @@ def check(
         final_error: Largest relative error for the highest order of `ORDERS`.
     """
     *values, reference = map(output, solves)
-    errors = [np.abs(value - reference).max() / np.abs(reference).max() for value in values]
+    errors = [relative_error(value, reference) for value in values]
     assert -np.polyfit(ORDERS, np.log10(errors), 1)[0] > digits_per_order
     assert errors[-1] < final_error
 

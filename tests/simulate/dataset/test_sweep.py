@@ -18,13 +18,12 @@ from isocharge.simulate import (
     Theory,
     load_sensor,
     parse_probe,
-    press,
     read_dataset,
     run_sweep,
-    touch_charge,
 )
 from isocharge.simulate.dataset import sweep as sweep_module
 from isocharge.simulate.dataset.sweep import outside_map, write_sweep
+from solved_charges import solved_charge
 
 SENSOR = load_sensor("three-25um-biaxial")
 
@@ -67,8 +66,8 @@ def test_samples_contain_the_presses_and_their_charges(small_dataset):
         np.testing.assert_array_equal(column, expected)
     assert set(read.samples.probe) == {"circle:1.0"}
     for i in (0, 123, 499):
-        solved = press(read.sensor.film, Circle(1.0), (x[i], y[i]), force[i])
-        np.testing.assert_allclose(read.samples.charge_pC[i], touch_charge(read.sensor, solved), rtol=1e-3)
+        expected = solved_charge(read.sensor, Circle(1.0), (x[i], y[i]), force[i])
+        np.testing.assert_allclose(read.samples.charge_pC[i], expected, rtol=1e-3)
 
 
 def test_manifest_of_a_sweep(small_dataset, three_map):
@@ -96,8 +95,8 @@ def test_presses_outside_the_radius_reach_up_to_the_clamp(small_dataset):
     assert np.mean(distance < 25.0) == pytest.approx((25.0**2 - 8.0**2) / (42.8**2 - 8.0**2), abs=1e-3)
     assert np.mean(outside.force_N < np.sqrt(0.05 * 2.0)) == pytest.approx(0.5, abs=1e-3)
     for i in np.flatnonzero(distance < 30.0)[:3]:
-        solved = press(read.sensor.film, Circle(1.0), (outside.x_mm[i], outside.y_mm[i]), outside.force_N[i])
-        np.testing.assert_allclose(outside.charge_pC[i], touch_charge(read.sensor, solved), rtol=5e-3)
+        expected = solved_charge(read.sensor, Circle(1.0), (outside.x_mm[i], outside.y_mm[i]), outside.force_N[i])
+        np.testing.assert_allclose(outside.charge_pC[i], expected, rtol=5e-3)
     about = read.manifest["outside"]
     assert (about["samples"], about["probe"], about["radius_mm"]) == (16_384, "circle:1.0", [8.0, 42.8])
     assert about["interpolation_error"] == 0.05

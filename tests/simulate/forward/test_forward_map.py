@@ -23,13 +23,12 @@ from isocharge.simulate import (
     SolveSettings,
     Theory,
     load_sensor,
-    press,
-    touch_charge,
 )
 from isocharge.simulate.forward import forward_map as forward_map_module
 from isocharge.simulate.forward.family import NODE_COUNTS, Family, NodeCount
 from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR
 from kept import kept
+from solved_charges import solved_charge, with_film
 
 QUICK = {"radius": 4.0, "force_range": (0.7, 1.0), "settings": COARSE}
 """A small family without bending: few and cheap solves."""
@@ -53,7 +52,7 @@ def errors(forward_map: ForwardMap, contact: np.ndarray, rotation: np.ndarray | 
     sensor, settings, probe = forward_map.sensor, forward_map.settings, forward_map.probe
     expected = np.array(
         [
-            touch_charge(sensor, press(sensor.film, probe.rotated(angle), (x, y), force, settings))
+            solved_charge(sensor, probe.rotated(angle), (x, y), force, settings)
             for (x, y, force), angle in zip(contact.tolist(), np.broadcast_to(rotation, len(contact)), strict=True)
         ]
     )
@@ -94,9 +93,7 @@ def test_footprint_grows_with_the_cube_root_of_the_force(near_electrodes):
     contact, _ = draw(growing, 6, seed=3)
     expected = np.array(
         [
-            touch_charge(
-                sensor, press(sensor.film, Finger(2.0 * force ** (1.0 / 3.0)), (x, y), force, growing.settings)
-            )
+            solved_charge(sensor, Finger(2.0 * force ** (1.0 / 3.0)), (x, y), force, growing.settings)
             for x, y, force in contact.tolist()
         ]
     )
@@ -152,7 +149,7 @@ FILMS = {
 
 @pytest.mark.parametrize(("film", "surface", "theory"), FILMS.values(), ids=FILMS.keys())
 def test_forward_map_of_other_films(near_electrodes, film, surface, theory):
-    sensor = replace(near_electrodes, film=replace(near_electrodes.film, **film), surface=surface)
+    sensor = replace(with_film(near_electrodes, **film), surface=surface)
     forward_map = kept(ForwardMap.build, sensor, Circle(1.0), 2.0, (0.8, 1.0), SolveSettings(theory=theory))
     assert forward_map.theory.bending == (film != {"pretension": 0.5})
     assert errors(forward_map, draw(forward_map, 4, seed=7)[0]).max() < 1e-3
@@ -251,7 +248,7 @@ UNEVEN_FILMS = {
 )
 def test_maps_of_films_that_are_not_axisymmetric_agree_with_direct_solves(near_electrodes, changes, probe):
     """The presses lie in all directions from the centre, and a probe that is not round has random orientations."""
-    sensor = replace(near_electrodes, film=replace(near_electrodes.film, **changes))
+    sensor = with_film(near_electrodes, **changes)
     forward_map = kept(ForwardMap.build, sensor, probe, **QUICK | {"force_range": (1.0, 1.0)})
     contact, rotation = draw(forward_map, 10, seed=12)
     assert errors(forward_map, contact, 0.0 if probe.is_axisymmetric else rotation).max() < 1e-3
@@ -267,8 +264,7 @@ def test_maps_of_films_that_are_not_axisymmetric_agree_with_direct_solves(near_e
 @pytest.mark.slow
 def test_taut_film_with_a_ratio_of_three_between_its_pretensions_is_interpolated():
     """Under a small force, the pretension alone determines the charges, and they contain many harmonics."""
-    sensor = load_sensor("four-25um-biaxial")
-    taut = replace(sensor, film=replace(sensor.film, pretension=2.4, deviator=(1.2, 0.0)))
+    taut = with_film(load_sensor("four-25um-biaxial"), pretension=2.4, deviator=(1.2, 0.0))
     assert ForwardMap.build(taut, Circle(1.0), 8.0, (0.05, 0.05)).error <= INTERPOLATION_ERROR
 
 

@@ -1,7 +1,6 @@
 """Tests of the properties of real films: each changes what it names and nothing else."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,9 +11,9 @@ from isocharge.common.errors import SensorError
 from isocharge.simulate import Circle, FilmPrior, load_sensor, parse_probe
 from isocharge.simulate.sensor.film_properties import LARGEST_PRETENSION
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
+from solved_charges import with_film
 
-UNSTRETCHED = load_sensor("four-25um-biaxial")
-SENSOR = replace(UNSTRETCHED, film=replace(UNSTRETCHED.film, pretension=0.5))
+SENSOR = with_film(load_sensor("four-25um-biaxial"), pretension=0.5)
 PRIOR = FilmPrior(SENSOR, Circle(1.0))
 
 

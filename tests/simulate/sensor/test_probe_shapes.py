@@ -19,9 +19,9 @@ from isocharge.simulate import (
     deflection,
     load_sensor,
     press,
-    touch_charge,
 )
 from isocharge.simulate.numerics.polygon import area_of, to_corners
+from solved_charges import solved_charge
 
 SENSOR = load_sensor("three-25um-biaxial")
 MEMBRANE = Theory(bending=False)
@@ -122,8 +122,8 @@ def test_curved_probe_has_the_charges_of_a_polygon_with_many_corners(shape):
     corners = to_corners(boundary_points(shape.probe, 24))
     polygon = Polygon.of(corners * np.sqrt(shape.area / area_of(corners)))
     settings = SolveSettings(theory=MEMBRANE)
-    curved_charge = touch_charge(SENSOR, press(SENSOR.film, shape.probe, (5.0, 3.0), 1.0, settings))
-    polygon_charge = touch_charge(SENSOR, press(SENSOR.film, polygon, (5.0, 3.0), 1.0, settings))
+    curved_charge = solved_charge(SENSOR, shape.probe, (5.0, 3.0), 1.0, settings)
+    polygon_charge = solved_charge(SENSOR, polygon, (5.0, 3.0), 1.0, settings)
     np.testing.assert_allclose(curved_charge, polygon_charge, rtol=3e-4)
 
 

@@ -17,6 +17,7 @@ from isocharge.simulate import (
     touch_charge,
     touch_stress,
 )
+from solved_charges import relative_error, solved_charge, with_film
 
 PLATE = Theory(bending=True)
 MEMBRANE = Theory(bending=False)
@@ -95,11 +96,7 @@ def test_charge_of_a_surface_is_the_integral_of_its_stress(thick):
 def test_surface_readout_without_bending_raises_error(film):
     sensor = replace(load_sensor("three-25um-biaxial"), surface="bottom")
     solved = press(film, Circle(1.0), (0.0, 0.0), 1.0, SolveSettings(theory=MEMBRANE))
-    message = (
-        r"surface 'bottom' needs bending, but the film was solved as a nonlinear membrane; solve it with "
-        r"SolveSettings\(theory="
-    )
-    with pytest.raises(SensorError, match=message):
+    with pytest.raises(SensorError, match=r"surface 'bottom' needs bending, .* solve it with SolveSettings\(theory="):
         touch_charge(sensor, solved)
     bent = press(film, Circle(1.0), (0.0, 0.0), 1.0)
     assert np.isfinite(touch_charge(sensor, bent)).all()
@@ -107,14 +104,12 @@ def test_surface_readout_without_bending_raises_error(film):
 
 def test_charges_at_a_surface_under_the_probe_equal_those_of_a_finer_mesh():
     """The bending stress changes its sign at the edge of the footprint, whose radius is 1 mm."""
-    nominal = load_sensor("four-25um-biaxial")
-    film = replace(nominal.film, pretension=1.0)
     inside = Electrode.of_square("A", (8.0, 3.0), 0.9)
     at_the_edge = Electrode.of_square("B", (9.0, 3.0), 0.9)
-    sensor = replace(nominal, film=film, surface="top", electrodes=(inside, at_the_edge))
+    stretched = with_film(load_sensor("four-25um-biaxial"), pretension=1.0)
+    sensor = replace(stretched, surface="top", electrodes=(inside, at_the_edge))
     finer = SolveSettings(resolution=Resolution(8, 16, 9, 2))
     charge, expected = (
-        touch_charge(sensor, press(film, Circle(1.0), (8.0, 3.0), 0.05, settings))
-        for settings in (SolveSettings(), finer)
+        solved_charge(sensor, Circle(1.0), (8.0, 3.0), 0.05, settings) for settings in (SolveSettings(), finer)
     )
-    np.testing.assert_allclose(charge, expected, atol=2e-4 * np.abs(expected).max())
+    assert relative_error(charge, expected) <= 2e-4

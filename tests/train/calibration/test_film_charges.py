@@ -16,8 +16,6 @@ from isocharge.simulate import (
     load_sensor,
     local_workers,
     parse_probe,
-    press,
-    touch_charge,
 )
 from isocharge.simulate.forward.charge_map import differences
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
@@ -27,6 +25,7 @@ from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.data.contact_errors import position_error
 from isocharge.train.data.presses import draw_contacts
 from kept import kept
+from solved_charges import solved_charge
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +39,7 @@ CONTACT = np.array([[3.0, 2.0, 0.5], [-4.0, 5.0, 1.0], [1.0, -6.0, 0.2]])
 
 def direct(sensor, probe, contact):
     """Charges of contacts, each of which is solved."""
-    return np.array(
-        [touch_charge(sensor, press(sensor.film, probe, (x, y), force)) for x, y, force in contact.tolist()]
-    )
+    return np.array([solved_charge(sensor, probe, (x, y), force) for x, y, force in contact.tolist()])
 
 
 def test_charges_of_a_similar_film_agree_with_direct_solves(solved):
