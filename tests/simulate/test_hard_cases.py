@@ -43,12 +43,12 @@ def draw_probe(rng: np.random.Generator) -> Probe:
     return Polygon.of(corners, rotation)
 
 
-def draw(seed: int, number: int) -> tuple[Film, Probe, tuple[float, float], float]:
-    """Draw a press: film, probe, position, mm, and force, N. It depends on the seed and the number only.
+def draw(number: int) -> tuple[Film, Probe, tuple[float, float], float]:
+    """Draw a press: film, probe, position, mm, and force, N. It depends on the number only.
 
     The film has a radius of 45 mm. Two of five films are slack, and one press of seven is close to the rim.
     """
-    rng = np.random.default_rng([seed, number])
+    rng = np.random.default_rng([7, number])
     pretension = 0.0 if rng.random() < 0.4 else log_uniform(rng, 0.01, 20.0)
     thickness = log_uniform(rng, 0.005, 2.0)
     poisson = float(rng.uniform(0.0, 0.49))
@@ -64,30 +64,20 @@ def draw(seed: int, number: int) -> tuple[Film, Probe, tuple[float, float], floa
     return film, probe, (float(position.real), float(position.imag)), force
 
 
-def check(seed: int) -> str:
-    """Solve the press of a seed and check its result.
-
-    Returns:
-        "converged", or the name of a permitted error.
-    """
-    film, probe, at, force = draw(7, seed)
+@pytest.mark.first_cases(3)
+@pytest.mark.parametrize("number", [3, 12, 21, 0, 17])
+def test_hard_cases_converge_or_raise_a_clear_error(number):
+    film, probe, at, force = draw(number)
     try:
         solved = press(film, probe, at, force)
     except (SceneError, SolveError) as error:
         if not any(re.match(reason, str(error)) for reason in REASONS):
             raise
-        return type(error).__name__
+        return
     assert solved.status == "converged"
-    assert solved.residual <= 1e-7 or "round-off" in solved.message, (seed, solved.residual)
+    assert solved.residual <= 1e-7 or "round-off" in solved.message
     assert np.isfinite(solved.field).all()
     charge = touch_charge(replace(load_sensor("four-25um-uniaxial"), film=film), solved)
     assert np.isfinite(charge).all()
     assert deflection(solved, np.array([at]))[0] > 0.0
-    assert 0.0 <= estimated_error(solved) < 0.2, (seed, estimated_error(solved))
-    return "converged"
-
-
-@pytest.mark.first_cases(3)
-@pytest.mark.parametrize("seed", [3, 12, 21, 0, 17])
-def test_hard_cases_converge_or_raise_a_clear_error(seed):
-    check(seed)
+    assert 0.0 <= estimated_error(solved) < 0.2

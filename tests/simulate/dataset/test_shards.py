@@ -97,12 +97,6 @@ def test_manifest_and_card_describe_the_dataset(dataset):
         assert part in card
 
 
-def test_dataset_of_measured_presses_needs_no_solver_entry(tmp_path):
-    """A measured dataset has no seed and no mesh, and its columns may be integers."""
-    measured = replace(samples(2), force_N=np.array([1, 2]))
-    assert len(read_dataset(write_dataset(tmp_path / "rig", SENSOR, [measured], {})).samples) == 2
-
-
 # Damage
 
 
@@ -133,7 +127,6 @@ MANIFESTS = {
     "no presses outside": (lambda table: table.update(format_version=1), "sweep again with 'isocharge simulate sweep'"),
     "yield": (lambda table: table.update(yield_force_N=0), "yield_force_N"),
     "no sensor": (lambda table: table.pop("sensor"), "key 'sensor' is missing"),
-    "no key of shards": (lambda table: table.pop("shards"), "key 'shards' is missing"),
     "no shards": (lambda table: table.update(shards=[]), "lists no shards"),
     "film": (lambda table: table["sensor"]["film"].update(colour="red"), r"unknown key 'film\.colour'"),
     "electrodes": (  # else read as each other's charges

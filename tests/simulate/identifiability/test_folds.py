@@ -60,7 +60,7 @@ def folded_map(extra: float | None = None, radius: float = 5.0, forces: tuple[fl
     return FunctionMap(charge, ("A", "B", "C", "D")[: 3 if extra is None else 4], Domain(radius, forces))
 
 
-def shaped_charges(*shapes, radius: float = 5.0) -> FunctionMap:
+def shaped_charges(*shapes) -> FunctionMap:
     """Charges that are functions of x and y, and one charge that depends only on the force."""
 
     def charge(contact):
@@ -68,7 +68,7 @@ def shaped_charges(*shapes, radius: float = 5.0) -> FunctionMap:
         columns = [3.0 + 0.3 * shape(x, y) for shape in shapes]
         return 300.0 * force[:, None] ** (2.0 / 3.0) * np.stack([*columns, np.full(len(x), 3.0)], axis=1)
 
-    return FineMap(charge, tuple("ABCDE"[: len(shapes) + 1]), Domain(radius, FORCES))
+    return FineMap(charge, tuple("ABCDE"[: len(shapes) + 1]), Domain(5.0, FORCES))
 
 
 def folds_of(charge_map, rings: Rings | None = None) -> np.ndarray:
@@ -99,20 +99,21 @@ def charges(film):
     return cache(lambda name: ChargeSpline.of(replace(film, sensor=load_sensor(name)), spacing=0.4))
 
 
-@pytest.mark.parametrize("extra", [None, 0.0], ids=["three charges", "constant fourth charge"])
-def test_find_folds_finds_a_known_fold_line(extra):
-    points = folds_of(folded_map(extra))
+@pytest.mark.parametrize(
+    ("charge_map", "axis"),
+    [
+        (folded_map(), 0),
+        (folded_map(0.0), 0),
+        (shaped_charges(lambda x, _: x, lambda _, y: y - y**2 / (2.0 * FOLD_X)), 1),
+    ],
+    ids=["three charges", "constant fourth charge", "fold line along x"],
+)
+def test_find_folds_finds_a_known_fold_line(charge_map, axis):
+    """Both sides of a line are compared across the line."""
+    points = folds_of(charge_map)
     assert len(points) > 50
-    assert points[:, 0] == pytest.approx(FOLD_X, abs=0.1)
-    assert np.ptp(points[:, 1]) > 7.0
-
-
-def test_find_folds_finds_a_fold_line_along_x():
-    """Both sides of such a line are compared across the line, along y."""
-    points = folds_of(shaped_charges(lambda x, _: x, lambda _, y: y - y**2 / (2.0 * FOLD_X)))
-    assert len(points) > 50
-    assert points[:, 1] == pytest.approx(FOLD_X, abs=0.1)
-    assert np.ptp(points[:, 0]) > 7.0
+    assert points[:, axis] == pytest.approx(FOLD_X, abs=0.1)
+    assert np.ptp(points[:, 1 - axis]) > 7.0
 
 
 def test_find_folds_finds_nothing_without_a_fold_line():

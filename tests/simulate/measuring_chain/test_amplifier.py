@@ -113,13 +113,11 @@ def test_amplifier_file_changes_the_given_values(tmp_path):
     [
         ("tau = 1", "unknown key 'tau'; did you mean 'tau_s'"),
         ("tau_s = 0", "tau_s: expected a positive number or inf, got 0"),
-        ("hum_pC = -1", "hum_pC: expected"),
         ("tau_mismatch = 0.5", "tau_mismatch: expected a number from 0 to 0.2, got 0.5"),
         ("bits = 33", "bits: expected a whole number from 0 to 32, got 33"),
         ("bits = 16", r"mine\.toml: bits: a converter of 16 bits needs the largest charge that it reads"),
         ("white_pC = inf", "white_pC: expected a number from 0, got inf"),
         ('like = "kitchen"', "like: expected one of bench, clean, measured, reference, surgery, got 'kitchen'"),
-        ("tau_s", "not a TOML file"),
     ],
 )
 def test_wrong_amplifier_file_raises_input_error(tmp_path, text, message):

@@ -56,11 +56,15 @@ def test_area_in_a_disk_is_bounded_and_additive_and_a_polygons_limit(a, x, y, ra
     )
 
 
-@pytest.mark.parametrize("corners", [[0, 1, 2, 2 + 1j, 1j], [0, 1, 1 + 1j, 0.5 + 0.2j, 1j], [0, 1, 1, 1j]])
-def test_polygon_with_a_straight_or_reentrant_or_repeated_corner_is_not_convex(corners):
+@pytest.mark.parametrize(
+    "corners",
+    [
+        [0, 1, 2, 2 + 1j, 1j],
+        [0, 1, 1 + 1j, 0.5 + 0.2j, 1j],
+        [0, 1, 1, 1j],
+        np.exp(0.8j * np.pi * np.arange(5)),  # it turns left at every corner, but it crosses itself
+    ],
+    ids=["straight corner", "reentrant corner", "repeated corner", "star"],
+)
+def test_polygon_is_not_convex(corners):
     assert not is_convex(corners_of(np.array(corners)))
-
-
-def test_star_polygon_is_not_convex():
-    """It turns left at every corner, but it crosses itself."""
-    assert not is_convex(corners_of(np.exp(0.8j * np.pi * np.arange(5))))

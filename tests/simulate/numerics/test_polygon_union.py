@@ -47,18 +47,19 @@ def test_union_area_agrees_with_monte_carlo():
     assert total_area(polygons) == pytest.approx(36.0 * inside.mean(), abs=4.0 * standard_error)
 
 
-@pytest.mark.parametrize(
-    ("polygons", "expected"),
-    [
-        pytest.param([SQUARE, SQUARE + 4.0], 32.0, id="common edge"),
-        pytest.param([SQUARE, SQUARE + (4.0 + 4.0j)], 32.0, id="common corner"),
-        pytest.param([SQUARE, SQUARE + (2.0 + 2.0j)], 28.0, id="overlapping"),
-        pytest.param([SQUARE, SQUARE], 16.0, id="identical"),
-        pytest.param([SQUARE, SQUARE + 10.0], 32.0, id="separate"),
-        pytest.param([SQUARE_WITH_HOLE], 12.0, id="hole"),
-        pytest.param([SQUARE_WITH_HOLE, 2.0 + 2.0j + 0.25 * (SQUARE - 2.0 - 2.0j)], 13.0, id="island in a hole"),
-    ],
-)
+UNIONS = {
+    "common edge": ([SQUARE, SQUARE + 4.0], 32.0),
+    "common corner": ([SQUARE, SQUARE + (4.0 + 4.0j)], 32.0),
+    "overlapping": ([SQUARE, SQUARE + (2.0 + 2.0j)], 28.0),
+    "identical": ([SQUARE, SQUARE], 16.0),
+    "separate": ([SQUARE, SQUARE + 10.0], 32.0),
+    "hole": ([SQUARE_WITH_HOLE], 12.0),
+    "island in a hole": ([SQUARE_WITH_HOLE, 2.0 + 2.0j + 0.25 * (SQUARE - 2.0 - 2.0j)], 13.0),
+}
+"""Polygons, and the area of their union."""
+
+
+@pytest.mark.parametrize(("polygons", "expected"), UNIONS.values(), ids=UNIONS)
 def test_union_area_in_closed_form(polygons, expected):
     assert total_area(polygons) == pytest.approx(expected, rel=1e-12)
 
@@ -76,20 +77,21 @@ def test_pieces_of_a_triangle_cover_it_and_have_short_sides(corners):
     assert max(np.linalg.norm(piece - np.roll(piece, 1, axis=0), axis=1).max() for piece in pieces) <= 3.0 + 1e-9
 
 
-@pytest.mark.parametrize(
-    ("corners", "expected"),
-    [
-        pytest.param([0, 1 + 1j, 2, 2 + 2j, 1 + 1j, 2j], True, id="touches itself at a point"),
-        pytest.param([0, 4, 4 + 4j, 2, 4j], True, id="corner touches an edge"),
-        pytest.param(SQUARE_WITH_HOLE, True, id="touches itself along an edge"),
-        pytest.param([0, 1, 1, 1 + 1j, 1j], True, id="double corner"),
-        pytest.param([0, 1 + 1j, 1, 1j], False, id="bow tie"),
-        pytest.param(np.exp(4j * np.pi * np.arange(5) / 5), False, id="pentagram"),
-        pytest.param(SQUARE[::-1], False, id="clockwise"),
-        pytest.param([0, 1, 2], False, id="on one line"),
-        pytest.param(np.zeros(4), False, id="a single point"),
-    ],
-)
+POLYGONS = {
+    "touches itself at a point": ([0, 1 + 1j, 2, 2 + 2j, 1 + 1j, 2j], True),
+    "corner touches an edge": ([0, 4, 4 + 4j, 2, 4j], True),
+    "touches itself along an edge": (SQUARE_WITH_HOLE, True),
+    "double corner": ([0, 1, 1, 1 + 1j, 1j], True),
+    "bow tie": ([0, 1 + 1j, 1, 1j], False),
+    "pentagram": (np.exp(4j * np.pi * np.arange(5) / 5), False),
+    "clockwise": (SQUARE[::-1], False),
+    "on one line": ([0, 1, 2], False),
+    "a single point": (np.zeros(4), False),
+}
+"""Corners of polygons, and whether the polygon is simple."""
+
+
+@pytest.mark.parametrize(("corners", "expected"), POLYGONS.values(), ids=POLYGONS)
 def test_is_simple_of_polygons_that_touch_or_cross_themselves(corners, expected):
     assert is_simple(to_corners(np.array(corners, dtype=complex))) is expected
 
