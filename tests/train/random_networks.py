@@ -1,15 +1,21 @@
-"""Networks with random weights, for tests of what a network is written to."""
+"""Networks with random weights, for tests of what a network is written to, and comparisons of their answers."""
 
 import itertools
 from dataclasses import replace
 
 import numpy as np
+from msgspec import structs
 
+from isocharge.serve import find_model, load_model, write_model
+from isocharge.train.model_release.onnx_graph import write_graph
 from isocharge.train.training.folded_network import ANGLES, LARGEST_INT8, TANH, FoldedNetwork, Layer, Perceptron
 from isocharge.train.training.network import logarithmic_features
 
 TYPICAL_pC = 512.0
 """Charge by which each charge is divided, pC."""
+
+FLOORS = np.array([1.0, 1.0, 0.1, 1.0, 1.0, 0.1, 20.0, 5.0, 5.0, 5.0])
+"""Values of a contact, mm, N, misfit and correlations, below which differences count as absolute differences."""
 
 
 def random_perceptron(rng, widths, activation=TANH):
@@ -50,3 +56,23 @@ def round_to_int8(perceptron):
     first, second = perceptron.hidden
     scale = np.abs(second.weight).max(axis=0) / LARGEST_INT8
     return replace(perceptron, hidden=(first, Layer(np.round(second.weight / scale) * scale, second.bias)))
+
+
+def write_random_model(folder, network, **changes):
+    """Write a model folder with a network, and with other metadata than a released model."""
+    released = load_model(find_model("four-25um-biaxial")).metadata
+    metadata = structs.replace(released, name=folder.name, version=1, **changes)
+    charge_pC = np.random.default_rng(1).uniform(100.0, 3000.0, (64, network.features.n_electrode)).astype(np.float32)
+    return write_model(folder, write_graph(network, metadata.to_props()), metadata, charge_pC, "card")
+
+
+def double_precision_answers(network, charge_pC):
+    """Return contact, standard deviations, misfit and correlations of a network, shape (n, 10)."""
+    contact, std, correlation, misfit = network.outputs(charge_pC.astype(float))
+    return np.concatenate([contact, std, misfit, correlation], axis=1)
+
+
+def check_agreement(given, expected, tolerance=1e-5):
+    """Check the relative differences of answers, shape (n, 10) or (n, 7) each."""
+    scale = np.maximum(np.abs(expected), FLOORS[: expected.shape[1]])
+    assert np.all(np.abs(given - expected) <= tolerance * scale)

@@ -113,6 +113,13 @@ def draw_frames(board, seed, seconds=20.0):
     return Frames(values, t_s, dt_s, limited, tare)
 
 
+def regular_frames(values):
+    """Return frames of which none is limited or begins a tare."""
+    dt_s = np.full(len(values), 1.0 / RATE_Hz)
+    never = np.zeros(len(values), dtype=bool)
+    return Frames(values, np.cumsum(dt_s), dt_s, limited=never, tare=never)
+
+
 def python_chain(device, frames, misfit):
     """Process frames with the signal chain in Python, and return arrays like those of `Exported.chain`.
 
@@ -186,12 +193,8 @@ def test_single_precision_changes_charges_by_less_than_a_twentieth_of_a_picocoul
 
 def test_contact_that_a_drift_begins_has_the_flag_drift_in_c_as_in_python(build):
     """The zero of the board drifts by 6 pC/s, which the tare cannot follow."""
-    n = 1000
-    dt_s = np.full(n, 1.0 / RATE_Hz)
-    t_s = np.cumsum(dt_s)
-    values = np.random.default_rng(0).standard_normal((n, 4)) + 6.0 * t_s[:, None]
-    never = np.zeros(n, dtype=bool)
-    frames = Frames(values, t_s, dt_s, limited=never, tare=never)
+    drift_pC = 6.0 * np.arange(1000)[:, None] / RATE_Hz
+    frames = regular_frames(np.random.default_rng(0).standard_normal((1000, 4)) + drift_pC)
     _, _, expected_contact, expected_flags = python_chain(device("any board"), frames, None)
     _, _, contact, flags = build("four-25um-biaxial", device("any board")).chain(*frames)
     np.testing.assert_array_equal(contact, expected_contact)
@@ -203,10 +206,7 @@ def test_contact_that_a_drift_begins_has_the_flag_drift_in_c_as_in_python(build)
 @pytest.fixture(scope="module")
 def restless_frames():
     """Seventy frames of a film that is never at rest."""
-    values = 100.0 * np.random.default_rng(0).standard_normal((70, 3))
-    dt_s = np.full(70, 0.005)
-    never = np.zeros(70, dtype=bool)
-    return Frames(values, np.cumsum(dt_s), dt_s, limited=never, tare=never)
+    return regular_frames(100.0 * np.random.default_rng(0).standard_normal((70, 3)))
 
 
 IMPATIENT_BOARD = device_from_table({"tare": {"frames": 20, "patience": 50}}, "board")

@@ -4,16 +4,26 @@ import subprocess
 
 import numpy as np
 import pytest
-from msgspec import structs
-from tests.train.random_networks import random_network
+from tests.train.random_networks import random_network, write_random_model
 
-from isocharge.serve import find_model, load_model, write_model
+from isocharge.serve import find_model, load_model
 from isocharge.serve.model.contact import Contacts, Validity
 from isocharge.serve.model.model_folder import model_names
 from isocharge.train.export_c.folder import export_c
 from isocharge.train.export_c.model_source import FLAG_BITS
-from isocharge.train.model_release.onnx_graph import write_graph
 from isocharge.train.training.folded_network import TANH
+
+
+@pytest.fixture
+def run_self_test(compile_c, tmp_path):
+    """Function that compiles and runs the self test of an export, and returns the exit code and the stdout."""
+
+    def run(folder, compiler="gcc", model="isocharge_model.c", options=("-O2",)):
+        program = compile_c(compiler, folder, tmp_path / "self_test", "self_test.c", model, options=options)
+        done = subprocess.run([program], capture_output=True, text=True, check=False)
+        return done.returncode, done.stdout
+
+    return run
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
@@ -26,33 +36,26 @@ from isocharge.train.training.folded_network import TANH
     ],
     ids=lambda options: options[-1],
 )
-def test_self_test_passes_in_strict_c99(compiler, options, exports, compile_c, tmp_path):
+def test_self_test_passes_in_strict_c99(compiler, options, exports, run_self_test):
     for folder in exports:
-        program = compile_c(
-            compiler, folder, tmp_path / "self_test", "self_test.c", "isocharge_model.c", options=options
-        )
-        done = subprocess.run([program], capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert " golden vectors, 0 wrong numbers" in done.stdout
+        code, printed = run_self_test(folder, compiler, options=options)
+        assert code == 0, printed
+        assert " golden vectors, 0 wrong numbers" in printed
 
 
 @pytest.mark.parametrize("name", model_names(find_model("four-25um-biaxial").parents[1]))
-def test_self_test_of_each_released_model_passes(name, compile_c, tmp_path):
-    folder = export_c(find_model(name), tmp_path / "export")
-    sources = ("self_test.c", "isocharge_model.c")
-    program = compile_c("gcc", folder, tmp_path / "self_test", *sources, options=("-O1",))
-    done = subprocess.run([program], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout
+def test_self_test_of_each_released_model_passes(name, run_self_test, tmp_path):
+    code, printed = run_self_test(export_c(find_model(name), tmp_path / "export"), options=("-O1",))
+    assert code == 0, printed
 
 
-def test_self_test_fails_if_a_weight_is_changed(exports, compile_c, tmp_path):
+def test_self_test_fails_if_a_weight_is_changed(exports, run_self_test, tmp_path):
     source = (exports[0] / "isocharge_model.c").read_text()
     begin = source.index("contact_1_weights[")
     (tmp_path / "changed.c").write_text(source[:begin] + source[begin:].replace("{\n    ", "{\n    1.0f + ", 1))
-    program = compile_c("gcc", exports[0], tmp_path / "self_test", "self_test.c", tmp_path / "changed.c")
-    done = subprocess.run([program], capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert "expected" in done.stdout
+    code, printed = run_self_test(exports[0], model=tmp_path / "changed.c")
+    assert code == 1
+    assert "expected" in printed
 
 
 LIMITS = {
@@ -68,9 +71,7 @@ LIMITS = {
 def test_flags_in_c_are_those_of_python(changes, build, tmp_path):
     released = load_model(find_model("four-25um-biaxial")).metadata
     more_errors = {"errors": {**released.errors, **changes.get("errors", {})}}
-    metadata = structs.replace(released, name="limits", version=1, **{**changes, **more_errors})
-    graph = write_graph(random_network(4, (4, 4), (4, 4)), metadata.to_props())
-    model = write_model(tmp_path / "limits", graph, metadata, np.full((4, 4), 800.0, np.float32), "card")
+    model = write_random_model(tmp_path / "limits", random_network(4, (4, 4), (4, 4)), **{**changes, **more_errors})
 
     random = np.random.default_rng(0)
     contacts = np.zeros((3000, 10), np.float32)
@@ -79,7 +80,7 @@ def test_flags_in_c_are_those_of_python(changes, build, tmp_path):
     contacts[:, 6] = random.exponential(2.5, 3000)
     contacts[0] = np.nan
     contacts[1, :3] = 1e30
-    expected = Validity.of(metadata).batch_flags(Contacts(*contacts.T))
+    expected = Validity.of(load_model(model).metadata).batch_flags(Contacts(*contacts.T))
     flags = build(model).flags(contacts[:, :7])
     assert flags.tolist() == [sum(FLAG_BITS[word] for word in words) for words in expected]
     assert {word for words in expected for word in words} >= set(FLAG_BITS) - {"stress"}

@@ -6,16 +6,17 @@ from dataclasses import replace
 import numpy as np
 import onnxruntime
 import pytest
-from msgspec import structs
-from tests.train.random_networks import random_network
+from tests.train.random_networks import (
+    check_agreement,
+    double_precision_answers,
+    random_network,
+    write_random_model,
+)
 
-from isocharge.serve import find_model, load_model, write_model
+from isocharge.serve import find_model, load_model
 from isocharge.serve.model.session import COLUMNS
 from isocharge.train.model_release.onnx_graph import write_graph
 from isocharge.train.training.network import signed_features
-
-FLOORS = np.array([1.0, 1.0, 0.1, 1.0, 1.0, 0.1, 20.0, 5.0, 5.0, 5.0])
-"""Values of a contact, mm, N, misfit and correlations, below which differences count as absolute differences."""
 
 MODELS = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial", "four-25um-biaxial-student")
 
@@ -25,17 +26,6 @@ def onnxruntime_answers(model, charge_pC):
     session = load_model(find_model(model)).session
     rows = [np.concatenate(session.run([*COLUMNS], {"charge_pC": charge[None]}), axis=1)[0] for charge in charge_pC]
     return np.array(rows)
-
-
-def double_precision_answers(network, charge_pC):
-    """Return contact, standard deviations, misfit and correlations of a network, shape (n, 10)."""
-    contact, std, correlation, misfit = network.outputs(charge_pC.astype(float))
-    return np.concatenate([contact, std, misfit, correlation], axis=1)
-
-
-def check_agreement(given, expected, tolerance=1e-5):
-    scale = np.maximum(np.abs(expected), FLOORS[: expected.shape[1]])
-    assert np.all(np.abs(given - expected) <= tolerance * scale)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -52,15 +42,6 @@ def test_extreme_charges_are_finite_as_in_onnxruntime_and_nan_is_nan(model, buil
     assert np.isnan(exported.predict(one_nan)).all()
 
 
-def write_random_model(folder, network):
-    """Write a model folder with a network, and with electrode names that could end a comment in C."""
-    electrodes = tuple(f"E{number} */" for number in range(network.features.n_electrode))
-    released = load_model(find_model(MODELS[0])).metadata
-    metadata = structs.replace(released, name=folder.name, version=1, electrodes=electrodes)
-    charge_pC = np.random.default_rng(1).uniform(100.0, 3000.0, (64, len(electrodes))).astype(np.float32)
-    return write_model(folder, write_graph(network, metadata.to_props()), metadata, charge_pC, "card")
-
-
 @pytest.mark.parametrize(
     ("electrodes", "hidden", "misfit_hidden", "is_int8", "arrays"),
     [
@@ -73,7 +54,8 @@ def write_random_model(folder, network):
 def test_any_width_and_number_of_electrodes(electrodes, hidden, misfit_hidden, is_int8, arrays, build, tmp_path):
     """The zeros beside the two blocks of a layer of the graph are left out, and weights of 8 bits take one byte."""
     network = random_network(electrodes, hidden, misfit_hidden, is_int8=is_int8)
-    exported = build(write_random_model(tmp_path / "random", network))
+    names = tuple(f"E{number} */" for number in range(electrodes))  # they could end a comment in C
+    exported = build(write_random_model(tmp_path / "random", network, electrodes=names))
     charge_pC = np.random.default_rng(2).uniform(50.0, 5000.0, (500, electrodes)).astype(np.float32)
     check_agreement(exported.predict(charge_pC), double_precision_answers(network, charge_pC))
     assert all(f"static const {array}" in exported.source for array in arrays)
