@@ -27,28 +27,20 @@ def with_rig_errors(contact: np.ndarray, rng: np.random.Generator) -> np.ndarray
     return measured_contact
 
 
-def measured_presses(
-    problem: CalibrationProblem,
-    contact: np.ndarray,
-    charge: np.ndarray,
-    position_std_mm: float = POSITION_STD_mm,
-    force_std: float = FORCE_STD,
-) -> MeasuredPresses:
+def measured_presses(problem: CalibrationProblem, contact: np.ndarray, charge: np.ndarray) -> MeasuredPresses:
     """Return measured presses, which are on the lines 2, 3, ... of a file.
 
     Args:
         problem: The films, whose electrodes are those of the presses.
         contact: Measured contacts (x, y, F), shape (n, 3), mm and N; NaN where a quantity was not measured.
         charge: Charges with noise, shape (n, n_electrode), pC.
-        position_std_mm: Standard deviation of each coordinate, mm.
-        force_std: Relative standard deviation of the forces.
     """
     count = len(contact)
     return MeasuredPresses(
         contact=contact,
         charge_pC=charge,
-        position_std_mm=np.full(count, position_std_mm),
-        force_std=np.full(count, force_std),
+        position_std_mm=np.full(count, POSITION_STD_mm),
+        force_std=np.full(count, FORCE_STD),
         electrodes=problem.electrodes,
         lines=tuple(range(2, count + 2)),
     )

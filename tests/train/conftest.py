@@ -1,17 +1,15 @@
 """Fixtures for the tests of this folder: a small dataset, a network after a short training, and a film."""
 
 import pytest
+from tests.train.short_training import short_training
 
 from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Sweep, load_sensor, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
-from isocharge.train import CalibrationProblem, FitConfig, NetworkConfig, TrainingConfig, TrainingData, fit
+from isocharge.train import CalibrationProblem, TrainingData, fit
 from isocharge.train.training.training_data import Split
 from kept import kept
 
-QUICK = FitConfig(
-    network=NetworkConfig(hidden=(32, 32), misfit_hidden=(24, 24)),
-    training=TrainingConfig(steps=400, misfit_steps=600, misfit_charges=4_000, batch=256),
-)
+QUICK = short_training(32, 24, 400, 600, 4_000)
 
 
 @pytest.fixture(scope="session")

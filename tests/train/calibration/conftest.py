@@ -5,15 +5,8 @@ import pytest
 from tests.benchmarks.measured_films import measured_presses, with_rig_errors
 from tests.train.calibration.synthetic_film import SyntheticFilm
 
-from isocharge.simulate import Circle, load_sensor
-from isocharge.train import CalibrationProblem
 from isocharge.train.calibration import calibrate as calibrate_module
 from isocharge.train.data.presses import draw_contacts
-
-
-@pytest.fixture(scope="session")
-def problem():
-    return CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))
 
 
 @pytest.fixture(scope="session")

@@ -29,12 +29,10 @@ class SyntheticFilm:
     Attributes:
         prior: Declarations of the properties.
         domain: Contacts for which the charges are known.
-        uneven: Whether each property has an effect that depends on the position and the force.
     """
 
     prior: object
     domain: Domain
-    uneven: float = 0.5
 
     into_domain = FilmCharges.into_domain
 
@@ -49,7 +47,7 @@ class SyntheticFilm:
         shape = (len(self.prior.names), len(self.prior.sensor.electrode_names))
         constant, by_x, by_y, by_force = EFFECT * rng.standard_normal((4, *shape)) / self.prior.std[:, None]
         constant[self.prior.index("pretension")] = -0.2  # a taut film gives smaller charges
-        return constant, self.uneven * by_x / LENGTH_MM, self.uneven * by_y / LENGTH_MM, self.uneven * 0.3 * by_force
+        return constant, 0.5 * by_x / LENGTH_MM, 0.5 * by_y / LENGTH_MM, 0.15 * by_force
 
     def linearised(self, values, contact):
         x, y, force = contact.T

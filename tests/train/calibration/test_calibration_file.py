@@ -78,7 +78,6 @@ FAULTS = {
         changed("unknowns.young", {"value": 0.0, "std": -0.1}),
         r"unknowns\.young\.std: expected a number from 0",
     ),
-    "text": (changed("radius_mm", "wide"), "radius_mm: expected"),
     "rows": (changed("correlations", [[], [0.1, 0.2]]), "correlations: expected 147 rows of 0 to 146 numbers"),
     "large": (
         lambda table: changed("correlations", [[1.0 - 2.0 * (i == 2)] * i for i in range(147)])(table),

@@ -9,20 +9,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from tests.train.calibration.conftest import rig
+from tests.train.short_training import short_training
 
 from isocharge.common.errors import ModelError, OutputExists, PressError
 from isocharge.serve import Predictor, read_presses
 from isocharge.simulate import NoiseModel, load_sensor
-from isocharge.train import CalibrationProblem, FitConfig, NetworkConfig, TrainingConfig, calibrate
+from isocharge.train import CalibrationProblem, calibrate
 from isocharge.train.calibration import calibrate as calibrate_module
 from isocharge.train.calibration import film_network
 from isocharge.train.calibration.folder import calibration_folder, read_earlier, write_calibration
 from kept import kept
 
-QUICK = FitConfig(
-    network=NetworkConfig(hidden=(32, 32), misfit_hidden=(16, 16)),
-    training=TrainingConfig(steps=300, misfit_steps=50, misfit_charges=1_000, batch=256),
-)
+QUICK = short_training(32, 16, 300, 50, 1_000)
 
 
 @pytest.fixture(scope="module")

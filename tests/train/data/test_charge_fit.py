@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 from scipy.optimize import minimize
+from tests.train.short_training import short_training
 
 from isocharge.common.errors import DatasetError, TrainingError
 from isocharge.serve.model.charge_file import charge_map_from_bytes
 from isocharge.simulate import Domain, noise_model
 from isocharge.simulate.identifiability.nearest_contact import into_domain, search
-from isocharge.train import FitConfig, NetworkConfig, TrainingConfig, fit, release
+from isocharge.train import fit, release
 from isocharge.train.data.charge_fit import fit_charge_series, fit_film_series
 from isocharge.train.data.contact_errors import rms
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
@@ -51,10 +52,6 @@ def test_too_few_presses_are_refused():
         fit_charge_series(DOMAIN, ("A", "B", "C"), few, few)
 
 
-TINY = FitConfig(
-    network=NetworkConfig(hidden=(8, 8), misfit_hidden=(8, 8)),
-    training=TrainingConfig(steps=5, misfit_steps=5, misfit_charges=1_000),
-)
 REFERENCE = noise_model("reference")
 
 
@@ -149,7 +146,7 @@ def test_charge_series_of_the_whole_domain_and_a_caution_are_released_if_the_dom
     contact = draw_contacts(np.random.default_rng(0), DOMAIN, 3000)
     presses = LabelledPresses(contact, 1000.0 * charges_folded_at(5.0)(*contact.T))
     data = TrainingData(sensor=sensor, probes=("circle:1.0",), domain=DOMAIN, presses=presses, sha256="0" * 64)
-    fitted = fit(data, TINY)
+    fitted = fit(data, short_training(8, 8, 5, 5, 1_000))
     series = charge_map_from_bytes(fitted.files["charges.npz"], ("A", "B", "C"))
     assert np.allclose(series.charges(contact), presses.charge, rtol=2e-3)
     assert fitted.domain.radius < 5.2 < series.domain.radius
