@@ -14,7 +14,7 @@ POISSON = 0.34
 
 def film_with(**changes):
     """Return the film of a built-in sensor with other attributes."""
-    return replace(load_sensor("four-25um-biaxial").film, **{"pretension": 0.8, **changes})
+    return replace(load_sensor("four-25um-biaxial").film, pretension=0.8, **changes)
 
 
 def test_tension_turns_with_the_axis_of_an_orthotropic_film():

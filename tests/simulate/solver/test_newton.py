@@ -11,25 +11,26 @@ from isocharge.simulate import Circle, Polygon, Resolution, SolveSettings, Theor
 FORCES = (1e-5, 0.1, 10.0)
 MEMBRANE = Theory(bending=False)
 FULL = Theory(bending=True)
-PROBES = {"circle": Circle(1.0), "rectangle": Polygon.rectangle(4.0, 2.0, 0.4)}
+CIRCLE = Circle(1.0)
+RECTANGLE = Polygon.rectangle(4.0, 2.0, 0.4)
 FAILING = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 3), tolerance=1e-30)
 
 
 @pytest.mark.parametrize(
     ("probe", "changes", "theory"),
     [
-        ("rectangle", {}, MEMBRANE),
-        ("circle", {}, FULL),
-        ("circle", {"thickness": 1.0}, FULL),
-        ("rectangle", {"pretension": 1e-3}, FULL),
-        ("circle", {"pretension": 20.0}, FULL),
+        (RECTANGLE, {}, MEMBRANE),
+        (CIRCLE, {}, FULL),
+        (CIRCLE, {"thickness": 1.0}, FULL),
+        (RECTANGLE, {"pretension": 1e-3}, FULL),
+        (CIRCLE, {"pretension": 20.0}, FULL),
     ],
     ids=str,
 )
 def test_newton_converges_from_the_flat_film_for_every_force(film, changes, theory, probe):
     """The user provides no load steps, no pretension and no starting equilibrium."""
     for force in FORCES:
-        solved = press(replace(film, **changes), PROBES[probe], (5.0, 3.0), force, SolveSettings(theory=theory))
+        solved = press(replace(film, **changes), probe, (5.0, 3.0), force, SolveSettings(theory=theory))
         assert solved.residual <= 1e-7 or "round-off" in solved.message
         assert solved.iterations <= 20
 

@@ -18,13 +18,8 @@ from isocharge.train.training.training_data import TrainingData, invertible_doma
 DOMAIN = Domain(8.0, (0.05, 2.0))
 
 
-@pytest.fixture(scope="module")
-def field(split):
-    """The charge series of a training."""
-    return split.field
-
-
-def test_charges_agree_with_the_simulator(field, film):
+def test_charges_agree_with_the_simulator(split, film):
+    field = split.field
     contact = draw_contacts(np.random.default_rng(8), DOMAIN, 500)
     relative_error = np.abs(field.charges(contact) / film.charges(contact) - 1.0)
     assert np.median(relative_error) < 2e-4
@@ -192,7 +187,8 @@ def scipy_distance(field, charge, start):
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_scipy_finds_no_nearer_contact(field, split, fault):
+def test_scipy_finds_no_nearer_contact(split, fault):
+    field = split.field
     rng = np.random.default_rng(1)
     charge = FAULTS[fault](split.test.charge[:12], rng)
     contact, residual = search(field, charge, REFERENCE.sigma(charge), starts=4)
