@@ -45,46 +45,27 @@ def test_written_films_are_read_again(tmp_path_factory, seed):
     assert np.linalg.eigvalsh(read.covariance)[0] > -1e-9 * (std**2).max()
 
 
-def changed(key, value):
-    """Return a function that changes one entry of a table, whose keys are joined by dots."""
-
-    def change(table):
-        *parents, last = key.split(".")
-        for parent in parents:
-            table = table[parent]
-        table[last] = value
-
-    return change
-
+REMOVED = None
+"""Value of an entry that is missing."""
 
 FAULTS = {
-    "older": (changed("format_version", 4), "format_version: expected 5, got 4; .* calibrate again with its presses"),
-    "no version": (
-        lambda table: table.pop("format_version"),
-        "key 'format_version' is missing; .* calibrate again with its presses",
-    ),
-    "sensor": (changed("sensor", "mine"), "sensor: expected four-25um-biaxial, as in this calibration, got mine"),
-    "probe": (changed("probe", "circle:2"), "probe: expected circle:1"),
-    "radius": (changed("radius_mm", 10.0), "radius_mm: expected 8"),
-    "missing": (
-        lambda table: table["unknowns"].pop("young"),
-        "unknowns: expected pretension, young, .*, got pretension",
-    ),
+    "older": ("format_version", 4, "format_version: expected 5, got 4; .* calibrate again with its presses"),
+    "no version": ("format_version", REMOVED, "key 'format_version' is missing; .* calibrate again with its presses"),
+    "sensor": ("sensor", "mine", "sensor: expected four-25um-biaxial, as in this calibration, got mine"),
+    "probe": ("probe", "circle:2", "probe: expected circle:1"),
+    "radius": ("radius_mm", 10.0, "radius_mm: expected 8"),
+    "missing": ("unknowns.young", REMOVED, "unknowns: expected pretension, young, .*, got pretension"),
     "bounds": (
-        changed("unknowns.pretension", {"value": -1.0, "std": 0.1}),
+        "unknowns.pretension",
+        {"value": -1.0, "std": 0.1},
         r"unknowns\.pretension\.value: expected 0 to",
     ),
-    "negative": (
-        changed("unknowns.young", {"value": 0.0, "std": -0.1}),
-        r"unknowns\.young\.std: expected a number from 0",
-    ),
-    "rows": (changed("correlations", [[], [0.1, 0.2]]), "correlations: expected 147 rows of 0 to 146 numbers"),
-    "large": (
-        lambda table: changed("correlations", [[1.0 - 2.0 * (i == 2)] * i for i in range(147)])(table),
-        "positive semidefinite",
-    ),
-    "beyond": (lambda table: table["correlations"][1].__setitem__(0, 1.5), r"correlations\[1\]\[0\]: expected"),
+    "negative": ("unknowns.young", {"value": 0.0, "std": -0.1}, r"unknowns\.young\.std: expected a number from 0"),
+    "rows": ("correlations", [[], [0.1, 0.2]], "correlations: expected 147 rows of 0 to 146 numbers"),
+    "large": ("correlations", [[1.0 - 2.0 * (i == 2)] * i for i in range(147)], "positive semidefinite"),
+    "beyond": ("correlations", [[1.5] * i for i in range(147)], r"correlations\[1\]\[0\]: expected"),
 }
+"""Key of an entry, joined by dots, its changed value, and the message that names the fault."""
 
 
 def test_sensor_file_of_the_earlier_calibration_is_required(tmp_path):
@@ -97,12 +78,15 @@ def test_sensor_file_of_the_earlier_calibration_is_required(tmp_path):
         read_film(path, replace(PROBLEM, sensor=sensor))
 
 
-@pytest.mark.parametrize("name", FAULTS)
-def test_damaged_files_are_refused_with_the_key(tmp_path, name):
-    change, message = FAULTS[name]
+@pytest.mark.parametrize(("key", "value", "message"), FAULTS.values(), ids=FAULTS)
+def test_damaged_files_are_refused_with_the_key(tmp_path, key, value, message):
     film = FilmEstimate(PROBLEM.prior.layout, PROBLEM.prior.mean, PROBLEM.prior.covariance(PLANNED))
     table = json.loads(json_text(film_table(PROBLEM, film)))
-    change(table)
+    *parents, last = key.split(".")
+    entries = table[parents[0]] if parents else table
+    entries[last] = value
+    if value is REMOVED:
+        del entries[last]
     path = tmp_path / "calibration.json"
     path.write_text(json.dumps(table))
     with pytest.raises(PressError, match=f"calibration.json: .*{message}"):
