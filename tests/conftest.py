@@ -16,6 +16,7 @@ from hypothesis import settings
 
 from extras import PACKAGES
 from isocharge.cli.main import main
+from processes import finished
 from whole_films import whole_film_map_solved_once
 
 ROOT = Path(__file__).parents[1]
@@ -192,7 +193,7 @@ def run_example():
     """
 
     def run(example, folder, environment):
-        done = _run([sys.executable, "-c", example], folder, environment, timeout=3600)
+        done = finished([sys.executable, "-c", example], cwd=folder, env=environment, timeout=3600)
         prints = [line for line in example.splitlines() if line.lstrip().startswith("print(")]
         expected = [line.rpartition(")  # ")[2] for line in prints]
         assert expected
@@ -212,19 +213,13 @@ def run_commands():
 
     def run(example, folder, environment, timeout=280):
         script = f"trap 'kill $(jobs -p) || true; wait' EXIT\n{example}"
-        done = _run(["bash", "-ec", script], folder, environment, timeout)
+        done = finished(["bash", "-ec", script], cwd=folder, env=environment, timeout=timeout)
         assert done.returncode == 0, done.stderr
         for output in re.findall(r" (?:-o|--record|>) ([\w./-]+)", example):
             assert (folder / output).exists(), output
         return done.stdout
 
     return run
-
-
-def _run(words, folder, environment, timeout):
-    return subprocess.run(
-        words, cwd=folder, env=environment, capture_output=True, text=True, timeout=timeout, check=False
-    )
 
 
 class PageExample(NamedTuple):

@@ -2,9 +2,10 @@
 
 import re
 import tomllib
-from pathlib import Path
 
-PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+from kept import ROOT
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 REQUIREMENTS = PROJECT["optional-dependencies"]
 

@@ -5,7 +5,6 @@
 
 import re
 import runpy
-import subprocess
 import sys
 from functools import partial
 from pathlib import Path
@@ -16,6 +15,7 @@ import pytest
 
 from isocharge.simulate import ForwardMap
 from kept import ROOT, kept
+from processes import finished
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ CHECKERS = {"mypy": ["mypy", "--strict"], "pyright": ["pyright", "--pythonpath",
 def test_the_program_with_types_counts_the_touches_and_reads_a_file(tmp_path):
     (tmp_path / "frames.txt").write_text("0,0,0\n" * 400 + "942.9,910.4,690.8\n" * 100 + "0,0,0\n" * 200)
     for words, touches in (([], ["0.50", "1.00"]), ([tmp_path / "frames.txt"], ["1.00"])):
-        done = subprocess.run([sys.executable, TYPED_PROGRAM, *words], capture_output=True, text=True, check=True)
+        done = finished([sys.executable, TYPED_PROGRAM, *words])
         assert re.findall(r"at most (\S+) N", done.stdout) == touches
 
 
@@ -93,5 +93,5 @@ def test_type_checkers_accept_the_program_with_types_and_find_a_misspelt_field(c
     correct.write_text("# pyright: strict\n" + TYPED_PROGRAM.read_text("utf-8"))
     for path, code in ((correct, 0), (misspelt, 1)):
         words = [Path(sys.executable).with_name(program), *options, path]
-        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        done = finished(words)
         assert done.returncode == code, done.stdout

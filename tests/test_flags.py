@@ -1,7 +1,6 @@
 """Shares of faulty presses with and without a flag, measured on new presses and compared with the pages."""
 
 import re
-from pathlib import Path
 
 import pytest
 
@@ -10,10 +9,9 @@ from isocharge.serve import Predictor
 from isocharge.simulate import Circle, load_sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train import fit, release
-from kept import kept
+from kept import ROOT, kept
 from press_faults import FaultStudy, WholeFilmStudy, film_map
 
-ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "serve" / "docs" / "unnoticed.md").read_text("utf-8")
 
 PRESSES = 1500

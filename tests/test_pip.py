@@ -9,14 +9,15 @@ import subprocess
 import sys
 import tomllib
 import venv
-from pathlib import Path
 
 import pytest
 import yaml
 from pyarrow import table
 from pyarrow.parquet import write_table
 
-ROOT = Path(__file__).parents[1]
+from kept import ROOT
+from processes import finished
+
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 VERSION = PROJECT["version"]
 
@@ -115,17 +116,16 @@ def base(tmp_path_factory, wheel):
     return install([wheel], tmp_path_factory.mktemp("fresh"), timeout=280)
 
 
-def run(base, *words, cwd, timeout=60):
-    return subprocess.run(
-        [base / words[0], *words[1:]], cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False
-    )
+def run(base, program, *words, timeout=60, **options):
+    """Run a program of an environment to its end."""
+    return finished([base / program, *words], timeout=timeout, **options)
 
 
 def test_twine_accepts_both_distributions(distributions):
     names = [path.name for path in distributions]
     assert names == [f"isocharge-{VERSION}-py3-none-any.whl", f"isocharge-{VERSION}.tar.gz"]
     twine = [sys.executable, "-m", "twine", "check", "--strict", *distributions]
-    done = subprocess.run(twine, capture_output=True, text=True, timeout=60, check=False)
+    done = finished(twine, timeout=60)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -204,7 +204,7 @@ def test_the_base_tests_pass_with_the_lower_bounds_of_all_packages(tmp_path):
     words = [bin_folder / "python", "-m", "pytest", "-n", "2", *options, *BASE_TESTS]
     words += ["--ignore", "tests/serve/model/test_conformance.py"]  # needs a newer protobuf
     words += ["--deselect", "tests/serve/network/grpc/test_service.py::test_compiled_protocol_file_equals_the_source"]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=3000, check=False)
+    done = finished(words, cwd=ROOT, timeout=3000)
     assert done.returncode == 0, done.stdout
 
 

@@ -1,10 +1,11 @@
 """Public names of the three packages: tab completion lists them, and each can be imported."""
 
-import subprocess
 import sys
 from importlib import import_module
 
 import pytest
+
+from processes import finished
 
 PACKAGES = ["isocharge.simulate", "isocharge.train", "isocharge.serve"]
 
@@ -14,7 +15,7 @@ def test_dir_lists_the_public_names_before_their_first_use(package):
     """The test runs in a new process, because a name becomes an ordinary attribute when it is used once."""
     code = f"""import sys, {package} as package
 print(dir(package) == package.__all__, sys.modules.keys() & {{"torch", "isocharge.simulate.solver"}})"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = finished([sys.executable, "-c", code])
     assert done.stdout == "True set()\n"
 
 
@@ -35,5 +36,5 @@ def test_a_misspelt_name_is_an_attribute_error(package):
 def test_a_sweep_imports_no_part_of_serve():
     code = """import sys, isocharge.cli.simulate.sweep
 print(sorted({".".join(name.split(".")[:3]) for name in sys.modules if name.startswith("isocharge.serve.")}))"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = finished([sys.executable, "-c", code])
     assert done.stdout == "[]\n"

@@ -2,11 +2,10 @@
 
 import importlib.util
 import tomllib
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+from kept import ROOT
 
 
 @pytest.fixture(scope="module")

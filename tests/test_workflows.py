@@ -2,7 +2,6 @@
 
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -10,19 +9,16 @@ import pytest
 import yaml
 
 from kept import ROOT
+from processes import finished
 
 WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
 TARGETS = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
 BIN = Path(sys.executable).parent
 
 
-def jobs(workflow):
-    return yaml.safe_load(workflow.read_text("utf-8"))["jobs"].values()
-
-
 @pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.name)
 def test_each_step_is_a_target_of_make_or_a_script(workflow):
-    for job in jobs(workflow):
+    for job in yaml.safe_load(workflow.read_text("utf-8"))["jobs"].values():
         targets = job.get("strategy", {}).get("matrix", {}).get("target", [])
         for command in (step["run"] for step in job["steps"] if "run" in step):
             program, argument = command.split()[:2]
@@ -41,7 +37,7 @@ def test_each_action_is_pinned_to_a_commit_with_its_version_in_a_comment(workflo
 
 def test_zizmor_finds_nothing():
     words = [BIN / "zizmor", "--offline", "--pedantic", *WORKFLOWS]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    done = finished(words, timeout=60)
     assert done.returncode == 0, done.stdout
 
 
@@ -52,7 +48,7 @@ def test_installation_lines_of_the_package_index_replace_those_of_a_clone(tmp_pa
     version = re.search(r'^version = "(.*)"', (ROOT / "pyproject.toml").read_text("utf-8"), re.MULTILINE)[1]
     for tag, code in (("v0.0.1", 1), (f"v{version}", 0), (f"v{version}", 0)):
         words = [sys.executable, ROOT / ".ci/published_lines.py", tag]
-        assert subprocess.run(words, cwd=tmp_path, capture_output=True, check=False).returncode == code
+        assert finished(words, cwd=tmp_path).returncode == code
     page = (tmp_path / "serve/docs/getting_started.md").read_text("utf-8")
     assert re.findall(r"^pip install (\S+)", page, re.MULTILINE) == [
         "isocharge",

@@ -35,7 +35,7 @@ They were computed with P3 elements and 30 triangles around the probe by `film_s
 """
 
 
-@pytest.mark.parametrize(("film", "expected"), BY_SCIKIT_FEM.values(), ids=BY_SCIKIT_FEM.keys())
+@pytest.mark.parametrize(("film", "expected"), BY_SCIKIT_FEM.values(), ids=BY_SCIKIT_FEM)
 def test_charges_of_imperfect_films_agree_with_scikit_fem(film, expected):
     charge = solved_charge(replace(SENSOR, film=film), PROBE, AT, FORCE)
     np.testing.assert_allclose(charge, expected, rtol=8e-4)

@@ -2,7 +2,6 @@
 
 import re
 import tomllib
-from pathlib import Path
 from textwrap import dedent
 
 import numpy as np
@@ -10,8 +9,9 @@ import numpy as np
 import isocharge.simulate
 from isocharge.simulate import load_amplifier, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
+from kept import ROOT
 
-DOCS = Path(__file__).parents[2] / "simulate" / "docs"
+DOCS = ROOT / "simulate" / "docs"
 DATASETS, FILES = ((DOCS / f"{name}.md").read_text("utf-8") for name in ("datasets", "files"))
 TABLES = re.findall(r"```toml\n(.*?)```", FILES, re.DOTALL)
 

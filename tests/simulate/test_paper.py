@@ -3,11 +3,10 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from kept import ROOT
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
 

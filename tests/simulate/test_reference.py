@@ -9,7 +9,6 @@ import json
 import re
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,10 +28,10 @@ from isocharge.simulate import (
     touch_charge,
 )
 from isocharge.simulate.solver.error_estimate import estimated_error
+from kept import ROOT
 from solved_charges import relative_error
 
-HERE = Path(__file__).parent
-ACCURACY = (HERE.parents[1] / "simulate" / "docs" / "accuracy.md").read_text("utf-8")
+ACCURACY = (ROOT / "simulate/docs/accuracy.md").read_text("utf-8")
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ class ReferenceCase:
 
 def read(name: str, source: str) -> list[ReferenceCase]:
     """Return the cases of a file in tests/data."""
-    document = json.loads((HERE.parent / "data" / name).read_text("utf-8"))
+    document = json.loads((ROOT / "tests/data" / name).read_text("utf-8"))
     radius, young, poisson = (document["film"][key] for key in ("radius_mm", "young_GPa", "poisson"))
     return [
         ReferenceCase(

@@ -1,7 +1,6 @@
 """Interrupted sweeps: no part of a dataset remains, and the workers of a killed process end."""
 
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -13,6 +12,7 @@ from isocharge.common.errors import OutputExists
 from isocharge.common.progress import listening
 from isocharge.simulate import Circle, Sweep, load_sensor, run_sweep
 from isocharge.simulate.forward import forward_map
+from processes import finished
 
 SENSOR = load_sensor("three-25um-biaxial")
 SWEEP = Sweep(radius=3.0, force_range=(1.0, 1.0), samples=60, seed=7, outside=15)
@@ -67,7 +67,7 @@ def test_workers_end_with_a_killed_process(tmp_path):
     """The process is killed by SIGKILL between two shards. No dataset appears, and its workers end as well."""
     script = tmp_path / "driver.py"
     script.write_text(DRIVER.format(path=sys.path, check_count=forward_map.CHECK_COUNT))
-    run = subprocess.run([sys.executable, script, tmp_path / "presses"], capture_output=True, text=True, timeout=100)
+    run = finished([sys.executable, script, tmp_path / "presses"], timeout=100)
     assert run.returncode == -signal.SIGKILL, run.stderr
     assert not (tmp_path / "presses").exists()
     for pid in map(int, run.stdout.split()):

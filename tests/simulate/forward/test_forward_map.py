@@ -147,7 +147,7 @@ FILMS = {
 }
 
 
-@pytest.mark.parametrize(("film", "surface", "theory"), FILMS.values(), ids=FILMS.keys())
+@pytest.mark.parametrize(("film", "surface", "theory"), FILMS.values(), ids=FILMS)
 def test_forward_map_of_other_films(near_electrodes, film, surface, theory):
     sensor = replace(with_film(near_electrodes, **film), surface=surface)
     forward_map = kept(ForwardMap.build, sensor, Circle(1.0), 2.0, (0.8, 1.0), SolveSettings(theory=theory))

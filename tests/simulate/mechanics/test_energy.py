@@ -31,7 +31,7 @@ PROBES = {
 }
 
 
-@pytest.fixture(scope="module", params=PROBES.values(), ids=PROBES.keys())
+@pytest.fixture(scope="module", params=PROBES.values(), ids=PROBES)
 def mesh(request):
     """A small mesh for each kind of template, with thin rings at the rim and a probe away from the centre."""
     return place(Film(1.0, 1e-3, 1.0, 0.3), request.param, (0.4, 0.0), Resolution(3, 8, 2, 1), 0.05)
@@ -59,7 +59,7 @@ def assembled(mesh, matrix: np.ndarray) -> np.ndarray:
     return dense
 
 
-@pytest.fixture(params=GROUPS.values(), ids=GROUPS.keys())
+@pytest.fixture(params=GROUPS.values(), ids=GROUPS)
 def elastic(request, mesh) -> ElasticFilm:
     return ElasticFilm(mesh.geometry, request.param)
 

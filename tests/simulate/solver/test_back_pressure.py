@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,6 +24,7 @@ from isocharge.simulate import (
 )
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.solver.error_estimate import mesh_error
+from kept import ROOT
 from solved_charges import relative_error, solved_charge, with_film
 
 ATMOSPHERE = 0.101325
@@ -33,7 +33,7 @@ ATMOSPHERE = 0.101325
 CAVITY = 20.0 * np.pi * 45.0**2
 """Volume of a cavity of 20 mm behind the film, mm^3."""
 
-SKFEM_CASES = json.loads((Path(__file__).parents[2] / "data" / "film_cases_air_skfem.json").read_text())
+SKFEM_CASES = json.loads((ROOT / "tests/data/film_cases_air_skfem.json").read_text())
 """Charges by an independent finite-element program; see the entry `method` of the file."""
 
 MEMBRANE = SolveSettings(theory=Theory(bending=False), accuracy=1e-4)

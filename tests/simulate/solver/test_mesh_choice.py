@@ -79,7 +79,7 @@ def worst_error(film: Film, rough, fine) -> float:
 
 
 @pytest.mark.first_cases(2)
-@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 def test_mesh_error_bounds_the_difference_from_a_finer_mesh(scene):
     """The finer mesh has an order that is higher by two, and more rings."""
     thickness, pretension, poisson, probe, distance, force = scene

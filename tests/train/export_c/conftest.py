@@ -2,7 +2,6 @@
 
 import ctypes
 import shutil
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import pytest
 from isocharge.serve import find_model
 from isocharge.serve.live.device import ANY_BOARD
 from isocharge.train.export_c.folder import export_c
+from processes import finished
 
 HERE = Path(__file__).parent
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
@@ -25,7 +25,7 @@ def compile_strictly(compiler, folder, output, *sources, options=("-O2",)):
     if shutil.which(compiler) is None:
         pytest.skip(f"{compiler} is not installed")
     command = [compiler, *STRICT, *options, "-I", str(folder), "-o", str(output), *map(str, sources), "-lm"]
-    completed = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    completed = finished(command, cwd=folder)
     assert completed.returncode == 0, completed.stderr
     return output
 

@@ -27,6 +27,7 @@ from isocharge.serve import (
 )
 from isocharge.simulate import load_amplifier
 from isocharge.train.export_c.folder import export_c
+from processes import finished
 
 HERE = Path(__file__).parent
 EXAMPLE = ("host_example.c", "isocharge_chain.c", "isocharge_frames.c", "isocharge_model.c")
@@ -88,7 +89,7 @@ def test_the_readme_says_what_works(exports, run_commands, installed, tmp_path, 
         f"{include}\nint main(void)\n{{\n{body}return (flags & ISOCHARGE_OUTSIDE) || !(contact[2] > 0);\n}}\n"
     )
     program = compile_c("gcc", folder, folder / "call", "call.c", "isocharge_model.c")
-    assert subprocess.run([program], check=False).returncode == 0
+    assert finished([program]).returncode == 0
     for path in exports[0].iterdir():
         assert path.stem in text or path.name == "README.md"
     assert "| the numbers of the signal chain, the defaults, because no device file was given |" in text
@@ -107,7 +108,7 @@ def host(tmp_path_factory, compile_c):
 
 def played(program, path, *words):
     """Exit code, records and stderr of the host example."""
-    done = subprocess.run([program, path, *map(str, words)], capture_output=True, text=True, check=False, timeout=60)
+    done = finished([program, path, *map(str, words)], timeout=60)
     return done.returncode, [json.loads(line) for line in done.stdout.splitlines()], done.stderr
 
 

@@ -1,7 +1,5 @@
 """The C source of a model: several compilers, sanitizers, a changed weight, and the functions that it needs."""
 
-import subprocess
-
 import numpy as np
 import pytest
 from tests.train.random_networks import random_network, write_random_model
@@ -12,6 +10,7 @@ from isocharge.serve.model.model_folder import model_names
 from isocharge.train.export_c.folder import export_c
 from isocharge.train.export_c.model_source import FLAG_BITS
 from isocharge.train.training.folded_network import TANH
+from processes import finished
 
 
 @pytest.fixture
@@ -20,7 +19,7 @@ def run_self_test(compile_c, tmp_path):
 
     def run(folder, compiler="gcc", model="isocharge_model.c", options=("-O2",)):
         program = compile_c(compiler, folder, tmp_path / "self_test", "self_test.c", model, options=options)
-        done = subprocess.run([program], capture_output=True, text=True, check=False)
+        done = finished([program])
         return done.returncode, done.stdout
 
     return run
@@ -107,7 +106,7 @@ def test_tanh_has_the_stated_error(exports, compile_c, tmp_path):
     assert TANH.c_source in (exports[0] / "isocharge_model.c").read_text()
     (tmp_path / "tanh.c").write_text(f"#include <math.h>\n#include <stdio.h>\n{TANH.c_source}{TANH_TEST}")
     program = compile_c("gcc", exports[0], tmp_path / "tanh", tmp_path / "tanh.c")
-    worst, *limits, not_a_number = map(float, subprocess.check_output([program], text=True).split())
+    worst, *limits, not_a_number = map(float, finished([program]).stdout.split())
     assert 0.0 < worst <= 4e-7
     assert limits == [1.0, -1.0, 0.0]
     assert np.isnan(not_a_number)
@@ -117,7 +116,7 @@ def test_no_memory_is_allocated_and_nothing_but_math_h_is_used(exports, compile_
     """The object file only refers to float functions of the C library, and it has no writable data."""
     for folder in exports:
         compile_c("gcc", folder, tmp_path / "model.o", "isocharge_model.c", options=("-O2", "-c"))
-        symbols = subprocess.check_output(["nm", tmp_path / "model.o"], text=True).splitlines()
+        symbols = finished(["nm", tmp_path / "model.o"]).stdout.splitlines()
         needed = {line.split()[-1] for line in symbols if " U " in line}
         assert needed <= {"logf", "log1pf", "expf", "sinhf", "sqrtf", "cosf", "memset", "memcpy", "__stack_chk_fail"}, (
             needed

@@ -4,7 +4,6 @@ import json
 import re
 import shlex
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,10 +26,10 @@ from isocharge.train import (
 )
 from isocharge.train.data.presses import draw_contacts
 from isocharge.train.model_release.evaluate import simulated_errors
-from kept import kept
+from kept import ROOT, kept
 
 REFERENCE = noise_model("reference")
-MODELS = Path(__file__).parents[3] / "models"
+MODELS = ROOT / "models"
 FORCE_RANGE_N = (0.05, 2.0)
 RADIUS_mm = 8.0
 LARGEST_RADIUS_mm = 15.001

@@ -1,7 +1,5 @@
 """Training: it is reproducible and reports failures; losses; ranges of its settings."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -16,6 +14,7 @@ from isocharge.train.training.folded_network import ANGLES_TO_COSINE_ARGUMENTS, 
 from isocharge.train.training.misfit_training import focused_squared_distance
 from isocharge.train.training.network import FIRST_LAYER_SLOPES, Posterior, TrainablePerceptron
 from isocharge.train.training.training_data import Split
+from kept import ROOT
 
 
 def stage_with_factor(factor, steps=400):
@@ -202,7 +201,7 @@ def test_rounded_weights_are_whole_numbers_times_the_scale_of_their_output(datas
     assert not np.array_equal(rounded.last.weight, exact.last.weight)  # trained after the rounding
 
 
-CONFIGS = Path(__file__).parents[3] / "train" / "configs"
+CONFIGS = ROOT / "train" / "configs"
 
 
 def write(folder, text):

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -15,6 +14,7 @@ from isocharge.cli.train import fit as fit_command
 from isocharge.common.errors import PressError
 from isocharge.serve import load_model
 from isocharge.train import fit
+from processes import finished
 
 SHORT_CONFIG = """
 [network]
@@ -39,9 +39,7 @@ finally:
     print(sorted(name for name in sys.modules if name.startswith(unwanted)))
 """
     words = ("train", "fit", dataset_folder, "--config", "short.toml", "-o", "models/m")
-    done = subprocess.run(
-        [sys.executable, "-c", code, *words], capture_output=True, text=True, check=True, cwd=tmp_path
-    )
+    done = finished([sys.executable, "-c", code, *words], cwd=tmp_path)
     assert done.stdout.splitlines()[-1] == "[]"
     assert "caution: PVDF yields beyond 0.86" in done.stderr
     version_folder = tmp_path / "models" / "m" / "1"
