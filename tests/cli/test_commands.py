@@ -223,6 +223,12 @@ BAD = [
     ),
     ("train fit --sensor SENSOR --config none.toml -o OUT", "ConfigError: none.toml: cannot be"),
     ("train fit --sensor SENSOR -o 'a b'", "ModelError: model name 'a b'"),
+    (
+        "train calibrate x.csv --sensor SENSOR --held-out y.csv",
+        "--held-out: expected --output FOLDER for the model",
+    ),
+    ("train calibrate --sensor SENSOR -o OUT", "expected PRESSES.csv, or --next K"),
+    ("train calibrate --sensor SENSOR --next 3 -o OUT", "--output: nothing is calibrated without PRESSES.csv"),
     ("serve bench nowhere", "ModelError: "),
     ("serve bench --seconds inf", "--seconds"),
     ("serve stream SENSOR --port - --follow", "expected at least four electrodes, got A, B, C"),

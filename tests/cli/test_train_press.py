@@ -1,5 +1,6 @@
 """`train press`: the dialogue with a list of events, and the command with a simulated board."""
 
+import json
 import os
 import re
 import threading
@@ -8,12 +9,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.train.calibration.conftest import rig
 from tests.train.calibration.synthetic_film import SyntheticFilm
 
 from boards import encoded_frames
+from isocharge.cli.train import calibrate as calibrate_command
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents, SessionEnd
 from isocharge.common.errors import PortLost
-from isocharge.serve import Chunk, PressWatch, ReadingStream, read_presses
+from isocharge.serve import Chunk, PressWatch, ReadingStream, read_presses, write_presses
 from isocharge.serve.live.steady_press import (
     PORT_LOST,
     Phase,
@@ -21,7 +24,7 @@ from isocharge.serve.live.steady_press import (
     WatchResult,
 )
 from isocharge.simulate import Circle, load_amplifier, load_sensor
-from isocharge.train import CalibrationProblem, next_presses
+from isocharge.train import CalibrationProblem, calibrate, next_presses
 from isocharge.train.calibration import calibrate as calibrate_module
 from isocharge.train.calibration import session as session_module
 
@@ -250,6 +253,19 @@ def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(
     std = np.hypot(1.0, 0.002 * clean) * np.sqrt(1 / 90 + 1 / 50)
     assert (np.abs(presses.charge_pC - clean) < 5 * std).all()
     np.testing.assert_array_equal(presses.contact, places)
+
+
+def test_a_calibration_without_an_output_only_states_the_film(command, desk, monkeypatch, synthetic, problem):
+    monkeypatch.setattr(calibrate_command, "calibrate", partial(calibrate, start=synthetic, accurate=False))
+    monkeypatch.setattr(calibrate_module, "SAME_FILM_STD", np.inf)
+    _, _, presses = rig(problem, synthetic, 8, seed=5)
+    write_presses(desk / "presses.csv", presses)
+    before = sorted(desk.iterdir())
+    code, out, err = command("train", "calibrate", "presses.csv", "--sensor", "four-25um-biaxial", "--json")
+    assert code == 0, err
+    expected = calibrate(presses, problem, start=synthetic, accurate=False)
+    assert json.loads(out)["properties"]["pretension"]["value"] == pytest.approx(expected.film.value("pretension"))
+    assert sorted(desk.iterdir()) == before
 
 
 def test_a_file_with_further_columns_is_not_overwritten(refused, desk):
