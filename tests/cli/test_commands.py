@@ -10,14 +10,17 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from isocharge.cli.demo import live_film
 from isocharge.cli.demo.full_demo import run_demo
-from isocharge.cli.demo.live_film import played_radius_mm
+from isocharge.cli.demo.live_film import played_radius_mm, show_live_film
 from isocharge.cli.shared import terminal
 from isocharge.common.progress import report, track
 from isocharge.common.toml_text import to_toml
@@ -296,3 +299,14 @@ def test_demo_plays_the_working_area_of_the_released_model_of_the_sensor():
     assert played_radius_mm("three-25um-biaxial") == pytest.approx(8.0, rel=2e-3)
     assert played_radius_mm("four-25um-biaxial-15mm") == pytest.approx(15.0, rel=2e-3)
     assert played_radius_mm("no-such-sensor") == 8.0
+
+
+@pytest.mark.parametrize(("name", "sensor"), [(None, "three-25um-biaxial"), ("four-25um-biaxial", "four-25um-biaxial")])
+def test_live_demo_streams_the_chosen_sensor_to_its_model(monkeypatch, name, sensor):
+    calls = []
+    board = SimpleNamespace(url="socket://127.0.0.1:1")
+    monkeypatch.setattr(live_film, "ForwardMap", SimpleNamespace(build=lambda sensor, *_: sensor.name))
+    monkeypatch.setattr(live_film, "virtual_sensor", lambda played: nullcontext(calls.append(played) or board))
+    monkeypatch.setattr(live_film, "stream_command", lambda *words, **options: calls.append((words, options["live"])))
+    show_live_film("8081", 2.0, name)
+    assert calls == [sensor, ((sensor, board.url), "8081")]
