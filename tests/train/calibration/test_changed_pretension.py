@@ -34,7 +34,8 @@ def test_charges_of_an_uneven_film_after_warming_agree_with_full_solves(problem)
     after = solve_charges(later, probe, contact)
 
     charges = solve_even(problem, values=film.film_values)
-    factors = _tension_factors(charges, film, contact, np.array([0.0, -0.4]), None)
+    uneven_map = replace(charges.film, sensor=replace(charges.film.sensor, film=sensor.film))
+    factors = _tension_factors(replace(charges, film=uneven_map), film, contact, np.array([0.0, -0.4]), None)
     np.testing.assert_array_equal(factors[:, 0], 1.0)
     np.testing.assert_allclose(factors[:, 1], after / before, rtol=1e-3)
 

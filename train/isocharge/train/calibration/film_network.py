@@ -18,11 +18,12 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.model.charge_series import CHUNK_SIZE, ChargeSeries, series_size
 from isocharge.serve.presses.measured_presses import CONTACT
-from isocharge.simulate import Domain, NoiseModel, Sweep
+from isocharge.simulate import Domain, ForwardMap, NoiseModel, Sweep
+from isocharge.simulate.forward.derivative_maps import few_nodes
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.film_properties import PRETENSION, UNEVEN_TENSIONS
 from isocharge.simulate.solver.stress_limit import yield_force
-from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.calibration.film_charges import FilmCharges, axisymmetric, round_probe
 from isocharge.train.calibration.film_estimate import FilmEstimate, discrepancy_jacobian
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.data.charge_fit import fit_film_series, fit_series
@@ -111,9 +112,9 @@ def _tension_factors(
 ) -> Array:
     """Compute the factors by which changes of the pretension multiply the charges.
 
-    The tension changes equally in all directions. The factors are those of an axisymmetric film under a circular probe
-    with first-order changes by the imperfections. A factor is 1 where the charges before and after the change have
-    different signs.
+    The tension changes equally in all directions. The factors are those of an axisymmetric film under a circular probe,
+    for an uneven film with first-order changes by the imperfections. A factor is 1 where the charges before and after
+    the change have different signs.
 
     Args:
         charges: Charges of the solved film and of similar films.
@@ -132,7 +133,14 @@ def _tension_factors(
         values = film.film_values.copy()
         values[film.layout.index(PRETENSION.name)] += change_MPa
         values[uneven] *= film.value(PRETENSION.name) / (film.value(PRETENSION.name) + change_MPa)
-        return FilmCharges.solve_roughly(charges.prior, values, charges.domain, executor).charges(values, contact)
+        if not charges.film.sensor.film.is_axisymmetric:
+            return FilmCharges.solve_roughly(charges.prior, values, charges.domain, executor).charges(values, contact)
+        sensor, probe = charges.prior.film(values)  # its imperfections hardly change the charges
+        nodes = few_nodes(sensor.film, charges.domain)
+        forward_map = ForwardMap.build_unchecked(
+            axisymmetric(sensor), round_probe(probe), charges.domain, nodes, executor=executor
+        )
+        return forward_map.charges(contact)
 
     factors = np.ones((len(contact), node_MPa.size, len(charges.prior.sensor.electrodes)))
     changed_nodes = np.flatnonzero(node_MPa)
