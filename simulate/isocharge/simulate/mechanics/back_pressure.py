@@ -1,0 +1,93 @@
+"""Energy of a static pressure on the film and of the air that is trapped behind it, and its derivatives."""
+
+from functools import cached_property
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.simulate.mechanics.theory import DimensionlessGroups
+from isocharge.simulate.mesh.placed_mesh import Geometry
+
+
+class BackPressure:
+    """Energy of the static pressure and of the trapped air for a given mesh and given dimensionless groups.
+
+    Let V0 be the volume of the closed cavity behind the film, and let p0 be the pressure of the atmosphere. If the film
+    displaces the volume V at constant temperature, the pressure of the trapped air rises by p0 V0 / (V0 - V) - p0
+    (Boyle's law). The energy of the trapped air is -p0 V0 (ln(1 - V / V0) + V / V0).
+
+    As in the theory of plates, the static pressure and the pressure of the air act perpendicular to the undeformed
+    film, and on its undeformed area. In the units of `mechanics.theory`, the ratio V / V0 is the integral of the
+    deflection W over the film, multiplied by the dimensionless group `compression`.
+
+    Attributes:
+        geometry: Elements of the mesh.
+        groups: Dimensionless groups of the press.
+    """
+
+    def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
+        self.geometry = geometry
+        self.groups = groups
+        # The nodal loads add up to one divided by the number of copies of the mesh that cover the whole film.
+        self._copies = 1.0 / float(geometry.load.sum())
+
+    @cached_property
+    def weights(self) -> Array:
+        """Weights with which nodal deflections are integrated over the meshed part of the film, shape (n_node,)."""
+        return self.geometry.gather(self.geometry.mass)
+
+    def energy(self, deflection: Array) -> float:
+        """Compute the energy of the static pressure and of the trapped air for the meshed part of the film.
+
+        The energy of the whole film is the energy of the trapped air minus the work of the static pressure. The energy
+        of the meshed part is the energy of the whole film divided by the number of copies of the mesh that cover the
+        film.
+
+        Args:
+            deflection: Scaled deflection W at the nodes, shape (n_node,).
+
+        Returns:
+            Energy, dimensionless. It is infinite if the film displaces the whole volume of the air.
+        """
+        volume = self._volume(deflection)
+        energy = -self.groups.static_pressure * volume
+        if self.groups.compression != 0.0:
+            displaced_share = self.groups.compression * volume
+            if displaced_share >= 1.0:
+                return np.inf
+            # The energy of the air is divided by p0 V0. In scaled units, the volume V0 of the air is 1 / compression.
+            energy_unit = self.groups.ambient_pressure / self.groups.compression
+            energy += energy_unit * (-np.log1p(-displaced_share) - displaced_share)
+        return float(energy / self._copies)
+
+    def forces(self, deflection: Array) -> Array:
+        """Compute the derivatives of the energy with respect to the deflection of each node.
+
+        Args:
+            deflection: Scaled deflection W at the nodes, shape (n_node,).
+
+        Returns:
+            Derivatives, shape (n_node,). They are infinite if the film displaces the whole volume of the air.
+        """
+        # At constant temperature, the pressure p0 of the air increases by p0 x / (1 - x), where x = V / V0 is the
+        # displaced share of the volume of the air.
+        displaced_share = self.groups.compression * self._volume(deflection)
+        if displaced_share >= 1.0:
+            return np.full_like(deflection, np.inf)
+        air_pressure = self.groups.ambient_pressure * displaced_share / (1.0 - displaced_share)
+        pressure = air_pressure - self.groups.static_pressure
+        return pressure * self.weights
+
+    def stiffness(self, deflection: Array) -> float:
+        """Compute the factor c in the second derivatives c * weights[i] * weights[j] of the energy.
+
+        Args:
+            deflection: Scaled deflection W at the nodes, shape (n_node,).
+        """
+        displaced_share = self.groups.compression * self._volume(deflection)
+        pressure_per_volume = self.groups.ambient_pressure * self.groups.compression / (1.0 - displaced_share) ** 2
+        return float(self._copies * pressure_per_volume)
+
+    def _volume(self, deflection: Array) -> float:
+        """Compute the integral of the scaled deflection W over the whole film."""
+        return self._copies * float(self.weights @ deflection)
