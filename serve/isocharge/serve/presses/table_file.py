@@ -92,11 +92,6 @@ class CsvTable(NumberTable):
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
         """Convert the cells of the requested columns to numbers, row by row.
 
-        Args:
-            rules: Rules of the requested columns, by the names of the columns. This method uses only their
-                descriptions, for error messages.
-            max_rows: Largest number of rows that is accepted.
-
         Raises:
             InputError: If there are too many rows, a row has the wrong number of cells, a cell is not a finite number,
                 or the decimal mark is not clear.
@@ -315,11 +310,6 @@ class ParquetTable(NumberTable):
 
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
         """Decode the requested columns.
-
-        Args:
-            rules: Rules of the requested columns, by the names of the columns. This method uses only their
-                descriptions, for error messages.
-            max_rows: Largest number of rows that is accepted.
 
         Raises:
             InputError: If there are too many rows, if the type of a column is not a number type, or if the file is

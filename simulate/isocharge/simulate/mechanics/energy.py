@@ -41,7 +41,7 @@ class ElasticFilm:
         groups: Dimensionless groups of the press.
         membrane: Stretching energy.
         bending: Bending energy; None if the theory omits bending.
-        back: Energy of the pressure on the whole film.
+        back: Energy of the pressure on the whole film; None without static pressure and trapped air.
     """
 
     def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
@@ -49,7 +49,8 @@ class ElasticFilm:
         self.groups = groups
         self.membrane = Membrane(geometry, groups)
         self.bending = Bending(geometry, groups.bending) if groups.bending > 0.0 else None
-        self.back = BackPressure(geometry, groups)
+        has_back_pressure = groups.static_pressure != 0.0 or groups.compression != 0.0
+        self.back = BackPressure(geometry, groups) if has_back_pressure else None
 
     @property
     def unknowns_per_node(self) -> int:
@@ -67,7 +68,8 @@ class ElasticFilm:
         stored_energy = self.membrane.energy(field)
         if self.bending is not None:
             stored_energy += self.bending.energy(deflection)
-        stored_energy += self.back.energy(deflection)
+        if self.back is not None:
+            stored_energy += self.back.energy(deflection)
         work = self.groups.load * float(self.geometry.load @ deflection)
         work += float(self.geometry.load @ in_plane @ np.array(self.groups.side_load))
         return stored_energy - work
@@ -93,15 +95,16 @@ class ElasticFilm:
 
         # `back.forces` is the derivative of the energy, which is the negative force of the pressure on the whole film.
         # Therefore the derivative is added.
-        residual[:, 2] += self.back.forces(deflection)
+        if self.back is not None:
+            residual[:, 2] += self.back.forces(deflection)
         return residual
 
     @property
     def load_scale(self) -> float:
         """Norm of the nodal forces of the probe, or of the static pressure if there is no probe."""
-        if self.groups.load == 0.0:
-            return abs(self.groups.static_pressure) * float(np.linalg.norm(self.back.weights))
-        return self.groups.load * float(np.linalg.norm(self.geometry.load))
+        if self.back is None or self.groups.load != 0.0:
+            return self.groups.load * float(np.linalg.norm(self.geometry.load))
+        return abs(self.groups.static_pressure) * float(np.linalg.norm(self.back.weights))
 
     def work(self, field: Array) -> float:
         """Compute the magnitude of the work that the probe does, or that the static pressure does if there is no probe.
@@ -109,9 +112,9 @@ class ElasticFilm:
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
         """
-        if self.groups.load == 0.0:
-            return abs(self.groups.static_pressure * float(self.back.weights @ field[:, 2]))
-        return self.groups.load * abs(float(self.geometry.load @ field[:, 2]))
+        if self.back is None or self.groups.load != 0.0:
+            return self.groups.load * abs(float(self.geometry.load @ field[:, 2]))
+        return abs(self.groups.static_pressure * float(self.back.weights @ field[:, 2]))
 
     def in_plane_scale(self, field: Array) -> float:
         """Compute the norm of the in-plane forces of the elements, which scales the in-plane residual.

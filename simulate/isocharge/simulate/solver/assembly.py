@@ -313,17 +313,17 @@ def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, added
         Function that solves linear systems with the tangent.
     """
     solve_film = assembly.factor(elastic.tangent(field, added_tension)).solve
-    has_air = elastic.groups.compression != 0.0
-    if not has_air or assembly.odd:  # odd fields do not compress the air
+    back = elastic.back
+    if back is None or elastic.groups.compression == 0.0 or assembly.odd:  # odd fields do not compress the air
         return solve_film
 
     # The air changes a solution x by -c / (1 + c v . y) (v . x) y, where y = K^-1 v is the response of the film to a
     # uniform pressure.
-    weights = elastic.back.weights  # v
+    weights = back.weights  # v
     uniform_pressure = np.zeros_like(field)
     uniform_pressure[:, 2] = weights
     response = solve_film(uniform_pressure)  # y
-    air_stiffness = elastic.back.stiffness(field[:, 2])
+    air_stiffness = back.stiffness(field[:, 2])
     pressure_per_volume = air_stiffness / (1.0 + air_stiffness * float(weights @ response[:, 2]))
 
     def solve_with_air(right: Array) -> Array:

@@ -74,19 +74,12 @@ class FilmCharges:
         """
         even_values = np.where(prior.is_imperfection, 0.0, values)
 
-        def solve(film_values: Array) -> ForwardMap:
-            """Solve the axisymmetric film with the given properties under the axisymmetric probe."""
-            sensor, probe = prior.film(film_values)
-            nodes = few_nodes(sensor.film, domain)
-            return ForwardMap.build_unchecked(
-                axisymmetric(sensor), round_probe(probe), domain, nodes, executor=executor
-            )
-
-        same_probe = solve(even_values)
+        same_probe = solve_even_map(prior, even_values, domain, executor)
         larger_probe = None
         if PROBE_RADIUS in prior.names:
             is_radius = np.arange(len(values)) == prior.index(PROBE_RADIUS)
-            larger_probe = solve(even_values + STEP * prior.std * is_radius)
+            larger_values = even_values + STEP * prior.std * is_radius
+            larger_probe = solve_even_map(prior, larger_values, domain, executor)
         return cls(
             prior=prior,
             values=even_values,
@@ -270,6 +263,16 @@ class FilmCharges:
         sensors = [changed_film(sensor, self.film.probe, {one.name: change})[0] for change in (step, -step)]
         forward, backward = (_read(self.film, changed).charges(contact) for changed in sensors)
         return np.asarray((forward - backward) / (2.0 * step))
+
+
+def solve_even_map(prior: FilmPrior, values: Array, domain: Domain, executor: Executor | None) -> ForwardMap:
+    """Solve the axisymmetric film with the mean properties, under an axisymmetric probe, at a few presses.
+
+    See `FilmCharges.solve_roughly`, which also computes the derivatives with respect to the properties.
+    """
+    sensor, probe = prior.film(values)
+    nodes = few_nodes(sensor.film, domain)
+    return ForwardMap.build_unchecked(axisymmetric(sensor), round_probe(probe), domain, nodes, executor=executor)
 
 
 def axisymmetric(sensor: Sensor) -> Sensor:

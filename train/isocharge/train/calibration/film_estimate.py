@@ -218,18 +218,20 @@ class FilmEstimate:
     def drifted(self) -> "FilmEstimate":
         """Return the estimate with which a later session begins.
 
-        The possible drift of the film since then increases the variances. The offset and the other unknowns of the
-        earlier session are removed.
+        The possible drift of the film since then is added to the covariance. A drift of the pretension comes from a
+        change of the temperature, which adds the same tension in all directions. The uneven parts of the tension then
+        remain in MPa, and their shares of the pretension change. The offset and the other unknowns of the earlier
+        session are removed.
         """
         layout = self.layout
         drift_std = np.zeros(len(self.values))
         drift_std[layout.film] = [one.drift for one in layout.prior.properties]
         drift_std[layout.coefficients] = COEFFICIENT_DRIFT
-        drift = np.diag(drift_std)
-        # A change of the temperature adds the same tension in all directions. The uneven parts become other shares.
-        pretension = max(self.value(PRETENSION.name), PRETENSION.drift)
+        drift = np.diag(drift_std)  # a column contains the effects of the drift of one unknown on all unknowns
+        tension = layout.index(PRETENSION.name)
         for name in UNEVEN_TENSIONS:
-            drift[layout.index(name), layout.index(PRETENSION.name)] = -self.value(name) * PRETENSION.drift / pretension
+            share_change_per_MPa = -self.value(name) / max(self.values[tension], PRETENSION.drift)
+            drift[layout.index(name), tension] = share_change_per_MPa * PRETENSION.drift
         values = self.values.copy()
         covariance = self.covariance + drift @ drift.T
         session = layout.session

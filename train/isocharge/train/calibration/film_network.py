@@ -18,12 +18,11 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.model.charge_series import CHUNK_SIZE, ChargeSeries, series_size
 from isocharge.serve.presses.measured_presses import CONTACT
-from isocharge.simulate import Domain, ForwardMap, NoiseModel, Sweep
-from isocharge.simulate.forward.derivative_maps import few_nodes
+from isocharge.simulate import Domain, FilmSlopes, NoiseModel, Sweep
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.film_properties import PRETENSION, UNEVEN_TENSIONS
 from isocharge.simulate.solver.stress_limit import yield_force
-from isocharge.train.calibration.film_charges import FilmCharges, axisymmetric, round_probe
+from isocharge.train.calibration.film_charges import FilmCharges, solve_even_map
 from isocharge.train.calibration.film_estimate import FilmEstimate, discrepancy_jacobian
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.data.charge_fit import fit_film_series, fit_series
@@ -126,23 +125,26 @@ def _tension_factors(
     Returns:
         Factors, shape (n, n_node, n_electrode), dimensionless.
     """
-    uneven = [film.layout.index(name) for name in UNEVEN_TENSIONS]
+    prior = charges.prior
+    mean_tension = film.layout.index(PRETENSION.name)
+    uneven_tensions = [film.layout.index(name) for name in UNEVEN_TENSIONS]
 
     def charges_after(change_MPa: float) -> Array:
-        """Solve the film after a change of its pretension, and return its charges."""
+        """Solve the film after an equal change of its tension in all directions, and return its charges."""
         values = film.film_values.copy()
-        values[film.layout.index(PRETENSION.name)] += change_MPa
-        values[uneven] *= film.value(PRETENSION.name) / (film.value(PRETENSION.name) + change_MPa)
-        if not charges.film.sensor.film.is_axisymmetric:
-            return FilmCharges.solve_roughly(charges.prior, values, charges.domain, executor).charges(values, contact)
-        sensor, probe = charges.prior.film(values)  # its imperfections hardly change the charges
-        nodes = few_nodes(sensor.film, charges.domain)
-        forward_map = ForwardMap.build_unchecked(
-            axisymmetric(sensor), round_probe(probe), charges.domain, nodes, executor=executor
-        )
-        return forward_map.charges(contact)
+        values[mean_tension] += change_MPa
+        # The uneven parts of the tension do not change in MPa, so their shares of the mean change.
+        values[uneven_tensions] *= film.values[mean_tension] / values[mean_tension]
+        even_map = solve_even_map(prior, values, charges.domain, executor)
+        is_even = charges.film.sensor.film.is_axisymmetric
+        if is_even:
+            return even_map.charges(contact)
+        slopes = FilmSlopes.build(even_map, executor=executor)
+        even_values = np.where(prior.is_imperfection, 0.0, values)
+        similar_films = FilmCharges(prior, even_values, even_map, slopes, larger_probe=None)  # the probe is the same
+        return similar_films.charges(values, contact)
 
-    factors = np.ones((len(contact), node_MPa.size, len(charges.prior.sensor.electrodes)))
+    factors = np.ones((len(contact), node_MPa.size, len(prior.sensor.electrodes)))
     changed_nodes = np.flatnonzero(node_MPa)
     if changed_nodes.size > 0:
         before = charges_after(0.0)
