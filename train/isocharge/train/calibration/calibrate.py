@@ -27,7 +27,7 @@ MAX_SOLVED_FILMS = 4
 """Largest number of axisymmetric films that are solved one after the other."""
 
 SAME_FILM_STD = 0.3
-"""Largest change of a mechanical property, in standard deviations of its estimate, for which no film is solved."""
+"""Largest accepted distance of an estimated property from that of the solved film, in standard deviations."""
 
 VISIBLE_ASYMMETRY = 0.03
 """Relative root-mean-square effect of the imperfections on the charges above which the uneven film itself is solved.

@@ -164,6 +164,7 @@ class FilmCharges:
         """
         change = dict(zip(self.prior.names, (values - self.values).tolist(), strict=True))
         solved_MPa = self._tensions(self.values)
+        # The derivatives with respect to the tensions are those per MPa.
         change |= {name: tension_MPa - solved_MPa[name] for name, tension_MPa in self._tensions(values).items()}
         charge_change = np.zeros_like(solved_charge)
         for name, derivative in stress_derivatives.items():

@@ -230,6 +230,7 @@ class FilmEstimate:
         drift = np.diag(drift_std)  # a column contains the effects of the drift of one unknown on all unknowns
         tension = layout.index(PRETENSION.name)
         for name in UNEVEN_TENSIONS:
+            # The limit avoids a very large change for a film that is nearly slack.
             share_change_per_MPa = -self.value(name) / max(self.values[tension], PRETENSION.drift)
             drift[layout.index(name), tension] = share_change_per_MPa * PRETENSION.drift
         values = self.values.copy()
