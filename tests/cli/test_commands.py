@@ -19,8 +19,9 @@ import numpy as np
 import pytest
 
 from isocharge.cli.demo import live_film
+from isocharge.cli.demo.command import demo_command
 from isocharge.cli.demo.full_demo import run_demo
-from isocharge.cli.demo.live_film import played_radius_mm, show_live_film
+from isocharge.cli.demo.live_film import played_radius_mm
 from isocharge.cli.shared import terminal
 from isocharge.common.progress import report, track
 from isocharge.common.toml_text import to_toml
@@ -276,7 +277,7 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
         **dict.fromkeys(("press", "draw_deflection", "draw_section", "draw_charge_map"), lambda *_: None),
     }.items():
         monkeypatch.setattr(f"isocharge.cli.demo.full_demo.{name}", stub)
-    run_demo(out, 2.0)
+    run_demo(out, 2.0, SENSOR)
     table, err = capsys.readouterr()
     assert 400 <= int(re.search(r"(\d+) frames, 0 lost, 0 repeated", err)[1]) < 500  # more came than were followed
     assert re.findall(r"^(\d)\. (\w+): ", err, re.M) == [
@@ -308,5 +309,5 @@ def test_live_demo_streams_the_chosen_sensor_to_its_model(monkeypatch, name, sen
     monkeypatch.setattr(live_film, "ForwardMap", SimpleNamespace(build=lambda sensor, *_: sensor.name))
     monkeypatch.setattr(live_film, "virtual_sensor", lambda played: nullcontext(calls.append(played) or board))
     monkeypatch.setattr(live_film, "stream_command", lambda *words, **options: calls.append((words, options["live"])))
-    show_live_film("8081", 2.0, name)
+    demo_command(live="8081", seconds=2.0, sensor=name)
     assert calls == [sensor, ((sensor, board.url), "8081")]

@@ -239,7 +239,7 @@ def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(
     monkeypatch.setattr(calibrate_module, "solve_even", lambda *_: synthetic)
     monkeypatch.setattr(calibrate_module, "SAME_FILM_STD", np.inf)
     _, _, err = command(*PRESS, "--port", "some.bin", "--press-list", "list.csv")
-    assert "presses.csv has 2 presses; the same command continues the session" in err
+    assert "presses in presses.csv: 2; the same command continues the session" in err
     assert len(read_presses(desk / "presses.csv")) == 2
 
     problem = ("--probe", "circle:1.1", "--radius", "7.9")

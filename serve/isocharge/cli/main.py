@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.lazy import LazyCommand, lazy_group
+from isocharge.cli.shared.lazy import lazy_group
 from isocharge.cli.shared.terminal import open_closed_streams, say, show, warnings_to_stderr
 from isocharge.common.errors import InputError, IsochargeError, package_version
 
@@ -19,101 +19,63 @@ app = lazy_group(
     "Compute the position and the force of a contact on a piezoelectric tactile film from the charges of three to "
     "eight electrodes.",
     {
-        "demo": LazyCommand(
-            "isocharge.cli.demo.command:demo_command",
-            "Run all stages once: simulate a film, train a network, track a virtual sensor, draw a picture.",
+        "demo.command:demo_command": (
+            "Run all stages once: simulate a film, train a network, track a virtual sensor, draw a picture."
         ),
-        "verify": LazyCommand(
-            "isocharge.cli.serve.verify:verify_command", "Check that a model folder is complete and unchanged."
-        ),
+        "serve.verify:verify_command": "Check that a model folder is complete and unchanged.",
     },
 )
 
-simulate_app = lazy_group(
-    "Compute the charges of presses, and the accuracy with which charges determine a press.",
-    {
-        "point": LazyCommand(
-            "isocharge.cli.simulate.point:point_command",
-            "Compute the charges and the deflection of one press.",
-            extra="simulate",
-        ),
-        "sweep": LazyCommand(
-            "isocharge.cli.simulate.sweep:sweep_command",
-            "Compute the charges of many presses and write them as a dataset for training.",
-            extra="simulate",
-        ),
-        "identify": LazyCommand(
-            "isocharge.cli.simulate.identify:identify_command",
-            "Compute error limits, folds and the working area of a sensor.",
-            extra="simulate",
-        ),
-        "design": LazyCommand(
-            "isocharge.cli.simulate.design:design_command",
-            "Search for the electrode positions with the smallest position errors.",
-            extra="design",
-        ),
-    },
+app.add_typer(
+    lazy_group(
+        "Compute the charges of presses, and the accuracy with which charges determine a press.",
+        {
+            "simulate.point:point_command [simulate]": "Compute the charges and the deflection of one press.",
+            "simulate.sweep:sweep_command [simulate]": (
+                "Compute the charges of many presses and write them as a dataset for training."
+            ),
+            "simulate.identify:identify_command [simulate]": (
+                "Compute error limits, folds and the working area of a sensor."
+            ),
+            "simulate.design:design_command [design]": (
+                "Search for the electrode positions with the smallest position errors."
+            ),
+        },
+    ),
+    name="simulate",
 )
 
-train_app = lazy_group(
-    "Train models on simulated or measured charges; calibrate films; compare methods.",
-    {
-        "fit": LazyCommand(
-            "isocharge.cli.train.fit:fit_command", "Train a network and write its model folder.", extra="train"
-        ),
-        "press": LazyCommand(
-            "isocharge.cli.train.press:press_command",
-            "Record presses at a port, and write them to a file.",
-            extra="train",
-        ),
-        "calibrate": LazyCommand(
-            "isocharge.cli.train.calibrate:calibrate_command",
-            "Fit a real film to some presses, and write its model folder.",
-            extra="train",
-        ),
-        "report": LazyCommand(
-            "isocharge.cli.train.report:report_command", "Compare methods: speed against error.", extra="train"
-        ),
-        "export-c": LazyCommand(
-            "isocharge.cli.train.export_c:export_c_command", "Write a model as C source.", extra="train"
-        ),
-    },
+app.add_typer(
+    lazy_group(
+        "Train models on simulated or measured charges; calibrate films; compare methods.",
+        {
+            "train.fit:fit_command [train]": "Train a network and write its model folder.",
+            "train.press:press_command [train]": "Record presses at a port, and write them to a file.",
+            "train.calibrate:calibrate_command [train]": "Fit a real film to some presses, and write its model folder.",
+            "train.report:report_command [train]": "Compare methods: speed against error.",
+            "train.export_c:export_c_command [train]": "Write a model as C source.",
+        },
+    ),
+    name="train",
 )
 
-serve_app = lazy_group(
-    "Estimate contacts from charges: from a file, from a sensor's port, over HTTP. Or play a virtual sensor.",
-    {
-        "predict": LazyCommand(
-            "isocharge.cli.serve.predict:predict_command", "Estimate the contacts of the charges in a file."
-        ),
-        "check": LazyCommand(
-            "isocharge.cli.serve.check:check_command", "Measure the errors of a model on measured presses."
-        ),
-        "stream": LazyCommand(
-            "isocharge.cli.serve.stream:stream_command", "Follow a sensor live: a record for every frame of charges."
-        ),
-        "replay": LazyCommand(
-            "isocharge.cli.serve.stream:replay_command", "Play a recording again, as it was or with other settings."
-        ),
-        "plot": LazyCommand("isocharge.cli.serve.plot:plot_command", "Draw a recording.", extra="simulate"),
-        "doctor": LazyCommand(
-            "isocharge.cli.serve.doctor:doctor_command", "Say what a port sends, and what is wrong with it."
-        ),
-        "http": LazyCommand("isocharge.cli.serve.http:http_command", "Serve models over HTTP and gRPC.", extra="http"),
-        "virtual": LazyCommand(
-            "isocharge.cli.serve.virtual:virtual_command",
-            "Play a virtual sensor on a pseudo-terminal.",
-            extra="simulate",
-        ),
-        "bench": LazyCommand(
-            "isocharge.cli.serve.bench:bench_command", "Measure speed against error of a model on this machine."
-        ),
-    },
+app.add_typer(
+    lazy_group(
+        "Estimate contacts from charges: from a file, from a sensor's port, over HTTP. Or play a virtual sensor.",
+        {
+            "serve.predict:predict_command": "Estimate the contacts of the charges in a file.",
+            "serve.check:check_command": "Measure the errors of a model on measured presses.",
+            "serve.stream:stream_command": "Follow a sensor live: a record for every frame of charges.",
+            "serve.stream:replay_command": "Play a recording again, as it was or with other settings.",
+            "serve.plot:plot_command [simulate]": "Draw a recording.",
+            "serve.doctor:doctor_command": "Say what a port sends, and what is wrong with it.",
+            "serve.http:http_command [http]": "Serve models over HTTP and gRPC.",
+            "serve.virtual:virtual_command [simulate]": "Play a virtual sensor on a pseudo-terminal.",
+            "serve.bench:bench_command": "Measure speed against error of a model on this machine.",
+        },
+    ),
+    name="serve",
 )
-
-app.add_typer(simulate_app, name="simulate")
-app.add_typer(train_app, name="train")
-app.add_typer(serve_app, name="serve")
 
 
 def _print_version(is_requested: bool) -> None:

@@ -24,7 +24,6 @@ def demo_command(
     seconds: Annotated[
         float | None,
         typer.Option(
-            "--seconds",
             min=3.0,
             max=1e6,
             help="Duration of the live part, s. (default: 10; with --live until Ctrl-C)",
@@ -33,7 +32,6 @@ def demo_command(
     sensor: Annotated[
         str | None,
         typer.Option(
-            "--sensor",
             metavar="NAME",
             help="Name of a built-in sensor. --live also needs a released model with this name. (default: "
             "three-25um-biaxial)",
@@ -43,7 +41,6 @@ def demo_command(
     playground: Annotated[
         Path | None,
         typer.Option(
-            "--playground",
             metavar="FILE.html",
             help="Only write the playground: a page on which a simulated film is pressed with the mouse. The file must "
             "not exist yet. (default: no file)",
@@ -67,15 +64,16 @@ def demo_command(
         return
 
     # The modules of both demos are imported late, because they need extras that may not be installed.
+    sensor_name = sensor or "three-25um-biaxial"
     if live is None:
         with require("train"):
             from isocharge.cli.demo.full_demo import run_demo
-        run_demo(output, seconds, sensor)
+        run_demo(output or Path("demo-output"), seconds or 10.0, sensor_name)
         return
     with require("simulate", "http"):
         from isocharge.cli.demo.live_film import show_live_film
 
-        show_live_film(live, seconds, sensor)
+        show_live_film(live, seconds, sensor_name)
 
 
 def _write_playground(path: Path) -> None:

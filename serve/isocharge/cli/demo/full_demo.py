@@ -5,11 +5,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
-from isocharge.cli.demo.live_film import DEFAULT_SENSOR, played_radius_mm
+from isocharge.cli.demo.live_film import played_radius_mm
+from isocharge.cli.serve.stream import summary
 from isocharge.cli.shared.forward_maps import N_SIMULATED_PRESSES
 from isocharge.cli.shared.terminal import say, show_result, shown_progress, this_command
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
@@ -17,8 +18,6 @@ from isocharge.common.arrays import Array
 from isocharge.common.files import new_folder
 from isocharge.common.progress import track
 from isocharge.serve import Port, Predictor, TouchStream
-from isocharge.serve.frames.frame import FrameCounts
-from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.simulate import Circle, Equilibrium, ForwardMap, Sweep, load_sensor, press, read_dataset
 from isocharge.simulate.dataset.sweep import solve_maps, write_sweep
 from isocharge.simulate.plots.figure import FELT, PRESSED, new_figure, save_picture
@@ -32,20 +31,16 @@ from isocharge.simulate.plots.film import (
 from isocharge.train import fit, release
 from isocharge.train.data.contact_errors import position_error
 
-LIVE_S = 10.0
-"""Duration of the live part, s."""
 
-
-def run_demo(output: Path | None, seconds: float | None, sensor_name: str | None = None) -> None:
+def run_demo(folder: Path, seconds: float, sensor_name: str) -> None:
     """Run the demo, print a table of its results, and write the dataset, the model and a picture into a new folder.
 
     Args:
-        output: The folder; None for demo-output.
-        seconds: Duration of the live part, s; None for `LIVE_S`.
-        sensor_name: Name of the simulated sensor and of the model that is trained; None for `DEFAULT_SENSOR`.
+        folder: The folder.
+        seconds: Duration of the live part, s.
+        sensor_name: Name of the simulated sensor and of the model that is trained.
     """
-    folder = output or Path("demo-output")
-    sensor = load_sensor(sensor_name or DEFAULT_SENSOR)
+    sensor = load_sensor(sensor_name)
     probe = Circle(1.0)
     sweep = Sweep(played_radius_mm(sensor.name), samples=N_SIMULATED_PRESSES)
     durations_s: dict[str, float] = {}
@@ -68,13 +63,24 @@ def run_demo(output: Path | None, seconds: float | None, sensor_name: str | None
             "a virtual sensor sends frames over a pseudo-terminal, the model answers live",
             durations_s,
         ):
-            followed, totals = _follow_live(forward_map, predictor, seconds or LIVE_S)
-            say(f"   {totals.frames} frames, {totals.lost} lost, {totals.repeated} repeated")
+            followed, totals = _follow_live(forward_map, predictor, seconds)
+            say(f"   {totals}")
         with _demo_step("show", "one page of pictures", durations_s):
             equilibrium = press(sensor.film, probe, (3.0, -2.0), 1.0)  # a press inside every working area
             draw_page(forward_map, equilibrium, followed, draft / "demo.png")
     say(f"   {folder / 'demo.png'}")
-    show_result(_results(predictor.metadata, followed, durations_s, folder), json=False)
+
+    errors = predictor.metadata.errors
+    live_median_mm, live_p95_mm = np.percentile(position_error(followed[:, 1], followed[:, 0]), (50, 95))
+    results = {
+        "model": predictor.metadata.label,
+        "position_error_mm": {"median": errors["position_median_mm"], "p95": errors["position_p95_mm"]},
+        "live_position_error_mm": {"median": live_median_mm, "p95": live_p95_mm},
+        "force_error_percent": {"median": errors["force_median_percent"], "rms": errors["force_rms_percent"]},
+        "step_s": durations_s,
+        "folder": str(folder),
+    }
+    show_result(results, json=False)
 
 
 @contextmanager
@@ -94,7 +100,7 @@ def _demo_step(name: str, description: str, durations_s: dict[str, float]) -> It
     durations_s[name] = time.perf_counter() - start_s
 
 
-def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) -> tuple[Array, FrameCounts]:
+def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) -> tuple[Array, str]:
     """Play a virtual sensor, and estimate its contacts from the frames at its port.
 
     Args:
@@ -104,8 +110,8 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
 
     Returns:
         Two values. The first is an array of the frames in which both the virtual sensor and the model have a contact,
-        shape (n, 2, 3): the true and the estimated (x, y, F), mm and N. The second contains the counts of all frames of
-        the stream.
+        shape (n, 2, 3): the true and the estimated (x, y, F), mm and N. The second contains the numbers of frames and
+        faults of the stream.
     """
     touch = TouchStream(predictor)
     followed = []
@@ -120,29 +126,7 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
             row = round(1e-6 * (record.t_device_us or 0) * rate_Hz) % len(script)
             if record.contact and sensor.script.touching[row]:
                 followed.append((script[row], (record.x_mm, record.y_mm, record.force_N)))
-    return np.array(followed, float), touch.totals()
-
-
-def _results(metadata: ModelMetadata, followed: Array, durations_s: dict[str, float], folder: Path) -> dict[str, Any]:
-    """Return the results of the demo, with units in their names.
-
-    Args:
-        metadata: Metadata of the trained model.
-        followed: True and estimated contacts of the live part, shape (n, 2, 3), mm and N.
-        durations_s: Duration of each step by its name, s.
-        folder: Folder of the results.
-    """
-    errors = metadata.errors
-    live_errors_mm = position_error(followed[:, 1], followed[:, 0])
-    live_median_mm, live_p95_mm = np.percentile(live_errors_mm, (50, 95))
-    return {
-        "model": metadata.label,
-        "position_error_mm": {"median": errors["position_median_mm"], "p95": errors["position_p95_mm"]},
-        "live_position_error_mm": {"median": live_median_mm, "p95": live_p95_mm},
-        "force_error_percent": {"median": errors["force_median_percent"], "rms": errors["force_rms_percent"]},
-        "step_s": durations_s,
-        "folder": str(folder),
-    }
+    return np.array(followed, float), summary(touch)
 
 
 def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array, path: Path) -> None:

@@ -10,9 +10,6 @@ from isocharge.common.errors import ModelError
 from isocharge.serve import Predictor, find_model
 from isocharge.simulate import Circle, ForwardMap, load_sensor
 
-DEFAULT_SENSOR = "three-25um-biaxial"
-"""Name of the sensor of the demo, and of its released model."""
-
 
 def played_radius_mm(sensor: str) -> float:
     """Return the largest distance of a press of the demo from the centre of the film, mm.
@@ -30,19 +27,18 @@ def played_radius_mm(sensor: str) -> float:
     return round(math.sqrt(validity.inscribed_radius_squared_mm2), 2)
 
 
-def show_live_film(live: str, seconds: float | None, sensor_name: str | None = None) -> None:
+def show_live_film(live: str, seconds: float | None, sensor: str) -> None:
     """Play a virtual sensor, estimate its contacts with a released model, and show the contacts on the live page.
 
     Args:
         live: Value of `--live`: address at which the page listens.
         seconds: Time after which the demo stops, s; None to stop at Ctrl-C.
-        sensor_name: Name of the sensor and of its released model; None for `DEFAULT_SENSOR`.
+        sensor: Name of the sensor and of its released model.
 
     Raises:
         ModelError: If there is no released model with this name.
         InputError: If the address has another form than PORT or HOST:PORT.
     """
-    sensor = sensor_name or DEFAULT_SENSOR
     find_model(sensor)  # an unknown model is refused before the film is solved
     with until_stopped():
         with shown_progress():

@@ -14,9 +14,7 @@ def bench_command(
     model: Annotated[
         str, typer.Argument(metavar="[MODEL]", help="Model: a name in `models/`, or a path.")
     ] = "three-25um-biaxial",
-    seconds: Annotated[
-        float, typer.Option("--seconds", min=0.1, max=86400.0, help="Time for all measurements, s.")
-    ] = 10.0,
+    seconds: Annotated[float, typer.Option(min=0.1, max=86400.0, help="Time for all measurements, s.")] = 10.0,
     models: ModelsOption = None,
     json: JsonOption = False,
 ) -> None:

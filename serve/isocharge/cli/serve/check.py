@@ -6,8 +6,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from isocharge.cli.shared.options import JsonOption, ModelArgument, ModelsOption
-from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption
+from isocharge.cli.shared.options import ForceStdOption, JsonOption, ModelArgument, ModelsOption, PositionStdOption
 from isocharge.cli.shared.terminal import say, show_result
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.prediction.press_check import PressCheck, check_presses

@@ -30,7 +30,6 @@ def doctor_command(
     port: Annotated[
         str | None,
         typer.Option(
-            "--port",
             metavar="URL",
             help="Port of the sensor: device path, tcp://HOST:PORT, udp://HOST:PORT, pyserial URL. (default: list the "
             "serial ports and what they seem to send)",
@@ -40,21 +39,20 @@ def doctor_command(
     model: Annotated[
         str | None,
         typer.Option(
-            "--model",
             metavar="MODEL",
             help="Model that is to be used, name or path: its electrodes are looked for. (default: none)",
         ),
     ] = None,
     models: ModelsOption = None,
-    seconds: Annotated[float, typer.Option("--seconds", min=0.5, max=3600.0, help="Time to listen, s.")] = 5.0,
+    seconds: Annotated[float, typer.Option(min=0.5, max=3600.0, help="Time to listen, s.")] = 5.0,
     wait: WaitOption = 0.0,
     baud: Annotated[
         int | None,
-        typer.Option("--baud", min=1, help="Speed of the port, bits per second. (default: the usual ones in turn)"),
+        typer.Option(min=1, help="Speed of the port, bits per second. (default: the usual ones in turn)"),
     ] = None,
     write: Annotated[
         Path | None,
-        typer.Option("--write", metavar="FILE", help="Write a device file for this board, TOML. (default: no)"),
+        typer.Option(metavar="FILE", help="Write a device file for this board, TOML. (default: no)"),
     ] = None,
     pC_per_unit: Annotated[
         str | None,
@@ -67,7 +65,6 @@ def doctor_command(
     request: Annotated[
         str | None,
         typer.Option(
-            "--request",
             metavar="TEXT",
             help=r"What the board has to be asked, as in '?\n' or '\x01\x04'. (default: nothing)",
         ),
@@ -110,7 +107,7 @@ def doctor_command(
         device=load_device(device),
         electrodes=electrodes,
         gain=gain,
-        request=_parse_request(request),
+        request=None if request is None else _parse_request(request),
         wait=wait,
     )
     if not json:
@@ -127,12 +124,12 @@ def doctor_command(
         show_json(asdict(examination) | {"found_channels": found_channels})
     if not examination.good:
         raise typer.Exit(1)
+    not_written = "" if write is None else f"{write} is not written, because "
     if examination.touch:
-        not_written = "" if write is None else f"{write} is not written, because "
         say(f"{not_written}the film was touched: take the finger away, and try again")
         raise typer.Exit(1)
     if is_unit_missing:
-        say(f"{write} is not written, because the charge of one unit is missing: add the option that is named above")
+        say(f"{not_written}the charge of one unit is missing: add the option that is named above")
         raise typer.Exit(1)
     if write is not None:
         _write_device_file(write, examination, model or "MODEL")
@@ -150,16 +147,12 @@ def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> Elec
     """
     device = device_from_table(examination.device, "board")
     channel_names = [channel.name for channel in examination.channels]
-    # Whether each electrode has a channel with its own name
-    are_names_equal = all(electrode in channel_names for electrode in electrodes)
 
-    # Determine the channel that each electrode is assumed to have before the check.
-    if device.channels:  # the device file assigns the channels
-        channel_of_electrode = dict(device.channels)
-    elif len(electrodes) == len(channel_names) and not are_names_equal:  # assigned by their order
-        channel_of_electrode = dict(zip(electrodes, channel_names, strict=True))
-    else:  # each channel is assumed to be an electrode with the name of the channel
-        channel_of_electrode = {name: name for name in channel_names}
+    # Determine the channel that each electrode is assumed to have before the check. If the device file does not assign
+    # the channels, they are assigned by their order, or each channel is an electrode with the name of the channel.
+    is_by_order = len(electrodes) == len(channel_names) and set(electrodes) != set(channel_names)
+    names = electrodes if is_by_order else channel_names
+    channel_of_electrode = device.channels or dict(zip(names, channel_names, strict=True))
 
     with Port(examination.url, baud=examination.baud, request=device.request) as port:
         rest_span = max(channel.span_pC or 0.0 for channel in examination.channels)
@@ -205,27 +198,24 @@ def _parse_gain(text: str) -> Any:
         ) from error
 
 
-def _parse_request(text: str | None) -> Request | None:
+def _parse_request(text: str) -> Request:
     r"""Convert the text of `--request` to the bytes that are sent to the board as a request for each frame.
 
     Args:
-        text: Value of the option; None if the option is not given. Each escape sequence, such as `\n` or `\x01`, stands
-            for one byte.
+        text: Value of the option. Each escape sequence, such as `\n` or `\x01`, stands for one byte.
 
     Raises:
-        InputError: If the text is empty, or an escape sequence is wrong.
+        InputError: If the text is empty, an escape sequence is wrong, or a character does not fit into one byte.
     """
-    if text is None:
-        return None
     try:
         # The codec `unicode_escape` decodes escape sequences in bytes of Latin-1. Other characters first become escape
         # sequences themselves. The last step refuses them, because they do not fit into one byte.
         data = text.encode("latin-1", "backslashreplace").decode("unicode_escape").encode("latin-1")
-        if data:
-            return Request(data)
-    except (UnicodeDecodeError, UnicodeEncodeError):
-        pass
-    raise InputError(rf"--request: expected a text like '?\n' or '\x01\x04', got {text!r}")
+    except UnicodeError:
+        data = b""
+    if not data:
+        raise InputError(rf"--request: expected a text like '?\n' or '\x01\x04', got {text!r}")
+    return Request(data)
 
 
 def _write_device_file(path: Path, examination: Examination, model: str) -> None:

@@ -5,7 +5,7 @@ import os
 import signal
 import threading
 from collections.abc import AsyncIterator, Iterator
-from contextlib import ExitStack, asynccontextmanager, closing, contextmanager, suppress
+from contextlib import asynccontextmanager, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,7 +17,6 @@ from isocharge.cli.shared.live_page import (
     TlsKeyOption,
     TokenOption,
     given_tls,
-    given_token,
 )
 from isocharge.cli.shared.terminal import announce, on_signal, unless_hung_up, write_stderr
 from isocharge.common.errors import IsochargeError, require
@@ -36,28 +35,20 @@ log.setLevel(logging.INFO)
 def http_command(
     models: Annotated[
         Path | None,
-        typer.Option(
-            "--models", metavar="DIR", help="Folder of the models to serve. (default: all in the usual places)"
-        ),
+        typer.Option(metavar="DIR", help="Folder of the models to serve. (default: all in the usual places)"),
     ] = None,
     host: Annotated[
         str,
-        typer.Option(
-            "--host", help="Name or IP address to listen on; one that other machines can reach needs --token."
-        ),
+        typer.Option(help="Name or IP address to listen on; one that other machines can reach needs --token."),
     ] = "127.0.0.1",
-    port: Annotated[
-        int, typer.Option("--port", min=0, max=65535, help="TCP port for HTTP; 0 takes a free one.")
-    ] = 8000,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port for HTTP; 0 takes a free one.")] = 8000,
     uds: Annotated[
         Path | None,
-        typer.Option(
-            "--uds", metavar="PATH", help="Unix socket to listen on instead of host and port. (default: none)"
-        ),
+        typer.Option(metavar="PATH", help="Unix socket to listen on instead of host and port. (default: none)"),
     ] = None,
     grpc_port: Annotated[
         int | None,
-        typer.Option("--grpc-port", min=0, max=65535, help="TCP port for gRPC; 0 takes a free one. (default: no gRPC)"),
+        typer.Option(min=0, max=65535, help="TCP port for gRPC; 0 takes a free one. (default: no gRPC)"),
     ] = None,
     allow_host: AllowHostOption = None,
     token: TokenOption = None,
@@ -77,14 +68,13 @@ def http_command(
     Example: isocharge serve http --port 8000
     """
     # Check the options that protect the server.
-    secret = given_token(token)
     address = Address(host, port, uds)
     # The gRPC server listens on the host even if the HTTP server listens on a Unix socket.
     most_exposed_address = address if grpc_port is None else Address(host)
-    check_exposure(most_exposed_address, has_token=secret is not None)
+    check_exposure(most_exposed_address, has_token=token is not None)
     tls = given_tls(tls_cert, tls_key)
     # Pages of other sites cannot reach a Unix socket, so every host name is then accepted.
-    access = AccessCheck(host, allow_host or (), token=secret, any_host=uds is not None)
+    access = AccessCheck(host, allow_host or (), token=token, any_host=uds is not None)
 
     # Load the models, and serve them until Ctrl-C.
     with suppress(KeyboardInterrupt), _traffic(log_format) as traffic:
@@ -93,7 +83,13 @@ def http_command(
             log.warning("refused: %s", reason)
         handler = Handler(store, traffic=traffic, access=access)
         server = HttpServer(handler, address, handler.limits, traffic, tls=tls)
-        with closing(server), _signals(server, store):
+        load_all = unless_hung_up(lambda: threading.Thread(target=_load_all, args=[store], name="load").start())
+        with (
+            closing(server),
+            on_signal(signal.SIGTERM, server.stop),
+            on_signal(signal.SIGINT, server.stop),
+            on_signal(signal.SIGHUP, load_all),
+        ):
             _log_loaded_models(store)
             server.run(beside=_announced(server, handler, host, grpc_port, tls))
 
@@ -101,24 +97,6 @@ def http_command(
 def _log_loaded_models(store: ModelStore) -> None:
     """Log the labels of all loaded models, separated by commas."""
     log.info("serving %s; Ctrl-C stops", ", ".join(loaded.metadata.label for loaded in store.loaded_versions()))
-
-
-@contextmanager
-def _signals(server: HttpServer, store: ModelStore) -> Iterator[None]:
-    """Handle signals while a `with` block runs (context manager).
-
-    SIGTERM and Ctrl-C stop the server. SIGHUP loads all models again, or stops the server if the signal was sent
-    because the terminal of the command was closed.
-    """
-
-    def load_all() -> None:
-        threading.Thread(target=_load_all, args=(store,), name="load").start()
-
-    with ExitStack() as stack:
-        for number in (signal.SIGTERM, signal.SIGINT):
-            stack.enter_context(on_signal(number, server.stop))
-        stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(load_all)))
-        yield
 
 
 def _load_all(store: ModelStore) -> None:

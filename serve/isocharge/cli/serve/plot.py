@@ -68,7 +68,7 @@ def recording_picture(samples: Samples, title: str) -> Figure:
     start_s = samples["timestamp"][0]
     time_s = samples["timestamp"] - start_s
     is_flagged = {flag: samples["flags"].astype(int) & bit > 0 for flag, bit in FLAG_BITS.items()}
-    flags = [flag for flag in FLAG_BITS if is_flagged[flag].any()]
+    flags = {flag: time_s[is_set] for flag, is_set in is_flagged.items() if is_set.any()}
     flag_height = 0.1 * (1 + len(flags))  # grows with the number of rows of flags
     figure = new_figure(12.0, 8.6)
     figure.suptitle(f"{title}: {len(time_s)} records; faint points: ± 2 standard deviations")
@@ -84,8 +84,7 @@ def recording_picture(samples: Samples, title: str) -> Figure:
         (points,) = axes.plot(time_s, values, ".", ms=2.0, label=quantity)
         for limit in (values - two_std, values + two_std):
             axes.plot(time_s, limit, ".", ms=1.0, alpha=0.3, color=points.get_color())
-    for row, flag in enumerate(flags):
-        flag_time_s = time_s[is_flagged[flag]]
+    for row, flag_time_s in enumerate(flags.values()):
         flag_axes.plot(flag_time_s, np.full(len(flag_time_s), row), "|", color=INK)
 
     charge_axes.set_ylabel("touch charge, pC")

@@ -4,6 +4,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
+from dataclasses import asdict
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -65,7 +66,6 @@ if TYPE_CHECKING:
 OutputOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--output",
         metavar="TARGET",
         help=f"Where to write the records; repeat the option for several targets. Forms: {target_forms()}. `json` and "
         "`csv` are standard output. Other packages can add forms. (default: json)",
@@ -107,8 +107,7 @@ def write_records(records: Iterable[PredictionRecord], writers: Iterable[RecordW
 
 def _listed(charge_pC: Mapping[str, float | None]) -> str:
     """Return the charges that are known, with the names of their electrodes, as text."""
-    known_pC = {electrode: charge for electrode, charge in charge_pC.items() if charge is not None}
-    return ", ".join(f"{electrode} {charge:.2f} pC" for electrode, charge in known_pC.items())
+    return ", ".join(f"{electrode} {charge:.2f} pC" for electrode, charge in charge_pC.items() if charge is not None)
 
 
 def command_outputs(targets: Sequence[str] | None, touch: TouchStream, *, is_live: bool) -> Outputs:
@@ -133,28 +132,24 @@ def command_outputs(targets: Sequence[str] | None, touch: TouchStream, *, is_liv
     return Outputs(targets or DEFAULT_TARGETS, context)
 
 
-def say_missing_records(outputs: Outputs) -> None:
+def say_missing_records(outputs: Outputs, state: str) -> None:
     """Print how many records are missing in each output. The outputs must have been closed.
 
     Args:
         outputs: The outputs. `not_written` contains the number of missing records of each incomplete output by its
-            target; None if an error ended the output.
+            target; None if this number is unknown.
+        state: What is printed about an output if the number is unknown.
     """
     for target, missing_records in outputs.not_written.items():
         if missing_records is not None:
             say(f"{target}: {missing_records} records not written, the oldest: the output was too slow")
         else:
-            say(f"{target}: incomplete")
+            say(f"{target}: {state}")
 
 
 def summary(touch: TouchStream) -> str:
     """Return the numbers of frames and faults of a stream."""
-    totals = touch.totals()
-    return (
-        f"{totals.frames} frames, {totals.lost} lost, {totals.repeated} repeated, {totals.restarts} restarts; "
-        f"{totals.crc_errors} CRC errors, {totals.malformed} malformed, {totals.bytes_dropped} bytes dropped; "
-        f"{totals.reconnects} reconnects"
-    )
+    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in asdict(touch.totals()).items())
 
 
 def stream_command(
@@ -162,7 +157,6 @@ def stream_command(
     port: Annotated[
         str,
         typer.Option(
-            "--port",
             metavar="URL",
             help="Port of the sensor: device path, tcp:// or udp://HOST:PORT; or a file of bytes; - reads stdin.",
         ),
@@ -173,7 +167,6 @@ def stream_command(
     record: Annotated[
         Path | None,
         typer.Option(
-            "--record",
             metavar="FILE",
             help="Also write raw bytes and records for `isocharge serve replay`. (default: no)",
         ),
@@ -181,17 +174,16 @@ def stream_command(
     name: Annotated[
         str | None,
         typer.Option(
-            "--name",
             metavar="TEXT",
             help="Name of this film, the `frame_id` of its records: tells two films on one computer apart. "
             "(default: name of the model's sensor)",
         ),
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option("--seconds", min=1e-3, help="Time after which to stop, s. (default: at Ctrl-C)")
+        float | None, typer.Option(min=1e-3, help="Time after which to stop, s. (default: at Ctrl-C)")
     ] = None,
     count: Annotated[
-        int | None, typer.Option("--count", min=1, help="Number of records after which to stop. (default: at Ctrl-C)")
+        int | None, typer.Option(min=1, help="Number of records after which to stop. (default: at Ctrl-C)")
     ] = None,
     wait: WaitOption = 0.0,
     baud: BaudOption = 115200,
@@ -288,7 +280,7 @@ def stream_command(
     has_no_frames = touch.totals().frames == 0
     if has_no_frames:
         say(f"no frames were recognised; {no_frames_hint(port, device)}")
-    say_missing_records(outputs)
+    say_missing_records(outputs, "incomplete")
     is_recording_incomplete = recorder is not None and recorder.failed
     is_without_result = has_no_frames and has_expired.is_set()
     if is_recording_incomplete or outputs.has_incomplete_file or is_without_result:
@@ -299,7 +291,7 @@ def replay_command(
     file: RecordingArgument,
     model: Annotated[
         str | None,
-        typer.Option("--model", metavar="MODEL", help="Model to use, name or path. (default: that of the recording)"),
+        typer.Option(metavar="MODEL", help="Model to use, name or path. (default: that of the recording)"),
     ] = None,
     models: ModelsOption = None,
     device: DeviceOption = None,
@@ -350,8 +342,7 @@ def replay_command(
             _play_on_page(play, page, PageFeed(page, touch), outputs)
     say(summary(touch))
     if outputs.has_incomplete_file:
-        incomplete = ", ".join(outputs.not_written)
-        say(f"{incomplete}: not written, because the replay was stopped before its end")
+        say_missing_records(outputs, "not written, because the replay was stopped before its end")
         raise typer.Exit(1)
 
 

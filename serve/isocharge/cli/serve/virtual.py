@@ -10,8 +10,7 @@ import numpy as np
 import typer
 
 from isocharge.cli.shared.forward_maps import ROUNDING_MARGIN, ProbeOption
-from isocharge.cli.shared.options import SensorArgument
-from isocharge.cli.shared.press_options import RadiusOption
+from isocharge.cli.shared.options import MapRadiusOption, SensorArgument
 from isocharge.cli.shared.terminal import announce, say, shown_progress, until_stopped
 from isocharge.cli.shared.virtual_sensor import film_charges, measure_function, random_script
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
@@ -22,8 +21,6 @@ from isocharge.serve.virtual_sensor.script import VirtualScript, load_script
 from isocharge.simulate import (
     Circle,
     ForwardMap,
-    Probe,
-    Sensor,
     load_amplifier,
     load_sensor,
     parse_probe,
@@ -35,33 +32,29 @@ def virtual_command(
     sensor: SensorArgument,
     seconds: Annotated[
         float | None,
-        typer.Option("--seconds", min=0.0, max=1e6, help="Time after which to stop, s. (default: at Ctrl-C)"),
+        typer.Option(min=0.0, max=1e6, help="Time after which to stop, s. (default: at Ctrl-C)"),
     ] = None,
-    rate: Annotated[
-        float, typer.Option("--rate", metavar="HZ", min=1.0, max=5000.0, help="Frames per second, Hz.")
-    ] = 200.0,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of presses, noise and offsets.")] = 0,
+    rate: Annotated[float, typer.Option(metavar="HZ", min=1.0, max=5000.0, help="Frames per second, Hz.")] = 200.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of presses, noise and offsets.")] = 0,
     force_max: Annotated[
-        float, typer.Option("--force-max", min=0.05, help="Largest force of a random press, N; the smallest is 0.05 N.")
+        float, typer.Option(min=0.05, help="Largest force of a random press, N; the smallest is 0.05 N.")
     ] = DEFAULT_PLAYED_FORCE_RANGE[1],
-    radius: RadiusOption = DEFAULT_RADIUS,
+    radius: MapRadiusOption = DEFAULT_RADIUS,
     rest: Annotated[
         float,
         typer.Option(
-            "--rest",
             min=0.0,
             max=1e6,
             help="Time after the start in which nothing touches the film, at least, s. The film is solved meanwhile.",
         ),
     ] = 0.0,
     noise: Annotated[
-        str, typer.Option("--noise", help="Amplifier: clean, reference, measured, bench, surgery, or a TOML file.")
+        str, typer.Option(help="Amplifier: clean, reference, measured, bench, surgery, or a TOML file.")
     ] = "reference",
     probe: ProbeOption = "circle:1.0",
     film: Annotated[
         int | None,
         typer.Option(
-            "--film",
             min=0,
             metavar="SEED",
             help="Play a film drawn at random about SENSOR and --probe, as on a bench that nobody has measured: "
@@ -71,19 +64,16 @@ def virtual_command(
     ] = None,
     link: Annotated[
         Path | None,
-        typer.Option("--link", metavar="PATH", help="Symbolic link to make to the port. (default: none)"),
+        typer.Option(metavar="PATH", help="Symbolic link to make to the port. (default: none)"),
     ] = None,
     script: Annotated[
         Path | None,
         typer.Option(
-            "--script",
             metavar="FILE",
             help="What to play, TOML: presses, faults of the line. (default: random presses, no faults)",
         ),
     ] = None,
-    frames: Annotated[
-        Literal["binary", "csv", "json"], typer.Option("--frames", help="Format of the frames.")
-    ] = "binary",
+    frames: Annotated[Literal["binary", "csv", "json"], typer.Option(help="Format of the frames.")] = "binary",
 ) -> None:
     """Play a sensor: simulate presses that wander over the film, and send their charges as frames on a pseudo-terminal.
 
@@ -96,7 +86,12 @@ def virtual_command(
         refuse_existing(link)
     settings = load_script(script) if script else VirtualScript()
     scripted_presses = settings.script(rate)
-    played_sensor, footprint = _sensor_and_probe(sensor, probe, film)
+    played_sensor = load_sensor(sensor)
+    footprint = parse_probe(probe)
+    if film is not None:
+        if not isinstance(footprint, Circle):
+            raise InputError(f"--film: expected a --probe like circle:1.0, whose radius is drawn, too, got {probe!r}")
+        played_sensor, footprint = virtual_film(played_sensor, footprint, film)
     if scripted_presses is not None and scripted_presses.touching.any():  # the map must contain the presses
         distance_mm = np.hypot(scripted_presses.x_mm, scripted_presses.y_mm)
         radius = max(DEFAULT_RADIUS, ROUNDING_MARGIN * float(np.nanmax(distance_mm)))
@@ -104,9 +99,10 @@ def virtual_command(
     electrode_count = len(played_sensor.electrodes)
     # Until the film is solved, the player sends frames without a touch. It then only computes the charges of an empty
     # list of contacts, for which the first function returns an empty array.
+    no_position = np.full(1, np.nan)
     player = VirtualSensor(
         lambda _: np.zeros((0, electrode_count)),
-        _untouched_frame(rate),
+        Script(no_position, no_position, np.zeros(1), rate),
         noise=measure_function(load_amplifier(noise), electrode_count, rate, seed),
         seed=seed,
         encode=encode_frame if frames == "binary" else partial(encode_text, notation=frames),
@@ -138,30 +134,3 @@ def virtual_command(
     )
     if player.paused_s > 0.0:
         say(f"the sensor paused for {player.paused_s:.1f} s in all, because this computer was busy")
-
-
-def _sensor_and_probe(sensor_name: str, probe_text: str, film_seed: int | None) -> tuple[Sensor, Probe]:
-    """Return the given sensor and probe or, if there is a seed, a random variation of both.
-
-    Args:
-        sensor_name: Name or file of the sensor.
-        probe_text: Probe in the notation of `--probe`.
-        film_seed: Seed of the random variation; None for no variation.
-
-    Raises:
-        InputError: If there is a seed and the probe is not a circle, because the radius of the probe is varied, too.
-    """
-    sensor = load_sensor(sensor_name)
-    probe = parse_probe(probe_text)
-    if film_seed is None:
-        return sensor, probe
-    if not isinstance(probe, Circle):
-        raise InputError(f"--film: expected a --probe like circle:1.0, whose radius is drawn, too, got {probe_text!r}")
-    return virtual_film(sensor, probe, film_seed)
-
-
-def _untouched_frame(rate_Hz: float) -> Script:
-    """Return a script of one frame without a press."""
-    no_position = np.full(1, np.nan)
-    no_force = np.zeros(1)
-    return Script(no_position, no_position, no_force, rate_Hz)

@@ -9,22 +9,21 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.options import parse_radius_mm, worker_count
 from isocharge.cli.shared.terminal import say
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT, FEW_ELECTRODES
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.simulate import Dataset, Film, Probe, Sensor, read_dataset
-from isocharge.simulate.execution import dask_workers, local_workers
+from isocharge.simulate.execution import cores, dask_workers, local_workers
 from isocharge.simulate.sensor.probe import PROBE_HELP
 
-ProbeOption = Annotated[str, typer.Option("--probe", metavar="SHAPE", help=PROBE_HELP)]
+ProbeOption = Annotated[str, typer.Option(metavar="SHAPE", help=PROBE_HELP)]
 
 DEFAULT_PROBE = "circle:1.0"
 """Notation of the probe if `--probe` is not given."""
 
 ProbesOption = Annotated[
     list[str] | None,
-    typer.Option("--probe", metavar="SHAPE", help=f"{PROBE_HELP} May be repeated. (default: {DEFAULT_PROBE})"),
+    typer.Option(metavar="SHAPE", help=f"{PROBE_HELP} May be repeated. (default: {DEFAULT_PROBE})"),
 ]
 
 ROUNDING_MARGIN = 1.0 + 1e-6
@@ -32,11 +31,11 @@ ROUNDING_MARGIN = 1.0 + 1e-6
 outermost presses beyond them."""
 
 
-def executor_for(workers: int | None, cluster: str | None) -> AbstractContextManager[Executor | None]:
+def executor_for(workers: int | None = None, cluster: str | None = None) -> AbstractContextManager[Executor | None]:
     """Return a context manager that yields the executor which the values of `--workers` and `--cluster` select.
 
     Args:
-        workers: Number of processes on this computer; None for one process for each core.
+        workers: Number of processes on this computer; None for one process for each core, but at most 64.
         cluster: Address of a Dask scheduler; None to compute on this computer.
 
     Raises:
@@ -44,7 +43,7 @@ def executor_for(workers: int | None, cluster: str | None) -> AbstractContextMan
     """
     if workers and cluster:
         raise InputError("expected either --workers or --cluster, got both")
-    return dask_workers(cluster) if cluster else local_workers(worker_count(workers))
+    return dask_workers(cluster) if cluster else local_workers(workers or min(cores(), 64))
 
 
 def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tuple[float, float]) -> float:
@@ -60,7 +59,10 @@ def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tupl
         InputError: If the text is neither a number nor `auto`, or there is no working area with `reference` noise.
     """
     if text != "auto":
-        return parse_radius_mm(text)
+        try:
+            return float(text)
+        except ValueError as error:
+            raise InputError(f"--radius: expected a number of mm or 'auto', got {text!r}") from error
     # imported late, because these imports load the solver and the noise levels
     from isocharge.simulate import noise_model, working_area
     from isocharge.simulate.identifiability.identification import map_to_search

@@ -8,9 +8,8 @@ command line.
 """
 
 from collections.abc import Mapping, Sequence
-from importlib import import_module
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -43,21 +42,7 @@ def insert_live_address(words: Sequence[str]) -> list[str]:
     return completed_words
 
 
-class LazyCommand(NamedTuple):
-    """Description of a command whose function is imported when the command is called.
-
-    Attributes:
-        function_path: Module and name of the function, "package.module:function".
-        summary: One sentence for the help of the group.
-        extra: Extra of pyproject.toml that the command always needs; None if the base install is enough.
-    """
-
-    function_path: str
-    summary: str
-    extra: str | None = None
-
-
-def lazy_group(summary: str, commands: Mapping[str, LazyCommand]) -> typer.Typer:
+def lazy_group(summary: str, summaries: Mapping[str, str]) -> typer.Typer:
     """Return a group of commands that are imported only when they are needed.
 
     A command is imported when the user calls it, completes its options, or requests its help. The help of the group
@@ -65,26 +50,28 @@ def lazy_group(summary: str, commands: Mapping[str, LazyCommand]) -> typer.Typer
 
     Args:
         summary: Summary of the group.
-        commands: The commands by name.
+        summaries: One sentence for each command, by the function of the command in the notation of entry points, such
+            as "train.export_c:export_c_command [train]" for a module of `isocharge.cli`. The function defines the name
+            of the command, `export-c`. The extra of pyproject.toml, `train`, is the one that the command always needs.
     """
+    functions = {path.partition(":")[2].partition("_command")[0].replace("_", "-"): path for path in summaries}
 
     # Typer creates the object of the group itself and accepts only a class. The class is therefore defined here, where
-    # its methods can use `commands`.
+    # its methods can use `functions`.
     class LazyGroup(TyperGroup):
         """A group that stores only the names and the summaries of its commands."""
 
         def __init__(self, **settings: Any) -> None:
             """Add a placeholder for each command, which has the summary of the command as its help."""
             super().__init__(**settings)
-            for name, command in commands.items():
-                placeholder = TyperCommand(name, help=command.summary, short_help=command.summary)
-                self.add_command(placeholder)
+            for name, path in functions.items():
+                self.add_command(TyperCommand(name, help=summaries[path], short_help=summaries[path]))
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
             """Import the command that the arguments name. Return this command instead of its placeholder."""
             name, command, remaining_args = super().resolve_command(ctx, args)
-            if name is not None and name in commands:
-                command = load_command(commands[name])
+            if name in functions:
+                command = load_command(functions[name])
                 remaining_args = insert_live_address(remaining_args)
             return name, command, remaining_args
 
@@ -98,17 +85,21 @@ def lazy_group(summary: str, commands: Mapping[str, LazyCommand]) -> typer.Typer
     )
 
 
-def load_command(command: LazyCommand) -> TyperCommand:
+def load_command(path: str) -> TyperCommand:
     """Import the function of a command, and return the Typer command for this function.
+
+    Args:
+        path: The function, as in the argument `summaries` of `lazy_group`.
 
     Raises:
         MissingExtra: If the extra of the command is not installed.
     """
-    module_name, _colon, function_name = command.function_path.partition(":")
+    from importlib.metadata import EntryPoint  # imported late, because the import is slow
+
+    entry_point = EntryPoint(name="", value=f"isocharge.cli.{path}", group="")
     # A missing package of the extra raises MissingExtra, whose message names the install command.
-    extras = [command.extra] if command.extra else []
-    with require(*extras):
-        command_function = getattr(import_module(module_name), function_name)
+    with require(*entry_point.extras):
+        command_function = entry_point.load()
 
     # Typer makes a command only from an app. An app with a single function becomes one command without subcommands.
     single_command_app = typer.Typer(add_completion=False, rich_markup_mode=None)

@@ -37,7 +37,6 @@ STATE_INTERVAL_S = 0.25
 LiveOption = Annotated[
     str | None,
     typer.Option(
-        "--live",
         metavar="[HOST:PORT]",
         help=f"Show the film on a page for browsers, at {DEFAULT_LIVE_ADDRESS} or at the given address. A port alone "
         "is a port of this machine, and port 0 chooses a free port. An address that other machines can reach needs "
@@ -48,8 +47,10 @@ LiveOption = Annotated[
 TokenOption = Annotated[
     str | None,
     typer.Option(
-        "--token",
         envvar="ISOCHARGE_TOKEN",
+        # If the variable is empty, the token is an empty text, which `AccessCheck` refuses. Typer alone would treat an
+        # empty token as a missing token.
+        callback=lambda token: os.environ.get("ISOCHARGE_TOKEN") if token is None else token,
         help="Secret that clients must send as `Authorization: Bearer TOKEN`; the live page asks for it, or takes it "
         "from #TOKEN in its address. (default: none)",
     ),
@@ -58,7 +59,6 @@ TokenOption = Annotated[
 AllowHostOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--allow-host",
         metavar="NAME",
         help="Further host name by which browsers reach the server, for example through a reverse proxy; repeat it for "
         "more. (default: IP addresses, localhost and the host that it listens on)",
@@ -67,12 +67,12 @@ AllowHostOption = Annotated[
 
 TlsCertOption = Annotated[
     Path | None,
-    typer.Option("--tls-cert", metavar="PEM", help="Certificate chain; turns TLS on. (default: no TLS)"),
+    typer.Option(metavar="PEM", help="Certificate chain; turns TLS on. (default: no TLS)"),
 ]
 
 TlsKeyOption = Annotated[
     Path | None,
-    typer.Option("--tls-key", metavar="PEM", help="Private key of it. (default: in the certificate's file)"),
+    typer.Option(metavar="PEM", help="Private key of it. (default: in the certificate's file)"),
 ]
 
 
@@ -93,15 +93,6 @@ def given_tls(certificate: Path | None, key: Path | None) -> Tls | None:
     return None
 
 
-def given_token(token: str | None) -> str | None:
-    """Return the token that the option or the environment contains, or None if there is no token.
-
-    If the environment variable `ISOCHARGE_TOKEN` is empty, the token is an empty text, which `AccessCheck` refuses.
-    Typer alone would treat an empty token as a missing token.
-    """
-    return os.environ.get("ISOCHARGE_TOKEN") if token is None else token
-
-
 def page_address(live: str) -> Address:
     """Return the address at which the page listens.
 
@@ -112,8 +103,7 @@ def page_address(live: str) -> Address:
         InputError: If `live` has another form.
     """
     host, _, port = live.rpartition(":")
-    is_port = port.isdecimal() and len(port) <= len("65535") and int(port) <= 65535
-    if not is_port:
+    if port not in map(str, range(1 << 16)):
         raise InputError(f"--live: expected PORT or HOST:PORT, as 8001 or {DEFAULT_LIVE_ADDRESS}, got {shown(live)}")
     return Address(host.strip("[]") or LOOPBACK, int(port))
 
@@ -160,12 +150,11 @@ def live_page(
         yield None
         return
     address = page_address(live)
-    secret = given_token(token)
-    check_exposure(address, has_token=secret is not None)
+    check_exposure(address, has_token=token is not None)
     with require("http"):
         from isocharge.serve.viewer.live_page import LivePage, serve_page
 
-    access = AccessCheck(address.host, allow_host or (), token=secret)
+    access = AccessCheck(address.host, allow_host or (), token=token)
     page = LivePage(describe_film(name, metadata), is_recording=is_recording, access=access)
 
     def show_warning(record: logging.LogRecord) -> None:

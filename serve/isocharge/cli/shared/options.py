@@ -17,16 +17,15 @@ RecordingArgument = Annotated[
     Path, typer.Argument(metavar="FILE", help="Recording of `isocharge serve stream --record`.")
 ]
 
-ForceOption = Annotated[float, typer.Option("--force", metavar="N", help="Force of the press, N; positive pushes.")]
+ForceOption = Annotated[float, typer.Option(metavar="N", help="Force of the press, N; positive pushes.")]
 
 ForceRangeOption = Annotated[
-    tuple[float, float], typer.Option("--force", metavar="MIN MAX", help="Smallest and largest force, N.")
+    tuple[float, float], typer.Option(metavar="MIN MAX", help="Smallest and largest force, N.")
 ]
 
 RadiusOption = Annotated[
     str,
     typer.Option(
-        "--radius",
         metavar="MM|auto",
         help="Largest distance of a press from the film's centre, mm; auto finds the working area, where the charges "
         "determine the position to 1 mm.",
@@ -35,13 +34,12 @@ RadiusOption = Annotated[
 
 StressLimitOption = Annotated[
     float,
-    typer.Option("--stress-limit", metavar="MPA", min=0.0, help="Largest stress of the film under the probe, MPa."),
+    typer.Option(metavar="MPA", min=0.0, help="Largest stress of the film under the probe, MPa."),
 ]
 
 WorkersOption = Annotated[
     int | None,
     typer.Option(
-        "--workers",
         min=1,
         max=64,
         help="Number of processes, on which the results do not depend. (default: one per core)",
@@ -51,7 +49,6 @@ WorkersOption = Annotated[
 ClusterOption = Annotated[
     str | None,
     typer.Option(
-        "--cluster",
         metavar="ADDRESS",
         help="Dask scheduler whose workers are used instead, such as tcp://10.0.0.1:8786. (default: none)",
     ),
@@ -60,7 +57,6 @@ ClusterOption = Annotated[
 NoiseOption = Annotated[
     str,
     typer.Option(
-        "--noise",
         metavar="LEVEL|FILE.toml",
         help="Noise of the readings: reference (1 pC and 0.2 %, assumed), measured (1 pC and 1.5 %), bench, surgery, "
         "or a TOML file with white_pC and proportional.",
@@ -69,7 +65,7 @@ NoiseOption = Annotated[
 
 ConfigOption = Annotated[
     Path | None,
-    typer.Option("--config", metavar="FILE", help="Training settings, TOML. (default: those of the released models)"),
+    typer.Option(metavar="FILE", help="Training settings, TOML. (default: those of the released models)"),
 ]
 
 NewFolderOption = Annotated[
@@ -79,7 +75,6 @@ NewFolderOption = Annotated[
 ModelsOption = Annotated[
     Path | None,
     typer.Option(
-        "--models",
         metavar="DIR",
         help="Folder in which a model's name is looked up before the usual places. (default: none)",
     ),
@@ -87,23 +82,56 @@ ModelsOption = Annotated[
 
 DeviceOption = Annotated[
     Path | None,
-    typer.Option(
-        "--device", metavar="FILE", help="Description of the board that sends the charges, TOML. (default: none)"
-    ),
+    typer.Option(metavar="FILE", help="Description of the board that sends the charges, TOML. (default: none)"),
 ]
 
-BaudOption = Annotated[
-    int, typer.Option("--baud", min=1, help="Speed of the port, bits per second; USB ports ignore it.")
-]
+BaudOption = Annotated[int, typer.Option(min=1, help="Speed of the port, bits per second; USB ports ignore it.")]
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text. (default: text)")]
 
+WaitOption = Annotated[
+    float,
+    typer.Option(
+        min=0.0,
+        max=3600.0,
+        help="Time to wait until the port can be opened, and until the first byte if this is more than 10 s, s.",
+    ),
+]
 
-def worker_count(workers: int | None) -> int:
-    """Return the value of `--workers`. Without the option, return the number of processor cores, but at most 64."""
-    from isocharge.simulate.execution import cores
+SensorOption = Annotated[
+    str,
+    typer.Option(metavar="SENSOR", help="Name of a built-in sensor, or a TOML file that describes it."),
+]
 
-    return workers or min(cores(), 64)
+MapRadiusOption = Annotated[
+    float,
+    typer.Option(metavar="MM", help="Radius of the working area, mm: the largest distance of a press."),
+]
+
+PositionStdOption = Annotated[
+    float,
+    typer.Option(
+        "--position-std", metavar="MM", help="Standard deviation of known x and y, mm, where the file has none."
+    ),
+]
+
+ForceStdOption = Annotated[
+    float,
+    typer.Option(
+        metavar="SHARE",
+        help="Standard deviation of known forces, a share of the force in N, where the file has none.",
+    ),
+]
+
+EarlierOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--from",
+        metavar="FOLDER",
+        help="Start from the film of the calibration in this folder, which may have drifted since. (default: the film "
+        "of the sensor file)",
+    ),
+]
 
 
 def parse_pair(text: str, expected: str) -> tuple[float, float]:
@@ -121,26 +149,3 @@ def parse_pair(text: str, expected: str) -> tuple[float, float]:
     except ValueError as error:
         raise InputError(f"{expected}, got {text!r}") from error
     return first, second
-
-
-def parse_radius_mm(text: str) -> float:
-    """Parse a value of `--radius` other than `auto`, and return the radius, mm.
-
-    Raises:
-        InputError: If the text is not a number.
-    """
-    try:
-        return float(text)
-    except ValueError as error:
-        raise InputError(f"--radius: expected a number of mm or 'auto', got {text!r}") from error
-
-
-WaitOption = Annotated[
-    float,
-    typer.Option(
-        "--wait",
-        min=0.0,
-        max=3600.0,
-        help="Time to wait until the port can be opened, and until the first byte if this is more than 10 s, s.",
-    ),
-]

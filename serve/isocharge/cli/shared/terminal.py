@@ -127,14 +127,11 @@ def _value_text(value: Any, separator: str = ", ") -> str:
 
 
 def announce(line: str) -> None:
-    """Print a line on stdout and flush it, for programs that wait for this line.
+    """Print a line on stdout at once, for programs that wait for this line.
 
-    A server continues if stdout is closed.
+    A server continues if stdout is full or closed.
     """
-    try:
-        print(printable(line), flush=True)
-    except OSError:
-        discard_output(STDOUT_FILENO)
+    say(line, err=False)
 
 
 def write_stdout(text: str) -> None:
@@ -243,15 +240,19 @@ PROGRESS_LINE_INTERVAL_S = 5.0
 """Time between two lines of progress if stderr is not a terminal, s."""
 
 
-def say(message: str) -> None:
-    """Print a message on stderr, in which all characters that are not printable are escaped.
+def say(message: str, *, err: bool = True) -> None:
+    """Print a message, in which all characters that are not printable are escaped.
 
-    The command continues if stderr is full or closed.
+    The command continues if the stream is full or closed.
+
+    Args:
+        message: The message.
+        err: Whether to print on stderr. If not, the message is printed on stdout.
     """
     try:
-        typer.echo(printable_lines(message), err=True)
+        typer.echo(printable_lines(message), err=err)
     except OSError:
-        discard_output(STDERR_FILENO)
+        discard_output(STDERR_FILENO if err else STDOUT_FILENO)
 
 
 def this_command() -> str:
@@ -289,12 +290,31 @@ def warnings_passed_to(write: Callable[[logging.LogRecord], None], package: str)
 
 @contextmanager
 def shown_progress() -> Iterator[None]:
-    """Context manager that shows the progress of its block: bars on a terminal, otherwise a line every few seconds."""
-    if sys.stderr.isatty():
-        with _progress_bars() as show_bar, listening(show_bar):
-            yield
-    else:
+    """Context manager that shows the progress of its block: bars on a terminal, otherwise a line every few seconds.
+
+    Each title has its own bar, which shows the finished share and the remaining time.
+    """
+    if not sys.stderr.isatty():
         with listening(_progress_lines()):
+            yield
+        return
+    # The import takes 40 ms, which help and short commands need not wait for.
+    from rich.console import Console
+    from rich.progress import Progress, TaskID
+
+    console = Console(stderr=True, markup=False, emoji=False)
+    columns = Progress.get_default_columns()
+    with Progress(*columns, "{task.fields[note]}", console=console, transient=True) as bars:
+
+        @cache
+        def bar_of(title: str) -> TaskID:
+            return bars.add_task(title, total=None, note="")
+
+        def update_bar(title: str, done: int, total: int, note: str) -> None:
+            """Show in the bar with the given title that `done` of `total` steps are complete."""
+            bars.update(bar_of(printable(title)), completed=done, total=total, note=printable(note))
+
+        with listening(update_bar):
             yield
 
 
@@ -310,35 +330,3 @@ def _progress_lines() -> Listener:
             say(f"{title}: {done} of {total} {note}".rstrip())
 
     return show_line
-
-
-@contextmanager
-def _progress_bars() -> Iterator[Listener]:
-    """Context manager that shows progress bars on stderr, and yields the function that updates the bars.
-
-    Each title has its own bar, which shows the finished share and the remaining time.
-    """
-    # The import takes 40 ms, which help and short commands need not wait for.
-    from rich.console import Console
-    from rich.progress import Progress, TaskID
-
-    console = Console(stderr=True, markup=False, emoji=False)
-    columns = Progress.get_default_columns()
-    with Progress(*columns, "{task.fields[note]}", console=console, transient=True) as bars:
-
-        @cache
-        def bar_of(title: str) -> TaskID:
-            return bars.add_task(title, total=None, note="")
-
-        def update_bar(title: str, done: int, total: int, note: str) -> None:
-            """Show in the bar with the given title that `done` of `total` steps are complete.
-
-            Args:
-                title: Title of the work, which identifies its bar.
-                done: Number of complete steps.
-                total: Number of all steps.
-                note: Text that is shown after the bar.
-            """
-            bars.update(bar_of(printable(title)), completed=done, total=total, note=printable(note))
-
-        yield update_bar

@@ -7,13 +7,13 @@ import typer
 from isocharge.cli.shared.forward_maps import ProbeOption, executor_for, warn_of_stress
 from isocharge.cli.shared.options import (
     ForceOption,
+    MapRadiusOption,
     NewFolderOption,
     NoiseOption,
     SensorArgument,
     StressLimitOption,
     WorkersOption,
 )
-from isocharge.cli.shared.press_options import RadiusOption
 from isocharge.cli.shared.terminal import say, show_result, shown_progress
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError
@@ -27,14 +27,11 @@ from isocharge.simulate.layout.design import design
 def design_command(
     sensor: SensorArgument,
     output: NewFolderOption,
-    radius: RadiusOption,
-    electrodes: Annotated[
-        int, typer.Option("--electrodes", metavar="N", help="Number of electrodes, 3 to 8, including kept ones.")
-    ],
+    radius: MapRadiusOption,
+    electrodes: Annotated[int, typer.Option(metavar="N", help="Number of electrodes, 3 to 8, including kept ones.")],
     goal: Annotated[
         Goal,
         typer.Option(
-            "--goal",
             help="Quantity to minimise: the largest error, or the root mean square of the errors.",
         ),
     ] = "worst",
@@ -48,18 +45,16 @@ def design_command(
     ] = False,
     keep: Annotated[
         str | None,
-        typer.Option(
-            "--keep", metavar="NAMES", help="Electrodes of SENSOR that are kept, such as A,B. (default: none)"
-        ),
+        typer.Option(metavar="NAMES", help="Electrodes of SENSOR that are kept, such as A,B. (default: none)"),
     ] = None,
     side: Annotated[
         float | None,
-        typer.Option("--side", metavar="MM", help="Side of the new squares, mm. (default: that of SENSOR's squares)"),
+        typer.Option(metavar="MM", help="Side of the new squares, mm. (default: that of SENSOR's squares)"),
     ] = None,
     probe: ProbeOption = "circle:1.0",
     force: ForceOption = 1.0,
     noise: NoiseOption = "reference",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the search. Equal seeds give equal designs.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the search. Equal seeds give equal designs.")] = 0,
     stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
     workers: WorkersOption = None,
 ) -> None:
@@ -77,13 +72,12 @@ def design_command(
     footprint = parse_probe(probe)
     if not isinstance(footprint, Circle):
         raise InputError(f"--probe: expected circle:RADIUS, for which layouts are designed, got {probe}")
-    kept_names = [name.strip() for name in (keep or "").split(",")]
     case = DesignCase(
         load_sensor(sensor),
         electrodes,
         radius,
         goal=goal,
-        keep=tuple(name for name in kept_names if name),
+        keep=tuple(keep.replace(" ", "").split(",")) if keep else (),
         probe=footprint,
         force=force,
         noise=noise_model(noise),
@@ -94,7 +88,7 @@ def design_command(
     warn_of_stress(case.sensor.film, [footprint], force, stress_limit)
 
     # Search for the positions, and write the files.
-    with shown_progress(), executor_for(workers, None) as executor:
+    with shown_progress(), executor_for(workers) as executor:
         result = design(case, executor=executor)
         write_design(result, output)
     results = result.to_dict()

@@ -17,15 +17,6 @@ from isocharge.simulate import identify, load_sensor, noise_model, parse_probe
 from isocharge.simulate.plots.error_maps import identification_picture, mirror_picture
 from isocharge.simulate.plots.figure import picture_bytes
 
-PICTURE = "identify.png"
-"""File name of the picture in the output folder."""
-
-MIRROR_PICTURE = "mirror.png"
-"""File name of the picture of the mirror region in the output folder."""
-
-RESULTS = "identify.json"
-"""File name of the numerical results in the output folder."""
-
 
 def identify_command(
     sensor: SensorArgument,
@@ -33,12 +24,11 @@ def identify_command(
     force: ForceRangeOption = DEFAULT_FORCE_RANGE,
     noise: NoiseOption = "reference",
     error: Annotated[
-        float, typer.Option("--error", metavar="MM", help="Largest position error in the working area, mm, rms.")
+        float, typer.Option(metavar="MM", help="Largest position error in the working area, mm, rms.")
     ] = 1.0,
     radius: Annotated[
         float | None,
         typer.Option(
-            "--radius",
             metavar="MM",
             help="Distance from the centre up to which presses are searched, mm. (default: distance of the outermost "
             "corner of an electrode)",
@@ -66,7 +56,7 @@ def identify_command(
     described_sensor = load_sensor(sensor)
     parsed_probe = parse_probe(probe)
     noise_level = noise_model(noise)
-    with shown_progress(), executor_for(workers, None) as pool:
+    with shown_progress(), executor_for(workers) as pool:
         identification = identify(
             described_sensor, parsed_probe, noise_level, force_range=force, radius=radius, error=error, executor=pool
         )
@@ -75,11 +65,11 @@ def identify_command(
     # Write the pictures and the results.
     if output is not None:
         with new_folder(output) as folder:
-            (folder / PICTURE).write_bytes(picture_bytes(identification_picture(identification)))
+            (folder / "identify.png").write_bytes(picture_bytes(identification_picture(identification)))
             if identification.mirror is not None:
                 picture = mirror_picture(described_sensor, identification.mirror)
-                (folder / MIRROR_PICTURE).write_bytes(picture_bytes(picture))
-            (folder / RESULTS).write_bytes(json_module.dumps(results, indent=1).encode())
+                (folder / "mirror.png").write_bytes(picture_bytes(picture))
+            (folder / "identify.json").write_bytes(json_module.dumps(results, indent=1).encode())
 
     # Print the results and a summary in sentences, which state the working area.
     limits = "limits_in_working_area"

@@ -24,31 +24,27 @@ from isocharge.simulate.forward.readout import thermal_charge
 from isocharge.simulate.mechanics.theory import theory_by_name
 from isocharge.simulate.mechanics.warming import warmed
 from isocharge.simulate.solver.error_estimate import summary
-from isocharge.simulate.solver.sensitivity import check_friction, friction_force
+from isocharge.simulate.solver.sensitivity import friction_force
 
 
 def point_command(
     sensor: SensorArgument,
     probe: ProbeOption = "circle:1.0",
-    at: Annotated[
-        str, typer.Option("--at", metavar="X,Y", help="Position of the probe, mm from the film's centre.")
-    ] = "0,0",
+    at: Annotated[str, typer.Option(metavar="X,Y", help="Position of the probe, mm from the film's centre.")] = "0,0",
     force: ForceOption = 1.0,
     accuracy: Annotated[
         float,
-        typer.Option("--accuracy", help="Allowed relative error of the charges, 1e-6 to 1. It determines the mesh."),
+        typer.Option(help="Allowed relative error of the charges, 1e-6 to 1. It determines the mesh."),
     ] = 1e-3,
     theory: Annotated[
         str,
         typer.Option(
-            "--theory",
             help="'nonlinear membrane' omits the resistance of the film to bending.",
         ),
     ] = "nonlinear membrane + bending",
     temperature: Annotated[
         float,
         typer.Option(
-            "--temperature",
             metavar="K",
             help="Temperature step of the film, K. Its charge is added. It changes the pretension if the sensor file "
             "has expansion coefficients.",
@@ -57,7 +53,6 @@ def point_command(
     side_force: Annotated[
         str | None,
         typer.Option(
-            "--side-force",
             metavar="FX,FY",
             help="Force of the probe on the film along x and y, N. (default: none)",
         ),
@@ -65,7 +60,6 @@ def point_command(
     friction: Annotated[
         float | None,
         typer.Option(
-            "--friction",
             metavar="MU",
             help="Coefficient of friction of a probe on a vertical stage, which gives the side force. (default: none)",
         ),
@@ -84,8 +78,6 @@ def point_command(
 
     if side_force is not None and friction is not None:
         raise InputError("--side-force and --friction: expected one of them, because friction gives the side force")
-    if friction is not None:
-        check_friction(friction)
     applied_side_force = (0.0, 0.0)
     if side_force is not None:
         applied_side_force = parse_pair(side_force, "--side-force: expected two numbers in N like '0.1,0'")
@@ -107,28 +99,15 @@ def point_command(
         report["side_force_N"] = list(applied_side_force)
     warnings = report["warnings"] if json else report.pop("warnings")
     show_result(report, json=json)
-    for warning in [*_cautions(report["estimated_error"], accuracy, theory), *warnings]:
-        say(f"caution: {warning}")
+    error = report["estimated_error"]
+    if error is None:  # infinite
+        warnings.append(f"a {theory} does not describe this film at all; omit --theory")
+    elif error > accuracy:
+        warnings.append(f"expected an error of the charges of at most {accuracy:.2g} (--accuracy), got {error:.2g}")
     if temperature and not warming_charge.any():
-        say(
-            "caution: --temperature changes no charge, because the sensor file has neither pyro_uC_per_m2_K nor "
+        warnings.append(
+            "--temperature changes no charge, because the sensor file has neither pyro_uC_per_m2_K nor "
             "expansion_ppm_per_K"
         )
-
-
-def _cautions(error: float | None, accuracy: float, theory: str) -> list[str]:
-    """Return warnings about the estimated error of the charges of a press.
-
-    Args:
-        error: Estimated relative error of the charges, dimensionless; None if it is infinite.
-        accuracy: Required relative error of the charges, dimensionless.
-        theory: Name of the theory of the film.
-
-    Returns:
-        A list with one warning if the estimated error exceeds the required error; otherwise an empty list.
-    """
-    if error is None:
-        return [f"a {theory} does not describe this film at all; omit --theory"]
-    if error > accuracy:
-        return [f"expected an error of the charges of at most {accuracy:.2g} (--accuracy), got {error:.2g}"]
-    return []
+    for warning in warnings:
+        say(f"caution: {warning}")

@@ -1,6 +1,5 @@
 """`isocharge train calibrate`: calibrate a film with measured presses, and write a model of this film."""
 
-from concurrent.futures import Executor
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -8,22 +7,23 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import ProbeOption
-from isocharge.cli.shared.options import JsonOption, StressLimitOption, worker_count
-from isocharge.cli.shared.press_options import (
+from isocharge.cli.shared.forward_maps import ProbeOption, executor_for
+from isocharge.cli.shared.options import (
     EarlierOption,
     ForceStdOption,
+    JsonOption,
+    MapRadiusOption,
     PositionStdOption,
-    RadiusOption,
     SensorOption,
+    StressLimitOption,
 )
-from isocharge.cli.shared.terminal import say, show, show_json, shown_progress, this_command
+from isocharge.cli.shared.terminal import say, show, show_json, show_result, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError
 from isocharge.serve.model.model_folder import load_model
-from isocharge.serve.presses.measured_presses import MeasuredPresses, read_presses
+from isocharge.serve.presses.measured_presses import read_presses
 from isocharge.serve.presses.std_factor import StdFactor
-from isocharge.simulate import load_sensor, local_workers, parse_probe
+from isocharge.simulate import load_sensor, parse_probe
 from isocharge.train import CalibrationProblem, CalibrationResult, ProposedPress, calibrate, next_presses
 from isocharge.train.calibration.calibrate import solve_even
 from isocharge.train.calibration.folder import (
@@ -55,7 +55,7 @@ def calibrate_command(
         ),
     ] = None,
     probe: ProbeOption = "circle:1.0",
-    radius: RadiusOption = DEFAULT_RADIUS,
+    radius: MapRadiusOption = DEFAULT_RADIUS,
     position_std_mm: PositionStdOption = 0.1,
     force_std: ForceStdOption = 0.01,
     next_count: Annotated[
@@ -69,7 +69,6 @@ def calibrate_command(
     held_out: Annotated[
         Path | None,
         typer.Option(
-            "--held-out",
             metavar="PRESSES.csv",
             help="22 or more presses that are not used for the calibration. The standard deviations of the model are "
             "multiplied by a factor with which its 95 % regions hold for such presses. (default: no factor)",
@@ -88,7 +87,15 @@ def calibrate_command(
 
     Example: isocharge train calibrate presses.csv --sensor four-25um-biaxial -o my-film
     """
-    _check_usage(file, output, next_count, held_out)
+    if held_out is not None and output is None:
+        raise InputError("--held-out: expected --output FOLDER for the model whose standard deviations it changes")
+    if file is None and not next_count:
+        raise InputError(
+            "expected PRESSES.csv, or --next K for presses to begin with, got neither; `isocharge train press` takes "
+            "presses at a port"
+        )
+    if file is None and output is not None:
+        raise InputError("--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out")
     problem = CalibrationProblem(load_sensor(sensor), parse_probe(probe), radius=radius, stress_limit=stress_limit)
     result: CalibrationResult | None = None  # None if only presses are proposed
     std_factor: StdFactor | None = None  # None without held-out presses
@@ -96,7 +103,7 @@ def calibrate_command(
     with (
         calibration_folder(output, problem) if output is not None else nullcontext(),
         shown_progress(),
-        local_workers(worker_count(None)) as executor,
+        executor_for() as executor,
     ):
         presses, held_out_presses = (
             None
@@ -112,7 +119,11 @@ def calibrate_command(
             for caution in result.cautions:
                 say(f"caution: {caution}")
         if result is not None and output is not None:
-            std_factor = _write(result, output, held_out_presses, executor)
+            say("training the network of this film")
+            version = write_calibration(result, output, this_command(), held_out=held_out_presses, executor=executor)
+            say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
+            if held_out_presses is not None:
+                std_factor = StdFactor(**load_model(version).metadata.made_with["std_factor"])
         if next_count:
             # The next presses are chosen for the calibrated film, or for the mean film if nothing was calibrated.
             charges = solve_even(problem, executor) if result is None else result.charges
@@ -120,71 +131,18 @@ def calibrate_command(
             proposed_presses = next_presses(
                 problem, charges, next_count, film, position_std_mm=position_std_mm, force_std=force_std
             )
-    _print_result(result, std_factor, proposed_presses, json=json)
 
-
-def _print_result(
-    result: CalibrationResult | None,
-    std_factor: StdFactor | None,
-    proposed_presses: list[ProposedPress],
-    *,
-    json: bool,
-) -> None:
-    """Print the result of a calibration, if there is one, and the proposed presses.
-
-    For each proposed press, the function prints the errors of position and force that would remain after this press.
-
-    Args:
-        result: Result of the calibration; None if only presses are proposed.
-        std_factor: Factor of the standard deviations of the model; None without held-out presses.
-        proposed_presses: Presses that should be made next.
-        json: Whether to print JSON instead of sentences.
-    """
+    # For each proposed press, print the errors that would remain after this press.
+    rows = [vars(press) for press in proposed_presses]
     if json:
         result_fields = {} if result is None else result_table(result)
         if std_factor is not None:
             result_fields["std_factor"] = std_factor.factor
-        show_json(result_fields | {"next": [vars(press) for press in proposed_presses]})
+        show_json(result_fields | {"next": rows})
         return
     if result is not None:
-        for sentence in result.summary:
-            show(sentence)
+        show("\n".join(result.summary))
     if std_factor is not None:
         show(f"Held-out presses: {std_factor.statement}.")
-    for press in proposed_presses:
-        show(
-            f"press {press.force_N:.2f} N at ({press.x_mm:.1f}, {press.y_mm:.1f}) mm: "
-            f"leaves {press.position_mm:.3f} mm, {press.force_percent:.2f} %"
-        )
-
-
-def _write(
-    result: CalibrationResult, folder: Path, held_out: MeasuredPresses | None, executor: Executor | None
-) -> StdFactor | None:
-    """Write the model of a calibrated film, and print the name of its version folder.
-
-    Returns:
-        Factor by which the standard deviations were multiplied; None without held-out presses.
-    """
-    say("training the network of this film")
-    version = write_calibration(result, folder, this_command(), held_out=held_out, executor=executor)
-    say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
-    return None if held_out is None else StdFactor(**load_model(version).metadata.made_with["std_factor"])
-
-
-def _check_usage(file: Path | None, output: Path | None, next_count: int, held_out: Path | None) -> None:
-    """Raise InputError if the options do not belong together.
-
-    Without presses, the command can only propose presses, and writes no model. Held-out presses need a model.
-    """
-    if held_out is not None and output is None:
-        raise InputError("--held-out: expected --output FOLDER for the model whose standard deviations it changes")
-    if file is not None:
-        return
-    if not next_count:
-        raise InputError(
-            "expected PRESSES.csv, or --next K for presses to begin with, got neither; `isocharge train press` takes "
-            "presses at a port"
-        )
-    if output is not None:
-        raise InputError("--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out")
+    if rows:
+        show_result({"next": rows}, json=False)

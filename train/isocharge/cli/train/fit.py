@@ -16,12 +16,11 @@ from isocharge.cli.shared.forward_maps import (
     sweep_radius,
     warn_of_stress,
 )
-from isocharge.cli.shared.options import ConfigOption, JsonOption, RadiusOption
-from isocharge.cli.shared.press_options import ForceStdOption, PositionStdOption
-from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
+from isocharge.cli.shared.options import ConfigOption, ForceStdOption, JsonOption, PositionStdOption, RadiusOption
+from isocharge.cli.shared.terminal import say, show_result, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError, ModelError, OutputError, OutputExists
-from isocharge.serve import ModelMetadata, read_presses
+from isocharge.serve import read_presses
 from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import (
     Dataset,
@@ -46,7 +45,7 @@ ModelFolderOption = Annotated[
 
 VersionOption = Annotated[
     int,
-    typer.Option("--version", min=1, help="Version of the model, which is the name of the folder in models/NAME."),
+    typer.Option(min=1, help="Version of the model, which is the name of the folder in models/NAME."),
 ]
 
 
@@ -65,7 +64,6 @@ def fit_command(
     sensor: Annotated[
         str | None,
         typer.Option(
-            "--sensor",
             metavar="SENSOR",
             help="Name of a built-in sensor or a TOML file. 24,000 presses from 0.05 to 2 N are simulated on this "
             "sensor, and 96,000 if it has more than four electrodes. (default: the sensor of DATASET)",
@@ -136,9 +134,7 @@ def fit_command(
     with shown_progress():
         fitted = train(fit_config)
         released = _release(fitted, version_folder)
-    if json:
-        show_json({"folder": str(released.folder), "errors": dict(released.metadata.errors)})
-    say(f"{released.folder}: {_errors_sentence(released.metadata)}")
+    show_result({"folder": str(released.folder), "errors": dict(released.metadata.errors)}, json=json)
 
 
 def _refuse_options(context: typer.Context, names: Sequence[str], reason: str) -> None:
@@ -211,18 +207,3 @@ def _fit_dataset(dataset: Dataset, config: FitConfig) -> Fitted:
     if data.yield_force_N is not None:
         say(f"caution: PVDF yields beyond {data.yield_force_N:g} N, and a dent stays")
     return fit(data, config)
-
-
-def _errors_sentence(metadata: ModelMetadata) -> str:
-    """Return a sentence that states the errors of a model."""
-    errors = metadata.errors
-    force_words = "the force is not estimated"
-    if "force_rms_percent" in errors:
-        force_words = f"force {errors['force_rms_percent']:g} % rms"
-    press_count = errors.get("measured_presses")
-    condition = f"on {press_count:.0f} measured presses at places that were left out, " if press_count else ""
-    return (
-        f"{condition}position error {errors['position_median_mm']:g} mm median, "
-        f"{errors['position_rms_mm']:g} mm rms, {errors['position_p95_mm']:g} mm at 95 %; "
-        f"{force_words}"
-    )

@@ -9,16 +9,18 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import ProbeOption
-from isocharge.cli.shared.options import BaudOption, DeviceOption, StressLimitOption, worker_count
-from isocharge.cli.shared.port_hints import no_frames_advice_added
-from isocharge.cli.shared.press_options import (
+from isocharge.cli.shared.forward_maps import ProbeOption, executor_for
+from isocharge.cli.shared.options import (
+    BaudOption,
+    DeviceOption,
     EarlierOption,
     ForceStdOption,
+    MapRadiusOption,
     PositionStdOption,
-    RadiusOption,
     SensorOption,
+    StressLimitOption,
 )
+from isocharge.cli.shared.port_hints import no_frames_advice_added
 from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
@@ -28,15 +30,13 @@ from isocharge.serve import ReadingStream, load_device, open_source
 from isocharge.serve.live.steady_press import PressWatch
 from isocharge.serve.presses.measured_presses import MeasuredPresses, read_press_list, read_presses, write_presses
 from isocharge.serve.signal_chain.thermal import ThermalRule
-from isocharge.simulate import load_sensor, local_workers, parse_probe
+from isocharge.simulate import load_sensor, parse_probe
 from isocharge.train import CalibrationProblem, read_earlier
 from isocharge.train.calibration.session import PressSession
 
 
 def press_command(
-    port: Annotated[
-        str, typer.Option("--port", metavar="URL", help="Port of the sensor: device path or pyserial URL.")
-    ],
+    port: Annotated[str, typer.Option(metavar="URL", help="Port of the sensor: device path or pyserial URL.")],
     sensor: SensorOption,
     output: Annotated[
         Path,
@@ -48,7 +48,7 @@ def press_command(
         ),
     ],
     probe: ProbeOption = "circle:1.0",
-    radius: RadiusOption = DEFAULT_RADIUS,
+    radius: MapRadiusOption = DEFAULT_RADIUS,
     position_std_mm: PositionStdOption = 0.1,
     force_std: ForceStdOption = 0.01,
     device: DeviceOption = None,
@@ -60,7 +60,6 @@ def press_command(
     press_list: Annotated[
         Path | None,
         typer.Option(
-            "--press-list",
             metavar="FILE",
             help="Presses that a machine makes, in their order: CSV with x_mm, y_mm, force_N. Nothing is asked. "
             "(default: proposed presses)",
@@ -69,7 +68,6 @@ def press_command(
     until: Annotated[
         float,
         typer.Option(
-            "--until",
             metavar="SHARE",
             min=0.0,
             help="Position error left by the film at which the session ends, as a share of the error by noise alone; "
@@ -106,10 +104,18 @@ def press_command(
         say(f"{device}: [common_mode] is not used for these presses, because it needs a model of the film")
 
     stds = {"position_std_mm": position_std_mm, "force_std": force_std}
-    presses = _earlier_presses(output, problem.electrodes, **stds)
-    if presses is not None:
+    presses = None
+    if output.is_file():  # the file of an earlier session
+        presses = read_presses(output, problem.electrodes, **stds)
+        if presses.ignored:
+            raise PressError(
+                f"{output}: expected a file of `isocharge train press`, got further columns: "
+                f"{', '.join(presses.ignored)}; they would be lost, so choose another output"
+            )
         say(f"{output} has {len(presses)} presses; the session continues with them. Delete the file to begin again")
-    with local_workers(worker_count(None)) as executor:
+    elif output.exists() or not output.parent.is_dir():
+        raise OutputError(f"{output}: expected a file in an existing folder; choose another output")
+    with executor_for() as executor:
         say("solving the film of the sensor file")
         save = partial(_save, output)
         session = PressSession(problem, save=save, presses=presses, until=until, executor=executor, **stds)
@@ -131,8 +137,7 @@ def press_command(
                     dialogue.follow_machine(contacts)
         finally:
             if len(session):
-                noun = "press" if len(session) == 1 else "presses"
-                say(f"{output} has {len(session)} {noun}; the same command continues the session")
+                say(f"presses in {output}: {len(session)}; the same command continues the session")
 
     if len(session) == 0:
         raise PressError(f"no press was taken, so {output} is not written")
@@ -142,35 +147,6 @@ def press_command(
     if earlier is not None:
         options += ["--from", str(earlier)]
     say(f"To make a model: isocharge train calibrate {shlex.join([str(output), *options])} -o my-film")
-
-
-def _earlier_presses(
-    path: Path, electrodes: tuple[str, ...], *, position_std_mm: float, force_std: float
-) -> MeasuredPresses | None:
-    """Return the presses of an earlier session, or None if there is no file.
-
-    Args:
-        path: File of the session.
-        electrodes: Names of the electrodes.
-        position_std_mm: Standard deviation of x and y of a press if the file does not contain it, mm.
-        force_std: Standard deviation of the force of a press if the file does not contain it, relative to the force.
-
-    Raises:
-        OutputError: If the file cannot be written.
-        PressError: If the file is not a file of presses, or if it has further columns. These columns would be lost when
-            the file is written again.
-    """
-    if path.is_file():
-        presses = read_presses(path, electrodes, position_std_mm=position_std_mm, force_std=force_std)
-        if presses.ignored:
-            raise PressError(
-                f"{path}: expected a file of `isocharge train press`, got further columns: "
-                f"{', '.join(presses.ignored)}; they would be lost, so choose another output"
-            )
-        return presses
-    if path.exists() or not path.parent.is_dir():
-        raise OutputError(f"{path}: expected a file in an existing folder; choose another output")
-    return None
 
 
 def _save(path: Path, presses: MeasuredPresses) -> None:

@@ -219,36 +219,22 @@ class Dialogue:
             self._wait_for(Phase.waiting)
             self._say("The tare is measured. Let the machine begin.")
             for row_number, contact in enumerate(contacts[first_row:], start=first_row + 1):
-                self._follow_press(row_number, contact)
+                self._say(f"{row_number}. {describe_press(contact)}")
+                event = self._wait_for(Phase.taken, Phase.refused)
+                if event.press is not None:
+                    self._say_steady(event.press)
+                    self._take(event.press, contact)
+                elif event.reason == PORT_LOST:
+                    raise PortLost(
+                        f"{PORT_LOST}; run the same command again, and let the machine continue with row {row_number} "
+                        "of its list"
+                    )
+                else:  # the machine has already moved on to the next row
+                    self._say(f"   row {row_number} is left out: {event.reason}")
         except SessionEnd as end:
             raise InputError(
                 "the port ended before the last press of the list; run the same command again for the remaining presses"
             ) from end
-
-    def _follow_press(self, row_number: int, contact: Array) -> None:
-        """Wait for the press that belongs to one row of a machine's list, and record the press.
-
-        A refused press is left out, because the machine has already moved on to the next row.
-
-        Args:
-            row_number: Number of the row in the list, from 1.
-            contact: Contact (x, y, F) of the row, shape (3,), mm and N.
-
-        Raises:
-            PortLost: If the connection to the board was lost during the press.
-        """
-        self._say(f"{row_number}. {describe_press(contact)}")
-        event = self._wait_for(Phase.taken, Phase.refused)
-        if event.press is not None:
-            self._say_steady(event.press)
-            self._take(event.press, contact)
-        elif event.reason == PORT_LOST:
-            raise PortLost(
-                f"{PORT_LOST}; run the same command again, and let the machine continue with row {row_number} of its "
-                "list"
-            )
-        else:
-            self._say(f"   row {row_number} is left out: {event.reason}")
 
     def _wait_for(self, *phases: Phase) -> WatchResult:
         """Wait for the next reading in one of the given phases.

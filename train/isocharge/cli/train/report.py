@@ -29,7 +29,6 @@ def report_command(
     model: Annotated[
         list[str] | None,
         typer.Option(
-            "--model",
             metavar="MODEL",
             help="Name or path of the model to compare, once for each DATASET. (default: the model with the name of "
             "the sensor)",
@@ -38,7 +37,7 @@ def report_command(
     models: ModelsOption = None,
     sensor: Annotated[
         str | None,
-        typer.Option("--sensor", metavar="SENSOR", help="Sensor of PRESSES.csv. (default: the sensor of DATASET)"),
+        typer.Option(metavar="SENSOR", help="Sensor of PRESSES.csv. (default: the sensor of DATASET)"),
     ] = None,
     probe: ProbeOption = "circle:1.0",
     quick: Annotated[
