@@ -114,15 +114,15 @@ def test_virtual_solves_the_film_only_up_to_the_scripted_distance(tmp_path, run,
     (tmp_path / "far.toml").write_text("presses = [[0, 0, 0, 0], [1, 0, 0, 0], [2, 5, 12, 1], [4, 5, 12, 0]]\n")
     for words in ((), ("--radius", 15), ("--script", tmp_path / "far.toml")):
         with suppress(SceneError):  # the small map does not reach so far
-            run("virtual", "four-25um-biaxial-15mm", "--seconds", 0, *words)
+            run("virtual", "four-25um-biaxial-15mm", "--seconds", 0.001, *words)
     assert [round(radius, 3) for _, _, radius, _ in solved] == [8.0, 15.0, 13.0]
 
 
 def test_random_presses_stay_below_the_yield_point_of_the_film_by_default(run, solved, monkeypatch):
     """A probe of 1 mm radius yields the built-in films at 0.87 N."""
-    run("virtual", "three-25um-biaxial", "--seconds", 0)
+    run("virtual", "three-25um-biaxial", "--seconds", 0.001)
     with suppress(SceneError):  # the small map has a smaller range of forces
-        run("virtual", "three-25um-biaxial", "--seconds", 0, "--force-max", 1.5)
+        run("virtual", "three-25um-biaxial", "--seconds", 0.001, "--force-max", 1.5)
     assert [force_range for _, _, _, force_range in solved] == [(0.05, 0.8), (0.05, 1.5)]
     assert wander(seed=1).force_N.max() <= 0.8
     domain = Domain(8.0, (0.05, 2.0))
@@ -143,8 +143,8 @@ def test_charges_below_the_smallest_force_follow_the_power_law_of_a_membrane():
 @pytest.mark.parametrize(
     ("words", "error", "message"),
     [
-        (f"{SENSOR} --seconds 0 --link TMP/film", OutputExists, "film is already there"),
-        (f"{SENSOR} --seconds 0 --link TMP/no/film", InputError, "the link cannot be made"),
+        (f"{SENSOR} --seconds 0.001 --link TMP/film", OutputExists, "film is already there"),
+        (f"{SENSOR} --seconds 0.001 --link TMP/no/film", InputError, "the link cannot be made"),
         ("five-25um-biaxial", SensorError, "no sensor 'five-25um-biaxial'"),
         (f"{SENSOR} --film 1 --probe triangle:4", InputError, r"--film: expected a --probe like circle.*'triangle:4'"),
     ],

@@ -52,8 +52,8 @@ def test_position_in_a_recording_limits_the_samples(start_page, record):
 
 def test_state_is_sent_if_it_has_changed(client):
     client.page.update(counters={"frames": 7}, recording="x.rec")
-    client.page.add_marker(1.0, "")
-    client.page.add_marker(2.0, "b")
+    client.page.add_marker((1.0, ""))
+    client.page.add_marker((2.0, "b"))
     answer = client.ask("read")
     assert answer["state"] == {"counters": {"frames": 7}, "recording": "x.rec", "markers": [[1.0, ""], [2.0, "b"]]}
     assert "state" not in client.ask("read", version=answer["version"])

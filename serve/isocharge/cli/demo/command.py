@@ -60,7 +60,12 @@ def demo_command(
         other_options = (output, seconds, sensor, live)
         if any(option is not None for option in other_options):
             raise InputError("expected --playground without another option, got another option with it")
-        _write_playground(playground)
+        from isocharge.serve.viewer.playground_page import playground_html  # imported late, because the import is slow
+
+        refuse_existing(playground)
+        playground.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(playground, playground_html().encode())
+        say(f"wrote {playground}; open it in a browser")
         return
 
     # The modules of both demos are imported late, because they need extras that may not be installed.
@@ -74,20 +79,3 @@ def demo_command(
         from isocharge.cli.demo.live_film import show_live_film
 
         show_live_film(live, seconds, sensor_name)
-
-
-def _write_playground(path: Path) -> None:
-    """Write the playground, and print how to open it.
-
-    Args:
-        path: Path of the HTML file. Missing folders are created.
-
-    Raises:
-        OutputExists: If the file exists already.
-    """
-    from isocharge.serve.viewer.playground_page import playground_html  # imported late, because the import is slow
-
-    refuse_existing(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, playground_html().encode())
-    say(f"wrote {path}; open it in a browser")

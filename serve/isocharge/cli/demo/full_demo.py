@@ -1,8 +1,5 @@
 """Complete demo: simulate a film, train a model, follow a virtual sensor, and draw the results."""
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import cast
@@ -43,65 +40,37 @@ def run_demo(folder: Path, seconds: float, sensor_name: str) -> None:
     sensor = load_sensor(sensor_name)
     probe = Circle(1.0)
     sweep = Sweep(played_radius_mm(sensor.name), samples=N_SIMULATED_PRESSES)
-    durations_s: dict[str, float] = {}
-    with new_folder(folder) as draft:
-        with _demo_step(
-            "simulate", f"{sensor.name}, circle of 1 mm, 0.05 to 2 N, within {sweep.radius:.3g} mm", durations_s
-        ):
-            # The forward map interpolates the charges of all presses. There is one map for each probe.
-            (forward_map,) = solve_maps(sensor, (probe,), sweep)
-            dataset = read_dataset(write_sweep(draft / "presses", (forward_map,), sweep))
-            say(
-                f"   {len(dataset.samples)} presses interpolated from {forward_map.solves} solves, relative error "
-                f"{forward_map.error:.1e}"
-            )
-        with _demo_step("train", "a small network on noisy charges, exported to ONNX", durations_s):
-            model = release(fit(dataset), draft / "models" / sensor.name, command=this_command())
-            predictor = Predictor(model.folder)
-        with _demo_step(
-            "serve",
-            "a virtual sensor sends frames over a pseudo-terminal, the model answers live",
-            durations_s,
-        ):
-            followed, totals = _follow_live(forward_map, predictor, seconds)
-            say(f"   {totals}")
-        with _demo_step("show", "one page of pictures", durations_s):
-            equilibrium = press(sensor.film, probe, (3.0, -2.0), 1.0)  # a press inside every working area
-            draw_page(forward_map, equilibrium, followed, draft / "demo.png")
+    with shown_progress(), new_folder(folder) as draft:
+        say(f"1. simulate: {sensor.name}, circle of 1 mm, 0.05 to 2 N, within {sweep.radius:.3g} mm")
+        # The forward map interpolates the charges of all presses. There is one map for each probe.
+        (forward_map,) = solve_maps(sensor, (probe,), sweep)
+        dataset = read_dataset(write_sweep(draft / "presses", (forward_map,), sweep))
+        say(
+            f"   {len(dataset.samples)} presses interpolated from {forward_map.solves} solves, relative error "
+            f"{forward_map.error:.1e}"
+        )
+        say("2. train: a small network on noisy charges, exported to ONNX")
+        model = release(fit(dataset), draft / "models" / sensor.name, command=this_command())
+        predictor = Predictor(model.folder)
+        say("3. serve: a virtual sensor sends frames over a pseudo-terminal, the model answers live")
+        followed = _follow_live(forward_map, predictor, seconds)
+        say("4. show: one page of pictures")
+        equilibrium = press(sensor.film, probe, (3.0, -2.0), 1.0)  # a press inside every working area
+        draw_page(forward_map, equilibrium, followed, draft / "demo.png")
     say(f"   {folder / 'demo.png'}")
 
-    errors = predictor.metadata.errors
     live_median_mm, live_p95_mm = np.percentile(position_error(followed[:, 1], followed[:, 0]), (50, 95))
     results = {
         "model": predictor.metadata.label,
-        "position_error_mm": {"median": errors["position_median_mm"], "p95": errors["position_p95_mm"]},
-        "live_position_error_mm": {"median": live_median_mm, "p95": live_p95_mm},
-        "force_error_percent": {"median": errors["force_median_percent"], "rms": errors["force_rms_percent"]},
-        "step_s": durations_s,
+        "errors": dict(predictor.metadata.errors),
+        "live_errors": {"position_median_mm": live_median_mm, "position_p95_mm": live_p95_mm},
         "folder": str(folder),
     }
     show_result(results, json=False)
 
 
-@contextmanager
-def _demo_step(name: str, description: str, durations_s: dict[str, float]) -> Iterator[None]:
-    """Context manager that prints the title of one step of the demo and shows the progress of the step.
-
-    Args:
-        name: Name of the step.
-        description: What the step does.
-        durations_s: Durations of the completed steps by name, s. The duration of this step is added.
-    """
-    step_number = len(durations_s) + 1
-    say(f"\n{step_number}. {name}: {description}")
-    start_s = time.perf_counter()
-    with shown_progress():
-        yield
-    durations_s[name] = time.perf_counter() - start_s
-
-
-def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) -> tuple[Array, str]:
-    """Play a virtual sensor, and estimate its contacts from the frames at its port.
+def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) -> Array:
+    """Play a virtual sensor, estimate its contacts from the frames at its port, and print the counts of the frames.
 
     Args:
         forward_map: Charges of the presses of the virtual sensor.
@@ -109,9 +78,8 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
         seconds: Duration, s.
 
     Returns:
-        Two values. The first is an array of the frames in which both the virtual sensor and the model have a contact,
-        shape (n, 2, 3): the true and the estimated (x, y, F), mm and N. The second contains the numbers of frames and
-        faults of the stream.
+        The frames in which both the virtual sensor and the model have a contact, shape (n, 2, 3): the true and the
+        estimated (x, y, F), mm and N.
     """
     touch = TouchStream(predictor)
     followed = []
@@ -126,7 +94,8 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
             row = round(1e-6 * (record.t_device_us or 0) * rate_Hz) % len(script)
             if record.contact and sensor.script.touching[row]:
                 followed.append((script[row], (record.x_mm, record.y_mm, record.force_N)))
-    return np.array(followed, float), summary(touch)
+    say(f"   {summary(touch)}")
+    return np.array(followed, float)
 
 
 def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array, path: Path) -> None:

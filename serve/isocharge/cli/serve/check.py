@@ -1,7 +1,7 @@
 """`isocharge serve check`: comparison of a model with measured presses."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -9,7 +9,7 @@ import typer
 from isocharge.cli.shared.options import ForceStdOption, JsonOption, ModelArgument, ModelsOption, PositionStdOption
 from isocharge.cli.shared.terminal import say, show_result
 from isocharge.serve.model.predictor import Predictor
-from isocharge.serve.prediction.press_check import PressCheck, check_presses
+from isocharge.serve.prediction.press_check import check_presses
 from isocharge.serve.presses.measured_presses import read_presses
 
 MAX_ROWS = 40
@@ -49,21 +49,16 @@ def check_command(
         del result["each"]
         summaries = {name: result.pop(name) for name in ("position_mm", "force_percent")}
         errors = {name: summary for name, summary in summaries.items() if summary is not None}
-        worst_presses = [
-            {check.errors.row_noun: row["line"]} | {name: row[name] for name in SHOWN} for row in _worst_presses(check)
-        ]
+        # The table contains the presses with the largest errors, in the order of the file. The squared errors of x, y
+        # and F are divided by their variances. An unknown error is NaN and does not count.
+        chi_squared = np.nansum(check.errors.squared_ratio, axis=1)  # shape (n,)
+        worst_indices = np.argsort(-chi_squared, kind="stable")[:MAX_ROWS]
+        if check.presses > MAX_ROWS:
+            say(f"the table has the {MAX_ROWS} worst of {check.presses} presses; --json has all")
+        rows = map(check.errors.row, sorted(worst_indices.tolist()))
+        worst_presses = [{check.errors.row_noun: row["line"]} | {name: row[name] for name in SHOWN} for row in rows]
         result = {"each": worst_presses, "errors": errors} | result
         if check.std_factor is not None:
             result["std_factor"] = f"{check.std_factor.statement}, if they were not used for the model"
     show_result(result, json=json)
     raise typer.Exit(0 if check.fits else 1)
-
-
-def _worst_presses(check: PressCheck) -> list[dict[str, Any]]:
-    """Return the `MAX_ROWS` presses with the largest errors, in the order of the file."""
-    squared_ratio = check.errors.squared_ratio  # squared errors of x, y and F over their variances, shape (n, 3)
-    chi_squared = np.nansum(squared_ratio, axis=1)  # shape (n,); an unknown error is NaN and does not count
-    worst_indices = np.argsort(-chi_squared, kind="stable")[:MAX_ROWS]
-    if check.presses > MAX_ROWS:
-        say(f"the table has the {MAX_ROWS} worst of {check.presses} presses; --json has all")
-    return [check.errors.row(press_index) for press_index in sorted(worst_indices.tolist())]

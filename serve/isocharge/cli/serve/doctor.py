@@ -168,13 +168,11 @@ def port_lines() -> Iterator[str]:
     for port in sorted(list_ports.comports()):
         try:
             examination = examine(port.device, seconds=1.0)
-        except IsochargeError as error:
-            yield f"{port.device} ({port.description}): {error}"
-            continue
-        if examination.good:
             received = f"{examination.format}, {examination.rate_Hz:.0f} frames/s at {examination.baud} baud"
-        else:
-            received = examination.missing[0]
+            if not examination.good:
+                received = examination.missing[0]
+        except IsochargeError as error:
+            received = str(error)
         yield f"{port.device} ({port.description}): {received}"
 
 

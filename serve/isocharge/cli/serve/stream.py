@@ -2,14 +2,14 @@
 
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing, nullcontext
 from dataclasses import asdict
 from functools import partial
 from itertools import islice
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -27,7 +27,9 @@ from isocharge.cli.shared.options import (
     DeviceOption,
     ModelArgument,
     ModelsOption,
+    PortOption,
     RecordingArgument,
+    SecondsOption,
     WaitOption,
 )
 from isocharge.cli.shared.port_hints import no_frames_advice_added, no_frames_hint
@@ -60,9 +62,6 @@ from isocharge.serve.live.recorded_stream import RecordedStream, replay
 from isocharge.serve.outputs.output import OutputContext
 from isocharge.serve.outputs.targets import Outputs, target_forms
 
-if TYPE_CHECKING:
-    from isocharge.serve.viewer.live_page import LivePage
-
 OutputOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -72,14 +71,8 @@ OutputOption = Annotated[
     ),
 ]
 
-DEFAULT_TARGETS = ("json",)
-"""Targets of the output if the option `--output` is not given."""
 
-RecordWriter = Callable[[PredictionRecord], object]
-"""Function that is called with each record."""
-
-
-def write_records(records: Iterable[PredictionRecord], writers: Iterable[RecordWriter]) -> None:
+def write_records(records: Iterable[PredictionRecord], writers: Iterable[Callable[[PredictionRecord], object]]) -> None:
     """Pass each record to all writers, and print each new tare, or the charges of the last record without a tare.
 
     Args:
@@ -114,7 +107,7 @@ def command_outputs(targets: Sequence[str] | None, touch: TouchStream, *, is_liv
     """Return the outputs for the targets of `--output`. They are opened when their context is entered.
 
     Args:
-        targets: Values of the option; None or empty for `DEFAULT_TARGETS`.
+        targets: Values of the option; None or empty for JSON on standard output.
         touch: The stream whose records are written.
         is_live: Whether the records come from a sensor.
 
@@ -129,7 +122,7 @@ def command_outputs(targets: Sequence[str] | None, touch: TouchStream, *, is_liv
         write_stdout=write_stdout,
         stdout_is_ready=stdout_is_ready,
     )
-    return Outputs(targets or DEFAULT_TARGETS, context)
+    return Outputs(targets or ["json"], context)
 
 
 def say_missing_records(outputs: Outputs, state: str) -> None:
@@ -154,13 +147,7 @@ def summary(touch: TouchStream) -> str:
 
 def stream_command(
     model: ModelArgument,
-    port: Annotated[
-        str,
-        typer.Option(
-            metavar="URL",
-            help="Port of the sensor: device path, tcp:// or udp://HOST:PORT; or a file of bytes; - reads stdin.",
-        ),
-    ],
+    port: PortOption,
     models: ModelsOption = None,
     device: DeviceOption = None,
     output: OutputOption = None,
@@ -179,9 +166,7 @@ def stream_command(
             "(default: name of the model's sensor)",
         ),
     ] = None,
-    seconds: Annotated[
-        float | None, typer.Option(min=1e-3, help="Time after which to stop, s. (default: at Ctrl-C)")
-    ] = None,
+    seconds: SecondsOption = None,
     count: Annotated[
         int | None, typer.Option(min=1, help="Number of records after which to stop. (default: at Ctrl-C)")
     ] = None,
@@ -238,9 +223,9 @@ def stream_command(
         return Predictor(load_checked_model(find_model(model, models)).folder)
 
     outputs: Outputs | None = None  # until the port is open
-    with ExitStack() as stack:  # closes the contexts in reverse order
-        stack.enter_context(until_stopped())
-        page_context = live_page(
+    with (
+        until_stopped(),
+        live_page(
             live,
             touch.frame_id,
             predictor.metadata,
@@ -248,24 +233,22 @@ def stream_command(
             tls_cert=tls_cert,
             tls_key=tls_key,
             allow_host=allow_host,
-        )
-        page = stack.enter_context(page_context)
-        stack.enter_context(stop_timer(seconds, has_expired))
-        source = stack.enter_context(open_source(port, baud=baud, reconnect=True, request=board.request, wait=wait))
-
+        ) as page,
+        stop_timer(seconds, has_expired),
+        open_source(port, baud=baud, reconnect=True, request=board.request, wait=wait) as source,
         # The handlers of the signals only request changes, which the stream carries out later.
-        stack.enter_context(on_signal(signal.SIGUSR1, stream.request_tare))
-        stack.enter_context(on_signal(signal.SIGHUP, unless_hung_up(partial(stream.request_model, load_latest))))
-
-        outputs = stack.enter_context(command_outputs(output, touch, is_live=source.is_live))
-        writers: list[RecordWriter] = [outputs.write]
+        on_signal(signal.SIGUSR1, stream.request_tare),
+        on_signal(signal.SIGHUP, unless_hung_up(partial(stream.request_model, load_latest))),
+        recorder or nullcontext(),
+        command_outputs(output, touch, is_live=source.is_live) as open_outputs,
+        closing(stream.follow(source)) as records,  # closed before the recorder
+    ):
+        outputs = open_outputs
+        writers: list[Callable[[PredictionRecord], object]] = [outputs.write]
         if page is not None:
             # The page must not begin a recording if the command itself records the stream.
             new_recorder = None if recorder else partial(Recorder, device=board.table, name=name)
             writers.append(PageFeed(page, touch, stream, new_recorder).write)
-        if recorder:
-            stack.enter_context(recorder)
-        records = stack.enter_context(closing(stream.follow(source)))  # closed before the recorder
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
             with no_frames_advice_added(port, device):
@@ -325,44 +308,30 @@ def replay_command(
     play = partial(replay, recording, touch, real_time=real_time, load=load)
 
     outputs = command_outputs(output, touch, is_live=False)
-    page_context = live_page(
-        live,
-        file.name,
-        predictor.metadata,
-        is_recording=True,
-        token=token,
-        tls_cert=tls_cert,
-        tls_key=tls_key,
-        allow_host=allow_host,
-    )
-    with until_stopped(), page_context as page, outputs:
+    with (
+        until_stopped(),
+        live_page(
+            live,
+            file.name,
+            predictor.metadata,
+            is_recording=True,
+            token=token,
+            tls_cert=tls_cert,
+            tls_key=tls_key,
+            allow_host=allow_host,
+        ) as page,
+        outputs,
+    ):
         if page is None:
             write_records(play(), [outputs.write])
         else:
-            _play_on_page(play, page, PageFeed(page, touch), outputs)
+            feed = PageFeed(page, touch)
+            write_records(play(on_marker=page.add_marker), [outputs.write, feed.write])
+            outputs.close()  # now, because Ctrl-C, until which the page stays open, would discard files that are open
+            feed.update_state()  # with the counters of the whole recording
+            page.update(is_complete=True)
+            threading.Event().wait()  # sleeps until Ctrl-C, because nothing sets the event
     say(summary(touch))
     if outputs.has_incomplete_file:
         say_missing_records(outputs, "not written, because the replay was stopped before its end")
         raise typer.Exit(1)
-
-
-def _play_on_page(
-    play: Callable[..., Iterator[PredictionRecord]],
-    page: "LivePage",
-    feed: PageFeed,
-    outputs: Outputs,
-) -> None:
-    """Write the records of a recording to the outputs and to the replay page, and keep the page open until Ctrl-C.
-
-    Args:
-        play: Function that yields the records. Its argument `on_marker` is called with each marker of the recording.
-        page: The page.
-        feed: Writer that passes the records to the page.
-        outputs: The outputs, which are closed at the end of the recording.
-    """
-    records = play(on_marker=lambda marker: page.add_marker(*marker))
-    write_records(records, [outputs.write, feed.write])
-    outputs.close()  # now, because the page stays open until Ctrl-C, which would discard files that are not closed
-    feed.update_state()  # with the counters of the whole recording
-    page.update(is_complete=True)
-    threading.Event().wait()  # sleeps until Ctrl-C, because nothing sets the event

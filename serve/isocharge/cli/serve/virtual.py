@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 from isocharge.cli.shared.forward_maps import ROUNDING_MARGIN, ProbeOption
-from isocharge.cli.shared.options import MapRadiusOption, SensorArgument
+from isocharge.cli.shared.options import MapRadiusOption, SecondsOption, SensorArgument
 from isocharge.cli.shared.terminal import announce, say, shown_progress, until_stopped
 from isocharge.cli.shared.virtual_sensor import film_charges, measure_function, random_script
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
@@ -30,10 +30,7 @@ from isocharge.simulate import (
 
 def virtual_command(
     sensor: SensorArgument,
-    seconds: Annotated[
-        float | None,
-        typer.Option(min=0.0, max=1e6, help="Time after which to stop, s. (default: at Ctrl-C)"),
-    ] = None,
+    seconds: SecondsOption = None,
     rate: Annotated[float, typer.Option(metavar="HZ", min=1.0, max=5000.0, help="Frames per second, Hz.")] = 200.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of presses, noise and offsets.")] = 0,
     force_max: Annotated[
@@ -120,9 +117,7 @@ def virtual_command(
                 radius=radius,
                 force_range=(DEFAULT_PLAYED_FORCE_RANGE[0], force_max),
             )
-        remaining_rest_s = start_s + rest - time.monotonic()
-        if remaining_rest_s > 0.0:
-            threading.Event().wait(remaining_rest_s)  # sleeps, because nothing sets the event
+        threading.Event().wait(start_s + rest - time.monotonic())  # sleeps, unless the time is negative
         presses = scripted_presses or random_script(forward_map, seed, rate, force_max)
         player.use(film_charges(forward_map), presses)
         played_name = sensor if film is None else f"film {film} of {sensor}"

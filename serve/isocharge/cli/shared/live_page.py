@@ -27,9 +27,6 @@ from isocharge.serve.viewer.film_description import describe_film
 if TYPE_CHECKING:
     from isocharge.serve.viewer.live_page import Action, LivePage
 
-LOOPBACK = "127.0.0.1"
-"""Host of the page if `--live` contains only a port."""
-
 STATE_INTERVAL_S = 0.25
 """Time between two messages with the counters, s."""
 
@@ -105,7 +102,7 @@ def page_address(live: str) -> Address:
     host, _, port = live.rpartition(":")
     if port not in map(str, range(1 << 16)):
         raise InputError(f"--live: expected PORT or HOST:PORT, as 8001 or {DEFAULT_LIVE_ADDRESS}, got {shown(live)}")
-    return Address(host.strip("[]") or LOOPBACK, int(port))
+    return Address(host.strip("[]") or "127.0.0.1", int(port))
 
 
 @contextmanager
@@ -215,7 +212,7 @@ class PageFeed:
             model=record.model,
             film=None if record.film is None else structs.asdict(record.film),
             tare_pC=record.tare_pC,
-            recording=None if recorder is None else str(recorder.path.name),
+            recording=None if recorder is None else recorder.path.name,
             recording_failed=recorder is not None and recorder.failed,
         )
 
@@ -230,7 +227,7 @@ class PageFeed:
         if isinstance(action, Marker):
             marker = recording.Marker(time.time(), action.text)
             stream.request_marker(marker)
-            self._page.add_marker(*marker)
+            self._page.add_marker(marker)
         elif not isinstance(action, Record):
             stream.request_tare()
         elif self._new_recorder is None:

@@ -46,14 +46,6 @@ WorkersOption = Annotated[
     ),
 ]
 
-ClusterOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        help="Dask scheduler whose workers are used instead, such as tcp://10.0.0.1:8786. (default: none)",
-    ),
-]
-
 NoiseOption = Annotated[
     str,
     typer.Option(
@@ -61,11 +53,6 @@ NoiseOption = Annotated[
         help="Noise of the readings: reference (1 pC and 0.2 %, assumed), measured (1 pC and 1.5 %), bench, surgery, "
         "or a TOML file with white_pC and proportional.",
     ),
-]
-
-ConfigOption = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Training settings, TOML. (default: those of the released models)"),
 ]
 
 NewFolderOption = Annotated[
@@ -84,6 +71,20 @@ DeviceOption = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="Description of the board that sends the charges, TOML. (default: none)"),
 ]
+
+PortOption = Annotated[
+    str,
+    typer.Option(
+        metavar="URL",
+        help="Port of the sensor: device path, tcp:// or udp://HOST:PORT; or a file of bytes; - reads stdin.",
+    ),
+]
+
+SecondsOption = Annotated[
+    float | None, typer.Option(min=1e-3, max=1e6, help="Time after which to stop, s. (default: at Ctrl-C)")
+]
+
+SeedOption = Annotated[int, typer.Option(min=0, help="Seed of random numbers. Equal seeds give equal results.")]
 
 BaudOption = Annotated[int, typer.Option(min=1, help="Speed of the port, bits per second; USB ports ignore it.")]
 

@@ -213,7 +213,7 @@ def stop_timer(seconds: float | None, has_expired: Event) -> Iterator[None]:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
-def unless_hung_up(act: Callable[[], object]) -> Callable[[], None]:
+def unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
     """Return a handler of SIGHUP that calls `act`, or stops the command as Ctrl-C does if its terminal has been closed.
 
     The user sends SIGHUP to request the action. The system sends the same signal when the terminal is closed. If a
@@ -224,16 +224,7 @@ def unless_hung_up(act: Callable[[], object]) -> Callable[[], None]:
         act: Function that the handler calls while the terminal is open.
     """
     terminals = [descriptor for descriptor in STANDARD_DESCRIPTORS if os.isatty(descriptor)]
-
-    def act_or_stop() -> None:
-        """Call `act`, or stop the command if its terminal has been closed."""
-        is_open = all(map(os.isatty, terminals))
-        if is_open:
-            act()
-        else:
-            signal.raise_signal(signal.SIGINT)
-
-    return act_or_stop
+    return lambda: act() if all(map(os.isatty, terminals)) else signal.raise_signal(signal.SIGINT)
 
 
 PROGRESS_LINE_INTERVAL_S = 5.0

@@ -164,8 +164,9 @@ class LivePage(Application):
             self._state = self._state | values
             self._version += 1
 
-    def add_marker(self, time_s: float, text: str) -> None:
-        """Add a marker at a Unix time, s, to the markers that the page shows."""
+    def add_marker(self, marker: tuple[float, str]) -> None:
+        """Add a marker, which consists of a Unix time, s, and a text, to the markers that the page shows."""
+        time_s, text = marker  # the encoder of JSON accepts no named tuple
         self._markers.append((time_s, text))
         self.update(markers=list(self._markers))
 

@@ -10,6 +10,7 @@ from isocharge.cli.shared.options import (
     MapRadiusOption,
     NewFolderOption,
     NoiseOption,
+    SeedOption,
     SensorArgument,
     StressLimitOption,
     WorkersOption,
@@ -54,7 +55,7 @@ def design_command(
     probe: ProbeOption = "circle:1.0",
     force: ForceOption = 1.0,
     noise: NoiseOption = "reference",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the search. Equal seeds give equal designs.")] = 0,
+    seed: SeedOption = 0,
     stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
     workers: WorkersOption = None,
 ) -> None:

@@ -51,19 +51,14 @@ def point_command(
         ),
     ] = 0.0,
     side_force: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FX,FY",
-            help="Force of the probe on the film along x and y, N. (default: none)",
-        ),
-    ] = None,
+        str, typer.Option(metavar="FX,FY", help="Force of the probe on the film along x and y, N.")
+    ] = "0,0",
     friction: Annotated[
-        float | None,
+        float,
         typer.Option(
-            metavar="MU",
-            help="Coefficient of friction of a probe on a vertical stage, which gives the side force. (default: none)",
+            metavar="MU", help="Coefficient of friction of a probe on a vertical stage, which gives the side force."
         ),
-    ] = None,
+    ] = 0.0,
     json: JsonOption = False,
 ) -> None:
     """Compute the charge of every electrode (pC) and the deflection of the film (mm) under one press.
@@ -76,11 +71,9 @@ def point_command(
     film_sensor = warmed(load_sensor(sensor), temperature)
     footprint = parse_probe(probe)
 
-    if side_force is not None and friction is not None:
+    applied_side_force = parse_pair(side_force, "--side-force: expected two numbers in N like '0.1,0'")
+    if any(applied_side_force) and friction:
         raise InputError("--side-force and --friction: expected one of them, because friction gives the side force")
-    applied_side_force = (0.0, 0.0)
-    if side_force is not None:
-        applied_side_force = parse_pair(side_force, "--side-force: expected two numbers in N like '0.1,0'")
 
     settings = SolveSettings(accuracy=accuracy, theory=theory_by_name(theory))
     film = film_sensor.film

@@ -6,10 +6,10 @@ import typer
 
 from isocharge.cli.shared.forward_maps import DEFAULT_PROBE, ProbesOption, executor_for, sweep_radius, warn_of_stress
 from isocharge.cli.shared.options import (
-    ClusterOption,
     ForceRangeOption,
     NewFolderOption,
     RadiusOption,
+    SeedOption,
     SensorArgument,
     StressLimitOption,
     WorkersOption,
@@ -31,10 +31,16 @@ def sweep_command(
         Literal["fixed", "random"],
         typer.Option(help="Angle of the probe: as given, or random for each press."),
     ] = "fixed",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the presses. Equal seeds give equal data.")] = 0,
+    seed: SeedOption = 0,
     stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
     workers: WorkersOption = None,
-    cluster: ClusterOption = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Dask scheduler whose workers are used instead, such as tcp://10.0.0.1:8786. (default: none)",
+        ),
+    ] = None,
 ) -> None:
     """Simulate many presses at different positions and forces, and write their charges as a dataset for training.
 

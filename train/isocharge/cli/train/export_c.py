@@ -2,7 +2,6 @@
 
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption, NewFolderOption
 from isocharge.cli.shared.terminal import say, this_command
-from isocharge.common.files import refuse_existing
 from isocharge.serve import find_model, load_device
 from isocharge.train.export_c.folder import export_c
 
@@ -19,7 +18,6 @@ def export_c_command(
 
     Example: isocharge train export-c four-25um-biaxial -o c
     """
-    refuse_existing(output)
     folder = export_c(find_model(model, models), output, load_device(device), command=this_command())
     file_names = sorted(path.name for path in folder.iterdir())
     say(f"{folder}: {', '.join(file_names)}")

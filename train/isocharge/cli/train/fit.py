@@ -16,7 +16,7 @@ from isocharge.cli.shared.forward_maps import (
     sweep_radius,
     warn_of_stress,
 )
-from isocharge.cli.shared.options import ConfigOption, ForceStdOption, JsonOption, PositionStdOption, RadiusOption
+from isocharge.cli.shared.options import ForceStdOption, JsonOption, PositionStdOption, RadiusOption
 from isocharge.cli.shared.terminal import say, show_result, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError, ModelError, OutputError, OutputExists
@@ -33,25 +33,18 @@ from isocharge.train import FitConfig, Fitted, TrainingData, fit, fit_presses, l
 from isocharge.train.data.presses import is_measured, measured_presses_of
 from isocharge.train.model_release.release import Release
 
-ModelFolderOption = Annotated[
-    Path,
-    typer.Option(
-        "--output",
-        "-o",
-        metavar="models/NAME",
-        help="Folder of the model. The name of the folder becomes the name of the model.",
-    ),
-]
-
-VersionOption = Annotated[
-    int,
-    typer.Option(min=1, help="Version of the model, which is the name of the folder in models/NAME."),
-]
-
 
 def fit_command(
     context: typer.Context,
-    output: ModelFolderOption,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="models/NAME",
+            help="Folder of the model. The name of the folder becomes the name of the model.",
+        ),
+    ],
     dataset: Annotated[
         Path | None,
         typer.Argument(
@@ -73,8 +66,13 @@ def fit_command(
     radius: RadiusOption = f"{DEFAULT_RADIUS}",
     position_std_mm: PositionStdOption = 0.1,
     force_std: ForceStdOption = 0.01,
-    config: ConfigOption = None,
-    version: VersionOption = 1,
+    config: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Training settings, TOML. (default: those of the released models)"),
+    ] = None,
+    version: Annotated[
+        int, typer.Option(min=1, help="Version of the model, which is the name of the folder in models/NAME.")
+    ] = 1,
     json: JsonOption = False,
 ) -> None:
     """Train a network on charges, measure its errors, and write a model folder: ONNX file, card, golden vectors.
@@ -106,24 +104,22 @@ def fit_command(
             f"calibrate {shlex.quote(str(dataset))} --sensor {sensor} -o {shlex.quote(str(output))}`, or leave "
             "--sensor out to train a network on the presses alone"
         )
-    if sensor is None:
-        _refuse_options(context, ("radius",), "belongs to --sensor; the presses determine the working area")
-    else:
-        _refuse_options(context, ("position_std_mm", "force_std"), "belongs to a file of measured presses")
 
     fit_config = load_config(config) if config else FitConfig()
     train: Callable[[FitConfig], Fitted]
     if sensor is not None:
+        _refuse_options(context, "simulated presses", "probe", "radius")
         electrodes = load_sensor(sensor).electrode_names
         train = partial(_fit_simulated_presses, sensor, probe or [DEFAULT_PROBE], radius)
     elif dataset is None:
         raise InputError("expected either a DATASET folder or a SENSOR, got neither")
     elif dataset.is_dir():
-        _refuse_options(context, ("probe", "position_std_mm", "force_std"), "is contained in the dataset folder")
+        _refuse_options(context, "a dataset folder")
         loaded_dataset = read_dataset(dataset)
         electrodes = loaded_dataset.sensor.electrode_names
         train = partial(_fit_dataset, loaded_dataset)
     else:  # a file or a pipe
+        _refuse_options(context, "measured presses", "probe", "position_std_mm", "force_std")
         presses = read_presses(dataset, position_std_mm=position_std_mm, force_std=force_std)
         electrodes = presses.electrodes
         say(f"{dataset}: {len(presses)} presses of the channels {', '.join(electrodes)}")
@@ -137,21 +133,22 @@ def fit_command(
     show_result({"folder": str(released.folder), "errors": dict(released.metadata.errors)}, json=json)
 
 
-def _refuse_options(context: typer.Context, names: Sequence[str], reason: str) -> None:
-    """Raise an error if one of the options is given, because it would have no effect.
+def _refuse_options(context: typer.Context, source: str, *used_options: str) -> None:
+    """Raise an error if an option is given that has no effect on the presses.
 
     Args:
         context: The command with its arguments.
-        names: Names of the function's arguments to which the options belong.
-        reason: End of a sentence that begins with the option.
+        source: What the presses are, for the error message.
+        *used_options: Parameters of the command that have an effect.
 
     Raises:
-        InputError: If an option is given.
+        InputError: If an option is given that has no effect.
     """
+    unused = {"probe", "radius", "position_std_mm", "force_std"} - {*used_options}
     for parameter in context.command.params:
-        source = context.get_parameter_source(parameter.name or "")
-        if parameter.name in names and source is not None and source.name == "COMMANDLINE":
-            raise InputError(f"{parameter.opts[0]}: {reason}; leave the option out")
+        origin = context.get_parameter_source(parameter.name or "")
+        if parameter.name in unused and origin is not None and origin.name == "COMMANDLINE":
+            raise InputError(f"{parameter.opts[0]}: has no effect on {source}; leave the option out")
 
 
 def _release(fitted: Fitted, version_folder: Path) -> Release:

@@ -16,6 +16,7 @@ from isocharge.cli.shared.options import (
     EarlierOption,
     ForceStdOption,
     MapRadiusOption,
+    PortOption,
     PositionStdOption,
     SensorOption,
     StressLimitOption,
@@ -36,7 +37,7 @@ from isocharge.train.calibration.session import PressSession
 
 
 def press_command(
-    port: Annotated[str, typer.Option(metavar="URL", help="Port of the sensor: device path or pyserial URL.")],
+    port: PortOption,
     sensor: SensorOption,
     output: Annotated[
         Path,

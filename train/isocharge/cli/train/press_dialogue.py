@@ -22,9 +22,6 @@ from isocharge.serve import Chunk, ReadingStream
 from isocharge.serve.live.steady_press import PORT_LOST, Phase, PressWatch, SteadyPress, WatchResult
 from isocharge.train.calibration.session import PressSession, describe_press, read_answer
 
-JOIN_TIMEOUT_s = 1.0
-"""Longest time to wait for the end of the thread that reads the port, s. With a silent port, the thread ends later."""
-
 
 class SessionEnd(Exception):
     """End of a press session, because the person quits, or because the input or the port has ended."""
@@ -69,7 +66,7 @@ class PressEvents:
     def __exit__(self, *error: object) -> None:
         """Stop the threads. A thread that waits for a silent port or for the keyboard ends only with the process."""
         self._stop.set()
-        self._port_thread.join(timeout=JOIN_TIMEOUT_s)
+        self._port_thread.join(timeout=1.0)
 
     def arm(self) -> None:
         """Discard all earlier readings, and detect only presses that begin after this call."""
@@ -141,10 +138,6 @@ PHASE_TEXTS = {
 }
 """Instruction for the person in each phase of the press watch."""
 
-QUESTION = '   Was it there, and as hard? Enter: yes; or type "x y force" (? is unknown), u: undo, q: quit'
-
-KEYS = "   (press elsewhere if you cannot reach a place; type u to undo the last press, q to quit)"
-
 
 class Dialogue:
     """Dialogue of one session, from the first press to the last. Its messages are sentences on stderr."""
@@ -194,7 +187,7 @@ class Dialogue:
                 place with the proposed force.
         """
         if asks:
-            self._say(KEYS)
+            self._say("   (press elsewhere if you cannot reach a place; type u to undo the last press, q to quit)")
         try:
             while not self._session.enough:
                 self._guide_press(asks=asks)
@@ -213,12 +206,16 @@ class Dialogue:
             PortLost: If the port is lost, because it is then unknown which press comes next.
             InputError: If the port ends before the last press.
         """
-        first_row = _count_rows_made(self._session, contacts)
+        # Count the rows up to and including the last press of an earlier session, if the list contains this press.
+        row_count = 0
+        if len(self._session):
+            is_last_press = np.isclose(contacts, self._session.presses.contact[-1], equal_nan=True).all(axis=1)
+            row_count = int(np.flatnonzero(is_last_press).max(initial=-1)) + 1
         try:
             # A press before the tare would be lost, and each later press would be assigned to the wrong row.
             self._wait_for(Phase.waiting)
             self._say("The tare is measured. Let the machine begin.")
-            for row_number, contact in enumerate(contacts[first_row:], start=first_row + 1):
+            for row_number, contact in enumerate(contacts[row_count:], start=row_count + 1):
                 self._say(f"{row_number}. {describe_press(contact)}")
                 event = self._wait_for(Phase.taken, Phase.refused)
                 if event.press is not None:
@@ -284,7 +281,9 @@ class Dialogue:
                     self._take(event.press, proposed.contact)
                     return
                 steady_press = event.press
-                self._say(QUESTION)
+                self._say(
+                    '   Was it there, and as hard? Enter: yes; or type "x y force" (? is unknown), u: undo, q: quit'
+                )
             elif event.phase == Phase.refused:
                 self._say(f"   not taken: {event.reason}; press again")
                 self._events.arm()
@@ -347,19 +346,3 @@ class Dialogue:
         """Print sentences that state how accurately the film is known."""
         for sentence in self._session.summary:
             self._say(f"   {sentence}")
-
-
-def _count_rows_made(session: PressSession, contacts: Array) -> int:
-    """Count the rows in a machine's list up to and including the last press of the session.
-
-    The number is 0 if the session has no press, or if its last press is not in the list. If several rows are equal to
-    the last press, the last of these rows counts.
-
-    Args:
-        session: The session.
-        contacts: Contacts of the list, shape (n_row, 3), mm and N.
-    """
-    if len(session) == 0:
-        return 0
-    is_equal = np.isclose(contacts, session.presses.contact[-1], equal_nan=True).all(axis=1)  # x, y and F are equal
-    return int(np.flatnonzero(is_equal).max(initial=-1)) + 1

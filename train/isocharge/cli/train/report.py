@@ -9,7 +9,6 @@ from isocharge.cli.shared.forward_maps import ProbeOption
 from isocharge.cli.shared.options import JsonOption, ModelsOption, NewFolderOption
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.errors import InputError
-from isocharge.common.files import refuse_existing
 from isocharge.serve import find_model, read_presses
 from isocharge.simulate import Dataset, load_sensor, parse_probe, read_dataset
 from isocharge.train.data.presses import dataset_of
@@ -61,7 +60,6 @@ def report_command(
     Example: isocharge train report presses -o report
     """
     # Find the datasets and, for each of them, the model to compare.
-    refuse_existing(output)
     if model and len(model) != len(datasets):
         raise InputError(f"--model: expected one model for each of {len(datasets)} datasets, got {len(model)}")
     loaded_datasets = [_read_dataset(path, sensor, probe) for path in datasets]
@@ -77,10 +75,6 @@ def report_command(
             command=this_command(),
         )
 
-    for section in record["datasets"]:
-        for method in section["methods"]:
-            error_mm = method["errors"].get("position_rms_mm", float("nan"))
-            say(f"{section['sensor']}: {method['name']}: {error_mm} mm rms, {method['single_press_us']} us")
     say(str(output / "report.md"))
     if json:
         show_json(record)
