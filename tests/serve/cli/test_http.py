@@ -94,7 +94,7 @@ def test_http_command_refuses_wrong_options_and_models(command, models, tmp_path
             (models, ("--token", ""), 2, "InputError: token: expected printable ASCII"),
             (models, ("--tls-key", "x"), 2, "InputError: --tls-key: expected --tls-cert too"),
             (models, ("--tls-cert", tmp_path / "cert.pem"), 2, f"InputError: {tmp_path}/cert.pem: not a certificate"),
-            (tmp_path / "empty", (), 2, f"ModelError: {tmp_path}/empty: expected models"),
+            (tmp_path / "empty", (), 2, "ModelError: no model can be served: expected models"),
             (
                 tmp_path / "damaged",
                 (),

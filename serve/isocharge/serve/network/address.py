@@ -61,8 +61,6 @@ class Address:
             is_ipv6 = ":" in self.host
             family = socket.AF_INET6 if is_ipv6 else socket.AF_INET
             return socket.create_server((self.host, self.port), family=family, backlog=backlog)
-        except ListenError:  # its message already states what to do
-            raise
         except (OSError, UnicodeError) as error:  # a host name that cannot be encoded causes a UnicodeError
             place = self.uds or f"{self.host}:{self.port}"
             raise ListenError(f"cannot listen on {place}: {error}; choose another address or port") from error
@@ -73,8 +71,7 @@ class Address:
         If the address is not a Unix socket, the function does nothing.
         """
         if self.uds:
-            with contextlib.suppress(ListenError):
-                _remove_stale_socket(self.uds)
+            _remove_stale_socket(self.uds)
 
     def url(self, listening: socket.socket, *, secure: bool) -> str:
         """Return the URL that clients use, or `unix:PATH` if the address is a Unix socket.
@@ -234,17 +231,11 @@ def _listen_unix(path: Path, backlog: int) -> socket.socket:
 def _remove_stale_socket(path: Path) -> None:
     """Remove the file of a Unix socket if no server listens on the socket any more.
 
-    If the file does not exist, the function does nothing.
-
-    Raises:
-        ListenError: If the file is not a socket, or if a server listens on the socket.
+    If the file does not exist or is not a socket, the function does nothing.
     """
-    if not path.exists():
-        return
     if not path.is_socket():
-        raise ListenError(f"{path}: expected nothing or a left-over socket, found a file; choose another path")
+        return
     with socket.socket(socket.AF_UNIX) as client:
         error_number = client.connect_ex(str(path))  # 0 if a server accepts the connection
-    if error_number != errno.ECONNREFUSED:  # the system refuses a connection only if no server listens
-        raise ListenError(f"{path}: another server listens there; stop it or choose another path")
-    path.unlink(missing_ok=True)
+    if error_number == errno.ECONNREFUSED:  # the system refuses a connection only if no server listens
+        path.unlink(missing_ok=True)

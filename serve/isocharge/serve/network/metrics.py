@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from types import SimpleNamespace
 from typing import Any
 
 import onnxruntime as ort
@@ -75,8 +76,7 @@ class ModelMetrics:
         return Statistics(**{field: metric.labels(name, version) for field, metric in self._metrics.items()})
 
 
-@dataclass(frozen=True)
-class Statistics:
+class Statistics(SimpleNamespace):
     """Metrics of one version of a model since the start of the server. Any thread may call any method.
 
     Attributes:
@@ -90,36 +90,23 @@ class Statistics:
         latest: Unix time of the latest inference, s.
     """
 
-    description: Info
-    ready: Gauge
-    presses: Counter
-    alarms: Counter
-    refused: Counter
-    latency: Histogram
-    refused_time: Counter
-    latest: Gauge
-
-    def count_answered(self, presses: int, duration_ns: int, alarms: int = 0) -> None:
+    def count_answered(self, presses: int, duration_s: float, alarms: int) -> None:
         """Count a request that was answered.
 
         Args:
             presses: Number of presses in the request.
-            duration_ns: Time to read the request, to run the model and to write the response, ns.
+            duration_s: Time to read the request, to run the model and to write the response, s.
             alarms: Number of presses whose misfit is above the limit.
         """
         self.presses.inc(presses)
         self.alarms.inc(alarms)
-        self.latency.observe(duration_ns / 1e9)
+        self.latency.observe(duration_s)
         self.latest.set(time.time())
 
-    def count_refused(self, ns: int) -> None:
-        """Count a request that was refused.
-
-        Args:
-            ns: Time from the complete request to the refusal, ns.
-        """
+    def count_refused(self, duration_s: float) -> None:
+        """Count a request that was refused after the given time, s."""
         self.refused.inc()
-        self.refused_time.inc(ns / 1e9)
+        self.refused_time.inc(duration_s)
 
     def to_json(self) -> dict[str, Any]:
         """Return the counters as a JSON object with the names that Triton uses in its statistics."""

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.serve.model.contact import Validity
@@ -53,21 +54,21 @@ class LoadedVersion:
         return Validity.of(self.metadata)
 
 
-@dataclass(frozen=True)
-class ModelVersions:
-    """Versions of one model by their numbers, in ascending order.
+class Version(NamedTuple):
+    """Version of a model that is loaded, was refused or was unloaded.
 
     Attributes:
-        loaded: Versions that are available for requests.
-        refused: Reasons why versions were refused or unloaded. New files of a loaded version may be refused.
+        name: Name of the model.
+        number: Number of the version.
+        loaded: The loaded version, or None if the version is not available for requests.
+        reason: Reason why the version was refused or unloaded, or an empty text. The new files of a loaded version may
+            be refused, too.
     """
 
-    loaded: Mapping[int, LoadedVersion]
-    refused: Mapping[int, str]
-
-
-NO_VERSIONS = ModelVersions({}, {})
-"""The versions of an unknown model."""
+    name: str
+    number: int
+    loaded: LoadedVersion | None
+    reason: str
 
 
 class ModelStore:
@@ -92,12 +93,14 @@ class ModelStore:
         self._roots = roots
         self._change_lock = threading.Lock()
         self.metrics = ModelMetrics()
-        # The dictionary is sorted by name, and is replaced as a whole, so that no thread reads half of a change.
-        self._models: dict[str, ModelVersions] = {}
+        # The list is sorted, and is replaced as a whole, so that no thread reads half of a change.
+        self._versions: list[Version] = []
         for name, folder in self._folders().items():
             self._load_versions(name, folder)
         if not self.loaded_versions():
-            raise ModelError(f"no model can be served: {'; '.join(self.refusals()) or 'no model was found'}")
+            searched = ", ".join(map(str, roots))
+            missing = f"expected models, <name>/<version>/model.onnx, found none in {searched}; correct --models"
+            raise ModelError(f"no model can be served: {'; '.join(self.refusals()) or missing}")
 
     def get(self, name: str, version: str = "") -> LoadedVersion:
         """Return a loaded version of a model.
@@ -115,10 +118,8 @@ class ModelStore:
             return versions[-1]
         label = f"{name}/{version}" if version else name
         available = ", ".join(loaded.metadata.label for loaded in self.loaded_versions()) or "no model"
-        reasons = [reason for number, reason in self._model(name).refused.items() if version in ("", str(number))]
-        raise ModelNotFound(
-            "; ".join([f"model {label!r:.200} is not found", f"serving: {available}", *dict.fromkeys(reasons)])
-        )
+        reasons = dict.fromkeys(row.reason for row in self._find(name, version) if row.reason)  # without repetitions
+        raise ModelNotFound("; ".join([f"model {label!r:.200} is not found", f"serving: {available}", *reasons]))
 
     def label(self, name: str, version: str = "") -> str | None:
         """Return the label `name/version` of the version that `get` returns, or None if the version is not loaded."""
@@ -127,7 +128,7 @@ class ModelStore:
 
     def loaded_versions(self) -> list[LoadedVersion]:
         """Return all loaded versions of all models, sorted by name and version."""
-        return [loaded for model in self._models.values() for loaded in model.loaded.values()]
+        return [row.loaded for row in self._versions if row.loaded]
 
     def versions_of(self, name: str, version: str = "") -> list[LoadedVersion]:
         """Return the loaded versions of one model, in ascending order of their numbers.
@@ -136,11 +137,15 @@ class ModelStore:
             name: Name of the model.
             version: Number of the only version that is returned, as a text. An empty text selects all versions.
         """
-        return [loaded for number, loaded in self._model(name).loaded.items() if version in ("", str(number))]
+        return [row.loaded for row in self._find(name, version) if row.loaded]
+
+    def _find(self, name: str, version: str = "") -> list[Version]:
+        """Return the versions of one model as `versions_of`, but also the versions that are not loaded."""
+        return [row for row in self._versions if row.name == name and version in ("", str(row.number))]
 
     def refusals(self) -> list[str]:
         """Return the reasons why versions were refused or unloaded, sorted by name and version."""
-        return [reason for model in self._models.values() for reason in model.refused.values()]
+        return [row.reason for row in self._versions if row.reason]
 
     def index(self) -> list[dict[str, str]]:
         """Return one row for every version that is loaded, was refused or was unloaded, and for every other model.
@@ -148,17 +153,15 @@ class ModelStore:
         A row contains the name of the model, and the number and the state of the version. If the version was refused or
         unloaded, the row also contains the reason. The number is empty if no version of a model was found.
         """
-        names = self._folders().keys() | self._models.keys()
-        models = {name: self._model(name) for name in sorted(names)}
+        new_names = self._folders().keys() - {row.name for row in self._versions}
         return [
             {
-                "name": name,
-                "version": str(number or ""),
-                "state": "READY" if number in model.loaded else "UNAVAILABLE",
-                "reason": model.refused.get(number, ""),
+                "name": row.name,
+                "version": str(row.number or ""),
+                "state": "READY" if row.loaded else "UNAVAILABLE",
+                "reason": row.reason,
             }
-            for name, model in models.items()
-            for number in sorted(model.loaded.keys() | model.refused.keys()) or [0]
+            for row in sorted([*self._versions, *(Version(name, 0, None, "") for name in new_names)])
         ]
 
     def load(self, name: str) -> None:
@@ -172,22 +175,18 @@ class ModelStore:
 
         Raises:
             ModelNotFound: If the folders contain no such model.
-            ModelError: If a version is refused, or if the model has no version. In both cases, all valid versions are
-                loaded, and versions that were loaded before remain loaded.
+            ModelError: If a version is refused. All valid versions are loaded nevertheless, and versions that were
+                loaded before remain loaded.
         """
         with self._change_lock:
             folder = self._folders().get(name)
             if folder is None:
                 raise ModelNotFound(f"model {name!r:.200} is not found in the repository")
-            refused = self._load_versions(name, folder)
-        # All valid versions are loaded now. The following errors only report which versions are not loaded.
-        if refused:
-            raise ModelError("; ".join(refused.values()))
-        if not version_folders(folder):
-            raise ModelError(
-                f"{folder}: expected folders of versions, found none; versions that were loaded before stay loaded, "
-                "and unload removes them"
-            )
+            self._load_versions(name, folder)
+        # All valid versions are loaded now. The error only reports which versions are refused.
+        reasons = [row.reason for row in self._find(name) if row.reason]
+        if reasons:
+            raise ModelError("; ".join(reasons))
 
     def unload(self, name: str) -> None:
         """Remove all versions of a model. Requests that have already begun are still answered.
@@ -197,17 +196,13 @@ class ModelStore:
         """
         with self._change_lock:
             self.get(name)  # raises ModelNotFound
-            self._replace(name, {}, dict.fromkeys(self._model(name).loaded, "unloaded"))
+            self._replace(name, [row._replace(loaded=None, reason="unloaded") for row in self._find(name)])
 
     def _folders(self) -> Mapping[str, Path]:
         """Search the repositories for models, and return the folder of each model by the name of the model."""
         return {name: root / name for root in reversed(self._roots) for name in model_names(root)}
 
-    def _model(self, name: str) -> ModelVersions:
-        """Return the versions of a model, which are none if the model is unknown."""
-        return self._models.get(name, NO_VERSIONS)
-
-    def _load_versions(self, name: str, folder: Path) -> Mapping[int, str]:
+    def _load_versions(self, name: str, folder: Path) -> None:
         """Load every version in the folder of a model, and replace the versions that were loaded before.
 
         If a version is refused, or if no version is found, every earlier version that was not replaced remains loaded.
@@ -215,21 +210,20 @@ class ModelStore:
         Args:
             name: Name of the model.
             folder: Folder of the model.
-
-        Returns:
-            Reasons why versions were refused, by the numbers of the versions.
         """
-        loaded: dict[int, LoadedVersion] = {}
-        refused: dict[int, str] = {}
+        earlier = {row.number: row.loaded for row in self._find(name) if row.loaded}
+        rows: dict[int, Version] = {}
         for number, version_folder in version_folders(folder).items():
+            loaded = earlier.get(number)
+            reason = ""
             try:
-                loaded[number] = self._load_version(name, number, version_folder)
+                loaded = self._load_version(name, number, version_folder)
             except Exception as error:  # any error in one folder must not affect the other models
-                refused[number] = _refusal_reason(version_folder, error)
-        if refused or not loaded:  # keep the versions that were loaded before, unless new files replace them
-            loaded = {**self._model(name).loaded, **loaded}
-        self._replace(name, loaded, refused)
-        return refused
+                reason = _refusal_reason(version_folder, error)
+            rows[number] = Version(name, number, loaded, reason)
+        if not rows or any(row.reason for row in rows.values()):
+            rows = {number: Version(name, number, loaded, "") for number, loaded in earlier.items()} | rows
+        self._replace(name, list(rows.values()))
 
     def _load_version(self, name: str, number: int, folder: Path) -> LoadedVersion:
         """Load one version of a model, check its files, and return the version.
@@ -242,22 +236,20 @@ class ModelStore:
         Raises:
             ModelError: If a check fails, or if the metadata contain another name than the folder.
         """
+        statistics = self.metrics.of(name, number)
+        statistics.ready.set_function(lambda: len(self.versions_of(name, str(number))))
         model = load_checked_model(folder)
         if model.metadata.name != name:
             raise ModelError(
                 f"{folder}: expected the model {name}/{number}, as the folders say, got {model.metadata.label}; "
                 "move it into folders of that name and version"
             )
-        statistics = self.metrics.of(name, number)
         statistics.description.info({"sensor": model.metadata.frame_id, "sha256": model.golden.sha256})
         return LoadedVersion(model, statistics)
 
-    def _replace(self, name: str, loaded: Mapping[int, LoadedVersion], refused: Mapping[int, str]) -> None:
-        """Replace the versions of a model, and the reasons why versions were refused or unloaded."""
-        for number in {*self._model(name).loaded, *loaded, *refused}:
-            self.metrics.of(name, number).ready.set(number in loaded)
-        versions = ModelVersions(dict(sorted(loaded.items())), refused)
-        self._models = dict(sorted({**self._models, name: versions}.items()))
+    def _replace(self, name: str, rows: list[Version]) -> None:
+        """Replace all versions of a model."""
+        self._versions = sorted([*(row for row in self._versions if row.name != name), *rows])
 
 
 def open_model_store(models: Path | None = None) -> ModelStore:
@@ -270,12 +262,8 @@ def open_model_store(models: Path | None = None) -> ModelStore:
     Raises:
         ModelError: If `models` is not a folder or contains no model, or if no version passes its checks.
     """
-    if models is None:
-        return ModelStore(repositories())
-    if not model_names(models):
-        repositories(models)  # raises an error if the folder itself is missing
-        raise ModelError(f"{models}: expected models, <name>/<version>/model.onnx, found none; correct --models")
-    return ModelStore([models])
+    roots = repositories(models)
+    return ModelStore(roots if models is None else [models])
 
 
 def _refusal_reason(folder: Path, error: Exception) -> str:

@@ -82,12 +82,12 @@ def test_charges_as_fp32_contents(serve, film, predictor, datatype):
         (
             {"inputs": [tensor([[1.0] * 3], contents={"bool_contents": [True]})]},
             "INVALID_ARGUMENT",
-            "expected `data`, numbers",
+            "expected 3 numbers for the shape",
         ),
         (
             {"inputs": [tensor([[1.0] * 3])], "raw_input_contents": [bytes(12)]},
             "INVALID_ARGUMENT",
-            "expected either `data`",
+            r"got \[1.0, 1.0, 1.0\] and 12 bytes",
         ),
         ({"inputs": [tensor([[1.0] * 3], shape=[5000, 3])]}, "RESOURCE_EXHAUSTED", "at most 4096 presses"),
         ({"model_name": "cubic"}, "NOT_FOUND", "'cubic' is not found; serving: linear/1, linear/2"),

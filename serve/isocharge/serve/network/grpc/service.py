@@ -56,9 +56,6 @@ METHODS: dict[str, tuple[type[Any], type[Any]]] = {
 }
 """Class of the request and class of the response, by the name of the method."""
 
-TENSOR_FIELDS = {"FP32": "fp32_contents", "FP64": "fp64_contents"}
-"""Field of the contents of a tensor that contains the numbers, by the type of the numbers."""
-
 
 def read_request(message: Any) -> tuple[InferBody, bytes]:
     """Read a ModelInferRequest, and return its content and the charges that are sent as raw contents.
@@ -75,40 +72,22 @@ def read_request(message: Any) -> tuple[InferBody, bytes]:
     raw_contents = message.raw_input_contents
     if len(raw_contents) > 1:
         raise RequestError(f"expected one input tensor, got {len(raw_contents)} raw contents")
-    raw_charges = raw_contents[0] if raw_contents else None
-    json_object = {
+    content = {
         "id": message.id,
-        "inputs": [_input_object(tensor, raw_charges) for tensor in message.inputs],
+        "inputs": [
+            {
+                "name": tensor.name,
+                "datatype": tensor.datatype,
+                "shape": list(tensor.shape),
+                "data": [*tensor.contents.fp32_contents, *tensor.contents.fp64_contents] or None,
+                "parameters": _unsupported_parameters(tensor),
+            }
+            for tensor in message.inputs
+        ],
         "outputs": [{"name": output.name, "parameters": _unsupported_parameters(output)} for output in message.outputs],
-        "parameters": {"binary_data_output": raw_charges is not None},
+        "parameters": {"binary_data_output": len(raw_contents) > 0},
     }
-    return convert(json_object, InferBody, "", RequestError), raw_charges or b""
-
-
-def _input_object(tensor: Any, raw_charges: bytes | None) -> dict[str, Any]:
-    """Convert an input tensor to the JSON object that describes the tensor in an HTTP request.
-
-    Args:
-        tensor: Message that contains the name, the number type and the shape of the tensor. It may also contain the
-            numbers.
-        raw_charges: Raw content of the request with the charges, or None if the request has no raw content. In an HTTP
-            request, these bytes would follow the JSON text.
-    """
-    parameters: dict[str, Any] = _unsupported_parameters(tensor)
-    json_object = {
-        "name": tensor.name,
-        "datatype": tensor.datatype,
-        "shape": list(tensor.shape),
-        "parameters": parameters,
-    }
-    if raw_charges is not None:
-        parameters["binary_data_size"] = len(raw_charges)
-    # If the request contains both numbers and raw content, the object contains both. The check of the request then
-    # refuses the object. It also refuses an unknown number type.
-    if tensor.HasField("contents") or raw_charges is None:
-        field = TENSOR_FIELDS.get(tensor.datatype, "fp32_contents")
-        json_object["data"] = list(getattr(tensor.contents, field))
-    return json_object
+    return convert(content, InferBody, "", RequestError), b"".join(raw_contents)
 
 
 def _unsupported_parameters(tensor: Any) -> dict[str, bool]:
@@ -221,7 +200,7 @@ class Service:
                 self._access.check_token(_authorization(context))
             timeout_s = self._limits.header_seconds
             while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:
-                if route.may_block:
+                if name.startswith("RepositoryModel"):  # loading a model takes a long time
                     response = await asyncio.to_thread(self._respond, name, data, call)
                 else:
                     response = self._respond(name, data, call)
@@ -307,8 +286,8 @@ class Service:
         try:
             response = response_type(infer_response=self._infer(request))
         except Exception as error:  # every error is sent to the client
-            _, status = statuses(error)
-            response = response_type(error_message=client_message(error))
+            status, message = _status_and_message(error)
+            response = response_type(error_message=message)
         self._traffic.count("grpc", f"{STREAM_METHOD} message", status)  # `_handle` counts the whole stream as one call
         return response
 
@@ -322,26 +301,18 @@ class Service:
             TooMany: If there are too many open calls, and none of them waits for a message.
         """
         if self._open_count >= self._limits.connections:
-            # The call that is ended counts as open until its coroutine ends. The count may briefly exceed the limit.
-            self._end_waiting_call()
+            oldest_timeout = next(iter(self._waiting), None)  # the first element has waited longest
+            if oldest_timeout is None:
+                raise TooMany(f"all {self._limits.connections} calls are taken; try again later")
+            # A timeout with a deadline in the past expires at once, and ends its call. The call counts as open until
+            # its coroutine ends. The count may briefly exceed the limit.
+            del self._waiting[oldest_timeout]
+            oldest_timeout.reschedule(0.0)
         self._open_count += 1
         try:
             yield
         finally:
             self._open_count -= 1
-
-    def _end_waiting_call(self) -> None:
-        """End the call that has waited longest for a message.
-
-        Raises:
-            TooMany: If no call waits for a message.
-        """
-        if not self._waiting:
-            raise TooMany(f"all {self._limits.connections} calls are taken; try again later")
-        oldest_timeout = next(iter(self._waiting))  # the first element has waited longest
-        del self._waiting[oldest_timeout]
-        # If the deadline of the timeout is the present time, the timeout expires at once. The waiting call then ends.
-        oldest_timeout.reschedule(asyncio.get_running_loop().time())
 
     async def _next_message(self, context: grpc.aio.ServicerContext, timeout_s: float) -> Any:
         """Wait for the next message of a call.
@@ -360,7 +331,7 @@ class Service:
                 call.
         """
         async with asyncio.timeout(timeout_s) as timeout:
-            self._waiting[timeout] = None  # `_end_waiting_call` may let this timeout expire early
+            self._waiting[timeout] = None  # `_count_open_call` may let this timeout expire early
             try:
                 return await context.read()
             finally:

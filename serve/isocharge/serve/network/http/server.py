@@ -23,7 +23,7 @@ from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 
 from isocharge.serve.network.address import Address, ServerLimits, Tls
 from isocharge.serve.network.metrics import Exchange, Traffic
-from isocharge.serve.network.protocol.response import refusal
+from isocharge.serve.network.protocol.response import json_response
 
 
 class RequestRefused(Exception):
@@ -155,7 +155,7 @@ class Connection(HttpToolsProtocol):
         """
         if self.transport.is_closing():
             return
-        response = refusal(status, message)
+        response = json_response({"error": message}, status)
         exchange = Exchange("http", "none", status, bytes_out=len(response.body), client=self.client)
         self._traffic.count_and_log(exchange)
         headers = b"".join(b"%s: %s\r\n" % header for header in response.headers)

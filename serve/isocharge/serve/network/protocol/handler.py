@@ -4,8 +4,7 @@ The class `Handler` answers the requests of the protocol. It does not depend on 
 The function `asgi_app` creates a handler that another program can mount. A request consists of method, path, headers
 and body. A response consists of status, headers and body. Any thread may answer requests. Most responses take
 microseconds to compute, and a response to the largest batch takes milliseconds. Some responses take longer, for example
-because a model is loaded. The method `may_block` returns whether computing the response for a path may take a long
-time.
+because a model is loaded. The paths of such requests are `blocking_paths`.
 
 The base class `Application` is a bare ASGI callable without a framework. It is also the base class of the live page.
 The handler needs no router of a framework, because the table `ROUTES` already selects the function for a request and
@@ -27,7 +26,7 @@ from isocharge.serve.network.browser_check import AccessCheck, header_values
 from isocharge.serve.network.metrics import Client, Exchange, Traffic
 from isocharge.serve.network.model_store import ModelStore, open_model_store
 from isocharge.serve.network.protocol.response import Response, decompress, error_response, json_response
-from isocharge.serve.network.protocol.routes import ROUTES, Request, Route
+from isocharge.serve.network.protocol.routes import ROUTES, UNKNOWN, Request, Route
 
 Headers = Iterable[tuple[bytes, bytes]]
 """Headers of a request. The names are in lower case, and the values are unchanged."""
@@ -47,9 +46,12 @@ class Application(ABC):
 
     Attributes:
         limits: Limits of the requests.
+        blocking_paths: Beginnings of the paths for which computing a response may take a long time. Such a response is
+            computed in another thread, so that other requests are not delayed.
     """
 
     limits: ServerLimits
+    blocking_paths: tuple[str, ...] = ()
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
         """Answer one HTTP request. If the client disconnects before its request is complete, nothing is sent.
@@ -64,24 +66,23 @@ class Application(ABC):
         """
         if scope["type"] != "http":
             raise ValueError(f"expected a scope of the type 'http', got {scope['type']!r}")
-        body = await _read_body(receive, self.limits.body_bytes)
-        if body is None:
-            return
+        # Stop reading as soon as the body is larger than allowed. The application then refuses the body.
+        body = bytearray()
+        is_complete = False
+        while not is_complete and len(body) <= self.limits.body_bytes:
+            message = await receive()
+            if message["type"] == "http.disconnect":
+                return
+            body += message.get("body", b"")
+            is_complete = not message.get("more_body", False)
         path = scope["path"].removeprefix(scope.get("root_path", ""))  # the root path is the path of a mounted program
-        request = (scope["method"], path, scope["headers"], body, scope["client"])
-        if self.may_block(path):
+        request = (scope["method"], path, scope["headers"], bytes(body), scope["client"])
+        if path.startswith(self.blocking_paths):
             response = await asyncio.to_thread(self.answer, *request)
         else:  # most answers take only microseconds
             response = self.answer(*request)
         await send({"type": "http.response.start", "status": response.status, "headers": response.headers})
         await send({"type": "http.response.body", "body": response.body})
-
-    def may_block(self, path: str) -> bool:  # noqa: ARG002  # other applications may decide by the path
-        """Return whether computing the response for a path may take a long time.
-
-        The application then computes the response in another thread, so that other requests are not delayed.
-        """
-        return False
 
     def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client = None) -> Response:  # noqa: ARG002
         """Answer one request.
@@ -116,27 +117,6 @@ class Application(ABC):
         """
 
 
-async def _read_body(receive: Receive, max_bytes: int) -> bytes | None:
-    """Read the body of a request, but stop as soon as the body is larger than allowed. The handler then refuses it.
-
-    Args:
-        receive: Function that returns the next part of the request.
-        max_bytes: Largest size of a body, bytes.
-
-    Returns:
-        The body or, if it is too large, its beginning. None if the client has disconnected.
-    """
-    body = bytearray()
-    is_complete = False
-    while not is_complete and len(body) <= max_bytes:
-        message = await receive()
-        if message["type"] == "http.disconnect":
-            return None
-        body += message.get("body", b"")
-        is_complete = not message.get("more_body", False)
-    return bytes(body)
-
-
 _PATTERNS = [
     (re.compile(template.format(model="(?P<model>[^/]*)", version="(?P<version>[^/]+)")), route)
     for route in ROUTES
@@ -146,22 +126,24 @@ _PATTERNS = [
 
 
 @lru_cache
-def match_path(path: str) -> tuple[Route | None, str, str]:
+def match_path(path: str) -> tuple[Route, str, str]:
     """Return the route of a path, and the name and the version of the model in the path.
 
     If the path contains no name or no version, the name or the version in the result is empty. If the server has no
-    route for the path, the route is None.
+    route for the path, the route is `UNKNOWN`.
     """
     for pattern, route in _PATTERNS:
         path_match = pattern.fullmatch(path)
         if path_match is not None:
             parameters = path_match.groupdict()
             return route, parameters.get("model", ""), parameters.get("version", "")
-    return None, "", ""
+    return UNKNOWN, "", ""
 
 
 class Handler(Application):
     """Application that answers HTTP requests with the models of a store, and counts and logs the requests."""
+
+    blocking_paths = ("/v2/repository/models/",)
 
     def __init__(
         self,
@@ -185,11 +167,6 @@ class Handler(Application):
         self.limits = limits or ServerLimits()
         self.traffic = traffic or Traffic()
 
-    def may_block(self, path: str) -> bool:
-        """Return whether the route of a path may take a long time."""
-        route, _, _ = match_path(path)
-        return route is not None and route.may_block
-
     def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client = None) -> Response:
         """Answer one request as `Application.answer`, count the request, and log the request if there is a log."""
         start_ns = time.perf_counter_ns()
@@ -197,7 +174,7 @@ class Handler(Application):
         route, model, version = match_path(path)
         exchange = Exchange(
             transport="http",
-            route="unknown" if route is None else route.paths[0],  # all paths are counted under the first path
+            route=route.paths[0],  # all paths are counted under the first path
             status=response.status,
             model=self.store.label(model, version),
             error=response.error,
@@ -214,17 +191,15 @@ class Handler(Application):
         route, model, version = match_path(path)
         # The token is checked before unknown paths are refused. A client without the token therefore cannot find out
         # which paths exist.
-        self.access.check(method, headers, needs_token=route is None or route.needs_token)
-        if route is None:
+        self.access.check(method, headers, needs_token=route.needs_token)
+        if route is UNKNOWN:
             raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
         # A HEAD request is answered like a GET request. The server then sends the response without its body.
         is_head_of_get = method == "HEAD" and route.method == "GET"
         if method != route.method and not is_head_of_get:
             raise WrongMethod(f"{path}: expected the method {route.method}, got {method[:20]}", route.method)
         self.limits.check_body(len(body))
-        encoding = headers.get(b"content-encoding")
-        if encoding is not None:
-            body = decompress(body, encoding.lower(), self.limits.body_bytes)
+        body = decompress(body, headers.get(b"content-encoding", b"").lower(), self.limits.body_bytes)
         answer = route.respond(Request(self.store, self.limits, self.traffic, headers, body, model, version))
         return answer if isinstance(answer, Response) else json_response(answer)
 

@@ -7,6 +7,7 @@ header contains the length of the JSON text. The gRPC service converts its messa
 Some clients send `null` for every field that is not given. All optional fields therefore accept `null`.
 """
 
+import math
 import struct
 import time
 from collections.abc import Callable
@@ -34,6 +35,10 @@ class Parameters(Struct, frozen=True):
     binary_data_size: int | None = None
     shared_memory_region: Unsupported = None
     classification: Unsupported = None
+
+
+NO_PARAMETERS = Parameters()
+"""Parameters of a request, of an input or of an output that contains none."""
 
 
 class InputTensor(Struct, frozen=True):
@@ -97,18 +102,26 @@ def read_infer(body: bytes, header_length: bytes | None) -> tuple[InferBody, byt
     Raises:
         RequestError: If the body is not a request for an inference.
     """
-    if header_length is None:
-        return parse_json(body, "", RequestError, InferBody), b""
-    # The characters are checked before the conversion, because int() also accepts signs, blanks and underscores, and is
-    # slow for long texts.
-    is_short_number = header_length.isdigit() and len(header_length) <= len(str(len(body)))
-    if not is_short_number or int(header_length) > len(body):
+    json_length = len(body)
+    if header_length is not None:
+        # The characters are checked before the conversion, because int() also accepts signs, blanks and underscores,
+        # and is slow for long texts.
+        is_short_number = header_length.isdigit() and len(header_length) <= len(str(len(body)))
+        if not is_short_number or int(header_length) > len(body):
+            raise RequestError(
+                f"Inference-Header-Content-Length: expected a whole number up to {len(body)}, the bytes of the body, "
+                f"got {header_length.decode('latin-1')!r:.50}"
+            )
+        json_length = int(header_length)
+    content = parse_json(body[:json_length], "", RequestError, InferBody)
+    binary = body[json_length:]
+    stated_size = (content.inputs[0].parameters or NO_PARAMETERS).binary_data_size or 0
+    if stated_size != len(binary):
         raise RequestError(
-            f"Inference-Header-Content-Length: expected a whole number up to {len(body)}, the bytes of the body, "
-            f"got {header_length.decode('latin-1')!r:.50}"
+            f"inputs[0].parameters.binary_data_size: expected {len(binary)}, the bytes after the JSON text of "
+            f"Inference-Header-Content-Length bytes, got {stated_size!r:.50}"
         )
-    json_length = int(header_length)
-    return parse_json(body[:json_length], "", RequestError, InferBody), body[json_length:]
+    return content, binary
 
 
 def _requested_outputs(body: InferBody) -> dict[str, bool]:
@@ -123,12 +136,12 @@ def _requested_outputs(body: InferBody) -> dict[str, bool]:
     Raises:
         RequestError: If an output is requested twice.
     """
-    default_is_binary = bool(body.parameters and body.parameters.binary_data_output)
+    default_is_binary = bool((body.parameters or NO_PARAMETERS).binary_data_output)
     if not body.outputs:
         return dict.fromkeys(OUTPUTS, default_is_binary)
     outputs: dict[str, bool] = {}
     for output in body.outputs:
-        stated_choice = (output.parameters or Parameters()).binary_data
+        stated_choice = (output.parameters or NO_PARAMETERS).binary_data
         outputs[output.name] = default_is_binary if stated_choice is None else stated_choice
     if len(outputs) < len(body.outputs):
         raise RequestError("outputs: expected each name once")
@@ -138,11 +151,9 @@ def _requested_outputs(body: InferBody) -> dict[str, bool]:
 def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...], max_presses: int) -> Singles:
     """Return the charges of an input tensor, shape (n, electrodes), pC.
 
-    The charges are either numbers in the JSON text, or bytes that follow the JSON text.
-
     Args:
         tensor: Input tensor of the request.
-        binary: Bytes that follow the JSON text. It is empty if no bytes follow.
+        binary: Binary tensor with the charges. It is empty if the input tensor itself contains the charges.
         electrodes: Names of the electrodes of the model, in the order of the charges.
         max_presses: Largest number of presses in one request.
 
@@ -157,43 +168,22 @@ def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...
             f"input {INPUT!r}: expected the shape [n, {len(electrodes)}] with n > 0, "
             f"a column for each of {electrodes}, got {shape!r:.100}"
         )
-    press_count, electrode_count = shape
-    if press_count > max_presses:
-        raise TooLarge(f"input {INPUT!r}: expected at most {max_presses} presses in one request, got {press_count}")
+    if shape[0] > max_presses:
+        raise TooLarge(f"input {INPUT!r}: expected at most {max_presses} presses in one request, got {shape[0]}")
 
-    stated_size = tensor.parameters.binary_data_size if tensor.parameters else None
-    if stated_size is None and not binary:  # the charges are numbers in the JSON text
-        return as_float32(_json_charges(tensor.data, shape), electrodes)
-
-    # The number of bytes must be equal to the stated size and to the size that follows from the shape.
     dtype = DATATYPES[tensor.datatype]
-    expected_size = press_count * electrode_count * dtype.itemsize
-    has_expected_size = stated_size == len(binary) == expected_size
-    if not has_expected_size or tensor.data is not None:
-        raise RequestError(
-            f"expected either `data` or {expected_size} bytes after the JSON, announced by `binary_data_size` of the "
-            f"input and Inference-Header-Content-Length, got binary_data_size {stated_size!r:.50} and {len(binary)} "
-            "bytes"
-        )
-    return as_float32(np.frombuffer(binary, dtype).reshape(shape), electrodes)
-
-
-def _json_charges(values: list[Any] | None, shape: list[int]) -> np.ndarray[Any, Any]:
-    """Convert a flat list of numbers, or a list of rows, to an array of the given shape.
-
-    Raises:
-        RequestError: If there are no values, or their number or arrangement does not agree with the shape.
-    """
-    press_count, electrode_count = shape
+    count = math.prod(shape)
     try:
-        charges = np.asarray(values, np.float64)
-    except (TypeError, ValueError):  # no values, or rows of different lengths
+        charges = np.frombuffer(binary, dtype) if binary else np.asarray(tensor.data, np.float64)
+    except (TypeError, ValueError):  # an incomplete number, no numbers, or rows of different lengths
         charges = np.empty(0)
-    if charges.shape not in ((press_count, electrode_count), (press_count * electrode_count,)):
+    is_sent_twice = binary and tensor.data is not None
+    if is_sent_twice or charges.shape not in (tuple(shape), (count,)):
         raise RequestError(
-            f"input {INPUT!r}: expected `data`, numbers for the shape {shape}, flat or in rows, got {values!r:.100}"
+            f"input {INPUT!r}: expected {count} numbers for the shape {shape}, flat or in rows, or {count} binary "
+            f"numbers of {dtype.itemsize} bytes each, got {tensor.data!r:.100} and {len(binary)} bytes"
         )
-    return charges.reshape(shape)
+    return as_float32(charges.reshape(shape), electrodes)
 
 
 def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
@@ -227,8 +217,7 @@ def answer_inference(
     Raises:
         IsochargeError: If `read` raises this error, if the request does not fit the model, or if the model fails.
     """
-    clock_ns = time.perf_counter_ns
-    start_ns = clock_ns()
+    start_s = time.perf_counter()
     try:
         body, binary = read()
         requested_outputs = _requested_outputs(body)
@@ -246,12 +235,12 @@ def answer_inference(
         ]
         response = write(content, binary_tensors)
     except Exception:
-        loaded.statistics.count_refused(clock_ns() - start_ns)
+        loaded.statistics.count_refused(time.perf_counter() - start_s)
         raise
-    duration_ns = clock_ns() - start_ns
+    duration_s = time.perf_counter() - start_s
     misfit = outputs["misfit"]
     alarms = np.count_nonzero(~(misfit <= loaded.validity.misfit_limit))  # also counts NaN
-    loaded.statistics.count_answered(len(misfit), duration_ns, int(alarms))
+    loaded.statistics.count_answered(len(misfit), duration_s, int(alarms))
     return response
 
 

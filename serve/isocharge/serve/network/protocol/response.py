@@ -81,14 +81,9 @@ def response_of(status: int, content_type: bytes, body: bytes, error: str | None
     return Response(status, headers, body, error)
 
 
-def json_response(content: Any) -> Response:
-    """Return a response with the status 200 whose body is the given value in JSON."""
-    return response_of(200, b"application/json", orjson.dumps(content))
-
-
-def refusal(status: int, message: str, error: str | None = None) -> Response:
-    """Return the response to a refused request. The body of the response is the JSON object {"error": message}."""
-    return response_of(status, b"application/json", orjson.dumps({"error": message}), error)
+def json_response(content: Any, status: int = 200, error: str | None = None) -> Response:
+    """Return a response whose body is the given value in JSON. The body of a refusal is {"error": message}."""
+    return response_of(status, b"application/json", orjson.dumps(content), error)
 
 
 def error_response(error: Exception) -> Response:
@@ -99,8 +94,7 @@ def error_response(error: Exception) -> Response:
     authentication.
     """
     http_status, _ = statuses(error)  # the status of gRPC is not needed
-    error_type = type(error).__name__  # for the log
-    response = refusal(http_status, client_message(error), error_type)
+    response = json_response({"error": client_message(error)}, http_status, type(error).__name__)
     if isinstance(error, errors.WrongMethod):
         response.headers.append((b"allow", error.allowed.encode()))
     if isinstance(error, errors.TokenError):
@@ -128,22 +122,16 @@ def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
     if encoding in (b"", b"identity"):
         return body
     if encoding not in ENCODINGS:
-        raise errors.UnknownEncoding(f"Content-Encoding {_quoted(encoding)}: expected gzip, deflate or identity")
+        name = errors.shown(encoding.decode("latin-1"))
+        raise errors.UnknownEncoding(f"Content-Encoding: expected gzip, deflate or identity, got {name}")
     decompressor = zlib.decompressobj(zlib.MAX_WBITS | 32)  # recognises both formats
     try:
         plain_body = decompressor.decompress(body, limit + 1)  # the additional byte shows that the limit is exceeded
     except zlib.error as error:
-        raise errors.RequestError(
-            f"the body is not {_quoted(encoding)}, as its Content-Encoding states: {error}"
-        ) from error
+        raise errors.RequestError(f"the body is not compressed as its Content-Encoding states: {error}") from error
     if len(plain_body) > limit:
         raise errors.TooLarge(f"the body unpacks to more than {limit} bytes; send smaller batches")
     # `eof` is False if the end of the data is missing, and `unused_data` are the bytes after the end.
     if not decompressor.eof or decompressor.unused_data:
-        raise errors.RequestError(f"the body ends before, or goes on after, the end of its {_quoted(encoding)} data")
+        raise errors.RequestError("the body ends before, or goes on after, the end of its compressed data")
     return plain_body
-
-
-def _quoted(encoding: bytes) -> str:
-    """Return the name of an encoding as a quoted text for an error message. Long names are shortened."""
-    return repr(encoding.decode("latin-1"))[:50]

@@ -9,7 +9,6 @@ from functools import partial
 from importlib.resources import files
 from typing import Any, NamedTuple, TypeVar
 
-import orjson
 from prometheus_client import generate_latest
 
 from isocharge.common.errors import ModelError, RequestError, package_version
@@ -78,7 +77,6 @@ class Route(NamedTuple):
         rpcs: Names of the gRPC methods that give the same answer.
         needs_token: Whether requests must contain the token of the server. Health checks need no token, because the
             programs that start and monitor servers do not have it.
-        may_block: Whether an answer may take a long time. The server then computes the answer in another thread.
     """
 
     method: str
@@ -86,14 +84,11 @@ class Route(NamedTuple):
     respond: Callable[[Request], Any]
     rpcs: tuple[str, ...] = ()
     needs_token: bool = True
-    may_block: bool = False
 
 
-def _show_openapi(_: Request) -> dict[str, Any]:
-    """Return the OpenAPI document of the file `openapi.json` with the version of this package."""
-    document: dict[str, Any] = orjson.loads(files(__package__).joinpath("openapi.json").read_bytes())
-    document["info"]["version"] = package_version()
-    return document
+def _show_openapi(_: Request) -> Response:
+    """Return the OpenAPI document."""
+    return response_of(200, b"application/json", files(__package__).joinpath("openapi.json").read_bytes())
 
 
 def _show_server(_: Request) -> dict[str, Any]:
@@ -225,11 +220,14 @@ ROUTES = (
     Route("GET", ("/v2",), _show_server, ("ServerMetadata",)),
     Route("GET", ("/v2/models/stats", *_model_paths("/stats")), _show_statistics, ("ModelStatistics",)),
     Route("POST", ("/v2/repository/index",), _show_index, ("RepositoryIndex",)),
-    Route("POST", ("/v2/repository/models/{model}/load",), _load, ("RepositoryModelLoad",), may_block=True),
-    Route("POST", ("/v2/repository/models/{model}/unload",), _unload, ("RepositoryModelUnload",), may_block=True),
+    Route("POST", ("/v2/repository/models/{model}/load",), _load, ("RepositoryModelLoad",)),
+    Route("POST", ("/v2/repository/models/{model}/unload",), _unload, ("RepositoryModelUnload",)),
     Route("GET", _model_paths(), _show_model, ("ModelMetadata",)),
     Route("GET", _model_paths("/ready"), lambda request: {"ready": bool(request.loaded)}, ("ModelReady",)),
     Route("GET", _model_paths("/config"), _show_config, ("ModelConfig",)),
     Route("POST", _model_paths("/infer"), _infer, ("ModelInfer", "ModelStreamInfer")),
 )
 """All routes of the HTTP server. If several templates match a path, the first of them is used."""
+
+UNKNOWN = Route("", ("unknown",), _show_server)
+"""Route under which requests with unknown paths are counted. Such requests are refused."""
