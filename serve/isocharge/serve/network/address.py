@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from isocharge.common.defaults import MAX_BATCH
-from isocharge.common.errors import InputError, ListenError, TooLarge
+from isocharge.common.errors import InputError, ListenError
 from isocharge.common.files import read_whole
 
 
@@ -164,18 +164,6 @@ class ServerLimits:
     grace_seconds: float = 10.0
     connections: int = 1024
     queued_requests: int = 100
-
-    def check_body(self, size: int) -> None:
-        """Check that the size of a body, or of the part that has arrived so far, does not exceed `body_bytes`.
-
-        Args:
-            size: The size, bytes.
-
-        Raises:
-            TooLarge: If the size exceeds `body_bytes`.
-        """
-        if size > self.body_bytes:
-            raise TooLarge(f"expected a body of at most {self.body_bytes} bytes, got more; send smaller batches")
 
 
 def url_host(host: str) -> str:

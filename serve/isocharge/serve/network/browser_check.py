@@ -112,7 +112,8 @@ class AccessCheck:
         if scheme.lower() != b"bearer" or not is_correct:
             received = "a wrong one" if authorization else "none"
             raise TokenError(
-                f"expected the header `Authorization: Bearer TOKEN` with this server's token, got {received}"
+                "expected `Authorization: Bearer TOKEN` with this server's token, in a header or in the metadata of "
+                f"gRPC, got {received}"
             )
 
     def _check_site(self, method: str, headers: Mapping[bytes, bytes]) -> None:

@@ -175,21 +175,14 @@ class RequestLog(logging.Handler):
         super().__init__()
         self._write = write
 
-    def write_exchange(self, exchange: Exchange) -> None:
-        """Write a line about a request and its response."""
-        is_internal_error = exchange.status in (500, "INTERNAL")  # the status of HTTP, and that of gRPC
-        client = exchange.client
-        client_text = "%s:%d" % client if isinstance(client, tuple) else client  # noqa: UP031 - twice as fast
-        self._write_line("error" if is_internal_error else "info", "request", vars(exchange) | {"client": client_text})
-
     def emit(self, record: logging.LogRecord) -> None:
         """Write a line with a message of the module `logging`, and with the traceback of the message if it has one."""
         message = {"logger": record.name, "message": record.getMessage()}
         if record.exc_info and record.exc_info[0] is not None:
             message["traceback"] = logging.Formatter().formatException(record.exc_info)
-        self._write_line(record.levelname.lower(), "message", message)
+        self.write_line(record.levelname.lower(), "message", message)
 
-    def _write_line(self, level: str, event: str, properties: dict[str, Any]) -> None:
+    def write_line(self, level: str, event: str, properties: dict[str, Any]) -> None:
         """Write a line about an event, which begins with the present time."""
         line = {"time": datetime.now(UTC).isoformat(), "level": level, "event": event, **properties}
         self._write(json.dumps(line))
@@ -239,4 +232,8 @@ class Traffic:
         """Count a request that was answered, and log the request if there is a log."""
         self.count(exchange.transport, exchange.route, exchange.status)
         if self.log is not None:
-            self.log.write_exchange(exchange)
+            is_internal_error = exchange.status in (500, "INTERNAL")  # the status of HTTP, and that of gRPC
+            client = exchange.client
+            client_text = "%s:%d" % client if isinstance(client, tuple) else client  # noqa: UP031 - twice as fast
+            level = "error" if is_internal_error else "info"
+            self.log.write_line(level, "request", vars(exchange) | {"client": client_text})

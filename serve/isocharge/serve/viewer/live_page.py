@@ -185,7 +185,6 @@ class LivePage(Application):
             raise UnknownPath(f"nothing is served under {path[:200]!r}; the page is /")
         if method != "POST":
             raise WrongMethod(f"{path}: expected the method POST, got {method[:20]}", "POST")
-        self.limits.check_body(len(body))
         request = parse_json(body, "", RequestError, Read | Action)  # type: ignore[arg-type]
         if isinstance(request, Read):
             return json_response(self._read(request))

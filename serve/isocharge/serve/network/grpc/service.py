@@ -14,8 +14,6 @@ All other messages are converted from and to the JSON objects of the HTTP routes
 
 import asyncio
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from importlib.resources import files
 from typing import Any
@@ -164,7 +162,9 @@ class Service:
         call = Exchange("grpc", name, "CANCELLED", client=context.peer())
         start_ns = time.perf_counter_ns()
         message = ""
+        self._open_count += 1
         try:
+            self._limit_open_calls()
             await self._answer(name, context, call)
             call.status = "OK"
         except grpc.aio.InternalError as error:  # no message can be sent or read, as the client has ended the call
@@ -173,13 +173,14 @@ class Service:
             call.status, message = _status_and_message(error)
             call.error = type(error).__name__
         finally:
+            self._open_count -= 1
             call.duration_us = (time.perf_counter_ns() - start_ns) / 1000
             self._traffic.count_and_log(call)
         if message:
             await context.abort(grpc.StatusCode[str(call.status)], message)
 
     async def _answer(self, name: str, context: grpc.aio.ServicerContext, call: Exchange) -> None:
-        """Check the number of open calls and the token, and answer the messages of a call.
+        """Check the token, and answer the messages of a call.
 
         A call of the method `STREAM_METHOD` may contain any number of messages, and every other call contains one
         message. The first message must arrive within `header_seconds`, and each later message within `idle_seconds`
@@ -194,23 +195,20 @@ class Service:
             TimeoutError: If the client does not send a message or does not read a response in time.
             IsochargeError: If the call is refused.
         """
-        with self._count_open_call():
-            route = ROUTE_OF_METHOD[name]
-            if route.needs_token:
-                self._access.check_token(_authorization(context))
-            timeout_s = self._limits.header_seconds
-            while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:
-                if name.startswith("RepositoryModel"):  # loading a model takes a long time
-                    response = await asyncio.to_thread(self._respond, name, data, call)
-                else:
-                    response = self._respond(name, data, call)
-                async with asyncio.timeout(self._limits.body_seconds):
-                    await context.write(response)
-                if name != STREAM_METHOD:
-                    return
-                timeout_s = self._limits.idle_seconds
+        if ROUTE_OF_METHOD[name].needs_token:
+            metadata = dict(context.invocation_metadata() or ())
+            self._access.check_token(str(metadata.get("authorization", "")).encode())
+        timeout_s = self._limits.header_seconds
+        while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:
+            if name.startswith("RepositoryModel"):  # loading a model takes a long time
+                response = await asyncio.to_thread(self._respond, name, data, call)
+            else:
+                response = self._respond(name, data, call)
+            async with asyncio.timeout(self._limits.body_seconds):
+                await context.write(response)
             if name != STREAM_METHOD:
-                raise RequestError(f"{name}: expected a message, got none")
+                return
+            timeout_s = self._limits.idle_seconds
 
     def _respond(self, name: str, data: bytes, call: Exchange) -> bytes:
         """Answer one message, and return the serialized response.
@@ -291,28 +289,21 @@ class Service:
         self._traffic.count("grpc", f"{STREAM_METHOD} message", status)  # `_handle` counts the whole stream as one call
         return response
 
-    @contextmanager
-    def _count_open_call(self) -> Iterator[None]:
-        """Return a context manager that counts a call as open until the `with` block ends.
-
-        If there are already too many open calls, the service first ends the call that has waited longest for a message.
+    def _limit_open_calls(self) -> None:
+        """If there are too many open calls, end the call that has waited longest for a message.
 
         Raises:
             TooMany: If there are too many open calls, and none of them waits for a message.
         """
-        if self._open_count >= self._limits.connections:
-            oldest_timeout = next(iter(self._waiting), None)  # the first element has waited longest
-            if oldest_timeout is None:
-                raise TooMany(f"all {self._limits.connections} calls are taken; try again later")
-            # A timeout with a deadline in the past expires at once, and ends its call. The call counts as open until
-            # its coroutine ends. The count may briefly exceed the limit.
-            del self._waiting[oldest_timeout]
-            oldest_timeout.reschedule(0.0)
-        self._open_count += 1
-        try:
-            yield
-        finally:
-            self._open_count -= 1
+        if self._open_count <= self._limits.connections:
+            return
+        oldest_timeout = next(iter(self._waiting), None)  # the first element has waited longest
+        if oldest_timeout is None:
+            raise TooMany(f"all {self._limits.connections} calls are taken; try again later")
+        # A timeout with a deadline in the past expires at once, and ends its call. The call counts as open until its
+        # coroutine ends. The count may briefly exceed the limit.
+        del self._waiting[oldest_timeout]
+        oldest_timeout.reschedule(0.0)
 
     async def _next_message(self, context: grpc.aio.ServicerContext, timeout_s: float) -> Any:
         """Wait for the next message of a call.
@@ -331,7 +322,7 @@ class Service:
                 call.
         """
         async with asyncio.timeout(timeout_s) as timeout:
-            self._waiting[timeout] = None  # `_count_open_call` may let this timeout expire early
+            self._waiting[timeout] = None  # `_limit_open_calls` may let this timeout expire early
             try:
                 return await context.read()
             finally:
@@ -344,12 +335,3 @@ def _status_and_message(error: Exception) -> tuple[str, str]:
         return "DEADLINE_EXCEEDED", "the call waited too long for its client, or others needed its place"
     _, grpc_status = statuses(error)
     return grpc_status, client_message(error)
-
-
-def _authorization(context: grpc.aio.ServicerContext) -> bytes:
-    """Return the value of the metadata field `authorization`.
-
-    The value is empty if the client has not sent the field.
-    """
-    metadata = dict(context.invocation_metadata() or ())
-    return str(metadata.get("authorization", "")).encode()

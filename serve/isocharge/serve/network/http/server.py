@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import AbstractAsyncContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
-from typing import Any, NoReturn
+from typing import Any
 
 import uvicorn
 import uvloop
@@ -24,10 +24,6 @@ from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from isocharge.serve.network.address import Address, ServerLimits, Tls
 from isocharge.serve.network.metrics import Exchange, Traffic
 from isocharge.serve.network.protocol.response import json_response
-
-
-class RequestRefused(Exception):
-    """Exception that stops the parser after a request was refused."""
 
 
 class Connection(HttpToolsProtocol):
@@ -79,11 +75,19 @@ class Connection(HttpToolsProtocol):
         return is_answered and not self.transport.is_closing()
 
     def data_received(self, data: bytes) -> None:
-        """Parse data of the client. Refuse a request whose head, trailers or chunk extensions are too long."""
-        self._pending_bytes += len(data)
-        super().data_received(data)
-        if self._pending_bytes > self._limits.header_bytes:
-            self.refuse(431, self._too_long_message())
+        """Parse data of the client in pieces. Refuse a request whose head, trailers or chunk extensions are too long.
+
+        The beginning of a head is not counted if its piece also contains the end of another request. Such a head may be
+        twice as long.
+        """
+        limit = self._limits.header_bytes
+        while data and not self.transport.is_closing():
+            size = limit + 1 - self._pending_bytes  # so many bytes of a head show that it is too long
+            self._pending_bytes += len(data[:size])
+            super().data_received(data[:size])
+            data = data[size:]
+            if self._pending_bytes > limit:
+                self.refuse(431, f"the request line and headers are longer than {limit} bytes")
 
     def eof_received(self) -> bool:  # type: ignore[override]
         """Keep the connection open until all complete requests are answered, although the client sends no more data."""
@@ -99,15 +103,11 @@ class Connection(HttpToolsProtocol):
         self.deadline = self.loop.time() + self._limits.header_seconds
         most = self._limits.queued_requests
         if len(self.pipeline) >= most:
-            self._refuse_and_stop(429, f"more than {most} requests wait; read the responses first")
+            self.refuse(429, f"more than {most} requests wait; read the responses first")
         super().on_message_begin()
 
     def on_headers_complete(self) -> None:
-        """Check the size of the complete head, and set the deadline of the body."""
-        separator_bytes = len(b": \r\n")
-        head_bytes = len(self.url) + sum(len(name) + len(value) + separator_bytes for name, value in self.headers)
-        if head_bytes > self._limits.header_bytes:
-            self._refuse_and_stop(431, self._too_long_message())
+        """Set the deadline of the body."""
         self._pending_bytes = 0
         self.deadline = self.loop.time() + self._limits.body_seconds
         super().on_headers_complete()
@@ -162,24 +162,6 @@ class Connection(HttpToolsProtocol):
         self.transport.write(STATUS_LINE[status] + headers + b"connection: close\r\n\r\n" + response.body)
         self.transport.close()
         self.deadline = self.loop.time() + self._limits.header_seconds
-
-    def _refuse_and_stop(self, status: int, message: str) -> NoReturn:
-        """Refuse a request while its data are parsed, and raise an exception that ends the parsing.
-
-        Without the exception, the parser would take the remaining data of the client for further requests.
-
-        Args:
-            status: HTTP status of the response that refuses the request.
-            message: Reason of the refusal.
-
-        Raises:
-            RequestRefused: Always.
-        """
-        self.refuse(status, message)
-        raise RequestRefused(message)
-
-    def _too_long_message(self) -> str:
-        return f"the request line and headers are longer than {self._limits.header_bytes} bytes"
 
 
 class HttpServer:

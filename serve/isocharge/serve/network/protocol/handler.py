@@ -20,7 +20,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from isocharge.common.errors import UnknownPath, WrongMethod
+from isocharge.common.errors import TooLarge, UnknownPath, WrongMethod
 from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.browser_check import AccessCheck, header_values
 from isocharge.serve.network.metrics import Client, Exchange, Traffic
@@ -98,6 +98,9 @@ class Application(ABC):
             The response. If an error occurs, it is not raised, but the response contains its status and its message.
         """
         try:
+            max_bytes = self.limits.body_bytes
+            if len(body) > max_bytes:
+                raise TooLarge(f"expected a body of at most {max_bytes} bytes, got more; send smaller batches")
             return self._check_and_answer(method, path, header_values(headers), body)
         except Exception as error:  # every error is sent to the client
             return error_response(error)
@@ -198,7 +201,6 @@ class Handler(Application):
         is_head_of_get = method == "HEAD" and route.method == "GET"
         if method != route.method and not is_head_of_get:
             raise WrongMethod(f"{path}: expected the method {route.method}, got {method[:20]}", route.method)
-        self.limits.check_body(len(body))
         body = decompress(body, headers.get(b"content-encoding", b"").lower(), self.limits.body_bytes)
         answer = route.respond(Request(self.store, self.limits, self.traffic, headers, body, model, version))
         return answer if isinstance(answer, Response) else json_response(answer)
