@@ -11,7 +11,8 @@ log line, fill the disk with long lines, or create new counters.
 import json
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from types import SimpleNamespace
@@ -90,23 +91,21 @@ class Statistics(SimpleNamespace):
         latest: Unix time of the latest inference, s.
     """
 
-    def count_answered(self, presses: int, duration_s: float, alarms: int) -> None:
-        """Count a request that was answered.
+    @contextmanager
+    def measure(self) -> Iterator[None]:
+        """Context manager that measures the time to read a request, to run the model and to write the response.
 
-        Args:
-            presses: Number of presses in the request.
-            duration_s: Time to read the request, to run the model and to write the response, s.
-            alarms: Number of presses whose misfit is above the limit.
+        The request is counted as answered or, if an error occurs, as refused.
         """
-        self.presses.inc(presses)
-        self.alarms.inc(alarms)
-        self.latency.observe(duration_s)
+        start_s = time.perf_counter()
+        try:
+            yield
+        except Exception:
+            self.refused.inc()
+            self.refused_time.inc(time.perf_counter() - start_s)
+            raise
+        self.latency.observe(time.perf_counter() - start_s)
         self.latest.set(time.time())
-
-    def count_refused(self, duration_s: float) -> None:
-        """Count a request that was refused after the given time, s."""
-        self.refused.inc()
-        self.refused_time.inc(duration_s)
 
     def to_json(self) -> dict[str, Any]:
         """Return the counters as a JSON object with the names that Triton uses in its statistics."""

@@ -3,6 +3,7 @@
 import asyncio
 import itertools
 import json
+import re
 import socket
 import subprocess
 import sys
@@ -89,6 +90,11 @@ def test_charges_as_fp32_contents(serve, film, predictor, datatype):
             "INVALID_ARGUMENT",
             r"got \[1.0, 1.0, 1.0\] and 12 bytes",
         ),
+        (
+            {"inputs": [{"name": "charge_pC", "datatype": "FP32", "shape": [2, 3]}], "raw_input_contents": [bytes(13)]},
+            "INVALID_ARGUMENT",
+            "or 6 binary numbers of 4 bytes each, got None and 13 bytes",
+        ),
         ({"inputs": [tensor([[1.0] * 3], shape=[5000, 3])]}, "RESOURCE_EXHAUSTED", "at most 4096 presses"),
         ({"model_name": "cubic"}, "NOT_FOUND", "'cubic' is not found; serving: linear/1, linear/2"),
     ],
@@ -97,6 +103,7 @@ def test_bad_requests_are_refused_with_the_reason(serve, fields, status, message
     with pytest.raises(grpc.RpcError, match=message) as caught:
         call(serve()(), "ModelInfer", **{"model_name": "linear", **fields})
     assert caught.value.code() is grpc.StatusCode[status]
+    assert not re.search("body|header|JSON|binary_data_size|`data`", caught.value.details())  # words of HTTP
 
 
 def test_message_above_the_size_limit_is_refused(serve):

@@ -187,7 +187,11 @@ BAD = {
     ),
     "output twice": (orjson.dumps(infer_request(outputs=[{"name": "misfit"}] * 2)), 400, "each name once"),
     "memory": (changed(parameters={"shared_memory_region": "r"}), 400, "does not support it, got 'r'"),
-    "size without bytes": (changed(parameters={"binary_data_size": 12}), 400, "binary_data_size: expected 0, .* got 12"),
+    "size without bytes": (
+        changed(parameters={"binary_data_size": 12}),
+        400,
+        "binary_data_size: expected 0, .* got 12",
+    ),
 }
 
 
@@ -210,7 +214,11 @@ def test_wrong_inference_header_content_length_is_refused(handler, length):
 @pytest.mark.parametrize(
     ("changes", "spoil", "message"),
     [
-        ({"tensor": {"parameters": {"binary_data_size": 8}}}, bytes, "binary_data_size: expected 12, the bytes after the JSON"),
+        (
+            {"tensor": {"parameters": {"binary_data_size": 8}}},
+            bytes,
+            "binary_data_size: expected 12, the bytes after the JSON",
+        ),
         ({"tensor": {"data": [1, 2, 3]}}, bytes, "got [1.0, 2.0, 3.0] and 12 bytes"),
         ({"tensor": {"shape": [2, 3]}}, bytes, "or 6 binary numbers of 4 bytes each, got None and 12 bytes"),
         ({}, lambda body: body[:-4], "binary_data_size: expected 8, the bytes after the JSON"),

@@ -30,7 +30,7 @@ from isocharge.common.errors import ModelError, RequestError, TooMany
 from isocharge.common.structs import convert
 from isocharge.serve.network.metrics import Exchange
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.network.protocol.inference import InferBody, answer_inference
+from isocharge.serve.network.protocol.inference import InferBody, infer
 from isocharge.serve.network.protocol.response import client_message, statuses
 from isocharge.serve.network.protocol.routes import ROUTES, Request
 
@@ -271,8 +271,8 @@ class Service:
     def _infer(self, request: Any) -> Any:
         """Run a model on the charges of a ModelInferRequest, and return the ModelInferResponse."""
         loaded = self._store.get(request.model_name, request.model_version)
-        # `answer_inference` calls `read` and `write_response`, because it measures the duration of these steps.
-        return answer_inference(loaded, self._limits.batch, partial(read_request, request), write_response)
+        with loaded.statistics.measure():
+            return write_response(*infer(loaded, self._limits.batch, *read_request(request)))
 
     def _infer_in_stream(self, request: Any) -> Any:
         """Return the response to one request of a stream.

@@ -9,12 +9,9 @@ Some clients send `null` for every field that is not given. All optional fields 
 
 import math
 import struct
-import time
-from collections.abc import Callable
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import numpy as np
-import orjson
 from msgspec import Meta, Struct
 
 from isocharge.common.arrays import Singles
@@ -84,8 +81,6 @@ This output is only computed if the client requests it.
 
 Rows = np.ndarray[Any, Any]
 """Values of an output, shape (n, width). They are texts for the output `flags`, and numbers for all other outputs."""
-
-ResponseType = TypeVar("ResponseType")
 
 
 def read_infer(body: bytes, header_length: bytes | None) -> tuple[InferBody, bytes]:
@@ -198,67 +193,40 @@ def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
     return np.array(texts, dtype=object)[:, np.newaxis]
 
 
-def answer_inference(
-    loaded: LoadedVersion,
-    max_presses: int,
-    read: Callable[[], tuple[InferBody, bytes]],
-    write: Callable[[dict[str, Any], list[bytes]], ResponseType],
-) -> ResponseType:
-    """Read a request, run the model, and return the response. The request is counted with its duration.
+def infer(
+    loaded: LoadedVersion, max_presses: int, body: InferBody, binary: bytes
+) -> tuple[dict[str, Any], list[bytes]]:
+    """Run a model on the presses of a request, and count the presses.
 
     Args:
         loaded: Version of the model that is run.
         max_presses: Largest number of presses in one request.
-        read: Function that returns the content of the request and the binary input, or raises an error if the request
-            cannot be read.
-        write: Function that converts the content of the response and its binary tensors to the response. The content
-            is the JSON object that an HTTP response contains. Its numbers are arrays, and its texts are lists.
-
-    Raises:
-        IsochargeError: If `read` raises this error, if the request does not fit the model, or if the model fails.
-    """
-    start_s = time.perf_counter()
-    try:
-        body, binary = read()
-        requested_outputs = _requested_outputs(body)
-        charge_pC = _read_charges(body.inputs[0], binary, loaded.metadata.electrodes, max_presses)
-        outputs = dict[str, Rows](run(loaded.model.session, charge_pC))
-        if FLAGS in requested_outputs:
-            outputs[FLAGS] = _flags(loaded, outputs)
-        content: dict[str, Any] = {"model_name": loaded.metadata.name, "model_version": loaded.version}
-        if body.id:
-            content["id"] = body.id
-        binary_tensors: list[bytes] = []
-        content["outputs"] = [
-            _output_tensor(name, outputs[name], binary_tensors if is_binary else None)
-            for name, is_binary in requested_outputs.items()
-        ]
-        response = write(content, binary_tensors)
-    except Exception:
-        loaded.statistics.count_refused(time.perf_counter() - start_s)
-        raise
-    duration_s = time.perf_counter() - start_s
-    misfit = outputs["misfit"]
-    alarms = np.count_nonzero(~(misfit <= loaded.validity.misfit_limit))  # also counts NaN
-    loaded.statistics.count_answered(len(misfit), duration_s, int(alarms))
-    return response
-
-
-def write_answer(content: dict[str, Any], binary_tensors: list[bytes]) -> tuple[bytes, int | None]:
-    """Return the body of the HTTP response to an inference.
-
-    Args:
-        content: Content of the JSON text.
-        binary_tensors: Outputs that are sent as binary tensors.
+        body: Content of the request.
+        binary: Binary tensor with the charges, which is empty if the content contains the charges.
 
     Returns:
-        Two values. The first value is the body, which is a JSON text that may be followed by binary tensors. The second
-        value is the length of the JSON text, bytes, or None if no binary tensors follow.
+        The content of the response, and its binary tensors. The content is the JSON object that an HTTP response
+        contains. Its numbers are arrays, and its texts are lists.
+
+    Raises:
+        IsochargeError: If the request does not fit the model, or if the model fails.
     """
-    json_text = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
-    if not binary_tensors:
-        return json_text, None
-    return b"".join([json_text, *binary_tensors]), len(json_text)
+    requested_outputs = _requested_outputs(body)
+    charge_pC = _read_charges(body.inputs[0], binary, loaded.metadata.electrodes, max_presses)
+    outputs = dict[str, Rows](run(loaded.model.session, charge_pC))
+    if FLAGS in requested_outputs:
+        outputs[FLAGS] = _flags(loaded, outputs)
+    content: dict[str, Any] = {"model_name": loaded.metadata.name, "model_version": loaded.version}
+    if body.id:
+        content["id"] = body.id
+    binary_tensors: list[bytes] = []
+    content["outputs"] = [
+        _output_tensor(name, outputs[name], binary_tensors if is_binary else None)
+        for name, is_binary in requested_outputs.items()
+    ]
+    loaded.statistics.presses.inc(len(charge_pC))
+    loaded.statistics.alarms.inc(np.count_nonzero(~(outputs["misfit"] <= loaded.validity.misfit_limit)))  # also NaN
+    return content, binary_tensors
 
 
 def _output_tensor(name: str, rows: Rows, binary_tensors: list[bytes] | None) -> dict[str, Any]:

@@ -5,10 +5,10 @@ messages of the gRPC service have the same fields as the JSON objects that the f
 """
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from importlib.resources import files
 from typing import Any, NamedTuple, TypeVar
 
+import orjson
 from prometheus_client import generate_latest
 
 from isocharge.common.errors import ModelError, RequestError, package_version
@@ -17,7 +17,7 @@ from isocharge.serve.model.session import INPUT, OUTPUTS
 from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.metrics import CONTENT_TYPE, Traffic
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
-from isocharge.serve.network.protocol.inference import IndexBody, answer_inference, read_infer, write_answer
+from isocharge.serve.network.protocol.inference import IndexBody, infer, read_infer
 from isocharge.serve.network.protocol.response import Response, response_of
 
 EXTENSIONS = (
@@ -189,15 +189,14 @@ def _infer(request: Request) -> Response:
     if not request.body and b"upgrade" in request.headers:  # uvicorn discards the body of a request for an upgrade
         raise RequestError("Upgrade: this server reads no body after this header; set the client to HTTP/1.1")
     header_length = request.headers.get(b"inference-header-content-length")
-    # `answer_inference` calls `read` and `write_answer`, because it measures the duration of these steps.
-    read = partial(read_infer, request.body, header_length)
-    body, json_length = answer_inference(loaded, request.limits.batch, read, write_answer)
-
-    # If binary tensors follow the JSON text, a header contains the length of the text.
-    content_type = b"application/json" if json_length is None else b"application/octet-stream"
-    response = response_of(200, content_type, body)
-    if json_length is not None:
-        response.headers.append((b"inference-header-content-length", b"%d" % json_length))
+    with loaded.statistics.measure():
+        body, binary = read_infer(request.body, header_length)
+        content, binary_tensors = infer(loaded, request.limits.batch, body, binary)
+        json_text = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
+    if not binary_tensors:
+        return response_of(200, b"application/json", json_text)
+    response = response_of(200, b"application/octet-stream", b"".join([json_text, *binary_tensors]))
+    response.headers.append((b"inference-header-content-length", b"%d" % len(json_text)))
     return response
 
 
