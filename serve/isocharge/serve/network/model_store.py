@@ -14,6 +14,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -93,8 +94,9 @@ class ModelStore:
         self._roots = roots
         self._change_lock = threading.Lock()
         self.metrics = ModelMetrics()
-        # The list is sorted, and is replaced as a whole, so that no thread reads half of a change.
-        self._versions: list[Version] = []
+        # Versions by the name of the model. The dictionary is replaced as a whole, so that no thread reads half of a
+        # change. It is sorted, and so are the versions of each model.
+        self._versions: dict[str, list[Version]] = {}
         for name, folder in self._folders().items():
             self._load_versions(name, folder)
         if not self.loaded_versions():
@@ -128,7 +130,7 @@ class ModelStore:
 
     def loaded_versions(self) -> list[LoadedVersion]:
         """Return all loaded versions of all models, sorted by name and version."""
-        return [row.loaded for row in self._versions if row.loaded]
+        return [row.loaded for row in chain(*self._versions.values()) if row.loaded]
 
     def versions_of(self, name: str, version: str = "") -> list[LoadedVersion]:
         """Return the loaded versions of one model, in ascending order of their numbers.
@@ -141,11 +143,11 @@ class ModelStore:
 
     def _find(self, name: str, version: str = "") -> list[Version]:
         """Return the versions of one model as `versions_of`, but also the versions that are not loaded."""
-        return [row for row in self._versions if row.name == name and version in ("", str(row.number))]
+        return [row for row in self._versions.get(name, []) if version in ("", str(row.number))]
 
     def refusals(self) -> list[str]:
         """Return the reasons why versions were refused or unloaded, sorted by name and version."""
-        return [row.reason for row in self._versions if row.reason]
+        return [row.reason for row in chain(*self._versions.values()) if row.reason]
 
     def index(self) -> list[dict[str, str]]:
         """Return one row for every version that is loaded, was refused or was unloaded, and for every other model.
@@ -153,7 +155,7 @@ class ModelStore:
         A row contains the name of the model, and the number and the state of the version. If the version was refused or
         unloaded, the row also contains the reason. The number is empty if no version of a model was found.
         """
-        new_names = self._folders().keys() - {row.name for row in self._versions}
+        new_names = self._folders().keys() - self._versions.keys()
         return [
             {
                 "name": row.name,
@@ -161,7 +163,7 @@ class ModelStore:
                 "state": "READY" if row.loaded else "UNAVAILABLE",
                 "reason": row.reason,
             }
-            for row in sorted([*self._versions, *(Version(name, 0, None, "") for name in new_names)])
+            for row in sorted(chain(*self._versions.values(), (Version(name, 0, None, "") for name in new_names)))
         ]
 
     def load(self, name: str) -> None:
@@ -249,7 +251,7 @@ class ModelStore:
 
     def _replace(self, name: str, rows: list[Version]) -> None:
         """Replace all versions of a model."""
-        self._versions = sorted([*(row for row in self._versions if row.name != name), *rows])
+        self._versions = dict(sorted((self._versions | {name: sorted(rows)}).items()))
 
 
 def open_model_store(models: Path | None = None) -> ModelStore:
