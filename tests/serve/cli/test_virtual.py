@@ -79,13 +79,15 @@ def test_random_presses_come_after_a_second_of_rest(played, solved):
     values, result = played(300, "--noise", "clean", "--force-max", 0.5)
     total = values.sum(axis=1)
     assert values.shape[1] == 3
-    assert np.ptp(total[:800]) < 1e-3
+    # A busy computer may add a line about pauses, and may open the port later, so that the first frames are withheld.
+    counts = re.search(
+        r"^\d+ frames sent, (\d+) withheld because no program read them, 0 lost", result.stderr, re.MULTILINE
+    )
+    rest_frames = int(np.argmax(np.abs(total - total[0]) > 1e-3))
+    assert rest_frames > 100
+    assert rest_frames + int(counts[1]) >= 1000
     assert total.max() - total[0] > 300.0
     assert result.stdout.startswith("/dev/")
-    # A busy computer may add a line about pauses.
-    assert re.search(
-        r"^\d+ frames sent, \d+ withheld because no program read them, 0 lost", result.stderr, re.MULTILINE
-    )
     assert solved == [(*DESCRIBED, 8.0, (0.05, 0.5))]
 
 
