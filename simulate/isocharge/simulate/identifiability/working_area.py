@@ -51,12 +51,7 @@ def has_reversed_orientation(first: Array, second: Array) -> Booleans:
     Returns:
         Whether the orientation is reversed, shape (...).
     """
-    # Rounding errors could change the sign of the determinant if the columns did not have unit lengths.
-    directions = [
-        jacobian / np.maximum(np.linalg.norm(jacobian, axis=-2, keepdims=True), np.finfo(float).tiny)
-        for jacobian in (first, second)
-    ]
-    products = np.einsum("...ei,...ej->...ij", *directions)  # sums over the electrodes (e)
+    products = np.einsum("...ei,...ej->...ij", first, second)  # sums over the electrodes (e)
     return np.asarray(np.linalg.det(products) < 0.0)
 
 
