@@ -12,7 +12,16 @@ import pytest
 from isocharge.cli.serve import doctor
 from isocharge.cli.shared.virtual_sensor import film_charges
 from isocharge.common.errors import PressCheckError
-from isocharge.serve import Chunk, Predictor, Script, VirtualSensor, device_from_table, load_device
+from isocharge.serve import (
+    Chunk,
+    Frame,
+    Predictor,
+    Script,
+    VirtualSensor,
+    device_from_table,
+    encode_frame,
+    load_device,
+)
 from isocharge.serve.examination import electrode_check
 from isocharge.serve.examination.electrode_check import (
     ElectrodeCheck,
@@ -146,6 +155,16 @@ def test_finger_that_is_on_the_film_at_first_is_waited_for(film, check):
     result = check(sensor, "ABC")
     assert result.found == {"A": "1", "B": "2", "C": "3"}
     assert [*result.sentences][-1] == "every channel belongs to its electrode"
+
+
+def test_damaged_frames_before_a_press_are_no_press(film, check):
+    def encode(frame):
+        damage_pC = (0.0, 300.0, 0.0) if frame.seq in (500, 501) else (0.0, 0.0, 0.0)
+        return encode_frame(Frame(frame.seq, frame.t_us, tuple(np.add(frame.values, damage_pC))))
+
+    script = press_script(film.directions, first_rest_s=3.0)
+    sensor = VirtualSensor(film.charges, script, noise=noise, offset_pC=[20.0] * 3, encode=encode)
+    assert check(sensor, "ABC").found == {"A": "1", "B": "2", "C": "3"}
 
 
 def test_settings_of_single_electrodes_move_with_their_channels():

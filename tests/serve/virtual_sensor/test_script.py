@@ -47,7 +47,7 @@ def test_impossible_script_is_refused(make, message):
         make()
 
 
-PRESSES = "presses = [[0, 1, 2, 0], [1, 1, 2, 0], [1.1, 1, 2, 0.5], [2.1, 3, 2, 0.5], [2.2, 3, 2, 0]]\n"
+PRESSES = "presses = [[3, 1, 2, 0], [4, 1, 2, 0], [4.1, 1, 2, 0.5], [5.1, 3, 2, 0.5], [5.2, 3, 2, 0]]\n"
 
 
 def test_load_script_reads_a_toml_file(tmp_path):

@@ -11,7 +11,7 @@ import pytest
 import serial
 
 from isocharge.common.errors import PortError, SceneError
-from isocharge.serve import BinaryParser, Port, Script, VirtualSensor, encode_frame, wander
+from isocharge.serve import BinaryParser, Faults, Port, Script, VirtualSensor, encode_frame, wander
 
 
 def steady(n=10, rate_Hz=200.0):
@@ -48,6 +48,14 @@ def test_amplifier_receives_the_repeated_script_in_the_order_of_time(film):
     clean = film.charge_pC([0.0], [0.0], [1.0])[0]
     np.testing.assert_allclose([frame.values for frame in frames], clean + np.arange(1200)[:, None], rtol=1e-6)
     assert {len(block) for block in seen} == {500}  # half a second
+
+
+def test_damaged_frames_are_counted(film):
+    sensor = VirtualSensor(film.charges, steady(), faults=Faults(corrupt_share=0.001))
+    frames = zip(sensor.frames(), VirtualSensor(film.charges, steady()).frames(), strict=True)
+    damaged_count = sum(sent_bytes != undamaged for sent_bytes, undamaged in islice(frames, 2000))
+    assert sensor.corrupted == damaged_count
+    assert 10 < damaged_count < 200
 
 
 def test_frame_number_and_clock_overflow(film):
