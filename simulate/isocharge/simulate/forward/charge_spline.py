@@ -345,7 +345,7 @@ def _fit_positions(cells: int, per_cell: float = 1.6, per_edge_cell: float = 2.0
     inner_count = int(per_cell * np.pi * (0.5 * cells) ** 2) + 16
     edge_count = int(per_edge_cell * np.pi * cells) + 8
     angle = 2.0 * np.pi * np.arange(edge_count) / edge_count
-    edge_positions = (1.0 - 1e-12) * np.stack([np.cos(angle), np.sin(angle)], axis=1)  # in the disk despite rounding
+    edge_positions = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return np.concatenate([sunflower(inner_count), edge_positions])
 
 
