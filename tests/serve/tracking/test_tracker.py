@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from isocharge.serve import Contact
+from isocharge.serve import Contact, Predictor
 from isocharge.serve.flags import INVALID
 from isocharge.serve.live.device import device_from_table, with_settings
+from isocharge.serve.model.model_folder import find_model, load_model
 from isocharge.serve.record.record import TrackedContact
 from isocharge.serve.tracking.motion_filter import (
     ACCELERATION_DENSITY,
@@ -248,6 +249,22 @@ def test_frames_with_the_same_time_are_smoothed(frames_per_time):
     ]
     assert np.std([contact.x_mm for contact in tracked[500:]]) < 0.2 * STD
     assert np.mean([contact.moving for contact in tracked[500:]]) < 0.1
+
+
+@pytest.mark.parametrize("name", ["eight-25um-biaxial", "three-25um-biaxial"])
+def test_slow_press_of_a_released_model_is_tracked_from_its_first_frame(name):
+    """The first frames state up to 1e5 mm, with correlations that rounding makes indefinite."""
+    predictor = Predictor(find_model(name))
+    charges = load_model(predictor.folder).golden.charge_pC.astype(float)
+    presses = [charge for charge in charges if not predictor.flags(predictor.predict(charge))][:20]
+    size = np.minimum(np.arange(1, 101) / 60.0, 1.0)[:, None] ** 2
+    for charge in presses:
+        frames = charge * size + RNG.standard_normal((100, len(charge)))
+        tracker = new_tracker()
+        tracked = [track(tracker, predictor.predict(frame), 0.005 * k)[0] for k, frame in enumerate(frames)]
+        truth = predictor.predict(charge)
+        assert np.isfinite([structs.astuple(contact) for contact in tracked]).all()
+        assert abs(tracked[-1].x_mm - truth.x_mm) < 4.0 * tracked[-1].x_std_mm
 
 
 def test_saturated_frames_have_a_small_weight():

@@ -85,6 +85,19 @@ WEAK_FLAGS = frozenset({SATURATED, BEYOND, MISFIT})
 WEAK_VARIANCE_FACTOR = 100.0
 """Factor by which the variance of a frame with such a flag is multiplied."""
 
+LARGEST_STD = np.array([100.0, 100.0, 3.0])
+"""Largest standard deviations of measured x and y (mm) and ln F.
+
+The first frames of a slow press may have much larger ones. They would contain no more information, but the covariance
+of the state would lose its positive eigenvalues because of rounding errors.
+"""
+
+CORRELATION_RIDGE = 1e-5
+"""Number that is added to the diagonal of the correlations, which models compute in single precision.
+
+The smallest eigenvalue of the correlations of released models is between -5e-6 and 1.
+"""
+
 NOISE_INTERVAL_s = 0.0045
 """Time after which the noise of two frames is independent, s. Boards filter their charges over shorter times."""
 
@@ -225,15 +238,17 @@ class MotionFilter:
             covariance: Covariance of the noise, shape (3, 3).
 
         Returns:
-            Whether the frame belongs to the contact. Otherwise nothing is updated.
+            Whether the frame belongs to the contact. Otherwise nothing is updated. The result is also False if rounding
+            errors have made a covariance useless.
         """
         innovation = (measured - self.mean[:, VALUES])[:, :, None]
         precision = np.linalg.inv(self.covariance[:, VALUES, VALUES] + covariance)
         squared_distance = (innovation * (precision @ innovation)).sum(axis=(1, 2))
         smallest = squared_distance.min()
-        if smallest > SQUARED_GATE:
+        determinant = np.linalg.det(precision)
+        if not (0.0 <= smallest <= SQUARED_GATE and determinant.min() > 0.0):
             return False
-        likelihood = np.exp(0.5 * (smallest - squared_distance)) * np.sqrt(np.linalg.det(precision))
+        likelihood = np.exp(0.5 * (smallest - squared_distance)) * np.sqrt(determinant)
         posterior = self.probability * likelihood
         self.probability = np.maximum(posterior / posterior.sum(), np.finfo(float).tiny)
         gain = self.covariance[:, :, VALUES] @ precision
@@ -316,17 +331,15 @@ class ContactFilter:
 
 
 def _measured_values(contact: Contact) -> tuple[Array, Array]:
-    """Return x, y and ln F of a contact, shape (3,), and their covariance, shape (3, 3).
+    """Return x, y and ln F of a contact, shape (3,), and their covariance, shape (3, 3), which has an inverse.
 
     Correlations of NaN count as 0.
     """
-    single = np.finfo(np.float32)  # the number type of the model
-    force_N = max(float(single.tiny), contact.force_N)
-    std = np.array([contact.x_std_mm, contact.y_std_mm, contact.force_std_N / force_N])
+    force_N = max(float(np.finfo(np.float32).tiny), contact.force_N)  # in the number type of the model
+    std = np.minimum([contact.x_std_mm, contact.y_std_mm, contact.force_std_N / force_N], LARGEST_STD)
     xy, xF, yF = contact.xy_correlation, contact.xF_correlation, contact.yF_correlation
     correlation = np.array([[1.0, xy, xF], [xy, 1.0, yF], [xF, yF, 1.0]])
     if math.isnan(xy):
         correlation = np.eye(3)
-    # Rounding must not make the covariance of fully correlated errors singular.
-    correlation += single.eps * np.eye(3)
+    correlation += CORRELATION_RIDGE * np.eye(3)
     return np.array([contact.x_mm, contact.y_mm, math.log(force_N)]), correlation * np.outer(std, std)
