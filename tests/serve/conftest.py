@@ -107,7 +107,7 @@ class LinearFilm:
         values = {
             "name": "linear",
             "version": 1,
-            "sensor": {"name": "linear-film", "film": {"radius_mm": 45.0}},
+            "sensor": {"name": "linear-film", "film": {"radius_mm": 45.0}, "piezo": {"d31": 8.0, "d32": 8.0}},
             "electrodes": self.electrodes,
             "working_area_mm": tuple((RADIUS_MM * np.cos(a), RADIUS_MM * np.sin(a)) for a in angle.tolist()),
             "probes": ("circle:1.0",),

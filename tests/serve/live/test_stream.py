@@ -9,6 +9,8 @@ from isocharge.common.errors import ChargeError, PortError
 from isocharge.serve import (
     Chunk,
     Frame,
+    Predictor,
+    TouchStream,
     device_from_table,
     encode_frame,
     open_source,
@@ -98,3 +100,27 @@ def test_file_without_a_frame_raises_an_error(predictor, data):
 def test_wrong_number_of_charges_raises_an_error(records_after_rest):
     with pytest.raises(ChargeError, match=r"model linear/1 expects 3 charges \('A', 'B', 'C'\), frame 10 has 4"):
         records_after_rest(Frame(10, 0, (1.0, 2.0, 3.0, 4.0)))
+
+
+SENSORS_OF_ANY_SIGN = [
+    {"name": "presses-alone"},
+    {"name": "opposite-poling", "film": {"radius_mm": 45.0}, "piezo": {"d31": -8.0, "d32": -8.0}},
+    {"name": "shear", "film": {"radius_mm": 45.0}, "piezo": {"d31": 0, "d32": 0, "d12": 5.0}},
+]
+
+
+@pytest.mark.parametrize("sensor", SENSORS_OF_ANY_SIGN, ids=lambda sensor: sensor["name"])
+@pytest.mark.parametrize("is_replaced", [False, True])
+def test_touch_with_negative_charges(film, predictor, sensor, is_replaced, tmp_path):
+    """The model is the first one of the stream, or it replaces the model of a film with positive charges."""
+    film.write(tmp_path, name="other", sensor=sensor)
+    other = Predictor("other", models=tmp_path)
+    touch = TouchStream(predictor if is_replaced else other, BOARD)
+    records = list(touch.feed(chunk(*rest_frames())))
+    if is_replaced:
+        touch.use(other)
+    values = tuple((OFFSET - press_charges(film)).tolist())
+    records += touch.feed(chunk(*[Frame(number, 5000 * number, values) for number in range(10, 15)]))
+    assert [record.contact for record in records] == [False] * 10 + [True] * 5
+    with pytest.raises(ChargeError, match="model other/1 expects 3 charges"):
+        list(touch.feed(chunk(Frame(15, 75_000, (1.0, 2.0)))))

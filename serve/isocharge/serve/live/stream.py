@@ -76,9 +76,7 @@ class ReadingStream:
             DeviceError: If the device file contains settings for other electrodes.
         """
         self._device = device
-        self._setup = Setup(electrodes, device, predictor, reader)
-        has_film = predictor is None or "film" in predictor.metadata.sensor  # false for a model of presses alone
-        self._setup.has_any_sign |= has_any_sign or not has_film
+        self._setup = Setup(electrodes, device, predictor, reader, has_any_sign=has_any_sign)
         self._before_restart = FrameCounts()  # counts of the time before the latest `restart`
         self._begin()
 
@@ -195,8 +193,7 @@ class TouchStream(ReadingStream):
             ModelError: If the device file requires an estimate of the pretension, but the pretension of this film
                 cannot be estimated with the model.
         """
-        metadata = predictor.metadata
-        super().__init__(metadata.electrodes, device, reader=f"model {metadata.label}", predictor=predictor)
+        super().__init__(predictor.metadata.electrodes, device, predictor=predictor)
         self._given_name = frame_id
         self._set_model(predictor)
 
@@ -206,12 +203,12 @@ class TouchStream(ReadingStream):
         Raises:
             ModelError: If a stage cannot use the model. The present stages and their model then remain in use.
         """
-        present_predictor = self._setup.predictor
-        self._setup.predictor = predictor
+        present_predictor = self._setup.model
+        self._setup.use(predictor)
         try:
             self._contact_stages = create_stages(self._setup, needs_contact=True)
         except ModelError:
-            self._setup.predictor = present_predictor
+            self._setup.use(present_predictor)
             raise
         self.predictor = predictor
         self._label = predictor.metadata.label

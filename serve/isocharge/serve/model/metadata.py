@@ -2,7 +2,8 @@
 
 The metadata describe the sensor for which the model was trained, the order of the charges, the domain in which the
 model is valid, and the measured errors of the model. The complete description of the sensor is stored, but this module
-reads only the name of the sensor. The name of the sensor is also the name of the coordinate frame of x and y.
+reads only its name and the signs of its charges. The name of the sensor is also the name of the coordinate frame of x
+and y.
 """
 
 import json
@@ -141,7 +142,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
     Attributes:
         name: Name of the model, which is also the name of its folder.
         version: Version number, 1 or more, which is also the name of the version folder.
-        sensor: Complete description of the sensor as JSON. Only its `name` is read here.
+        sensor: Complete description of the sensor as JSON. Only its `name` and the signs of `d31` and `d32` are read here.
         electrodes: Names of the electrodes in the order of the charges.
         working_area_mm: Corners (x, y) of the polygon inside which the model was trained, mm.
         probes: Notations of the probes in the training.
@@ -208,6 +209,17 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
     def frame_id(self) -> str:
         """Name of the sensor, which is also the name of the coordinate frame of x and y."""
         return str(self.sensor["name"])
+
+    @property
+    def has_any_sign(self) -> bool:
+        """Whether the charges of a touch may have any sign.
+
+        They are mostly positive if the sensor describes a film on which tension causes no negative charge.
+        """
+        match self.sensor:
+            case {"film": _, "piezo": {"d31": int() | float() as d31, "d32": int() | float() as d32}}:
+                return min(d31, d32) < 0.0 or d31 == d32 == 0.0
+        return True
 
     def to_props(self) -> dict[str, str]:
         """Return the metadata as ONNX `metadata_props`, a table of texts with one JSON text for each field.

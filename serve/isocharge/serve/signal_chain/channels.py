@@ -41,7 +41,7 @@ class Channels(Stage):
         self._allows_any_unit = any_unit or setup.device.rule(GainRule) is not None
         self._electrodes = setup.electrodes
         self._channels = setup.device.channels
-        self._reader = setup.reader
+        self._setup = setup
         self._where = setup.device.where
         # Names, number of values and channel indices of the previous frame. `step` uses the indices again.
         self._previous_names: tuple[str, ...] | None = None  # None before the first frame
@@ -140,7 +140,7 @@ class Channels(Stage):
         keys = (name if re.fullmatch("[A-Za-z0-9_-]+", name) else dumps(name) for name in self._electrodes)
         example_keys = ", ".join(f'{key} = "..."' for key in keys)
         return ChargeError(
-            f"{self._reader} expects {len(self._electrodes)} charges {self._electrodes}, {number} has "
+            f"{self._setup.reader} expects {len(self._electrodes)} charges {self._electrodes}, {number} has "
             f"{len(frame.values)} {channel_names(frame)}{advice}; choose the "
             f"model of this sensor, or say in the device file which is which: [channels] {example_keys}"
         )

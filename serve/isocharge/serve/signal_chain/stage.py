@@ -135,6 +135,12 @@ class Setup:
         """Allow any sign for a board that sends currents."""
         self.has_any_sign |= self.device.has_currents
 
+    def use(self, predictor: Predictor) -> None:
+        """Use a model, and store its label and whether its film has charges of any sign."""
+        self.predictor = predictor
+        self.reader = f"model {predictor.metadata.label}"
+        self.has_any_sign = self.device.has_currents or predictor.metadata.has_any_sign
+
     @property
     def model(self) -> Predictor:
         """The present model of a stream that has a model."""

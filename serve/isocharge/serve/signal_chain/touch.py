@@ -119,8 +119,7 @@ class Touch(Stage):
     def reset(self) -> None:
         """Discard the touch."""
         n_electrode = len(self._setup.electrodes)
-        self._rest_direction = np.full(n_electrode, 0.0 if self._setup.has_any_sign else 1.0)
-        self._direction = self._rest_direction  # sum of the directions of the frames of the latest touch
+        self._touch_direction: Array | None = None  # sum of the directions of the frames of the latest touch
         self._base = np.zeros(n_electrode)  # charges that are no touch
         self._last = np.zeros(n_electrode)  # charges of the latest frame
         self._last_size = 0.0
@@ -129,6 +128,11 @@ class Touch(Stage):
         self._is_contact = False
         self._peak = 0.0  # largest size in this touch
         self._rest_s = 0.0  # time for which the charges have been small
+
+    @property
+    def _rest_direction(self) -> Array:
+        """Direction of the charges without an earlier touch; zero if they may have any sign."""
+        return np.full(len(self._setup.electrodes), 0.0 if self._setup.has_any_sign else 1.0)
 
     def step(self, frame: Frame) -> None:
         """Determine whether something touches the film in this frame."""
@@ -159,6 +163,7 @@ class Touch(Stage):
         reference = self._last if self._setup.has_any_sign else self._rest_direction
         is_reversed = float(charge @ reference) < 0.0
         self._last = charge
+        direction = self._rest_direction if self._touch_direction is None else self._touch_direction
         if self._is_contact:
             self._peak = max(self._peak, two_frame_peak)
             release_size = max((rule.release_share or 0.0) * self._peak, 0.5)
@@ -168,12 +173,11 @@ class Touch(Stage):
                 self._mean = charge
                 self._rest_s = 0.0
             else:
-                self._direction = self._direction + charge / size
+                self._touch_direction = direction + charge / size
             return
 
         # While a finger leaves the film, a remaining base must not decay, because this charge still belongs to the
         # finger.
-        direction = self._direction
         is_remainder = float(self._base @ direction) > 0.0
         if not (frame.is_base_held and is_remainder):
             self._base = self._base * math.exp(-frame.dt_s / frame.base_relax_s)
@@ -184,7 +188,7 @@ class Touch(Stage):
         elif change_size > 1.0:
             self._is_contact = True
             self._peak = two_frame_peak
-            self._direction = charge / max(size, 1.0)
+            self._touch_direction = charge / max(size, 1.0)
             self._has_drifted = _norm(self._mean - self._base) > 0.5
             return
         elif is_remainder and size < _norm(self._base):
@@ -195,7 +199,7 @@ class Touch(Stage):
             frame.flags.append(NEGATIVE)
         self._rest_s = 0.0 if size > 1.0 else self._rest_s + frame.dt_s
         if self._rest_s >= RISE_S:
-            self._direction = self._rest_direction
+            self._touch_direction = None
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:

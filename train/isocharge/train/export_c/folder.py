@@ -140,7 +140,7 @@ def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[
     files = {
         "isocharge_model.h": model_header(metadata, network),
         "isocharge_model.c": model_source(metadata, network),
-        "isocharge_device.h": device_header(device, metadata.electrodes, has_any_sign="film" not in metadata.sensor),
+        "isocharge_device.h": device_header(device, metadata.electrodes, has_any_sign=metadata.has_any_sign),
         **{name: source_text(name) for name in (*BOARD_SOURCES, "host_example.c")},
         "self_test.c": self_test(loaded.golden, metadata),
         "README.md": source_text(
