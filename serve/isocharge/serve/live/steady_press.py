@@ -18,8 +18,8 @@ from isocharge.common.arrays import Array
 from isocharge.serve.flags import RECONNECTED, RESTART, SATURATED, TARE
 from isocharge.serve.frames.frame import Frame
 
-PORT_LOST = "the port was lost: do not touch the film until it is tared"
-"""Reason for which a press is refused if the port was lost."""
+PORT_LOST = "the port was lost or the board was restarted: do not touch the film until it is tared"
+"""Reason for which a press is refused after an interruption."""
 
 NO_REST_BEFORE_PRESS = (
     "pressed too soon after the last touch: do not touch the film for half a second before a press; if that does not "

@@ -142,7 +142,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
     Attributes:
         name: Name of the model, which is also the name of its folder.
         version: Version number, 1 or more, which is also the name of the version folder.
-        sensor: Complete description of the sensor as JSON. Only its `name` and the signs of `d31` and `d32` are read here.
+        sensor: Complete description of the sensor as JSON. Only its name and the signs of d31 and d32 are read here.
         electrodes: Names of the electrodes in the order of the charges.
         working_area_mm: Corners (x, y) of the polygon inside which the model was trained, mm.
         probes: Notations of the probes in the training.

@@ -17,7 +17,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.stage import Rule, Setting, Setup, Stage, TimeConstant
+from isocharge.serve.signal_chain.stage import Divisor, Rule, Setting, Setup, Stage
 
 MIN_SQUARED_STEP = 0.02
 """Smallest squared change of the unit phasor between two frames for an update of the hum, dimensionless."""
@@ -32,8 +32,8 @@ class HumRule(Rule, frozen=True, kw_only=True):
         limit_pC: Limit to which a difference of two frames is clipped, pC.
     """
 
-    frequency_Hz: Setting = 50.0
-    settle_s: TimeConstant = 0.5
+    frequency_Hz: Divisor = 50.0
+    settle_s: Divisor = 0.5
     limit_pC: Setting = 5.0
 
 

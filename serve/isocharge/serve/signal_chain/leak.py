@@ -28,7 +28,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.structs import Positive
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.stage import LARGEST, OffsetStage, Rule, Setting, Setup, TimeConstant
+from isocharge.serve.signal_chain.stage import LARGEST, Divisor, OffsetStage, Rule, Setting, Setup
 
 
 class LeakRule(Rule, frozen=True, kw_only=True):
@@ -48,11 +48,11 @@ class LeakRule(Rule, frozen=True, kw_only=True):
 
     tau_s: Positive | dict[str, Positive] = LARGEST
     learn: bool = True
-    settle_s: TimeConstant = 3.0
+    settle_s: Divisor = 3.0
     hold_off_s: Setting = 0.5
     clip_sigmas: Setting = 4.0
     clip_pC: Setting = 0.1
-    relax_s: TimeConstant = 1.0
+    relax_s: Divisor = 1.0
     look_back_s: Setting = 0.25
 
 

@@ -37,8 +37,8 @@ Share = Annotated[float, Meta(ge=0, lt=1)]
 Count = Annotated[int, Meta(ge=0, le=LARGEST)]
 """Whole number from 0 to `LARGEST`."""
 
-TimeConstant = Annotated[float, Meta(ge=1e-3, le=LARGEST)]
-"""Time constant, s. It is never 0, because the signal chain divides by it."""
+Divisor = Annotated[float, Meta(ge=1e-3, le=LARGEST)]
+"""Number by which the signal chain divides, such as a time constant. It is never 0."""
 
 
 class Rule(Settings, frozen=True):

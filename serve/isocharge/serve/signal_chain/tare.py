@@ -5,17 +5,17 @@ follows a slow drift of the charge at rest.
 """
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from msgspec import structs
+from msgspec import Meta, structs
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DeviceError, TareError
 from isocharge.common.structs import WrongKey
 from isocharge.serve.flags import TARE
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.stage import Count, OffsetStage, Rule, Setting, Setup, TimeConstant
+from isocharge.serve.signal_chain.stage import LARGEST, Count, Divisor, OffsetStage, Rule, Setting, Setup
 
 MAX_TARE_FRAMES_IN_C = 10_000
 """Largest number of frames of a tare in C, which limits the memory that the C program needs."""
@@ -35,11 +35,11 @@ class TareRule(Rule, frozen=True, kw_only=True):
             changes by at most `noise_limit_pC / relax_s`, so that a touch does not change it noticeably.
     """
 
-    frames: Count = 100
+    frames: Annotated[int, Meta(ge=1, le=LARGEST)] = 100
     noise_limit_pC: Setting = 5.0
     offset_limit_pC: Setting = 100.0
     patience: Count = 2000
-    relax_s: TimeConstant = 2.0
+    relax_s: Divisor = 2.0
 
     def __post_init__(self) -> None:
         """Check that the search can find enough frames.
@@ -173,7 +173,7 @@ class Tare(OffsetStage):
             DeviceError: If the tare is too long for the memory of the C program.
         """
         rule = setup.device.rule(TareRule)
-        if rule is not None and not 1 <= rule.frames <= MAX_TARE_FRAMES_IN_C:
+        if rule is not None and rule.frames > MAX_TARE_FRAMES_IN_C:
             raise DeviceError(
                 f"{setup.device.where}: tare.frames: expected a whole number from 1 to {MAX_TARE_FRAMES_IN_C} for a "
                 f"signal chain in C, which stores all frames of the tare, got {rule.frames}"

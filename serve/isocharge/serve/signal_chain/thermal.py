@@ -25,7 +25,7 @@ from isocharge.common.errors import DeviceError
 from isocharge.common.structs import Finite
 from isocharge.serve.flags import BLIND, SATURATED, THERMAL
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.stage import NOT_IN_C, Rule, Setting, Setup, Stage
+from isocharge.serve.signal_chain.stage import NOT_IN_C, Divisor, Rule, Setting, Setup, Stage
 
 TRIED_PC = np.array([-20.0, -10.0, 0.0, 10.0, 20.0])
 """Changes of the common charge at which the misfit is evaluated, pC. A parabola is fitted to the squared misfits."""
@@ -57,7 +57,7 @@ class ThermalRule(Rule, frozen=True, kw_only=True):
 
     every_s: Setting = 0.05
     wander_pC: Setting = 50.0
-    noise: Setting = 3.0
+    noise: Divisor = 3.0
     blind_pC: Setting = 60.0
     tell_pC: Setting = 10.0
     pC_per_K: dict[str, Finite] | None = None
