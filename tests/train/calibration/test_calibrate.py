@@ -151,7 +151,7 @@ def test_proposed_presses_reduce_the_errors_as_announced(problem, synthetic):
     ("change", "message"),
     [
         (lambda p: replace(p, contact=np.full_like(p.contact, np.nan))[np.arange(3)], None),
-        (lambda p: replace(p, contact=p.contact + np.array([20.0, 0.0, 0.0])), "most of them lie outside"),
+        (lambda p: replace(p, contact=p.contact + np.array([20.0, 0.0, 0.0])), r"\(--radius\) and of .* N; is it"),
         (lambda p: replace(p, contact=p.contact[::-1].copy()), "no film of 'four-25um-biaxial' explains these 12"),
     ],
     ids=["unknown", "outside", "mixed up"],

@@ -35,7 +35,10 @@ IMPOSSIBLE = {
     ),
     "all negative": (lambda c, q: (c, -q), "all electrodes have the opposite sign.* d31 and d32"),
     "missing": (lambda c, q: (c, np.where(np.arange(4) == 3, np.nan, q)), "electrode 'D': no press has a charge"),
-    "too strong": (lambda c, q: (c * [1.0, 1.0, 100.0], q), "most of them lie outside"),
+    "too strong": (
+        lambda c, q: (c * [1.0, 1.0, 100.0], q),
+        "A film would explain them if the forces are in g",
+    ),
 }
 
 

@@ -11,6 +11,7 @@ itself. A property that depends on the direction has two components, the size of
 sine of twice the angle of its axis.
 """
 
+import cmath
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -296,6 +297,25 @@ class FilmPrior:
         values = np.zeros(len(self.properties))
         values[self.index(PRETENSION.name)] = self.sensor.film.pretension
         return values
+
+    def even(self, values: Array) -> Array:
+        """Return the values of the film with the same mean properties and no imperfections, shape (n_property,).
+
+        These values also remove the imperfections that the sensor file describes, except for a described shear modulus.
+
+        Args:
+            values: Values, shape (n_property,).
+        """
+        film = self.sensor.film
+        described = dict.fromkeys(self.names, 0.0)
+        pretension = values[self.index(PRETENSION.name)]
+        if pretension > 0.0:
+            described |= dict(zip(UNEVEN_TENSIONS, np.divide(film.deviator, pretension), strict=True))
+        stiffness = cmath.rect(math.log(film.young_ratio), 2.0 * film.axis)
+        oval = cmath.rect(film.oval, 2.0 * film.oval_axis)
+        described |= {"stiffness_x": stiffness.real, "stiffness_xy": stiffness.imag}
+        described |= {"oval_x": oval.real, "oval_xy": oval.imag}
+        return np.where(self.is_imperfection, [-described[name] for name in self.names], values)
 
     def film(self, values: Array) -> tuple[Sensor, Probe]:
         """Return the sensor and the probe with the given values of the properties.

@@ -11,6 +11,7 @@ from isocharge.serve.presses.measured_presses import MeasuredPresses, row_words
 from isocharge.simulate.solver.assembly import single_threaded_blas
 from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.diagnosis import (
+    SUSPICIOUS_MISFIT,
     check_channels,
     check_places,
     find_mistakes,
@@ -34,9 +35,6 @@ VISIBLE_ASYMMETRY = 0.03
 
 The neglected second-order effect is about the square of this value.
 """
-
-SUSPICIOUS_MISFIT = 8.0
-"""Misfit of the recorded presses, as `misfit` returns it, above which mistakes are searched for before the fit."""
 
 MAX_USUAL_NOISE = 0.01
 """Noise that is proportional to the charge, above which a caution is given, dimensionless."""
@@ -90,13 +88,11 @@ def calibrate(
         used_presses = ordered_presses[~is_outside]
         if len(ordered_presses) == 1 or _is_uninformative(used_presses):
             raise PressError(outside_words)
-        outside_cautions.append(f"{outside_words}; left out")
+        outside_cautions.append(outside_words)
     with single_threaded_blas():
         charges = start or solve_even(problem, executor)
         if is_outside.mean() > 0.5:
-            raise unexplained_error(
-                ordered_presses, charges, "most of them lie outside the places and forces of a calibration"
-            )
+            raise unexplained_error(ordered_presses, charges, outside_cautions[0])
         check_channels(used_presses, charges)
         is_suspicious = not _is_one_place(used_presses) and misfit(used_presses, charges) > SUSPICIOUS_MISFIT
         if is_suspicious and find_mistakes(used_presses, charges):
@@ -116,7 +112,7 @@ def calibrate(
         presses=used_presses,
         estimation=estimation,
         sensitivity=sensitivity,
-        cautions=(*outside_cautions, *_cautions(used_presses, estimation)),
+        cautions=(*(f"{words}; left out" for words in outside_cautions), *_cautions(used_presses, estimation)),
     )
 
 
@@ -179,14 +175,17 @@ def _solved_distance(estimation: Estimation) -> float:
 
 
 def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
-    """Return whether the solved film has the real probe, and nearly all imperfections of a film.
+    """Return whether the solved film has the real probe, and nearly all imperfections and the shear modulus of a film.
 
     Args:
         charges: The solved film.
         values: Properties of the film, shape (n_property,).
         contact: Contacts at which the effect of the missing imperfections is computed, shape (n, 3).
     """
-    if charges.film.probe.is_axisymmetric != charges.prior.probe.is_axisymmetric:
+    solved, described = charges.film, charges.prior
+    if solved.probe.is_axisymmetric != described.probe.is_axisymmetric:
+        return False
+    if solved.sensor.film.shear != described.sensor.film.shear:
         return False
     charge, jacobian = charges.linearised(values, contact)
     missing = np.where(charges.prior.is_imperfection, values - charges.values, 0.0)
@@ -200,7 +199,7 @@ def _outside_words(presses: MeasuredPresses, problem: CalibrationProblem) -> str
     low, high = domain.force_range
     return (
         f"{row_words(presses.lines, presses.row_noun)}: a calibration takes presses within "
-        f"{domain.radius:.3g} mm of the centre and of {low:.2g} to {high:.2g} N"
+        f"{domain.radius:.3g} mm of the centre (--radius) and of {low:.2g} to {high:.2g} N"
     )
 
 

@@ -52,6 +52,9 @@ The piezoelectric coefficients cause such an offset."""
 MAX_SQUARED_DEVIATION = 4.0
 """Upper limit of the squared deviation between logarithms of charges, which bounds the effect of outliers."""
 
+SUSPICIOUS_MISFIT = 8.0
+"""Misfit of presses, as `misfit` returns it, above which they probably contain a mistake."""
+
 BETTER_MISFIT_RATIO = 0.25
 """Ratio of two misfits below which one explanation of the presses counts as clearly better than another."""
 
@@ -190,8 +193,8 @@ def expected_charges(charges: FilmCharges, contact: Array) -> Array:
 def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     """Find the mistakes whose correction makes the presses agree far better with a film.
 
-    A mistake is returned if the presses agree clearly better with a film after its correction than before, and no other
-    correction is clearly better.
+    A mistake is returned if its correction makes the presses agree with a film, clearly better than before, and no
+    other correction is clearly better.
 
     Args:
         presses: The measured presses. A press whose place or force is unknown is not used.
@@ -208,7 +211,7 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
         sentence: misfit(replace(placed_presses, contact=contact, charge_pC=charge), charges)
         for sentence, contact, charge in _possible_corrections(placed_presses, charges)
     }
-    limit = BETTER_MISFIT_RATIO * misfit(placed_presses, charges)
+    limit = min(BETTER_MISFIT_RATIO * misfit(placed_presses, charges), SUSPICIOUS_MISFIT)
     best = min(misfits.values())
     clear = [name for name, value in misfits.items() if value < limit and BETTER_MISFIT_RATIO * value <= best]
     return sorted(clear, key=lambda sentence: misfits[sentence])

@@ -72,8 +72,7 @@ class FilmCharges:
             SceneError: If some presses of the domain cannot exist.
             SolveError: If a press has no equilibrium.
         """
-        even_values = np.where(prior.is_imperfection, 0.0, values)
-
+        even_values = prior.even(values)
         same_probe = solve_even_map(prior, even_values, domain, executor)
         larger_probe = None
         if PROBE_RADIUS in prior.names:
@@ -195,9 +194,9 @@ class FilmCharges:
 
     def _tensions(self, values: Array) -> dict[str, float]:
         """Return the mean pretension and its uneven parts, MPa, by the names of their properties."""
-        value = dict(zip(self.prior.names, values.tolist(), strict=True))
-        pretension = value[PRETENSION.name]
-        return {PRETENSION.name: pretension} | {name: value[name] * pretension for name in UNEVEN_TENSIONS}
+        sensor, _ = self.prior.film(values)
+        uneven_MPa = dict(zip(UNEVEN_TENSIONS, sensor.film.deviator, strict=True))
+        return {PRETENSION.name: sensor.film.pretension} | uneven_MPa
 
     def _jacobian(
         self, values: Array, sensor: Sensor, contact: Array, charge: Array, stress_derivatives: dict[str, Array]

@@ -100,8 +100,8 @@ def _film_charges(charges: FilmCharges, film: FilmEstimate, contact: Array) -> A
 def _nodes(film: FilmEstimate) -> Array:
     """Return the changes of the pretension at the nodes, of which none makes the film slack, shape (n_node,), MPa."""
     node_MPa = np.array(NODES_MPa)
-    uneven_share = np.linalg.norm([film.value(name) for name in UNEVEN_TENSIONS])
-    lowest_MPa = -0.95 * film.value(PRETENSION.name) * (1.0 - uneven_share)
+    sensor, _ = film.layout.prior.film(film.film_values)
+    lowest_MPa = -0.95 * (sensor.film.pretension - np.hypot(*sensor.film.deviator))
     reach = min(1.0, lowest_MPa / node_MPa.min()) if node_MPa.min() < 0.0 else 1.0
     return np.unique(np.where(node_MPa < 0.0, reach * node_MPa, node_MPa))
 
@@ -140,8 +140,9 @@ def _tension_factors(
         if is_even:
             return even_map.charges(contact)
         slopes = FilmSlopes.build(even_map, executor=executor)
-        even_values = np.where(prior.is_imperfection, 0.0, values)
-        similar_films = FilmCharges(prior, even_values, even_map, slopes, larger_probe=None)  # the probe is the same
+        similar_films = FilmCharges(
+            prior, prior.even(values), even_map, slopes, larger_probe=None
+        )  # the probe is the same
         return similar_films.charges(values, contact)
 
     factors = np.ones((len(contact), node_MPa.size, len(prior.sensor.electrodes)))
