@@ -163,6 +163,22 @@ def test_a_sudden_change_is_followed_after_twenty_touches(series, model, change_
     assert np.mean(np.abs(normalised) < 2.0) > 0.85
 
 
+def test_nearly_slack_film_that_has_not_changed_is_not_lost(series, tmp_path):
+    """The pretension is 0.01 MPa and cannot become smaller."""
+    rng = np.random.default_rng(2)
+    looser = series.coefficients[1] + 0.01 / 0.7 * (series.coefficients[0] - series.coefficients[1])
+    slack = replace(
+        series, node_MPa=np.array([-0.01, 0.0, 0.7]), coefficients=np.stack([looser, *series.coefficients[1:]])
+    )
+    model = model_in(tmp_path, slack)
+    _, charge = touches(slack, np.zeros(3), rng, 100)
+    follower = FilmFollower(model)
+    for number, row in enumerate(NOISE.add(charge, rng)):
+        follower.observe_frame(row, model.predict(row), (), float(number))
+        follower.observe_frame(None, None, (), number + 0.5)
+        assert not follower.is_lost
+
+
 def test_touches_that_agree_determine_the_pretension_better_than_touches_of_warm_fingers(series, model):
     """The assumed errors of a touch are an upper limit. The touches themselves show how large the errors are."""
     rng = np.random.default_rng(3)

@@ -9,7 +9,7 @@ from tests.benchmarks.measured_films import measured_presses
 from tests.train.calibration.conftest import rig
 from tests.train.calibration.synthetic_film import SyntheticFilm
 
-from isocharge.common.errors import PressError
+from isocharge.common.errors import PressError, SensorError
 from isocharge.simulate import Circle, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, next_presses
 
@@ -45,6 +45,12 @@ def test_film_is_solved_beyond_the_radius_but_not_at_the_clamp(problem):
     assert problem.solved_domain.radius > problem.radius
     near_clamp = replace(problem, radius=film.radius - 1.5 * probe.reach)
     assert near_clamp.radius <= near_clamp.solved_domain.radius < film.radius - 1.2 * probe.reach
+
+
+def test_described_film_that_cannot_be_found_is_refused(problem):
+    film = replace(problem.sensor.film, pretension=8.0)
+    with pytest.raises(SensorError, match=r"pretension_MPa: expected at most 4 MPa.*got 8; train on many presses"):
+        replace(problem, sensor=replace(problem.sensor, film=film))
 
 
 @pytest.mark.parametrize("offset", [10.0, -12.0])

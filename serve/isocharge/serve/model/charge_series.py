@@ -181,8 +181,7 @@ class ChargeSeries:
             charges.
         offset_pC: Charge that is added to the charge of each electrode, pC. A calibration found it in all presses.
         pretension_MPa: Mean pretension of the film as it was calibrated, MPa.
-        tension_std_MPa: Standard deviation of t when a stream begins, MPa. It includes the uncertainty of the
-            calibration.
+        tension_std_MPa: Standard deviation of t when a stream begins, MPa.
     """
 
     domain: Domain

@@ -133,7 +133,7 @@ class FollowedFilm(Struct, frozen=True):
     """Parameters of the film that are estimated from all touches so far."""
 
     pretension_MPa: Annotated[float, Meaning("Pretension for which the model answered.", "MPa")]
-    pretension_std_MPa: Annotated[float, Meaning("Standard deviation of the pretension.", "MPa")]
+    pretension_std_MPa: Annotated[float, Meaning("Standard deviation of its change since the calibration.", "MPa")]
     touches: Annotated[int, Meaning("Number of touches from which the pretension was estimated.")]
 
 

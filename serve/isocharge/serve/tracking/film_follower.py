@@ -119,6 +119,12 @@ MAX_DEVIATION = 20.0
 MAX_MEAN_SQUARE = 3.0
 """Largest mean squared distance of the latest touches from the predicted touches, for a film that is not lost."""
 
+CLEAR_CHANGE = 3.0
+"""Standard deviations by which an unknown has changed clearly. A film that is lost has changed clearly, up to an end.
+
+The pretension of a nearly slack film is always close to its lower end.
+"""
+
 FADING_TOUCHES = 256
 """Number of touches after which the knowledge from a touch would have decreased to 1/e.
 
@@ -312,7 +318,8 @@ class FilmFollower:
 
         # Twice the cost is the squared distance, in which large residuals have little weight.
         self._mean_square += (2.0 * scale * estimate.cost - self._mean_square) / MEMORY_TOUCHES
-        at_end = (estimate.state <= self._lowest) | (estimate.state >= self._highest)
+        is_changed = np.abs(estimate.state) > CLEAR_CHANGE * np.sqrt(estimate.covariance.diagonal())
+        at_end = is_changed & ((estimate.state <= self._lowest) | (estimate.state >= self._highest))
         was_lost = self.is_lost
         self.is_lost = self._mean_square > MAX_MEAN_SQUARE or bool(at_end[0] or at_end[self._offset])
         if self.is_lost and not was_lost:

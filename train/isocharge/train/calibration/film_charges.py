@@ -194,9 +194,11 @@ class FilmCharges:
 
     def _tensions(self, values: Array) -> dict[str, float]:
         """Return the mean pretension and its uneven parts, MPa, by the names of their properties."""
-        sensor, _ = self.prior.film(values)
-        uneven_MPa = dict(zip(UNEVEN_TENSIONS, sensor.film.deviator, strict=True))
-        return {PRETENSION.name: sensor.film.pretension} | uneven_MPa
+        value = dict(zip(self.prior.names, values.tolist(), strict=True))
+        pretension = value[PRETENSION.name]
+        described = zip(UNEVEN_TENSIONS, self.prior.sensor.film.deviator, strict=True)
+        uneven = {name: described_MPa + value[name] * pretension for name, described_MPa in described}
+        return {PRETENSION.name: pretension} | uneven
 
     def _jacobian(
         self, values: Array, sensor: Sensor, contact: Array, charge: Array, stress_derivatives: dict[str, Array]

@@ -78,10 +78,13 @@ def compact_charges(
     unit_contact = domain.to_unit(contact)
     size = charge if series.log_size is None else series_size(series.log_size, unit_contact[:, 2])[0]
     values = changes / size[:, None]  # a direction changes the value v of the series
-    coefficients = fit_series(unit_contact, values.reshape(len(contact), -1), *DIRECTION_DEGREES)
+    directions = None
+    if values.size > 0:
+        coefficients = fit_series(unit_contact, values.reshape(len(contact), -1), *DIRECTION_DEGREES)
+        directions = coefficients.reshape(*coefficients.shape[:3], *changes.shape[1:])
     return replace(
         series,
-        directions=coefficients.reshape(*coefficients.shape[:3], *changes.shape[1:]) if changes.shape[1] else None,
+        directions=directions,
         # A film is at most as well described as its charges can be measured.
         charge_std=max(series.charge_std, noise.gain),
         offset_pC=film.value("offset"),
@@ -140,9 +143,8 @@ def _tension_factors(
         if is_even:
             return even_map.charges(contact)
         slopes = FilmSlopes.build(even_map, executor=executor)
-        similar_films = FilmCharges(
-            prior, prior.even(values), even_map, slopes, larger_probe=None
-        )  # the probe is the same
+        # The radius of the probe is the same.
+        similar_films = FilmCharges(prior, prior.even(values), even_map, slopes, larger_probe=None)
         return similar_films.charges(values, contact)
 
     factors = np.ones((len(contact), node_MPa.size, len(prior.sensor.electrodes)))

@@ -333,7 +333,7 @@ def write_calibration(
     check_calibration_folder(folder, result.problem.electrodes)
     problem, film = result.problem, result.film
     if held_out is not None:
-        held_out = usable_held_out(held_out, problem.domain)
+        held_out = usable_held_out(held_out.of_electrodes(problem.electrodes, problem.sensor.name), problem.domain)
     noisy_problem = replace(problem, noise=film.noise)
     with single_threaded_blas():
         series = compact_charges(noisy_problem, result.charges, film, executor)

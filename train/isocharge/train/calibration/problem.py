@@ -4,7 +4,9 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
+from isocharge.common.errors import SensorError
 from isocharge.simulate import Domain, FilmPrior, NoiseModel, Probe, Sensor, noise_model
+from isocharge.simulate.sensor.film_properties import PRETENSION
 from isocharge.train.calibration.estimator import Prior
 from isocharge.train.calibration.film_charges import round_probe
 from isocharge.train.calibration.film_estimate import FilmEstimate, Layout
@@ -45,6 +47,19 @@ class CalibrationProblem:
     earlier: FilmEstimate | None = None
     stress_limit: float = DEFAULT_STRESS_LIMIT
     noise: NoiseModel = field(default_factory=partial(noise_model, "reference"))
+
+    def __post_init__(self) -> None:
+        """Check that a calibration can find the film that the sensor file describes.
+
+        Raises:
+            SensorError: If its pretension is too large.
+        """
+        _, largest = PRETENSION.limits
+        if self.sensor.film.pretension > largest:
+            raise SensorError(
+                f"{self.sensor.name}: film.pretension_MPa: expected at most {largest:g} MPa, up to which a calibration "
+                f"searches, got {self.sensor.film.pretension:g}; train on many presses instead (`isocharge train fit`)"
+            )
 
     @property
     def electrodes(self) -> tuple[str, ...]:
