@@ -391,12 +391,19 @@ def test_clock_in_text_that_wraps(name, unit, modulus):
 
 
 @pytest.mark.parametrize(
-    ("begin", "end", "restarts"),
-    [*((modulus - 20, modulus, 0) for modulus in (100, 256, 1000, 10_000, 65536)), (290, 301, 1), (70, 98, 1)],
+    ("sent", "lost", "restarts"),
+    [
+        *(([*range(modulus - 20, modulus), *range(20)], 0, 0) for modulus in (100, 256, 1000, 10_000, 65536)),
+        ([*range(290, 301), *range(20)], 0, 1),
+        ([*range(70, 98), *range(20)], 0, 1),
+        ([*range(290, 301), 700], 399, 0),
+        ([*range(90, 100), *range(256), *range(20)], 0, 0),
+    ],
+    ids=lambda sent: f"{sent[0]} to {sent[-1]}" if isinstance(sent, list) else None,
 )
-def test_frame_counter_in_text_that_wraps_or_restarts(begin, end, restarts):
+def test_frame_counter_in_text_that_wraps_or_restarts(sent, lost, restarts):
     parser = TextParser()
-    for seq in [*range(begin, end), *range(20)]:
+    for seq in sent:
         for frame in feed(f"seq:{seq},A:1", parser=parser):
             parser.sequence_flags(frame.seq)
-    assert (parser.counts.lost, parser.counts.repeated, parser.counts.restarts) == (0, 0, restarts)
+    assert (parser.counts.lost, parser.counts.repeated, parser.counts.restarts) == (lost, 0, restarts)
