@@ -17,7 +17,7 @@ from isocharge.common.errors import PressError, shown
 from isocharge.serve.model.contact import inside_polygon
 from isocharge.serve.presses.measured_presses import CONTACT, MeasuredPresses
 from isocharge.simulate import Domain
-from isocharge.train.data.channel_noise import LEAST_SHARE, usual_size
+from isocharge.train.data.channel_noise import LEAST_SHARE
 
 HULL_RATIO = 0.3
 """Length above which an edge of the outline bends inwards to further places.
@@ -230,8 +230,7 @@ def _check_independence(channels: Mapping[str, Array]) -> None:
             channels that contribute to the singular vector of this value.
     """
     charge = np.column_stack(list(channels.values()))
-    scaled_charge = charge / usual_size(charge)
-    standardised_charge = (scaled_charge - scaled_charge.mean(axis=0)) / scaled_charge.std(axis=0)
+    standardised_charge = (charge - charge.mean(axis=0)) / charge.std(axis=0)
     _, singular_values, directions = np.linalg.svd(standardised_charge, full_matrices=False)
     largest, *_, smallest = singular_values
     if smallest > LEAST_INDEPENDENCE * largest:
