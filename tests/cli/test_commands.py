@@ -198,6 +198,7 @@ BAD = [
     ("simulate point SENSOR --at 3", "InputError: --at: expected two numbers in mm"),
     ("simulate point SENSOR --probe cube:1", "SceneError: probe 'cube:1'"),
     ("simulate point SENSOR --accuracy 0", "InputError: --accuracy: expected"),
+    ("simulate point SENSOR --temperature nan", "InputError: --temperature: expected a finite number"),
     ("simulate point SENSOR --force 1e308", "beyond small strains"),
     ("simulate sweep SENSOR --radius 44.5 -o OUT", "leave the film of radius 45 mm"),
     (

@@ -152,6 +152,16 @@ def test_presses_of_a_machine_are_those_of_its_list(capsys):
     assert "row 2 is left out: it moves" in message
 
 
+@pytest.mark.parametrize(("taken", "next_row"), [([0], 2), ([0, 1, 2], 4), ([0, 2, 0], 5)])
+def test_list_that_repeats_its_presses_is_continued_at_the_next_row(taken, next_row):
+    contacts = np.concatenate([LIST, LIST])
+    session = FakeSession()
+    session.taken = [*LIST[taken]]
+    session.presses = SimpleNamespace(contact=LIST[taken])
+    with pytest.raises(PortLost, match=f"continue with row {next_row} of its list"):
+        Dialogue(session, Script(TARED, refused(PORT_LOST)), NAMES).follow_machine(contacts)
+
+
 def test_a_port_that_goes_away_under_a_machine_ends_the_session():
     with pytest.raises(PortLost, match="continue with row 2 of its list"):
         dialogue(TARED, STEADY, refused(PORT_LOST), contacts=LIST)

@@ -186,6 +186,8 @@ class Measurement:
         Returns:
             Readings, shape (n, electrodes), pC.
         """
+        if len(charge) == 0:
+            return charge
         time = (self._readings + np.arange(len(charge))) / self.rate
         self._readings += len(charge)
 

@@ -9,6 +9,7 @@ import struct
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from crcmod.predefined import mkPredefinedCrcFun
 from hypothesis import given, settings
@@ -166,6 +167,23 @@ def test_cobs_slip_and_hdlc_frames_are_read(framing):
     assert (counts.crc_errors, counts.malformed, counts.bytes_dropped) == (1, 1, dropped_bytes)
 
 
+def test_damaged_frame_in_a_datagram_makes_no_other_frame():
+    parser = stuffed("datagram", length=6, checksum="sum-8").parser()
+    rng = np.random.default_rng(0)
+    for _ in range(2000):
+        frames = [struct.pack("<Bf", seq, rng.normal()) for seq in range(4)]
+        frames = [bytearray(frame + bytes([sum(frame) % 256])) for frame in frames]
+        frames[2][3] ^= 0x55
+        assert [frame.seq for frame in parser.feed(b"".join(frames))] == [0, 1, 3]
+    assert (parser.counts.crc_errors, parser.counts.bytes_dropped) == (2000, 12_000)
+
+
+def test_line_feed_after_a_datagram_of_printable_bytes_is_ignored():
+    parser = stuffed("datagram", sync="41", length=6, checksum="none").parser()
+    data = struct.pack("<BBf", 0x41, 0x42, 0.5)
+    assert [frame.values for frame in parser.feed(data + b"\n")] == [(0.5,)]
+
+
 def test_datagrams_contain_whole_frames():
     parser = stuffed("datagram", sync="A5", length=6, checksum="none").parser()
     first = struct.pack("<BBf", 0xA5, 1, 0.5)
@@ -174,7 +192,7 @@ def test_datagrams_contain_whole_frames():
     assert [frame.values for frame in parser.feed(first + second)] == [(0.5,), (1.0,)]
     assert parser.feed(first[:3]) == []
     assert [frame.values for frame in parser.feed(first_with_another_sync + second)] == [(1.0,)]
-    assert (parser.counts.malformed, parser.counts.bytes_dropped) == (1, 9)
+    assert (parser.counts.malformed, parser.counts.bytes_dropped) == (2, 9)
     assert parser.sequence_flags(1) == ()
     parser.feed(first + second)
     assert parser.sequence_flags(4) == ("gap",)

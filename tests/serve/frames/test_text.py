@@ -183,6 +183,17 @@ def test_word_that_changes_is_no_name(notation):
     assert len(feed(*lines)) == 12
 
 
+@pytest.mark.parametrize("columns", [(), ("n", "T", "A", "B")])
+def test_names_of_the_counter_and_the_clock_in_a_header_have_their_meaning(columns):
+    parser = TextParser(columns, {"n": "seq", "T": "t_ms"})
+    header = [] if columns else ["n,T,A,B"]
+    frames = feed("", *header, *[f"{k},{5 * k},{k}.5,-1.5" for k in range(5)], parser=parser)
+    assert [(frame.seq, frame.t_us, frame.values) for frame in frames] == [
+        (k, 5000 * k, (k + 0.5, -1.5)) for k in range(5)
+    ]
+    assert frames[-1].names == ("A", "B")
+
+
 LEVELS = st.tuples(*[st.integers(-9999, 9999).map(lambda value: value / 10)] * 3)
 
 
@@ -397,6 +408,7 @@ def test_clock_in_text_that_wraps(name, unit, modulus):
         ([*range(290, 301), *range(20)], 0, 1),
         ([*range(70, 98), *range(20)], 0, 1),
         ([*range(290, 301), 700], 399, 0),
+        ([*range(99_990, 100_000), *range(20)], 0, 1),
         ([*range(90, 100), *range(256), *range(20)], 0, 0),
     ],
     ids=lambda sent: f"{sent[0]} to {sent[-1]}" if isinstance(sent, list) else None,

@@ -1,6 +1,7 @@
 """Tests of the properties of real films: each changes what it names and nothing else."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 
 from isocharge.common.errors import SensorError
 from isocharge.simulate import Circle, FilmPrior, load_sensor, parse_probe
-from isocharge.simulate.sensor.film_properties import LARGEST_PRETENSION
+from isocharge.simulate.sensor.film_properties import LARGEST_PRETENSION, changed_film
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from solved_charges import with_film
 
@@ -59,6 +60,14 @@ def test_each_property_changes_what_it_names_and_nothing_else(name):
         if getattr(part, key) != getattr(whole, key)
     ]
     assert len(changed) == 1
+
+
+def test_all_moduli_change_with_the_modulus_of_the_film():
+    """The default of the shear modulus, stated explicitly, describes the same film."""
+    shear = 0.5 * SENSOR.film.young / (1.0 + SENSOR.film.poisson)
+    stated = replace(SENSOR, film=replace(SENSOR.film, shear=shear))
+    (changed, _), (default, _) = (changed_film(sensor, Circle(1.0), {"young": 0.2}) for sensor in (stated, SENSOR))
+    assert changed.film.shear == pytest.approx(0.5 * default.film.young / (1.0 + default.film.poisson))
 
 
 def test_all_properties_are_tested():

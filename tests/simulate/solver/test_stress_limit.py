@@ -68,6 +68,11 @@ def test_yield_force_of_a_taut_film_lies_in_the_range_of_forces():
     assert largest_stress(taut, TIP, force) == pytest.approx(45.0, rel=2e-3)
 
 
+def test_yield_force_of_a_single_force_that_stresses_the_film_too_much():
+    assert yield_force(FILM, [TIP], (15.0, 15.0)) == 15.0
+    assert yield_force(FILM, [TIP], (0.05, 0.05)) is None
+
+
 def test_yield_force_of_a_small_film_is_not_rounded_to_zero():
     small = replace(FILM, radius=1.0, thickness=5e-4)
     force = yield_force(small, [Circle(0.02)], (1e-6, 1e-3))

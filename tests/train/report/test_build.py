@@ -6,11 +6,13 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 from tests.train.measured import measured_presses, with_samples
 
 from isocharge.cli.train import report as report_module
 from isocharge.common.errors import DatasetError, ModelError, OutputExists, PressError
 from isocharge.serve import benchmark, find_model
+from isocharge.serve.model.model_folder import load_model
 from isocharge.simulate import Circle, Sweep, load_sensor
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train.data.contact_errors import ContactErrorStatistics
@@ -140,6 +142,12 @@ def test_unsuitable_datasets_and_models_are_refused(dataset, tmp_path, change, m
     with pytest.raises((ModelError, DatasetError, PressError), match=message):
         write_report(tmp_path / "out", [(change(dataset), find_model(model))], SMALL)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_model_of_presses_alone_is_not_tested_on_its_own_presses(dataset):
+    metadata = structs.replace(load_model(find_model(NAME)).metadata, sensor={"name": "pad"})
+    with pytest.raises(ModelError, match="got a model of presses alone, which has learned from all presses"):
+        evaluation._check_same_sensor(metadata, measured(dataset, (1.0, 1.0)))
 
 
 def test_limit_of_an_inaccurate_series_is_left_out_with_the_reason(dataset, tmp_path):

@@ -93,8 +93,9 @@ def write_records(records: Iterable[PredictionRecord], writers: Iterable[Callabl
             say(f"tared: {_listed(record.tare_pC)}")
     if untared_pC:
         say(
-            f"caution: no tare, because the film did not rest near zero; the last charges are {_listed(untared_pC)}; "
-            "leave the film alone longer, or state an offset of the board as offset in [gain]"
+            "caution: no tare, because the stream ended before the film had rested near zero for long enough; the last "
+            f"charges are {_listed(untared_pC)}; leave the film alone longer, or state an offset of the board as "
+            "offset in [gain]"
         )
 
 

@@ -302,7 +302,8 @@ class Parser(ABC):
         if increase == 0:
             self.counts.repeated += 1
             return (REPEAT,)
-        if increase >= self.seq_modulus // 2:  # modulo `seq_modulus`, a decrease is the same as a large increase
+        # Modulo `seq_modulus`, a decrease is the same as a large increase. A larger counter does not wrap there.
+        if increase >= self.seq_modulus // 2 or self.seq_modulus <= previous_seq > seq:
             self.counts.restarts += 1
             return (RESTART,)
         self.counts.lost += increase - 1

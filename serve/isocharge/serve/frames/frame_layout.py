@@ -207,6 +207,9 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
             raise WrongKey("fields", "names that differ", names)
         if not self.columns.channels:
             raise WrongKey("fields", "one or more that are channels", names)
+        _, _, clock_modulus = _parser_arguments(self)
+        if clock_modulus < 1:
+            raise WrongKey("fields", "a clock with a positive scale that counts microseconds or more", names)
 
         checksum_start = len(self.sync) + self.body.size  # position of the checksum, which is at the end of the frame
         expected_length = checksum_start + self.selected_checksum.size
@@ -386,11 +389,14 @@ class DatagramParser(SyncParser):
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that one datagram contains.
 
-        If the length of the datagram is not a multiple of the length of a frame, the whole datagram is rejected.
+        If the length of the datagram is not a multiple of the length of a frame, the whole datagram is rejected. A line
+        feed that follows the frames is ignored, because a UDP socket adds one to bytes that are all printable.
         """
-        if len(data) % self.layout.length != 0:
+        length = self.layout.length
+        if len(data) % length == 1:
+            data = data.removesuffix(b"\n")
+        if len(data) % length != 0:
             self.counts.count_rejected(len(data))
             return []
-        frames = super().feed(data)
-        self._drop_tail()
-        return frames
+        pieces = (data[start : start + length] for start in range(0, len(data), length))
+        return [frame for piece in pieces for frame in self._try_decode(self.layout.decode, piece, dropped_size=length)]

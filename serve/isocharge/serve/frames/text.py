@@ -164,6 +164,10 @@ class TextParser(DelimitedParser):
         except ValueError:
             return self._reject(size)
 
+    def _meant(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Replace the names that the device uses for its counter and its clock by their meanings."""
+        return tuple(self._meanings.get(name, name) for name in names)
+
     def _reject(self, size: int) -> list[Frame]:
         """Count a rejected line, and return an empty list, because a rejected line completes no frame."""
         self.counts.count_rejected(size)
@@ -194,7 +198,7 @@ class TextParser(DelimitedParser):
             columns = text.replace(",", " ").replace(";", " ").split()
             is_plain_header = all(column[0].isalpha() for column in columns)
             return [] if is_plain_header else self._reject(size)
-        if all(layout.names) or not layout.name_unnamed(header_names(text, layout.example)):
+        if all(layout.names) or not layout.name_unnamed(self._meant(header_names(text, layout.example))):
             return self._reject(size)
         self._describe_layout(layout)
         return []
@@ -220,8 +224,7 @@ class TextParser(DelimitedParser):
         Returns:
             The frames of all equal cycles; an empty list if no layout is recognised yet.
         """
-        names = tuple(self._meanings.get(name, name) for name in line.names)
-        self._collected_lines.append((line._replace(names=names), size))
+        self._collected_lines.append((line._replace(names=self._meant(line.names)), size))
         repeats = MESSAGE_REPEATS if line.is_prose else RECOGNITION_REPEATS
         cycle_length = self._repeated_cycle_length(repeats)
         repeated_lines = self._collected_lines[-repeats * cycle_length :] if cycle_length > 0 else []
@@ -236,9 +239,9 @@ class TextParser(DelimitedParser):
             self._reject(rejected_size)
         self._collected_lines = []
         layout = Layout(frame_lines)
-        is_named = layout.name_unnamed(self._columns)
+        is_named = layout.name_unnamed(self._meant(self._columns))
         while self._headers and not is_named:
-            is_named = layout.name_unnamed(header_names(self._headers.pop(), layout.example))
+            is_named = layout.name_unnamed(self._meant(header_names(self._headers.pop(), layout.example)))
         self.layout = layout
         self._describe_layout(layout)
         frames = []

@@ -120,7 +120,7 @@ def foreign_kind(name: str, head: bytes) -> str:
     if head.startswith(PARQUET_START):
         return f"a Parquet file; compute its contacts with: isocharge serve predict MODEL {quoted_name}"
     columns = {column.strip(' "') for column in re.split("[,;|\t]", first_line.decode("utf-8", "replace").strip())}
-    if columns & PRESS_COLUMNS:
+    if columns & PRESS_COLUMNS and name != STDIN:
         return (
             f"a table of presses; compute its contacts with: isocharge serve predict MODEL {quoted_name}; if a board "
             f"has sent these lines, use: isocharge serve stream MODEL --port - < {quoted_name}"

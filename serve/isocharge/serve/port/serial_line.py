@@ -249,6 +249,9 @@ UDP_SCHEME = "udp://"
 The URL contains the address on which the socket receives datagrams.
 """
 
+MAX_LINE_DATAGRAMS = 8
+"""Largest number of datagrams over which a serial bridge divides a line."""
+
 _CONTROL_CHARACTER = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
 
@@ -278,7 +281,8 @@ class UdpSocket:
         except OSError:
             self._socket.close()
             raise
-        self._board_ends_lines = False  # whether a datagram of the board has ended with a line feed
+        self._board_ends_lines = False  # whether the board ends its lines, although a line may need several datagrams
+        self._datagrams_without_end = 0  # number of successive datagrams without a line feed
         self._is_text = False  # whether the latest datagram is valid UTF-8 without control characters
         self._peer: tuple[str, int] | None = None  # sender of the latest datagram, to which answers are sent
 
@@ -303,7 +307,7 @@ class UdpSocket:
             data, self._peer = self._socket.recvfrom(MAX_READ_BYTES)
             if data:
                 is_utf8 = data.decode("utf-8", "replace").encode() == data  # decoding replaces invalid bytes
-                self._is_text = is_utf8 and _CONTROL_CHARACTER.search(data) is None
+                self._is_text = is_utf8 and _CONTROL_CHARACTER.search(data.removesuffix(b"\0")) is None
                 return self._with_line_feed(data)
         return b""
 
@@ -331,12 +335,15 @@ class UdpSocket:
     def _with_line_feed(self, data: bytes) -> bytes:
         """Return a datagram of text with a line feed at its end.
 
-        If this datagram or an earlier datagram of the board ends with a line feed, the datagram is returned unchanged.
-        A datagram that is no text is also returned unchanged.
+        If this datagram or one of the latest datagrams of the board ends with a line feed, the datagram is returned
+        unchanged. A datagram that is no text is also returned unchanged.
 
         Args:
             data: The datagram.
         """
-        if data.endswith(b"\n"):
+        self._datagrams_without_end = 0 if b"\n" in data else self._datagrams_without_end + 1
+        if self._datagrams_without_end > MAX_LINE_DATAGRAMS:
+            self._board_ends_lines = False
+        elif data.endswith(b"\n"):
             self._board_ends_lines = True
         return data + b"\n" if self._is_text and not self._board_ends_lines else data

@@ -275,7 +275,7 @@ def _electrode_columns(table: NumberTable) -> tuple[str, ...]:
         PressError: If the name of a column is similar to a name in `PRESS_RULES`. The name is then probably misspelt.
     """
     electrodes = tuple(name for name in table.header if name and name not in {TEMPERATURE, *PRESS_RULES})
-    table.refuse_similar_names(electrodes, PRESS_RULES)
+    table.refuse_similar_names(electrodes, (TEMPERATURE, *PRESS_RULES))
     return electrodes
 
 

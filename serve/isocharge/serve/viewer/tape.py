@@ -53,7 +53,7 @@ def sample_values(record: PredictionRecord, electrodes: tuple[str, ...]) -> tupl
     if record.tracked is not None:  # the tracked contact has only some of the numbers
         values = [getattr(record.tracked, name, value) for name, value in zip(RECORD_NUMBERS, values, strict=True)]
     others = [None if record.other is None else getattr(record.other, name) for name in OTHER_NUMBERS]
-    flags = sum(FLAG_BITS[flag] for flag in record.flags)
+    flags = sum(FLAG_BITS.get(flag, 0) for flag in record.flags)
     record_count = 1  # `coalesce` adds the counts of the samples that it replaces by a single sample
     charge_pC = record.charge_pC or {}
     charges = [charge_pC.get(electrode) for electrode in electrodes]

@@ -54,6 +54,12 @@ def identify_command(
     if not 0.0 < error < inf:
         raise InputError(f"--error: expected a positive number of mm, got {error}")
     described_sensor = load_sensor(sensor)
+    smallest_N, largest_N = force
+    if smallest_N == largest_N and described_sensor.film.pretension > 0.0:
+        raise InputError(
+            "--force: expected a smaller and a larger force, which determine how the charges of a taut film change, "
+            f"got {smallest_N:g} N twice"
+        )
     parsed_probe = parse_probe(probe)
     noise_level = noise_model(noise)
     with shown_progress(), executor_for(workers) as pool:

@@ -1,5 +1,6 @@
 """Command `isocharge simulate point`, which computes the charges and the deflection of one press."""
 
+import math
 from typing import Annotated
 
 import typer
@@ -67,6 +68,8 @@ def point_command(
     """
     if not 1e-6 <= accuracy <= 1.0:
         raise InputError(f"--accuracy: expected a relative error from 1e-6 to 1, got {accuracy}")
+    if not math.isfinite(temperature):
+        raise InputError(f"--temperature: expected a finite number of kelvin, got {temperature}")
 
     film_sensor = warmed(load_sensor(sensor), temperature)
     footprint = parse_probe(probe)

@@ -297,7 +297,8 @@ def map_to_search(
         SceneError: If a press in the domain cannot exist.
         SolveError: If the map with the smallest of these radii cannot be built.
     """
-    radii = search_radius(sensor, probe) * RADIUS_REDUCTION ** np.arange(MAX_REDUCTIONS + 1.0)
+    largest_probe = probe.under(force_range[1])
+    radii = search_radius(sensor, largest_probe) * RADIUS_REDUCTION ** np.arange(MAX_REDUCTIONS + 1.0)
     for radius in radii.tolist():
         try:
             return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)

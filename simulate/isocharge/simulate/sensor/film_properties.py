@@ -175,6 +175,7 @@ def _changed_mechanics(film: Film, value: Mapping[str, float]) -> Film:
             difference + value["tension_difference"] * pretension,
             shear + value["tension_shear"] * pretension,
         ),
+        shear=None if film.shear is None else film.shear * math.exp(value["young"]),
         young_ratio=math.exp(log_ratio),
         axis=axis,
         oval=oval,

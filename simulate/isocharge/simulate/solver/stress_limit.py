@@ -119,13 +119,15 @@ def yield_force(film: Film, probes: Sequence[Probe], force_range: tuple[float, f
         Force, N, rounded to four digits; None if the film does not yield within the range of forces.
     """
     min_force, max_force = force_range
-    smallest_force = max_force  # stays at this value if the film does not yield
+    yield_forces = []
     for probe in probes:
         try:
             probe_force = force_within_stress(film, probe, DEFAULT_STRESS_LIMIT, force_range)
         except SceneError:  # the film yields already at the smallest force
-            probe_force = min_force
+            yield_forces.append(min_force)
         except SolveError:
             continue
-        smallest_force = min(smallest_force, probe_force)
-    return float(f"{smallest_force:.4g}") if smallest_force < max_force else None
+        else:
+            if probe_force < max_force:
+                yield_forces.append(probe_force)
+    return float(f"{min(yield_forces):.4g}") if yield_forces else None

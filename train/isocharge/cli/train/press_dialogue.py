@@ -206,11 +206,12 @@ class Dialogue:
             PortLost: If the port is lost, because it is then unknown which press comes next.
             InputError: If the port ends before the last press.
         """
-        # Count the rows up to and including the last press of an earlier session, if the list contains this press.
+        # Find the presses of an earlier session in the list, one after the other. Rows between them were left out.
         row_count = 0
-        if len(self._session):
-            is_last_press = np.isclose(contacts, self._session.presses.contact[-1], equal_nan=True).all(axis=1)
-            row_count = int(np.flatnonzero(is_last_press).max(initial=-1)) + 1
+        for recorded in self._session.presses.contact:
+            is_row = np.isclose(contacts[row_count:], recorded, equal_nan=True).all(axis=1)
+            if is_row.any():
+                row_count += int(np.argmax(is_row)) + 1
         try:
             # A press before the tare would be lost, and each later press would be assigned to the wrong row.
             self._wait_for(Phase.waiting)

@@ -322,18 +322,25 @@ class DatasetEvaluation:
 def _check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
     """Raise an error if a model was not trained for the sensor of a dataset.
 
-    For measured presses, the names of the electrodes must be equal, because a calibrated model has another film. For
-    simulated presses, all values of the two sensors must be equal, except the names of the sensors.
+    For measured presses, the names of the electrodes must be equal, because a calibrated model has another film. A
+    model of presses alone may have learned from the presses on which it would be tested. For simulated presses, all
+    values of the two sensors must be equal, except the names of the sensors.
 
     Args:
         model: Metadata of the model.
         dataset: The dataset.
 
     Raises:
-        ModelError: If the sensors differ. The message names the values that differ.
+        ModelError: If the sensors differ, or the model is one of presses alone. The message names the values that
+            differ.
     """
     names = dataset.sensor.electrode_names
     if is_measured(dataset):
+        if "film" not in model.sensor:
+            raise ModelError(
+                f"model {model.label}: expected a model of a film, got a model of presses alone, which has learned "
+                "from all presses; its card states its errors on held-out presses"
+            )
         differences = [] if model.electrodes == names else [f"electrodes ({', '.join(model.electrodes)})"]
     else:
         expected = sensor_to_dict(dataset.sensor)
