@@ -37,4 +37,4 @@ def test_a_map_that_folds_is_reported_drawn_and_written(command, refused, tmp_pa
 def test_single_force_on_a_taut_film_is_refused(refused, tmp_path):
     path = tmp_path / "taut.toml"
     path.write_text(sensor_to_toml(with_film(load_sensor("three-25um-uniaxial"), pretension=1.5)))
-    refused("simulate", "identify", path, "--force", "1", "1", message="expected a smaller and a larger force", code=1)
+    refused("simulate", "identify", path, "--force", "1", "1", message="expected a smaller and a larger force")

@@ -48,6 +48,15 @@ def test_dxf_has_the_positions_and_sizes_of_the_sensor(sensor, drawing, tmp_path
     assert names == ["".join(filter(str.isprintable, name)) for name in sensor.electrode_names]
 
 
+def test_rim_of_an_oval_film_is_not_a_circle():
+    """The semi-axes of the rim are 10 % larger and smaller than the radius of 45 mm."""
+    sensor = load_sensor("three-25um-biaxial")
+    space = draw_layout(replace(sensor, film=replace(sensor.film, oval=0.1))).modelspace()
+    (rim,) = space.query('LWPOLYLINE[layer=="FILM"]')
+    assert box([*rim.get_points("xy")]) == pytest.approx([-49.5, -40.5, 49.5, 40.5])
+    assert not space.query("CIRCLE")
+
+
 def test_svg_is_to_scale(sensor, drawing, tmp_path):
     path = tmp_path / "layout.svg"
     path.write_text(to_svg(drawing), "utf-8")

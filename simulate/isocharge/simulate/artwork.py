@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from isocharge.common.errors import require
 from isocharge.common.files import new_folder, write_whole
 from isocharge.simulate.layout.design import Design
@@ -56,7 +58,12 @@ def draw_layout(sensor: Sensor) -> Drawing:
 
     # Draw the film and the electrodes with their names.
     space = document.modelspace()
-    space.add_circle((0.0, 0.0), sensor.film.radius, dxfattribs={"layer": "FILM"})
+    if sensor.film.oval:
+        angle = np.radians(np.arange(360))
+        rim = sensor.film.rim_distance(angle) * np.array([np.cos(angle), np.sin(angle)])
+        space.add_lwpolyline(rim.T.tolist(), close=True, dxfattribs={"layer": "FILM"})
+    else:
+        space.add_circle((0.0, 0.0), sensor.film.radius, dxfattribs={"layer": "FILM"})
     for electrode in sensor.electrodes:
         for polygon in electrode.front:
             space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "ELECTRODES"})

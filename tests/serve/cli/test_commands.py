@@ -42,6 +42,14 @@ def test_predict_from_stdin_and_from_a_file_of_measured_presses(presses, models,
     assert (result.stdout, "ignored columns" in result.stderr) == (expected, True)
 
 
+def test_leak_of_a_file_without_times_is_not_ignored(models, refused, tmp_path):
+    device, frames = tmp_path / "leak.toml", tmp_path / "frames.csv"
+    device.write_text("[leak]\ntau_s = 5.0\n")
+    frames.write_text("A,B,C\n" + "1,2,3\n" * 200)
+    words = ("serve", "stream", "linear", "--models", models, "--port", frames, "--device", device)
+    refused(*words, message="expected a column t_ms, t_us or t_s")
+
+
 @pytest.fixture
 def measured(tmp_path, film):
     """Write presses of the linear film, their forces read on a scale with an error of its own."""

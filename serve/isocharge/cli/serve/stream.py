@@ -61,6 +61,9 @@ from isocharge.serve.live.device import with_settings
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
 from isocharge.serve.outputs.output import OutputContext
 from isocharge.serve.outputs.targets import Outputs, target_forms
+from isocharge.serve.signal_chain.hum import HumRule
+from isocharge.serve.signal_chain.leak import LeakRule
+from isocharge.serve.signal_chain.thermal import ThermalRule
 
 OutputOption = Annotated[
     list[str] | None,
@@ -96,6 +99,19 @@ def write_records(records: Iterable[PredictionRecord], writers: Iterable[Callabl
             "caution: no tare, because the stream ended before the film had rested near zero for long enough; the last "
             f"charges are {_listed(untared_pC)}; leave the film alone longer, or state an offset of the board as "
             "offset in [gain]"
+        )
+
+
+def _require_time(record: PredictionRecord) -> None:
+    """Raise an error if a record of a file contains no time of the board.
+
+    Raises:
+        InputError: If the time is missing.
+    """
+    if record.t_device_us is None:
+        raise InputError(
+            "a file without times of the board: expected a column t_ms, t_us or t_s, because a correction of leak, hum "
+            "or warming needs the time between frames; add the column, or play a recording (--record)"
         )
 
 
@@ -250,6 +266,8 @@ def stream_command(
             # The page must not begin a recording if the command itself records the stream.
             new_recorder = None if recorder else partial(Recorder, device=board.table, name=name)
             writers.append(PageFeed(page, touch, stream, new_recorder).write)
+        if Path(port).is_file() and not {LeakRule, HumRule, ThermalRule}.isdisjoint(board.rules):
+            writers.insert(0, _require_time)
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
             with no_frames_advice_added(port, device):
