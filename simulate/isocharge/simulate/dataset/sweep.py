@@ -30,6 +30,7 @@ from isocharge.common.errors import SceneError, SolveError
 from isocharge.common.files import new_folder, refuse_existing
 from isocharge.common.progress import report, reporting_as, second_thread
 from isocharge.simulate.dataset.shards import (
+    MAX_SHARD_BYTES,
     Samples,
     write_dataset,
     write_files,
@@ -280,7 +281,7 @@ def run_sweep(
         outside_job = thread.submit(outside_map, sensor, probes, sweep, executor=executor)
         maps = solve_maps(sensor, probes, sweep, settings, executor=executor)
         whole_film = outside_job.result()
-        shards = _shards(sweep, presses, shard, whole_film)
+        shards = _shards(sweep, presses, _rows_in_shard(probes, shard), whole_film)
         samples = _samples(maps, whole_film, shards, executor)
         write_files(draft, folder.name, sensor, samples, _manifest_entries(maps, whole_film, sweep))
     return folder
@@ -354,7 +355,7 @@ def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
     sensor = maps[0].sensor
     probes = [forward_map.probe for forward_map in maps]
     whole_film = outside_map(sensor, probes, sweep)
-    shards = _shards(sweep, sweep.over(probes), SHARD_SIZE, whole_film)
+    shards = _shards(sweep, sweep.over(probes), _rows_in_shard(probes, SHARD_SIZE), whole_film)
     samples = _samples(maps, whole_film, shards, None)
     return write_dataset(folder, sensor, samples, _manifest_entries(maps, whole_film, sweep))
 
@@ -407,12 +408,18 @@ def _shards(sweep: Sweep, presses: SweepPresses, size: int, whole_film: ForwardM
         presses: Presses within the radius of the sweep.
         size: Number of presses in a shard. The last shard may have fewer.
         sweep: Definition of the presses.
-        whole_film: Map of the presses outside the radius, which get a shard of their own; None if there are none.
+        whole_film: Map of the presses outside the radius, which get shards of their own; None if there are none.
     """
-    shards = [presses[start : start + size] for start in range(0, len(presses), size)]
+    parts = [presses]
     if whole_film is not None:
-        shards.append(sweep.outside_presses(whole_film.domain.radius))
-    return shards
+        parts.append(sweep.outside_presses(whole_film.domain.radius))
+    return [part[start : start + size] for part in parts for start in range(0, len(part), size)]
+
+
+def _rows_in_shard(probes: Sequence[Probe], largest: int) -> int:
+    """Return the number of samples in a shard, at most `largest`, whose notations of probes fit into half of a file."""
+    longest_notation_bytes = 4 * max(len(probe.notation) for probe in probes)
+    return min(largest, MAX_SHARD_BYTES // (2 * longest_notation_bytes))
 
 
 def _samples(
