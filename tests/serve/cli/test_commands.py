@@ -243,11 +243,12 @@ def test_doctor_refuses_with_the_reason(resting, run, words, message):
         run("doctor", "--port", sensor.url, "--seconds", 0.5, *words)
 
 
-def test_doctor_refuses_a_gain_beside_a_device_file(refused, tmp_path):
+@pytest.mark.parametrize(("option", "value"), [("--pc-per-unit", 1000), ("--request", "?")])
+def test_doctor_refuses_what_a_device_file_states(refused, tmp_path, option, value):
     board = tmp_path / "board.toml"
     board.write_text("[gain]\npC_per_unit = 2.0\n")
-    words = ("serve", "doctor", "--port", "/dev/ttyNone", "--device", board, "--pc-per-unit", 1000)
-    refused(*words, message="--pc-per-unit: expected no gain beside --device")
+    words = ("serve", "doctor", "--port", "/dev/ttyNone", "--device", board, option, value)
+    refused(*words, message=f"{option}: expected none beside --device")
 
 
 def test_doctor_writes_no_file_of_which_the_unit_is_missing(resting, command, tmp_path):

@@ -79,6 +79,13 @@ def test_edge_readout_equals_equation_3_of_the_paper():
     np.testing.assert_allclose(charge_of(area, over_x), AREA * (D31 + D32) * h2 / 3, rtol=1e-12)
 
 
+def test_edges_of_a_turned_pattern_are_those_of_the_same_squares(solved):
+    """The pattern of four squares has the same squares after a quarter turn, with other names."""
+    sensor = replace(load_sensor("four-25um-uniaxial"), readout="edge")
+    turned = replace(sensor, calibration=Calibration(rotation=0.5 * np.pi))
+    np.testing.assert_allclose(sorted(touch_charge(turned, solved)), sorted(touch_charge(sensor, solved)), rtol=1e-9)
+
+
 @pytest.fixture(scope="module")
 def solved(film) -> Equilibrium:
     return press(film, Circle(1.0), (4.0, 3.0), 1.0)

@@ -94,11 +94,12 @@ def doctor_command(
         refuse_existing(write)
     electrodes = Predictor(model, models=models).metadata.electrodes if model else ()  # empty for any model
     gain = None if pC_per_unit is None else {"pC_per_unit": _parse_gain(pC_per_unit)}
-    if gain is not None and device is not None:
-        raise InputError(
-            "--pc-per-unit: expected no gain beside --device, because the device file states it; leave the option out, "
-            f"or write the gain into the section [gain] of {device}"
-        )
+    for option, value, section in (("--pc-per-unit", gain, "gain"), ("--request", request, "frames")):
+        if value is not None and device is not None:
+            raise InputError(
+                f"{option}: expected none beside --device, because the device file states it; leave the option out, "
+                f"or write it into the section [{section}] of {device}"
+            )
     say(f"listening for {seconds:g} s; leave the film alone")
     examination = examine(
         port,

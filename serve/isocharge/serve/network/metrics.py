@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from types import SimpleNamespace
 from typing import Any
 
 import onnxruntime as ort
@@ -77,7 +76,8 @@ class ModelMetrics:
         return Statistics(**{field: metric.labels(name, version) for field, metric in self._metrics.items()})
 
 
-class Statistics(SimpleNamespace):
+@dataclass(frozen=True)
+class Statistics:
     """Metrics of one version of a model since the start of the server. Any thread may call any method.
 
     Attributes:
@@ -90,6 +90,15 @@ class Statistics(SimpleNamespace):
         refused_time: Total duration of the refused requests, s.
         latest: Unix time of the latest inference, s.
     """
+
+    description: Info
+    ready: Gauge
+    presses: Counter
+    alarms: Counter
+    refused: Counter
+    latency: Histogram
+    refused_time: Counter
+    latest: Gauge
 
     @contextmanager
     def measure(self) -> Iterator[None]:

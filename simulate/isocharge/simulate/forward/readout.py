@@ -11,6 +11,7 @@ right edges, and the mean of s22 over the lower and upper edges (equation 3 of t
 charge under load minus the charge without load. The charge of a uniform pretension therefore cancels.
 """
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -122,6 +123,10 @@ class ElectrodePieces:
             sensor: Sensor with the electrodes, the readout, the gains and the piezoelectric coefficients.
         """
         nominal = cls.covering(sensor.electrodes, sensor.readout)
+        rotation = sensor.calibration.rotation
+        if sensor.readout == "edge" and abs(math.sin(rotation)) > abs(math.cos(rotation)):
+            # The left and right edges of a pattern that is turned by 90 degrees lie below and above.
+            nominal = replace(nominal, charge_per_stress=nominal.charge_per_stress[:, [1, 0, 2]])
         return replace(
             nominal,
             corners=to_complex(sensor.calibration.place(to_corners(nominal.corners))),

@@ -225,7 +225,8 @@ def infer(
         for name, is_binary in requested_outputs.items()
     ]
     loaded.statistics.presses.inc(len(charge_pC))
-    loaded.statistics.alarms.inc(np.count_nonzero(~(outputs["misfit"] <= loaded.validity.misfit_limit)))  # also NaN
+    alarm_count = np.count_nonzero(~(outputs["misfit"] <= loaded.validity.misfit_limit))  # also NaN
+    loaded.statistics.alarms.inc(float(alarm_count))
     return content, binary_tensors
 
 
