@@ -51,7 +51,7 @@ def lazy_group(summary: str, summaries: Mapping[str, str]) -> typer.Typer:
     Args:
         summary: Summary of the group.
         summaries: One sentence for each command, by the function of the command in the notation of entry points, such
-            as "train.export_c:export_c_command [train]" for a module of `isocharge.cli`. The function defines the name
+            as "train.export_c:export_c_command [train]" for a module in the folder `cli`. The function defines the name
             of the command, `export-c`. The extra of pyproject.toml, `train`, is the one that the command always needs.
     """
     functions = {path.partition(":")[2].partition("_command")[0].replace("_", "-"): path for path in summaries}
