@@ -99,11 +99,15 @@ def test_page_does_not_describe_methods_that_are_left_out():
 
 
 @pytest.mark.slow
-def test_report_command_prints_the_record_and_the_errors(film, tmp_path, command):
+def test_report_command_prints_the_record_and_names_the_page(film, tmp_path, command):
     folder = write_sweep(tmp_path / "presses", (film,), Sweep(samples=3000))
     _, out, err = command("train", "report", folder, "-o", tmp_path / "out", "--quick", "--json")
     (section,) = json.loads(out)["datasets"]
-    assert all(f"{method['name']}: {method['errors']['position_rms_mm']} mm" in err for method in section["methods"])
+    page_path = tmp_path / "out" / "report.md"
+    assert str(page_path) in err
+    text = page_path.read_text("utf-8")
+    assert len(section["methods"]) == 3
+    assert all(f"{method['errors']['position_rms_mm']:.3g}" in text for method in section["methods"])
 
 
 def with_one_position(dataset):
