@@ -81,6 +81,18 @@ def test_readings_without_a_device_clock_share_the_time_between_chunks():
     np.testing.assert_allclose(np.diff([time.clock_s for time in times[1:]])[1:], 0.005, atol=1e-6)
 
 
+def test_clock_that_is_reset_after_half_of_its_range_does_not_jump_ahead():
+    """A reset after 3e9 us looks like a wrap: the next time of the device would be 1.29e9 us later."""
+    before_us = 3_000_000_000 + 5000 * np.arange(400)
+    after_us = 5000 * np.arange(400)
+    arrival_s = START_S + np.concatenate([0.005 * np.arange(400), 4.0 + 0.005 * np.arange(400)])
+    _, times = follow(np.concatenate([before_us, after_us]), arrival_s)
+    steps_s = np.diff([time.clock_s for time in times])
+    np.testing.assert_allclose(steps_s[:399], 0.005)
+    assert steps_s[399] == 0.0
+    np.testing.assert_allclose(steps_s[400:], 0.005)
+
+
 @pytest.mark.parametrize("jump_s", [3.0, -3.0, 3600.0, -3600.0, 0.2, 8e10])
 @pytest.mark.parametrize("has_clock", [False, True])
 def test_wall_clock_that_is_set_changes_no_step(jump_s, has_clock):

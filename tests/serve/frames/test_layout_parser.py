@@ -267,6 +267,7 @@ def test_wrong_frame_descriptions_are_refused(good, bad, message):
     [
         ("[]", r"fields: expected one or more that are channels, got \[\]"),
         ('[{name = "seq", type = "u8"}]', r"fields: expected one or more that are channels, got \['seq'\]"),
+        ('[{name = "t_us", type = "u8", scale = 0.001}, {name = "A", type = "u8"}]', "a clock with a positive scale"),
         ("3", r"fields: expected a list of tables, got 3"),
         ("[3]", r"fields\[0\]: expected a table, got 3"),
     ],

@@ -267,6 +267,12 @@ def test_slow_press_of_a_released_model_is_tracked_from_its_first_frame(name):
         assert abs(tracked[-1].x_mm - truth.x_mm) < 4.0 * tracked[-1].x_std_mm
 
 
+def test_filter_whose_covariance_has_a_negative_eigenvalue_takes_no_frame():
+    motion = MotionFilter(np.zeros(3), -np.eye(3))
+    assert not motion.update(np.ones(3), 0.1 * np.eye(3))
+    np.testing.assert_array_equal(motion.mean, 0.0)
+
+
 def test_saturated_frames_have_a_small_weight():
     tracker = new_tracker()
     update_all(tracker, noisy_contacts(np.zeros(100)), begin_s=0.0)

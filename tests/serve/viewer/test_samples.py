@@ -30,7 +30,9 @@ def sample_of(record):
 
 
 def test_unknown_numbers_of_a_record_are_nan(record):
-    sample = sample_of(record(charge_pC={"A": -1e300}, misfit=1e200, y_mm=None, flags=("gap", "misfit")))
+    sample = sample_of(
+        record(charge_pC={"A": -1e300}, misfit=1e200, y_mm=None, flags=("gap", "misfit", "of a later version"))
+    )
     assert (sample["charge_pC.A"], sample["misfit"], sample["contact"]) == (-1e300, 1e200, 1.0)
     assert sample["flags"] == FLAG_BITS["gap"] + FLAG_BITS["misfit"]
     assert np.isnan([sample["y_mm"], sample["charge_pC.B"]]).all()

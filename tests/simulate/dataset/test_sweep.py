@@ -152,7 +152,7 @@ def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path, monkeypatc
 def test_shards_of_a_probe_with_many_corners_fit_into_a_file():
     angle = 2.0 * np.pi * np.arange(60) / 60
     polygon = Polygon.of(np.stack([1.3 * np.cos(angle), np.sin(angle)], axis=1))
-    rows = sweep_module._rows_in_shard([Circle(1.0), polygon], sweep_module.SHARD_SIZE)
+    rows = sweep_module._shard_size([Circle(1.0), polygon], sweep_module.SHARD_SIZE)
     assert 1000 < rows < sweep_module.SHARD_SIZE
     assert np.full(rows, polygon.notation).nbytes < 2**26
-    assert sweep_module._rows_in_shard([Circle(1.0)], sweep_module.SHARD_SIZE) == sweep_module.SHARD_SIZE
+    assert sweep_module._shard_size([Circle(1.0)], sweep_module.SHARD_SIZE) == sweep_module.SHARD_SIZE

@@ -61,6 +61,7 @@ from isocharge.serve.live.device import with_settings
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
 from isocharge.serve.outputs.output import OutputContext
 from isocharge.serve.outputs.targets import Outputs, target_forms
+from isocharge.serve.port.file_source import FileSource
 from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.serve.signal_chain.leak import LeakRule
 from isocharge.serve.signal_chain.thermal import ThermalRule
@@ -103,7 +104,7 @@ def write_records(records: Iterable[PredictionRecord], writers: Iterable[Callabl
 
 
 def _require_time(record: PredictionRecord) -> None:
-    """Raise an error if a record of a file contains no time of the board.
+    """Raise an error if a record contains no time of the board. A file does not state when the frame arrived, either.
 
     Raises:
         InputError: If the time is missing.
@@ -266,7 +267,8 @@ def stream_command(
             # The page must not begin a recording if the command itself records the stream.
             new_recorder = None if recorder else partial(Recorder, device=board.table, name=name)
             writers.append(PageFeed(page, touch, stream, new_recorder).write)
-        if Path(port).is_file() and not {LeakRule, HumRule, ThermalRule}.isdisjoint(board.rules):
+        needs_time = not {LeakRule, HumRule, ThermalRule}.isdisjoint(board.rules)
+        if needs_time and isinstance(source, FileSource) and source.is_on_disk:
             writers.insert(0, _require_time)
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:

@@ -140,7 +140,7 @@ class DeviceClock:
         has_fit = self._fitted_us is not None and not self._is_fit_provisional
         if has_fit and is_new_arrival and predicted_s - arrival_s > MAX_LEAD_s:
             self._fitted_us = None  # discards the fit
-            self._device_us -= step_us
+            self._device_us -= step_us  # the time of the device goes on from the previous reading
             step_us = 0  # the time since the previous reading is unknown
 
         # Without a fit, begin a provisional fit in which the host time of this reading is its arrival time, or the host

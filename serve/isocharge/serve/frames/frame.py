@@ -302,8 +302,10 @@ class Parser(ABC):
         if increase == 0:
             self.counts.repeated += 1
             return (REPEAT,)
-        # Modulo `seq_modulus`, a decrease is the same as a large increase. A larger counter does not wrap there.
-        if increase >= self.seq_modulus // 2 or self.seq_modulus <= previous_seq > seq:
+        # Modulo `seq_modulus`, a decrease is the same as a large increase. A counter that has exceeded the modulus does
+        # not wrap at it, so each decrease is a restart.
+        is_decrease_beyond_modulus = self.seq_modulus <= previous_seq > seq
+        if increase >= self.seq_modulus // 2 or is_decrease_beyond_modulus:
             self.counts.restarts += 1
             return (RESTART,)
         self.counts.lost += increase - 1

@@ -92,22 +92,20 @@ class AccessCheck:
             self.check_token(headers.get(b"authorization", b""))
 
     def check_token(self, authorization: bytes) -> None:
-        """Check the value of an Authorization header. Without a token, every value is accepted.
-
-        The duration of a comparison does not depend on how many characters of a wrong token are correct. A client
-        therefore cannot use the duration to guess the token character by character.
+        """Check the token that a client has sent. If the server has no token, every client is accepted.
 
         Args:
-            authorization: Value of the header, which is empty if the request has no such header. The name `Bearer` may
-                be in upper case or lower case (RFC 9110, 11.1).
+            authorization: Value of the header or the gRPC metadata `authorization`, such as b"Bearer TOKEN"; empty if
+                the client has sent none. The word `Bearer` may be in upper case or lower case (RFC 9110, 11.1).
 
         Raises:
-            TokenError: If the header does not contain the token.
+            TokenError: If the token is missing or wrong.
         """
         if self._token is None:
             return
         scheme, _, token = authorization.partition(b" ")
-        # The time that compare_digest takes does not depend on the number of correct characters.
+        # The duration of this comparison does not depend on the number of correct characters. A client therefore cannot
+        # use it to guess the token character by character.
         is_correct = hmac.compare_digest(token.lstrip(b" "), self._token)
         if scheme.lower() != b"bearer" or not is_correct:
             received = "a wrong one" if authorization else "none"

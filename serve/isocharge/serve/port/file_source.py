@@ -98,6 +98,8 @@ def check_file(path: Path) -> None:
 def foreign_kind(name: str, head: bytes) -> str:
     """Return the kind of a file that does not come from a board, with advice; empty if it may come from a board.
 
+    Lines of text with the column names of a table of presses are only accepted from the standard input.
+
     Args:
         name: Path of the file, or - for the standard input.
         head: First bytes of the file. They are compared with the beginnings of known kinds of files.
@@ -120,7 +122,8 @@ def foreign_kind(name: str, head: bytes) -> str:
     if head.startswith(PARQUET_START):
         return f"a Parquet file; compute its contacts with: isocharge serve predict MODEL {quoted_name}"
     columns = {column.strip(' "') for column in re.split("[,;|\t]", first_line.decode("utf-8", "replace").strip())}
-    if columns & PRESS_COLUMNS and name != STDIN:
+    is_table = not columns.isdisjoint(PRESS_COLUMNS)
+    if is_table and name != STDIN:
         return (
             f"a table of presses; compute its contacts with: isocharge serve predict MODEL {quoted_name}; if a board "
             f"has sent these lines, use: isocharge serve stream MODEL --port - < {quoted_name}"
@@ -137,6 +140,7 @@ class FileSource:
 
     Attributes:
         is_live: Always False, because no bytes are lost if they are read later.
+        is_on_disk: Whether the bytes come from a file on a disk, which does not state when they arrived.
     """
 
     is_live = False
@@ -145,6 +149,7 @@ class FileSource:
         """Store the file descriptor and the name."""
         self._descriptor = descriptor
         self._name = name
+        self.is_on_disk = stat.S_ISREG(os.fstat(descriptor).st_mode)
 
     def __iter__(self) -> Iterator[Chunk]:
         """Yield chunks until the file ends.
@@ -156,13 +161,12 @@ class FileSource:
             InputError: If the file is a recording, a table or another file that does not come from a board.
         """
         start_s = time.time()
-        is_on_disk = stat.S_ISREG(os.fstat(self._descriptor).st_mode)
         is_first_chunk = True
         while data := os.read(self._descriptor, HEAD_BYTES):
             if is_first_chunk:
                 check_bytes(self._name, data)
             is_first_chunk = False
-            arrival_s = start_s if is_on_disk else time.time()
+            arrival_s = start_s if self.is_on_disk else time.time()
             yield Chunk(data, arrival_s, time.perf_counter_ns())
 
 

@@ -281,7 +281,7 @@ def run_sweep(
         outside_job = thread.submit(outside_map, sensor, probes, sweep, executor=executor)
         maps = solve_maps(sensor, probes, sweep, settings, executor=executor)
         whole_film = outside_job.result()
-        shards = _shards(sweep, presses, _rows_in_shard(probes, shard), whole_film)
+        shards = _shards(sweep, presses, _shard_size(probes, shard), whole_film)
         samples = _samples(maps, whole_film, shards, executor)
         write_files(draft, folder.name, sensor, samples, _manifest_entries(maps, whole_film, sweep))
     return folder
@@ -355,7 +355,7 @@ def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
     sensor = maps[0].sensor
     probes = [forward_map.probe for forward_map in maps]
     whole_film = outside_map(sensor, probes, sweep)
-    shards = _shards(sweep, sweep.over(probes), _rows_in_shard(probes, SHARD_SIZE), whole_film)
+    shards = _shards(sweep, sweep.over(probes), _shard_size(probes, SHARD_SIZE), whole_film)
     samples = _samples(maps, whole_film, shards, None)
     return write_dataset(folder, sensor, samples, _manifest_entries(maps, whole_film, sweep))
 
@@ -416,10 +416,18 @@ def _shards(sweep: Sweep, presses: SweepPresses, size: int, whole_film: ForwardM
     return [part[start : start + size] for part in parts for start in range(0, len(part), size)]
 
 
-def _rows_in_shard(probes: Sequence[Probe], largest: int) -> int:
-    """Return the number of samples in a shard, at most `largest`, whose notations of probes fit into half of a file."""
-    longest_notation_bytes = 4 * max(len(probe.notation) for probe in probes)
-    return min(largest, MAX_SHARD_BYTES // (2 * longest_notation_bytes))
+def _shard_size(probes: Sequence[Probe], largest: int) -> int:
+    """Return the number of samples in a shard.
+
+    A sample contains the notation of its probe, which is long for a polygon with many corners. The notations fill at
+    most half of the largest file.
+
+    Args:
+        probes: Probes of the sweep.
+        largest: Largest number of samples.
+    """
+    bytes_per_notation = 4 * max(len(probe.notation) for probe in probes)  # a character needs four bytes
+    return min(largest, MAX_SHARD_BYTES // (2 * bytes_per_notation))
 
 
 def _samples(

@@ -11,7 +11,7 @@ right edges, and the mean of s22 over the lower and upper edges (equation 3 of t
 charge under load minus the charge without load. The charge of a uniform pretension therefore cancels.
 """
 
-import math
+import cmath
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -53,8 +53,7 @@ NEAR_SIDE = 5.0
 """Longest side of a near piece of an electrode, in units of half the width of the footprint.
 
 Half the width of a circle is its radius. The stress has a peak at the probe and a kink at the edge of the footprint.
-With longer sides, the error of a charge exceeds 1e-4: it is 9e-4 for a side of 8 units, and 1e-3 for a side of 20 units
-with 20 points along the side.
+With longer sides, the error of a charge exceeds 1e-4. It is 9e-4 for 8 units, and 1e-3 for 20 units with 20 points.
 """
 
 
@@ -93,7 +92,9 @@ class ElectrodePieces:
     charge_per_stress: Array
 
     @classmethod
-    def covering(cls, electrodes: Sequence[Electrode], readout: Readout = "area") -> "ElectrodePieces":
+    def covering(
+        cls, electrodes: Sequence[Electrode], readout: Readout = "area", rotation: float = 0.0
+    ) -> "ElectrodePieces":
         """Return the pieces of electrodes at their nominal positions.
 
         The attribute `charge_per_stress` contains the weights of s11, s22 and s12 in the mean stress, because the
@@ -102,11 +103,12 @@ class ElectrodePieces:
         Args:
             electrodes: Electrodes of a layout, which may be empty.
             readout: "area" for a mean over the area of an electrode, "edge" for a mean over its edges.
+            rotation: Angle by which the electrodes are turned later, rad. It decides which edges are the left ones.
         """
         pieces = [
             (index, *piece)
             for index, electrode in enumerate(electrodes)
-            for piece in (_edge_lines(electrode) if readout == "edge" else _area_pieces(electrode))
+            for piece in (_edge_lines(electrode, rotation) if readout == "edge" else _area_pieces(electrode))
         ]
         return cls(
             corners=to_complex(np.array([corners for _, corners, _, _ in pieces]).reshape(-1, 4, 2)),
@@ -122,11 +124,7 @@ class ElectrodePieces:
         Args:
             sensor: Sensor with the electrodes, the readout, the gains and the piezoelectric coefficients.
         """
-        nominal = cls.covering(sensor.electrodes, sensor.readout)
-        rotation = sensor.calibration.rotation
-        if sensor.readout == "edge" and abs(math.sin(rotation)) > abs(math.cos(rotation)):
-            # The left and right edges of a pattern that is turned by 90 degrees lie below and above.
-            nominal = replace(nominal, charge_per_stress=nominal.charge_per_stress[:, [1, 0, 2]])
+        nominal = cls.covering(sensor.electrodes, sensor.readout, sensor.calibration.rotation)
         return replace(
             nominal,
             corners=to_complex(sensor.calibration.place(to_corners(nominal.corners))),
@@ -263,10 +261,9 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     """Compute the charge that the contact pressure of a probe induces on the electrodes.
 
     The charge per area is the coefficient d33 times the mean of the stress s33 over the thickness. The stress s33 is
-    minus the contact pressure at the probe, and zero at the free back of the film. The mean of s33 over the thickness
-    is therefore minus half of the contact pressure. The charge of an electrode is therefore -d33 / 2 times the part of
-    the force that acts on the electrode, times the gain of the electrode. The coefficient d33 of PVDF is negative, so
-    the charge is positive.
+    minus the contact pressure at the probe, and zero at the free back of the film. Its mean over the thickness is
+    minus half of the contact pressure. The charge of an electrode is therefore -d33 / 2 times the part of the force
+    that acts on the electrode, times the gain. The coefficient d33 of PVDF is negative, so the charge is positive.
 
     Args:
         sensor: Sensor with the electrodes.
@@ -284,11 +281,8 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     for electrode, (part_centres, part_radii) in zip(sensor.electrodes, sensor.part_circles, strict=True):
         # Only parts whose enclosing circle meets the footprint can contribute.
         near_parts = np.flatnonzero(np.abs(position - part_centres) < part_radii + probe.reach)
-        force_share = 0.0
-        for part in near_parts:
-            placed_corners = sensor.calibration.place(electrode.parts[part])
-            force_share += probe.force_share(placed_corners, position)
-        force_shares.append(force_share)
+        placed_parts = [sensor.calibration.place(electrode.parts[part]) for part in near_parts]
+        force_shares.append(sum(probe.force_share(corners, position) for corners in placed_parts))
     return np.asarray(-0.5 * sensor.piezo.d33 * force * sensor.gains * np.array(force_shares))
 
 
@@ -355,25 +349,27 @@ def _area_pieces(electrode: Electrode) -> Iterator[tuple[Array, float, Array]]:
             yield polygon[[0, second, second + 1, min(second + 2, n_corner - 1)]], 0.0, np.ones(3)
 
 
-def _edge_lines(electrode: Electrode) -> Iterator[tuple[Array, float, Array]]:
+def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[tuple[Array, float, Array]]:
     """Return the lines of the edge readout (Mirbagheri et al., 2007, equation 3).
 
-    The stress s11 is averaged over the left and right edges of the electrode. The stress s22 is averaged over the lower
-    and upper edges of the electrode. Each line is half of an edge, so that there are sufficiently many points.
+    The stress s11 is averaged over the left and right edges of the turned electrode. The stress s22 is averaged over
+    its lower and upper edges. Each line is half of an edge, so that there are sufficiently many points.
 
     Args:
         electrode: A square electrode.
+        rotation: Angle by which the electrode is turned, rad.
 
     Yields:
-        Nominal corners (x, y) of the line, shape (4, 2), mm. The area that the line represents, mm^2. Weights of s11,
-        s22 and s12.
+        The same as `_area_pieces`, with the area that the line represents.
     """
-    # The corners are listed anticlockwise from the lower left corner. Each edge leads from a corner to the next one, so
-    # the first edge is the lower edge. Each mean is over two edges, so each half of an edge represents a quarter.
+    # Each edge leads from a corner to the next one. Each mean is over two edges, so each half of an edge represents a
+    # quarter of the area.
     corners = np.array(electrode.corners)
-    for edge_index, (start, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         middle = 0.5 * (start + end)
-        components = np.array([0.0, 1.0, 0.0]) if edge_index % 2 == 0 else np.array([1.0, 0.0, 0.0])
+        turned_edge = complex(*(end - start)) * cmath.rect(1.0, rotation)
+        is_lower_or_upper = abs(turned_edge.real) > abs(turned_edge.imag)
+        components = np.array([0.0, 1.0, 0.0] if is_lower_or_upper else [1.0, 0.0, 0.0])
         for first, last in ((start, middle), (middle, end)):
             yield np.array([first, last, last, first]), 0.25 * electrode.area, components
 

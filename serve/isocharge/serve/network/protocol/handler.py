@@ -4,7 +4,7 @@ The class `Handler` answers the requests of the protocol. It does not depend on 
 The function `asgi_app` creates a handler that another program can mount. A request consists of method, path, headers
 and body. A response consists of status, headers and body. Any thread may answer requests. Most responses take
 microseconds to compute, and a response to the largest batch takes milliseconds. Some responses take longer, for example
-because a model is loaded. The paths of such requests are `blocking_paths`.
+because a model is loaded. The attribute `blocking_paths` lists the paths of such requests.
 
 The base class `Application` is a bare ASGI callable without a framework. It is also the base class of the live page.
 The handler needs no router of a framework, because the table `ROUTES` already selects the function for a request and

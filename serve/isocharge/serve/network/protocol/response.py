@@ -124,14 +124,14 @@ def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
     if encoding not in ENCODINGS:
         name = errors.shown(encoding.decode("latin-1"))
         raise errors.UnknownEncoding(f"Content-Encoding: expected gzip, deflate or identity, got {name}")
-    decompressor = zlib.decompressobj(zlib.MAX_WBITS | 32)  # recognises both formats
+    decompressor = zlib.decompressobj(zlib.MAX_WBITS | 32)  # recognises gzip and deflate
     try:
         plain_body = decompressor.decompress(body, limit + 1)  # the additional byte shows that the limit is exceeded
     except zlib.error as error:
         raise errors.RequestError(f"the body is not compressed as its Content-Encoding states: {error}") from error
     if len(plain_body) > limit:
         raise errors.TooLarge(f"the body unpacks to more than {limit} bytes; send smaller batches")
-    # `eof` is False if the end of the data is missing, and `unused_data` are the bytes after the end.
+    # `eof` is False if the end of the compressed data is missing. `unused_data` are the bytes that follow this end.
     if not decompressor.eof or decompressor.unused_data:
         raise errors.RequestError("the body ends before, or goes on after, the end of its compressed data")
     return plain_body
