@@ -1,10 +1,14 @@
 """Tests of a report on measured presses, which are tested on held-out presses and never on simulated ones."""
 
+import shutil
+
 import numpy as np
 import pytest
 from tests.train.measured import measured_presses
 
+from isocharge.common.errors import PressError
 from isocharge.serve import Predictor, check_presses, find_model
+from isocharge.serve.presses.table_file import csv_text
 from isocharge.simulate import (
     Circle,
     Domain,
@@ -15,6 +19,7 @@ from isocharge.simulate import (
 )
 from isocharge.train.data.presses import dataset_of, draw_contacts, position_ranks
 from isocharge.train.report import QUICK, write_report
+from isocharge.train.report.evaluation import DatasetEvaluation
 
 NAME = "three-25um-biaxial"
 PROBE = Circle(1.0)
@@ -54,3 +59,20 @@ def test_errors_equal_those_of_serve_check_on_the_held_out_presses(section, pres
     assert released["position_rms_mm"] == pytest.approx(position_rms_mm, rel=1e-3)
     assert released["force_rms_percent"] == pytest.approx(force_rms_percent, rel=1e-3)
     assert released["position_median_mm"] > 0.3  # it is 0.07 mm on simulated presses of the described film
+
+
+def test_presses_of_the_calibrations_of_a_model_are_not_held_out(presses, tmp_path):
+    model_folder = tmp_path / NAME / "1"
+    shutil.copytree(find_model(NAME), model_folder)
+    dataset = dataset_of(presses, load_sensor(NAME), PROBE)
+    held_out = presses[position_ranks(presses.contact) < 0.2]
+
+    (model_folder / "presses.csv").write_text(csv_text(held_out[np.arange(50)].columns))
+    evaluation = DatasetEvaluation.prepare(dataset, model_folder, QUICK)
+    np.testing.assert_array_equal(evaluation.held_out_presses.charge, held_out.charge_pC[50:])
+
+    earlier_version = tmp_path / NAME / "2"  # a calibration continues the earlier ones
+    earlier_version.mkdir()
+    (earlier_version / "presses.csv").write_text(csv_text(held_out.columns))
+    with pytest.raises(PressError, match="measure more presses"):
+        DatasetEvaluation.prepare(dataset, model_folder, QUICK)

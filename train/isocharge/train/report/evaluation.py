@@ -12,16 +12,18 @@ from pathlib import Path
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import DatasetError, ModelError, TrainingError
+from isocharge.common.errors import DatasetError, ModelError, PressError, TrainingError
 from isocharge.common.progress import track
 from isocharge.serve.benchmark import Contender, take_turns
 from isocharge.serve.model.contact import Contact, inside_polygon
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.session import COLUMNS
+from isocharge.serve.presses.measured_presses import read_presses
 from isocharge.simulate import ChargeMap, Dataset, NoiseModel, Triangulation, limits_at, noise_model
 from isocharge.simulate.identifiability.nearest_contact import search
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
+from isocharge.train.calibration.folder import PRESSES
 from isocharge.train.data.charge_fit import fit_charge_series
 from isocharge.train.data.contact_errors import ContactErrorStatistics, rms, rounded
 from isocharge.train.data.presses import (
@@ -235,7 +237,8 @@ class DatasetEvaluation:
         """Select the presses that the model covers, and hold out a part of them for the test.
 
         Of simulated presses, a tenth of the positions is held out, which a training on the same dataset also holds out.
-        Of measured presses, which are fewer, a fifth is held out.
+        Of measured presses, which are fewer, a fifth is held out. Held-out presses from which the model was calibrated
+        are left out.
 
         Args:
             dataset: The dataset.
@@ -248,7 +251,7 @@ class DatasetEvaluation:
         Raises:
             DatasetError: If the methods cannot be fitted to the dataset.
             ModelError: If the model is for another sensor than the dataset.
-            PressError: If there are too few measured presses.
+            PressError: If there are too few measured presses, or the model was calibrated from all that are held out.
         """
         model = Predictor(model_folder).metadata
         _check_same_sensor(model, dataset)
@@ -267,6 +270,14 @@ class DatasetEvaluation:
         if is_measured(dataset):
             check_enough(len(covered.samples), len(samples), dataset.sensor.name)
             presses, held_out = split_by_position(presses_of(covered, FEWEST_PLACES), 1.0 / HELD_PARTS)
+            learned_charge = _calibration_charges(model_folder, model)
+            is_learned = (held_out.charge[:, None] == learned_charge).all(axis=2).any(axis=1)
+            if is_learned.all():
+                raise PressError(
+                    f"expected held-out presses that the model {model.label} has not learned, got only presses of its "
+                    "calibrations; measure more presses"
+                )
+            held_out = held_out[~is_learned]
         else:
             presses, held_out = split_by_position(presses_of(covered), TrainingConfig().hold_out)
         return cls(covered, model_folder, presses, held_out, settings)
@@ -317,6 +328,17 @@ class DatasetEvaluation:
             methods=measure_methods(methods, test, self.settings.seconds),
             left_out=failure_reasons,
         )
+
+
+def _calibration_charges(model_folder: Path, model: ModelMetadata) -> Array:
+    """Return the charges of all presses from which a model was calibrated, shape (n, n_electrode), pC.
+
+    A calibration may continue an earlier one, so the presses of all versions of the model are returned. A model that
+    was not calibrated has none.
+    """
+    files = model_folder.parent.glob(f"*/{PRESSES}")
+    charges = [read_presses(file, model.electrodes).charge_pC for file in files]
+    return np.concatenate([np.empty((0, len(model.electrodes))), *charges])
 
 
 def _check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
