@@ -155,6 +155,13 @@ def test_forward_map_of_other_films(near_electrodes, film, surface, theory):
     assert errors(forward_map, draw(forward_map, 4, seed=7)[0]).max() < 1e-3
 
 
+def test_derivatives_of_a_map_with_a_single_force_are_refused(near_electrodes):
+    single = QUICK | {"force_range": (1.0, 1.0)}
+    forward_map = kept(ForwardMap.build, near_electrodes, Circle(1.0), **single)
+    with pytest.raises(SceneError, match=r"one of the force 1 N; build a map from 0\.9 to 1\.1 N"):
+        forward_map.derivatives(np.array([[1.0, 0.0, 1.0]]))
+
+
 @pytest.mark.slow
 def test_forward_map_reaches_40_mm_on_a_taut_film_of_45_mm():
     """Near the clamp the fields change over the distance from the press to the clamp."""

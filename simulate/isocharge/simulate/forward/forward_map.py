@@ -20,7 +20,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Complexes
 from isocharge.common.contact_domain import Domain, as_contacts
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.common.errors import SolveError
+from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate.execution import in_order
 from isocharge.simulate.forward.charge_map import STEPS, differences
 from isocharge.simulate.forward.family import (
@@ -260,13 +260,19 @@ class ForwardMap:
             Derivatives, shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
 
         Raises:
-            SceneError: If a press lies outside the domain.
+            SceneError: If a press lies outside the domain, or the domain has a single force, so that the derivative
+                with respect to the force is unknown.
         """
         contact = self.domain.check(contact, "forward map")
+        min_force, max_force = self.domain.force_range
+        if min_force == max_force:
+            raise SceneError(
+                f"expected a forward map of different forces for derivatives, got one of the force {min_force:g} N; "
+                f"build a map from {0.9 * min_force:.3g} to {1.1 * min_force:.3g} N"
+            )
         n_stepped = len(contact) * 2 * contact.shape[1]  # two steps of each variable
 
         # The charges change within the width of the footprint, so the steps of a small probe are shorter.
-        min_force, _ = self.domain.force_range
         footprint_scale = min(1.0, self.probe.under(min_force).half_width)
         x_step, y_step, log_force_step = STEPS
         steps = (x_step * footprint_scale, y_step * footprint_scale, log_force_step)
