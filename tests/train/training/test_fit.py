@@ -12,7 +12,12 @@ from isocharge.train.training.contact_training import covariance_loss, mean_loss
 from isocharge.train.training.descent import TrainingStage
 from isocharge.train.training.folded_network import ANGLES_TO_COSINE_ARGUMENTS, COSINES_TO_CORRELATIONS, LARGEST_INT8
 from isocharge.train.training.misfit_training import focused_squared_distance
-from isocharge.train.training.network import FIRST_LAYER_SLOPES, Posterior, TrainablePerceptron
+from isocharge.train.training.network import (
+    FIRST_LAYER_SLOPES,
+    Posterior,
+    TrainablePerceptron,
+    logarithmic_features,
+)
 from isocharge.train.training.training_data import Split
 from kept import ROOT
 
@@ -52,6 +57,17 @@ def test_losses_that_are_never_finite_are_an_error(bad_value):
     stage = stage_with_factor(lambda progress: float(bad_value) if progress >= 0.5 else 1.0)
     with pytest.raises(TrainingError, match=rf"small network is {bad_value} at step 205 of 400, .* lower training\."):
         stage.run()
+
+
+@pytest.mark.parametrize(
+    ("white_noise_pC", "lowest_pC"), [(0.0, 0.05), (0.01, 0.05), (0.2, 0.2), (1.0, 1.0), (3.0, 1.0)]
+)
+def test_charges_below_1_pC_are_distinguished_down_to_the_noise_or_the_smallest_charge(white_noise_pC, lowest_pC):
+    charge = np.array([[0.05, 0.4, 30.0], [0.1, 0.8, 60.0]])
+    features = logarithmic_features(charge, white_noise_pC)
+    assert features.low_pC == lowest_pC
+    expected_typical_pC = np.sqrt(np.maximum(charge[0], lowest_pC) * np.maximum(charge[1], lowest_pC))
+    np.testing.assert_array_less(np.abs(np.log2(features.typical_pC / expected_typical_pC)), 0.5001)
 
 
 def settings(hidden=(16, 16), misfit_hidden=(8, 8), weights="float32", **training):

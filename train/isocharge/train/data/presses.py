@@ -20,7 +20,7 @@ from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor
 from isocharge.train.data.channel_noise import Noise
 
 LOWEST_CHARGE = 1.0
-"""Lower limit of a charge whose logarithm is computed, pC. Smaller charges are set to this value."""
+"""Lower limit of a charge whose logarithm is computed, pC, unless the presses have smaller charges above the noise."""
 
 HIGHEST_CHARGE = 1e6
 """Upper limit of a charge whose logarithm is computed, pC. Larger charges are set to this value."""

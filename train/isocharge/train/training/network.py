@@ -43,7 +43,7 @@ from isocharge.train.training.folded_network import (
 )
 
 
-def logarithmic_features(charge: Array) -> ChargeFeatures:
+def logarithmic_features(charge: Array, white_noise_pC: float = LOWEST_CHARGE) -> ChargeFeatures:
     """Return features for positive charges: the logarithms of charge / typical charge.
 
     The typical charge of an electrode is the power of two nearest to the geometric mean of its charges. A division by a
@@ -51,11 +51,14 @@ def logarithmic_features(charge: Array) -> ChargeFeatures:
 
     Args:
         charge: Charges of presses without noise, shape (n, n_electrode), pC.
+        white_noise_pC: Standard deviation of the white noise, pC. Charges below `LOWEST_CHARGE` are distinguished down
+            to this noise or to the smallest charge.
     """
-    clipped_charge = np.clip(charge, LOWEST_CHARGE, HIGHEST_CHARGE)
+    lowest_pC = min(LOWEST_CHARGE, max(white_noise_pC, float(charge.min())))
+    clipped_charge = np.clip(charge, lowest_pC, HIGHEST_CHARGE)
     return ChargeFeatures(
         typical_pC=2.0 ** np.round(np.log2(clipped_charge).mean(axis=0)),
-        low_pC=np.array(LOWEST_CHARGE),
+        low_pC=np.array(lowest_pC),
         high_pC=np.array(HIGHEST_CHARGE),
     )
 

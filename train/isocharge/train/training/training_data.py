@@ -212,12 +212,12 @@ class Split:
         sines of charge / typical charge, which are linear for small charges and logarithmic for large charges.
 
         Args:
-            noise: Noise of the charges, which determines the typical charges.
+            noise: Noise of the charges, which determines the typical charges or the lower limit of the charges.
         """
         charge = self.train.charge
         has_both_signs = self.train.signed or self.test.signed
         if not has_both_signs:
-            return logarithmic_features(charge)
+            return logarithmic_features(charge, noise.white)
         channel_noise = ChannelNoise.alike(noise)
         # The typical charge of a channel is the charge above which the noise would be proportional to the charge if the
         # white noise were multiplied by `SIGNED_FEATURE_SCALE`.
