@@ -158,7 +158,7 @@ def parse_json(text: str | bytes, where: str, error_class: type[InputError], tar
         content = msgspec.json.decode(text)
     except (ValueError, RecursionError):
         raise error_class(f"{_prefix(where)}expected JSON, got {shown(text)} ({cut(str(cause))})") from cause
-    raise error_class(_prefix(where) + _first_mistake(content, target_type, cause)) from cause
+    return convert(content, target_type, where, error_class)
 
 
 def convert(value: object, target_type: type[T], where: str, error_class: type[InputError]) -> T:
@@ -175,8 +175,14 @@ def convert(value: object, target_type: type[T], where: str, error_class: type[I
     """
     try:
         return msgspec.convert(value, target_type)
-    except (msgspec.ValidationError, RecursionError) as cause:
-        raise error_class(_prefix(where) + _first_mistake(value, target_type, cause)) from cause
+    except RecursionError as cause:
+        raise error_class(f"{_prefix(where)}nested too deeply") from cause
+    except msgspec.ValidationError as cause:
+        try:
+            mistake = _describe_mistake(value, target_type, cause)
+        except (LookupError, ValueError, StopIteration):  # a key of the file imitates the keys in a message of msgspec
+            mistake = cut(str(cause))
+        raise error_class(_prefix(where) + mistake) from cause
 
 
 def finite_or_none(value: float | None) -> float | None:
@@ -202,30 +208,6 @@ def plain_values(value: object) -> Any:
 def _prefix(where: str) -> str:
     """Return the beginning of an error message: `where` and a colon, or an empty text if `where` is empty."""
     return f"{where}: " if where else ""
-
-
-def _first_mistake(value: object, target_type: Any, cause: Exception) -> str:
-    """Return a description of the first mistake in a value for an error message.
-
-    Args:
-        value: Value from TOML or JSON.
-        target_type: Type to which the value could not be converted.
-        cause: Exception of msgspec. Its message is returned if `msgspec.convert` accepts the value, as 1e999 in JSON.
-    """
-    try:
-        msgspec.convert(value, target_type)
-    except msgspec.ValidationError as error:
-        try:
-            return _describe_mistake(value, target_type, error)
-        except (
-            LookupError,
-            ValueError,
-            StopIteration,
-        ):  # a key of the file imitates the keys in the message of msgspec
-            return cut(str(error))
-    except RecursionError:
-        return "nested too deeply"
-    return cut(str(cause))
 
 
 _MESSAGE = re.compile(r"^(.*?)(?: - at `\$([^`]*)`)?$", re.DOTALL)

@@ -62,7 +62,7 @@ def model_in(folder, series, noise=NOISE):
     """
     shutil.copy(GOLDEN, folder)
     put_charge_map(folder, charge_map_bytes(series))
-    calibrated = series.at_state(series.calibrated_state)
+    calibrated = series.calibrated_series
 
     def predict(charge_pC):
         contact = np.array([0.0, 0.0, np.log(0.5)])
@@ -218,7 +218,7 @@ def test_film_that_is_lost_again_keeps_the_state_of_the_latest_touches(series, m
 
 
 def test_models_that_cannot_be_followed_are_refused(series, tmp_path):
-    single = series.at_state(series.calibrated_state)
+    single = series.calibrated_series
     with pytest.raises(ModelError, match="calibrate"):
         FilmFollower(model_in(tmp_path, single))
     three = replace(

@@ -76,8 +76,8 @@ def test_presses_that_no_contact_explains_hardly_count():
     contact, charge = presses(rng, 30, state)
     charge[::6] *= rng.uniform(0.8, 1.3, (5, 4))
     robust = estimate(charge, contact)
-    assert np.median(robust.weights[::6]) < 0.1
-    assert (np.delete(robust.weights, np.s_[::6]) > 0.4).all()
+    assert np.median(robust.chi2[::6]) > 46.0  # a weight of (4 + 1) / (4 + 46) = 0.1
+    assert (np.delete(robust.chi2, np.s_[::6]) < 8.5).all()
     deviation = robust.state - state
     assert deviation @ np.linalg.solve(robust.covariance, deviation) < 13.8  # 99.9 % of a chi-square of 2 degrees
     not_robust = estimate(charge, contact, freedom=1e9)

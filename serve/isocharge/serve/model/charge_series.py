@@ -274,28 +274,11 @@ class ChargeSeries:
         charge_pC, charge_per_value, by_contact = self._charges(value, nearest, excess)
         return ModelValues(charge_pC + self.offset_pC, by_contact, charge_per_value[:, :, None] * value_by_state)
 
-    def at_state(self, state: Array) -> "ChargeSeries":
-        """Return the map of the film in another state, which becomes the calibrated film of the result.
-
-        The result has a single node and no directions. It is evaluated faster than `changes`.
-
-        Args:
-            state: State (t, z_1, ..., z_K) of the film, shape (1 + K,), MPa and standard deviations.
-        """
-        weights, _ = interpolation_weights(self.node_MPa, state[:1])  # shape (1, n_node)
-        coefficients = np.tensordot(weights, self.coefficients, axes=1)
-        if self.directions is not None:
-            change = np.moveaxis(self.directions, 3, 0)
-            coefficients = _sum_of_series(coefficients, np.tensordot(state[None, 1:], change, axes=1))
-        pretension_MPa = self.pretension_MPa + float(state[0])
-        single_node_MPa = np.zeros(1)
-        return replace(
-            self,
-            coefficients=coefficients,
-            node_MPa=single_node_MPa,
-            directions=None,
-            pretension_MPa=pretension_MPa,
-        )
+    @property
+    def calibrated_series(self) -> "ChargeSeries":
+        """Charge map of the film as it was calibrated, with a single node and without directions."""
+        coefficients = self._calibrated.coefficients[np.newaxis]
+        return replace(self, coefficients=coefficients, node_MPa=np.zeros(1), directions=None)
 
     @cached_property
     def _calibrated(self) -> Series:
@@ -408,12 +391,3 @@ def _continued(values: Array, excess: Array) -> Array:
     if excess.any():
         values[:, 0] += np.einsum("ns,nsk->nk", excess, values[:, 1:])
     return values
-
-
-def _sum_of_series(first: Array, second: Array) -> Array:
-    """Add coefficients of two series whose degrees may differ; all axes but the first and the last contain degrees."""
-    shape = np.maximum(first.shape, second.shape)
-    total = np.zeros(shape)
-    for coefficients in (first, second):
-        total[tuple(slice(0, length) for length in coefficients.shape)] += coefficients
-    return total

@@ -103,14 +103,6 @@ class UnnoticedPresses(Struct, frozen=True, kw_only=True):
     force_N: tuple[Positive, Positive]
     share: Annotated[tuple[tuple[Share, ...], ...], Meta(min_length=1)]
 
-    def __post_init__(self) -> None:
-        if self.from_mm >= self.to_mm:
-            raise WrongKey("to_mm", f"a number above from_mm ({self.from_mm:g})", self.to_mm)
-        sector_counts = [len(ring) for ring in self.share]
-        has_different_counts = len(set(sector_counts)) > 1
-        if has_different_counts or sector_counts[0] == 0:
-            raise WrongKey("share", "as many sectors in every ring", sector_counts)
-
     @property
     def total_share(self) -> float:
         """Share of unnoticed presses between the two circles, from 0 to 1. The rings are weighted by their areas."""
@@ -179,9 +171,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         Raises:
             WrongKey: For the first key that is missing or not valid.
         """
-        if "name" not in self.sensor:
-            raise WrongKey("sensor.name")
-        sensor_name = self.sensor["name"]
+        sensor_name = self.sensor.get("name")
         if not isinstance(sensor_name, str) or not sensor_name:
             raise WrongKey("sensor.name", "a text", sensor_name)
         has_duplicate_names = len(set(self.electrodes)) < len(self.electrodes)
@@ -227,10 +217,14 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         Fields that are None are left out.
 
         Raises:
-            ModelError: If a value, such as NaN, cannot be expressed in JSON.
+            TypeError, ValueError: If a value, such as NaN, cannot be expressed in JSON.
         """
         values = {name: getattr(self, name) for name in self.__struct_fields__}
-        return {name: _to_json(name, value) for name, value in values.items() if value is not None}
+        return {
+            name: json.dumps(value, allow_nan=False, default=to_builtins)
+            for name, value in values.items()
+            if value is not None
+        }
 
     @classmethod
     def from_props(cls, props: Mapping[str, str], where: str) -> "ModelMetadata":
@@ -248,35 +242,13 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
             names = [name for name in cls.__struct_fields__ if name in props]
             values = {name: parse_json(props[name], f"{place}: {name}", ModelError, object) for name in names}
             # The version is checked before the other keys, because other versions may have other keys.
-            version = convert(values, _Version, place, ModelError).format_version
+            version = values.get("format_version", FORMAT_VERSION)
             if version == FORMAT_VERSION:
                 return convert(values, cls, place, ModelError)
         except ModelError as error:
             raise ModelError(f"{error}; export the model again") from error
         # The metadata have another version of the format.
         raise ModelError(
-            f"{place} format {version} is not supported (this version reads {FORMAT_VERSION}); export it again or "
-            "upgrade isocharge"
+            f"{place} format {shown(version)} is not supported (this version reads {FORMAT_VERSION}); export it again "
+            "or upgrade isocharge"
         )
-
-
-class _Version(Struct):
-    """Version of the format of the metadata. Metadata of every version have the key `format_version`."""
-
-    format_version: Annotated[int, Meta(ge=1)]
-
-
-def _to_json(key: str, value: Any) -> str:
-    """Convert the value of a field to JSON.
-
-    Args:
-        key: Name of the field, for the error message.
-        value: Value of the field.
-
-    Raises:
-        ModelError: If the value cannot be expressed in JSON.
-    """
-    try:
-        return json.dumps(value, allow_nan=False, default=to_builtins)
-    except (TypeError, ValueError) as error:
-        raise ModelError(f"model metadata {key!r}: expected a JSON value, got {shown(value)} ({error})") from error

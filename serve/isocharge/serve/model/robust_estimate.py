@@ -86,7 +86,6 @@ class RobustEstimate(NamedTuple):
         state: Most probable state, shape (p,).
         covariance: Covariance of the state in the linearised problem, shape (p, p).
         contacts: Most probable coordinates of the contacts, shape (n, 3).
-        weights: Weight of each press, shape (n,); about 1 for good presses, and small for outliers.
         chi2: Squared residual chi2_i of each press, shape (n,).
         cost: Minimised function without constants.
     """
@@ -94,7 +93,6 @@ class RobustEstimate(NamedTuple):
     state: Array
     covariance: Array
     contacts: Array
-    weights: Array
     chi2: Array
     cost: float
 
@@ -159,7 +157,6 @@ def robust_estimate(
         state=point.state,
         covariance=np.asarray(np.linalg.inv(normal_matrix)),
         contacts=point.contacts,
-        weights=point.weights,
         chi2=point.chi2,
         cost=point.cost,
     )

@@ -213,7 +213,7 @@ def training_data(
         sha256=hashlib.sha256(charge.tobytes()).hexdigest(),
         outside=_outside_presses(charges, domain, executor),
         yield_force_N=yield_force(sensor.film, [probe], domain.force_range),
-        field=series.at_state(series.calibrated_state),
+        field=series.calibrated_series,
     )
 
 
