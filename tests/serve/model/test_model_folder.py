@@ -86,7 +86,7 @@ def test_refused_model_leaves_no_files(film, tmp_path, mistake, error, message):
 def test_golden_vectors_are_checked_before_a_version_appears(film, tmp_path, monkeypatch):
     def wrong(*arguments):
         golden = make_golden(*arguments)
-        golden.outputs["contact"][0] += 1.0
+        golden.outputs["contact"][0][0] += 1.0
         return golden
 
     monkeypatch.setattr("isocharge.serve.model.model_folder.make_golden", wrong)

@@ -93,7 +93,7 @@ def test_answers_are_the_golden_vectors(page, name):
     misfit = [answer["misfit"] for answer in answers]
     np.testing.assert_allclose(misfit, np.ravel(golden.outputs["misfit"]), rtol=1e-4, atol=1e-4)
     correlation = [answer["correlation"] for answer in answers]
-    np.testing.assert_allclose(correlation, golden.outputs["contact_correlation"][:, 0], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(correlation, np.array(golden.outputs["contact_correlation"])[:, 0], rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("index", range(len(MODELS)))

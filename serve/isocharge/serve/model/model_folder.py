@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
+import numpy as np
 import onnxruntime as ort
 from numpy.typing import ArrayLike
 
@@ -36,7 +37,6 @@ from isocharge.serve.model.session import (
     OUTPUTS,
     Golden,
     check_interface,
-    check_outputs,
     contact_floors,
     make_golden,
     open_session,
@@ -245,9 +245,23 @@ def check_golden(model: Model) -> None:
         ModelError: If an output differs from the output in `golden.json` by more than the tolerance.
     """
     where = str(model.folder / "model.onnx")
+    golden = model.golden
     with error_prefix(f"{where}: ", ModelError):
-        outputs = run(model.session, model.golden.charge_pC)
-    check_outputs(model.golden, outputs, where)
+        outputs = run(model.session, golden.charge_pC)
+    for name, rows in outputs.items():
+        expected = np.array(golden.outputs[name])
+        # Below its floor, a value has a constant tolerance, because a relative tolerance would approach 0.
+        tolerance = golden.tolerance.relative * np.maximum(np.abs(expected), golden.tolerance.floor[name])
+        with np.errstate(invalid="ignore"):
+            excess = np.abs(rows - expected) - tolerance
+        excess[np.isnan(excess)] = np.inf  # a value that is not a number counts as an infinite difference
+        row, column = np.unravel_index(np.argmax(excess), excess.shape)  # the largest difference of this output
+        if excess[row, column] > 0.0:
+            raise ModelError(
+                f"{where}: {name}[{row}, {column}]: expected {expected[row, column]:.9g} +- "
+                f"{tolerance[row, column]:.1g} (golden.json), got {rows[row, column]:.9g}; copy or export the model "
+                "again"
+            )
 
 
 def load_checked_model(folder: Path) -> Model:
@@ -268,7 +282,7 @@ def load_checked_model(folder: Path) -> Model:
             "move it into a folder of that version, or export it again"
         )
     existing_names = {path.name for path in folder.glob("*.npz")}
-    for name in sorted(existing_names | model.golden.companion_sha256.keys()):
+    for name in sorted(existing_names | model.golden.files.keys()):
         read_companion_file(folder, name, "make the model again")
     check_golden(model)
     return model
@@ -316,11 +330,17 @@ def write_model(
     # Write the version under a temporary name. `new_folder` renames it to `target` after the check has succeeded.
     with new_folder(target) as draft:
         write_whole(draft / "model.onnx", onnx_model)
-        write_whole(draft / "golden.json", golden.to_json().encode())
+        write_whole(draft / "golden.json", golden.to_json())
         write_whole(draft / "card.md", card.encode())
         for name, content in companion_files.items():
             write_whole(draft / name, content)
-        _check_draft(draft, metadata)
+        # Make all checks that are made when a model is read. The metadata in the graph must also be the expected ones.
+        model = load_model(draft)
+        actual = model.metadata.to_props()
+        for key, value in metadata.to_props().items():
+            if actual[key] != value:
+                raise ModelError(f"the graph's metadata disagree on {key!r}: expected {value}, got {actual[key]}")
+        check_golden(model)
     write_whole(folder / "config.pbtxt", triton_config(metadata.name, len(metadata.electrodes)).encode())
     return target
 
@@ -356,27 +376,6 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
     return target
 
 
-def _check_draft(draft: Path, metadata: ModelMetadata) -> None:
-    """Check the files of a new version with all checks that are made when a model is read.
-
-    The metadata in the new `model.onnx` must also equal the expected metadata.
-
-    Args:
-        draft: Folder with the files of the new version.
-        metadata: The expected metadata.
-
-    Raises:
-        ModelError: If a reader would refuse the model, or the metadata differ.
-    """
-    model = load_model(draft)
-    actual = model.metadata.to_props()
-    expected = metadata.to_props()
-    for key, value in expected.items():
-        if actual[key] != value:
-            raise ModelError(f"the graph's metadata disagree on {key!r}: expected {value}, got {actual[key]}")
-    check_golden(model)
-
-
 def triton_config(name: str, n_electrode: int) -> str:
     """Return the text of the file `config.pbtxt`, which describes the inputs and outputs of a model for Triton.
 
@@ -385,17 +384,9 @@ def triton_config(name: str, n_electrode: int) -> str:
         n_electrode: Number of electrodes.
     """
     head = f'name: "{name}"\nplatform: "onnxruntime_onnx"\nmax_batch_size: {MAX_BATCH}\n'
-    return head + _tensor_list("input", {INPUT: n_electrode}) + _tensor_list("output", OUTPUTS)
-
-
-def _tensor_list(list_name: str, widths: dict[str, int]) -> str:
-    """Return the part of `config.pbtxt` that lists the inputs or the outputs of a model.
-
-    The list contains the widths of the tensors only, because Triton adds the batch dimension.
-
-    Args:
-        list_name: "input" or "output".
-        widths: Width of each tensor by its name.
-    """
-    lines = [f'  {{ name: "{name}" data_type: TYPE_FP32 dims: [ {width} ] }}' for name, width in widths.items()]
-    return f"{list_name} [\n" + ",\n".join(lines) + "\n]\n"
+    parts = [head]
+    for list_name, widths in (("input", {INPUT: n_electrode}), ("output", OUTPUTS)):
+        # The widths do not contain the batch dimension, because Triton adds it.
+        lines = [f'  {{ name: "{tensor}" data_type: TYPE_FP32 dims: [ {width} ] }}' for tensor, width in widths.items()]
+        parts.append(f"{list_name} [\n" + ",\n".join(lines) + "\n]\n")
+    return "".join(parts)

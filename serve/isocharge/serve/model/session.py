@@ -15,18 +15,16 @@ computes the same outputs. A computed output a agrees with a stored output b if
 where the floor is a constant for each column of the output.
 """
 
-import json
 import math
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import onnxruntime as ort
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, json
 
 from isocharge.common.arrays import Singles
 from isocharge.common.errors import ModelError, cut
@@ -238,40 +236,50 @@ def contact_floors(metadata: ModelMetadata) -> tuple[float, float, float]:
     return position_floor_mm, position_floor_mm, max(force_floor_N, RANGE_SHARE * max_force_N)
 
 
-@dataclass(frozen=True)
-class Golden:
-    """Golden vectors of one model.
+Rows = Annotated[list[list[Finite]], Meta(min_length=1)]
+"""Rows of numbers, one for each press."""
+
+
+class Tolerance(Struct, frozen=True):
+    """Largest differences of outputs, the object `tolerance` of `golden.json`.
+
+    Attributes:
+        relative: Largest difference of two outputs, relative to max(|output|, floor).
+        floor: Floor for each column of an output, by the name of the output.
+        rule: Formula of the comparison, for readers of the file.
+    """
+
+    relative: NotNegative
+    floor: dict[str, tuple[Finite, ...]]
+    rule: str = "|a - b| <= relative * max(|b|, floor)"
+
+
+class Golden(Struct, frozen=True):
+    """Golden vectors of one model, the content of `golden.json`.
 
     Attributes:
         sha256: Checksum of the model file.
-        charge_pC: Input charges, shape (n, electrodes), pC.
-        outputs: Outputs of the model by name, each of shape (n, width).
-        relative_tolerance: Largest difference of two outputs, relative to max(|output|, floor).
-        floors: Floor for each column of an output, by the name of the output.
-        companion_sha256: Checksums of the files that lie beside the model, such as `charges.npz`, by file name.
+        tolerance: Largest differences of outputs.
+        inputs: Rows of input charges, pC, by the name of the input.
+        outputs: Rows of outputs by name.
+        files: Checksums of the files that lie beside the model, such as `charges.npz`, by file name.
     """
 
-    sha256: str
-    charge_pC: Singles
-    outputs: dict[str, Singles]
-    relative_tolerance: float
-    floors: dict[str, tuple[float, ...]]
-    companion_sha256: Mapping[str, str] = field(default_factory=dict)
+    sha256: Text
+    tolerance: Tolerance
+    inputs: dict[str, Rows]
+    outputs: dict[str, Rows]
+    files: dict[Text, Text]
 
-    def to_json(self) -> str:
-        """Return the text of `golden.json`."""
-        content = {
-            "sha256": self.sha256,
-            "tolerance": {
-                "rule": "|a - b| <= relative * max(|b|, floor)",
-                "relative": self.relative_tolerance,
-                "floor": self.floors,
-            },
-            "inputs": {INPUT: self.charge_pC.tolist()},
-            "outputs": {name: rows.tolist() for name, rows in self.outputs.items()},
-            "files": dict(self.companion_sha256),
-        }
-        return json.dumps(content, indent=1, allow_nan=False) + "\n"
+    @property
+    def charge_pC(self) -> Singles:
+        """Input charges, shape (n, electrodes), pC. A charge beyond the range of float32 is infinite."""
+        with np.errstate(over="ignore"):
+            return np.array(self.inputs[INPUT], np.float32)
+
+    def to_json(self) -> bytes:
+        """Return the content of `golden.json`."""
+        return json.format(json.encode(self), indent=1) + b"\n"
 
 
 def make_golden(
@@ -304,33 +312,11 @@ def make_golden(
             )
     return Golden(
         sha256=sha256_of(onnx_model),
-        charge_pC=charge_pC,
-        outputs=outputs,
-        relative_tolerance=RELATIVE_TOLERANCE,
-        floors=FLOORS | {"contact": contact_floor, "contact_std": contact_floor},
-        companion_sha256={name: sha256_of(content) for name, content in companion_files.items()},
+        tolerance=Tolerance(RELATIVE_TOLERANCE, FLOORS | {"contact": contact_floor, "contact_std": contact_floor}),
+        inputs={INPUT: charge_pC.tolist()},
+        outputs={name: rows.tolist() for name, rows in outputs.items()},
+        files={name: sha256_of(content) for name, content in companion_files.items()},
     )
-
-
-Rows = Annotated[list[list[Finite]], Meta(min_length=1)]
-"""Rows of numbers, one for each press."""
-
-
-class _Tolerance(Struct):
-    """The object `tolerance` of `golden.json`."""
-
-    relative: NotNegative
-    floor: dict[str, tuple[Finite, ...]]
-
-
-class _GoldenFile(Struct):
-    """The content of `golden.json`."""
-
-    sha256: Text
-    inputs: dict[str, Rows]
-    outputs: dict[str, Rows]
-    tolerance: _Tolerance
-    files: dict[Text, Text]
 
 
 def read_golden(path: Path) -> Golden:
@@ -342,29 +328,19 @@ def read_golden(path: Path) -> Golden:
     if not path.exists():
         raise ModelError(f"{path}: missing; every model has this file: copy the whole folder of the model again")
     try:
-        content = read_json(path, "golden vectors", ModelError, _GoldenFile)
-        # Numbers that are too large for float32 become infinite. They differ from every output of a model.
-        with np.errstate(over="ignore"):
-            outputs = {name: np.array(rows, np.float32) for name, rows in content.outputs.items()}
-            charge_pC = np.array(content.inputs[INPUT], np.float32)
+        golden = read_json(path, "golden vectors", ModelError, Golden)
+        n_press = len(golden.charge_pC)
         for name, width in OUTPUTS.items():
-            sizes = (*outputs[name].shape, len(content.tolerance.floor[name]))
-            if sizes != (len(charge_pC), width, width):
+            sizes = (*np.shape(golden.outputs[name]), len(golden.tolerance.floor[name]))
+            if sizes != (n_press, width, width):
                 raise ValueError(
-                    f"{name}: expected {len(charge_pC)} rows of {width} numbers, and {width} floors, got an array of "
-                    f"shape {sizes[:-1]} and {sizes[-1]} floors"
+                    f"{name}: expected {n_press} rows of {width} numbers, and {width} floors, got an array of shape "
+                    f"{sizes[:-1]} and {sizes[-1]} floors"
                 )
     except (ModelError, ValueError, KeyError) as error:  # rows of different lengths, or a missing entry
         where = "" if isinstance(error, ModelError) else f"{path}: "
         raise ModelError(f"{where}{error}; the file is damaged: copy or export the model again") from error
-    return Golden(
-        sha256=content.sha256,
-        charge_pC=charge_pC,
-        outputs=outputs,
-        relative_tolerance=content.tolerance.relative,
-        floors=content.tolerance.floor,
-        companion_sha256=content.files,
-    )
+    return golden
 
 
 def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
@@ -387,7 +363,7 @@ def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
     """
     path = version_folder / name
     data = read_needed(path, ModelError, advice)
-    checksums = read_golden(version_folder / "golden.json").companion_sha256
+    checksums = read_golden(version_folder / "golden.json").files
     # If `golden.json` does not list the file, the comparison with this text fails, and the message contains the text.
     expected_sha256 = checksums.get(name, "no such file")
     actual_sha256 = sha256_of(data)
@@ -397,31 +373,3 @@ def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
             f"damaged or belongs to another model: copy the whole folder of the model again, or {advice}"
         )
     return data
-
-
-def check_outputs(golden: Golden, outputs: dict[str, Singles], where: str) -> None:
-    """Check that the outputs that a model has computed from the golden charges agree with the stored outputs.
-
-    Args:
-        golden: Golden vectors with the stored outputs and the tolerances.
-        outputs: Computed outputs by name, each of shape (n, width).
-        where: Name or file of the model, for error messages.
-
-    Raises:
-        ModelError: If an output differs by more than the tolerance. The message names the largest difference of this
-            output.
-    """
-    for name, rows in outputs.items():
-        expected = golden.outputs[name].astype(float)
-        # Below its floor, a value has a constant tolerance, because a relative tolerance would approach 0.
-        tolerance = golden.relative_tolerance * np.maximum(np.abs(expected), golden.floors[name])
-        with np.errstate(invalid="ignore"):
-            excess = np.abs(rows - expected) - tolerance
-        excess[np.isnan(excess)] = np.inf  # a value that is not a number counts as an infinite difference
-        row, column = np.unravel_index(np.argmax(excess), excess.shape)
-        if excess[row, column] > 0.0:
-            raise ModelError(
-                f"{where}: {name}[{row}, {column}]: expected {expected[row, column]:.9g} +- "
-                f"{tolerance[row, column]:.1g} (golden.json), got {rows[row, column]:.9g}; copy or export the model "
-                "again"
-            )

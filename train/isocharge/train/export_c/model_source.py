@@ -289,15 +289,15 @@ def self_test(golden: Golden, metadata: ModelMetadata) -> str:
         golden: Golden vectors of the model.
         metadata: Metadata of the model.
     """
-    answers = np.concatenate([golden.outputs[name] for name in COLUMNS], axis=1)
+    answers = np.concatenate([golden.outputs[name] for name in COLUMNS], axis=1).astype(np.float32)
     contacts = Contacts(*answers.T)
     flags = [sum(FLAG_BITS[flag] for flag in words) for words in Validity.of(metadata).batch_flags(contacts)]
-    floors = np.array([floor for name in COLUMNS for floor in golden.floors[name]], np.float32)
+    floors = np.array([floor for name in COLUMNS for floor in golden.tolerance.floor[name]], np.float32)
     return source_text(
         "self_test.c",
         vectors=len(answers),
         numbers=answers.shape[1],
-        relative=c_float(golden.relative_tolerance),
+        relative=c_float(golden.tolerance.relative),
         floors=c_array("FLOOR", floors),
         charges=c_array("CHARGE_PC", golden.charge_pC),
         contacts=c_array("CONTACT", answers),
