@@ -6,15 +6,17 @@ from concurrent.futures import CancelledError
 
 import pytest
 
-from isocharge.common.progress import listening, report, reporting_as, second_thread
+from isocharge.common.progress import listening, report, second_thread
 
 
-def test_the_progress_of_a_second_thread_reaches_the_listener():
+@pytest.mark.parametrize(("shown_title", "title"), [(None, "sums"), ("the other sums", "the other sums")])
+def test_the_progress_of_a_second_thread_reaches_the_listener(shown_title, title):
     calls = []
-    with listening(lambda *call: calls.append(call)), second_thread() as executor:
+    with listening(lambda *call: calls.append(call)), second_thread(shown_title) as executor:
         future = executor.submit(report, "sums", 1, 2, "half")
         assert future.result() is None
-    assert calls == [("sums", 1, 2, "half")]
+        report("sums", 2, 2)
+    assert calls == [(title, 1, 2, "half"), ("sums", 2, 2, "")]
 
 
 def test_an_error_of_the_second_thread_is_raised_by_its_result():
@@ -45,14 +47,3 @@ def test_a_second_thread_stops_at_its_next_report_if_the_first_thread_is_interru
         interrupted_block()
     (future,) = futures
     assert isinstance(future.exception(), CancelledError)
-
-
-def test_another_title_replaces_that_of_all_reports():
-    calls = []
-    with listening(lambda *call: calls.append(call)):
-        with reporting_as("the other film"):
-            report("the film", 1, 2, "soon")
-        report("the film", 2, 2)
-    assert calls == [("the other film", 1, 2, "soon"), ("the film", 2, 2, "")]
-    with reporting_as("nobody listens"):
-        report("the film", 1, 2)

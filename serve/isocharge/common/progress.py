@@ -54,28 +54,15 @@ def report(title: str, done: int, total: int, note: str = "") -> None:
 
 
 @contextmanager
-def reporting_as(title: str) -> Iterator[None]:
-    """During the `with` block, report the progress of the present thread under another title.
-
-    Two computations that run at the same time need different titles, because a title identifies a progress bar.
-
-    Args:
-        title: Title that replaces those of all reports.
-    """
-    listener = _listener.get()
-    if listener is None:
-        yield
-        return
-    with listening(lambda _title, done, total, note: listener(title, done, total, note)):
-        yield
-
-
-@contextmanager
-def second_thread() -> Iterator[Executor]:
+def second_thread(shown_title: str | None = None) -> Iterator[Executor]:
     """Provide an executor with one thread. The calls in this thread report to the listener of the present thread.
 
     At the end of the `with` block, the executor waits for all calls. If the block raises an exception, calls that have
     not started are cancelled. The running call ends with a `CancelledError` when it next reports its progress.
+
+    Args:
+        shown_title: Title of all reports of the thread, because a title identifies a progress bar, and two computations
+            that run at the same time need different titles; None for the titles that the calls state.
 
     Yields:
         The executor.
@@ -88,7 +75,7 @@ def second_thread() -> Iterator[Executor]:
         if has_failed.is_set():
             raise CancelledError
         if listener:
-            listener(title, done, total, note)
+            listener(shown_title or title, done, total, note)
 
     # The listener is a context variable, which a new thread does not inherit. The initializer sets it in the thread.
     with ThreadPoolExecutor(1, initializer=_listener.set, initargs=(report_unless_failed,)) as executor:

@@ -28,7 +28,7 @@ from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.common.files import new_folder, refuse_existing
-from isocharge.common.progress import report, reporting_as, second_thread
+from isocharge.common.progress import report, second_thread
 from isocharge.simulate.dataset.shards import (
     MAX_SHARD_BYTES,
     Samples,
@@ -276,7 +276,8 @@ def run_sweep(
     presses = sweep.over(probes)
 
     # BLAS is faster with one thread, because the matrices are small.
-    with new_folder(folder) as draft, single_threaded_blas(), second_thread() as thread:
+    thread_title = "solving the film up to the clamp"
+    with new_folder(folder) as draft, single_threaded_blas(), second_thread(thread_title) as thread:
         # The solves of the whole film keep the workers busy while this thread fits the maps of the probes.
         outside_job = thread.submit(outside_map, sensor, probes, sweep, executor=executor)
         maps = solve_maps(sensor, probes, sweep, settings, executor=executor)
@@ -332,8 +333,7 @@ def outside_map(
     if sweep.outside == 0 or outermost_distance(sensor.film, probe) < sweep.radius + MIN_RING_WIDTH:
         return None
     try:
-        with reporting_as("solving the film up to the clamp"):
-            return whole_film_map(sensor, probe, sweep.force_range, executor=executor)
+        return whole_film_map(sensor, probe, sweep.force_range, executor=executor)
     except (SceneError, SolveError) as error:
         _log.warning("presses outside %g mm are not simulated: %s", sweep.radius, error)
         return None
