@@ -64,20 +64,6 @@ class Timing(NamedTuple):
     p99_us: float
     presses_per_s: float
 
-    @classmethod
-    def from_durations(cls, name: str, presses: int, durations_ns: Array) -> "Timing":
-        """Compute the statistics of the durations of the calls of one contender.
-
-        Args:
-            name: Name of the contender.
-            presses: Number of presses that one call predicts.
-            durations_ns: Duration of each call, shape (calls,), ns.
-        """
-        p50_us, p99_us = np.percentile(durations_ns, (50, 99)) / 1e3
-        total_s = float(durations_ns.sum()) / 1e9
-        presses_per_s = presses * len(durations_ns) / total_s
-        return cls(name, presses, len(durations_ns), float(p50_us), float(p99_us), presses_per_s)
-
 
 def take_turns(contenders: Sequence[Contender], seconds: float, clock: Clock = time.perf_counter_ns) -> list[Timing]:
     """Measure how long the calls of each contender take. A contender is one way to compute predictions.
@@ -96,32 +82,28 @@ def take_turns(contenders: Sequence[Contender], seconds: float, clock: Clock = t
     turn_ns = round(seconds * 1e9 / (ROUNDS * len(contenders)))
     durations: list[list[int]] = [[] for _ in contenders]
     for round_number in track(range(ROUNDS), "measuring", ROUNDS):
-        is_warm_up = round_number == 0
-        for contender, contender_durations in zip(contenders, durations, strict=True):
-            turn_durations = _measure_turn(contender.call, turn_ns, clock)
-            if not is_warm_up:
-                contender_durations.extend(turn_durations)
+        for contender, durations_ns in zip(contenders, durations, strict=True):
+            if round_number == 1:
+                durations_ns.clear()  # the first round was the warm-up
+            call_end_ns = clock()
+            turn_end_ns = call_end_ns + turn_ns
+            while call_end_ns < turn_end_ns:
+                call_start_ns = clock()
+                contender.call()
+                call_end_ns = clock()
+                durations_ns.append(call_end_ns - call_start_ns)
     return [
-        Timing.from_durations(contender.name, contender.presses, np.array(contender_durations, float))
-        for contender, contender_durations in zip(contenders, durations, strict=True)
+        _timing(contender, np.array(durations_ns, float))
+        for contender, durations_ns in zip(contenders, durations, strict=True)
     ]
 
 
-def _measure_turn(call: Callable[[], object], turn_ns: int, clock: Clock) -> list[int]:
-    """Call a function repeatedly during one turn, and return the duration of each call in ns.
-
-    Args:
-        call: Function whose duration is measured.
-        turn_ns: Length of the turn, ns. The turn takes longer if its only call takes longer.
-        clock: Function that returns the time, ns.
-    """
-    durations_ns: list[int] = []
-    turn_end_ns = clock() + turn_ns
-    while not durations_ns or clock() < turn_end_ns:
-        call_start_ns = clock()
-        call()
-        durations_ns.append(clock() - call_start_ns)
-    return durations_ns
+def _timing(contender: Contender, durations_ns: Array) -> Timing:
+    """Compute the statistics of the durations of the calls of one contender, shape (calls,), ns."""
+    p50_us, p99_us = np.percentile(durations_ns, (50, 99)) / 1e3
+    calls = len(durations_ns)
+    presses_per_s = contender.presses * calls / float(durations_ns.sum()) * 1e9
+    return Timing(contender.name, contender.presses, calls, float(p50_us), float(p99_us), presses_per_s)
 
 
 def press_charges(predictor: Predictor, golden_pC: Singles) -> Singles:
