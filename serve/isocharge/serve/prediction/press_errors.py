@@ -119,19 +119,25 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
     metadata = predictor.metadata
     model_presses = presses.of_electrodes(metadata.electrodes, metadata.label)  # charges in the order of the model
     measured = model_presses.contact  # x, y and force, shape (n, 3)
-    predicted = _predicted_contacts(predictor, model_presses.charge_pC)
+
+    # If a charge of a press is unknown, the press has no contact and no flags.
+    n_press = len(model_presses)
+    is_complete = ~np.isnan(model_presses.charge_pC).any(axis=1)
+    contacts = predictor.predict_batch(model_presses.charge_pC[is_complete])
+    predicted = np.full((n_press, len(Contacts._fields)), np.nan)
+    predicted[is_complete] = contacts
+    flags: list[tuple[str, ...]] = [()] * n_press
+    for press, words in zip(np.flatnonzero(is_complete), predictor.validity.batch_flags(contacts), strict=True):
+        flags[press] = words
 
     # Differences of x and y are errors in mm. Differences of the force are divided by the measured force.
-    divisor = np.ones((len(model_presses), 3))
+    divisor = np.ones((n_press, 3))
     divisor[:, FORCE] = measured[:, FORCE]
 
     # Standard deviations of the measured values. The standard deviation of the force is already relative.
     position_std_mm = model_presses.position_std_mm
     rig_std = np.column_stack([position_std_mm, position_std_mm, model_presses.force_std])
     is_unknown = np.isnan(measured)
-    is_complete = np.asarray(np.isfinite(predicted[:, COLUMNS["contact"]]).all(axis=1))
-    contacts = Contacts(*predicted.astype(np.float32).T)
-    flags = predictor.validity.batch_flags(contacts)
     return PressErrors(
         lines=model_presses.lines,
         row_noun=model_presses.row_noun,
@@ -139,8 +145,8 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
         error=(predicted[:, COLUMNS["contact"]] - measured) / divisor,
         noise_std=np.where(is_unknown, np.nan, predicted[:, COLUMNS["contact_std"]] / divisor),
         rig_std=np.where(is_unknown, np.nan, rig_std),
-        flags=tuple(words if is_known else () for words, is_known in zip(flags, is_complete, strict=True)),
-        has_misfit=contacts.misfit > misfit_limit(metadata),
+        flags=tuple(flags),
+        has_misfit=predicted[:, Contacts._fields.index("misfit")] > misfit_limit(metadata),
         exclusion_reasons=_exclusion_reasons(predictor.validity, model_presses),
     )
 
@@ -152,22 +158,6 @@ def misfit_limit(metadata: ModelMetadata) -> float:
         metadata: Metadata of the model. If they do not contain this limit, the result is `MISFIT_LIMIT`.
     """
     return float(metadata.errors.get("misfit_p99", MISFIT_LIMIT))
-
-
-def _predicted_contacts(predictor: Predictor, charge_pC: Array) -> Array:
-    """Predict contacts from the charges of presses. Some charges may be unknown.
-
-    Args:
-        predictor: The model.
-        charge_pC: Charges, shape (n, electrodes), pC; NaN where unknown.
-
-    Returns:
-        Values of the attributes of `Contact` for each press, shape (n, 10). If a charge is unknown, the row is NaN.
-    """
-    predicted = np.full((len(charge_pC), len(Contacts._fields)), np.nan)
-    is_complete = ~np.isnan(charge_pC).any(axis=1)
-    predicted[is_complete] = np.column_stack(predictor.predict_batch(charge_pC[is_complete]))
-    return predicted
 
 
 def _exclusion_reasons(validity: Validity, presses: MeasuredPresses) -> tuple[str, ...]:

@@ -153,23 +153,19 @@ class Dialogue:
         self._session = session
         self._events = events
         self._electrodes = electrodes
-        self._latest_sentence = ""
-
-    def _say(self, sentence: str) -> None:
-        """Print a sentence."""
-        self._latest_sentence = sentence
-        say(sentence)
+        self._shown_phase = ""  # instruction that was printed last for the present press
 
     def _say_phase(self, watched: WatchResult) -> None:
-        """Print the instruction of the present phase and the reason for it, unless they were printed last.
+        """Print the instruction of the present phase and the reason for it, unless they have just been printed.
 
         In a phase without an instruction, for example the phase of a steady press, nothing is printed.
         """
         if watched.phase in PHASE_TEXTS:
             reason = f" ({watched.reason})" if watched.reason else ""
             phase_text = f"   {PHASE_TEXTS[watched.phase]}{reason}"
-            if phase_text != self._latest_sentence:
-                self._say(phase_text)
+            if phase_text != self._shown_phase:
+                self._shown_phase = phase_text
+                say(phase_text)
 
     def _say_steady(self, press: SteadyPress) -> None:
         """Print the charges of a steady press."""
@@ -177,7 +173,7 @@ class Dialogue:
             f"{name} {charge:.1f}" for name, charge in zip(self._electrodes, press.charge_pC, strict=True)
         )
         flags = f" [{', '.join(press.flags)}]" if press.flags else ""
-        self._say(f"   steady after {press.held_s:.1f} s: {charges} pC{flags}")
+        say(f"   steady after {press.held_s:.1f} s: {charges} pC{flags}")
 
     def guide_person(self, *, asks: bool = True) -> None:
         """Propose and record presses until the film is known accurately enough, or the person quits.
@@ -187,13 +183,13 @@ class Dialogue:
                 place with the proposed force.
         """
         if asks:
-            self._say("   (press elsewhere if you cannot reach a place; type u to undo the last press, q to quit)")
+            say("   (press elsewhere if you cannot reach a place; type u to undo the last press, q to quit)")
         try:
             while not self._session.enough:
                 self._guide_press(asks=asks)
         except SessionEnd:
             return
-        self._say("The film is known well enough. With --until 0 the same command takes more presses.")
+        say("The film is known well enough. With --until 0 the same command takes more presses.")
 
     def follow_machine(self, contacts: Array) -> None:
         """Record the presses that a machine makes, in the order of its list.
@@ -215,9 +211,10 @@ class Dialogue:
         try:
             # A press before the tare would be lost, and each later press would be assigned to the wrong row.
             self._wait_for(Phase.waiting)
-            self._say("The tare is measured. Let the machine begin.")
+            say("The tare is measured. Let the machine begin.")
             for row_number, contact in enumerate(contacts[row_count:], start=row_count + 1):
-                self._say(f"{row_number}. {describe_press(contact)}")
+                say(f"{row_number}. {describe_press(contact)}")
+                self._shown_phase = ""
                 event = self._wait_for(Phase.taken, Phase.refused)
                 if event.press is not None:
                     self._say_steady(event.press)
@@ -228,7 +225,7 @@ class Dialogue:
                         "of its list"
                     )
                 else:  # the machine has already moved on to the next row
-                    self._say(f"   row {row_number} is left out: {event.reason}")
+                    say(f"   row {row_number} is left out: {event.reason}")
         except SessionEnd as end:
             raise InputError(
                 "the port ended before the last press of the list; run the same command again for the remaining presses"
@@ -263,7 +260,8 @@ class Dialogue:
         """
         proposed = self._session.proposed
         steady_press: SteadyPress | None = None  # the press about which a question is open; None without a question
-        self._say(f"{len(self._session) + 1}. Press {describe_press(proposed.contact)} and hold.")
+        say(f"{len(self._session) + 1}. Press {describe_press(proposed.contact)} and hold.")
+        self._shown_phase = ""
         self._events.arm()  # only presses from now on count
 
         # A command that removes an earlier press changes the proposal of the session. The loop then ends, so that the
@@ -282,11 +280,9 @@ class Dialogue:
                     self._take(event.press, proposed.contact)
                     return
                 steady_press = event.press
-                self._say(
-                    '   Was it there, and as hard? Enter: yes; or type "x y force" (? is unknown), u: undo, q: quit'
-                )
+                say('   Was it there, and as hard? Enter: yes; or type "x y force" (? is unknown), u: undo, q: quit')
             elif event.phase == Phase.refused:
-                self._say(f"   not taken: {event.reason}; press again")
+                say(f"   not taken: {event.reason}; press again")
                 self._events.arm()
             else:
                 self._say_phase(event)
@@ -315,15 +311,15 @@ class Dialogue:
             if answer.reply == "take" and press is not None:
                 return self._take(press, proposed if answer.contact is None else answer.contact)
             if answer.reply == "take":
-                self._say("   press first: the question comes when the press is steady")
+                say("   press first: the question comes when the press is steady")
                 return False
             if press is not None:
-                self._say("   this press is not taken")
+                say("   this press is not taken")
                 return True
-            self._say(f"   press {self._session.undo()} is removed")
+            say(f"   press {self._session.undo()} is removed")
             self._say_summary()
         except PressError as error:
-            self._say(f"   {error}")
+            say(f"   {error}")
         return False  # an open question remains open; without one, the caller compares the proposal with the new one
 
     def _take(self, press: SteadyPress, contact: Array) -> bool:
@@ -338,7 +334,7 @@ class Dialogue:
         try:
             self._session.take(press.charge_pC, contact)
         except PressError as error:
-            self._say(f"   {error}")
+            say(f"   {error}")
             return False
         self._say_summary()
         return True
@@ -346,4 +342,4 @@ class Dialogue:
     def _say_summary(self) -> None:
         """Print sentences that state how accurately the film is known."""
         for sentence in self._session.summary:
-            self._say(f"   {sentence}")
+            say(f"   {sentence}")
