@@ -43,7 +43,7 @@ class FakeSession:
 
     def _place(self):
         self.proposed = SimpleNamespace(contact=np.array([len(self.taken), 0.0, 1.0]))
-        self.presses = SimpleNamespace(contact=np.array(self.taken))
+        self.presses = SimpleNamespace(contact=np.array(self.taken), electrodes=NAMES)
 
     def __len__(self):
         return len(self.taken)
@@ -89,7 +89,7 @@ def refused(reason):
 def dialogue(*events, asks=True, contacts=None):
     """The session after a dialogue with a person, or with a machine that makes the presses of a list."""
     session, script = FakeSession(), Script(*events)
-    talk = Dialogue(session, script, NAMES)
+    talk = Dialogue(session, script)
     if contacts is None:
         talk.guide_person(asks=asks)
     else:
@@ -159,7 +159,7 @@ def test_list_that_repeats_its_presses_is_continued_at_the_next_row(taken, next_
     session.taken = [*LIST[taken]]
     session.presses = SimpleNamespace(contact=LIST[taken])
     with pytest.raises(PortLost, match=f"continue with row {next_row} of its list"):
-        Dialogue(session, Script(TARED, refused(PORT_LOST)), NAMES).follow_machine(contacts)
+        Dialogue(session, Script(TARED, refused(PORT_LOST))).follow_machine(contacts)
 
 
 def test_a_port_that_goes_away_under_a_machine_ends_the_session():

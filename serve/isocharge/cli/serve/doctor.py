@@ -113,9 +113,13 @@ def doctor_command(
     )
     if not json:
         show_result(brief_report(examination), json=False)
-    is_unit_missing = write is not None and device is None and examination.unit != "pC"
+    obstacle = ""  # reason why no device file can be written
+    if examination.touch:
+        obstacle = "the film was touched: take the finger away, and try again"
+    elif write is not None and device is None and examination.unit != "pC":
+        obstacle = "the charge of one unit is missing: add the option that is named above"
     found_channels = None
-    if check_wiring and examination.good and not examination.touch and not is_unit_missing:
+    if check_wiring and examination.good and not obstacle:
         wiring = _check_wiring(examination, electrodes)
         found_channels = wiring.found
         examination = replace(examination, device=corrected_table(examination.device, wiring))
@@ -125,12 +129,8 @@ def doctor_command(
         show_json(asdict(examination) | {"found_channels": found_channels})
     if not examination.good:
         raise typer.Exit(1)
-    not_written = "" if write is None else f"{write} is not written, because "
-    if examination.touch:
-        say(f"{not_written}the film was touched: take the finger away, and try again")
-        raise typer.Exit(1)
-    if is_unit_missing:
-        say(f"{not_written}the charge of one unit is missing: add the option that is named above")
+    if obstacle:
+        say(obstacle if write is None else f"{write} is not written, because {obstacle}")
         raise typer.Exit(1)
     if write is not None:
         _write_device_file(write, examination, model or "MODEL")

@@ -82,12 +82,12 @@ def show_result(result: Mapping[str, Any], *, json: bool) -> None:
         result: Values by their names, which contain the units. The dictionaries of a table have the same keys.
         json: Whether to print JSON.
     """
+    if json:
+        show_json(result)
+        return
     from isocharge.common.structs import plain_values  # imports msgspec, which help does not need
 
     values: Any = plain_values(result)
-    if json:
-        show_json(values)
-        return
     width = max(map(len, values))
     next_line = "\n" + " " * (width + 2)
     for name, value in values.items():

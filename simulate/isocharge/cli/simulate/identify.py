@@ -1,7 +1,6 @@
 """Command `isocharge simulate identify`, which computes error limits, folds and the working area of a sensor."""
 
 import json as json_module
-from math import inf
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +23,8 @@ def identify_command(
     force: ForceRangeOption = DEFAULT_FORCE_RANGE,
     noise: NoiseOption = "reference",
     error: Annotated[
-        float, typer.Option(metavar="MM", help="Largest position error in the working area, mm, rms.")
+        float,
+        typer.Option(metavar="MM", min=1e-6, max=1e6, help="Largest position error in the working area, mm, rms."),
     ] = 1.0,
     radius: Annotated[
         float | None,
@@ -51,8 +51,6 @@ def identify_command(
     """
     if output is not None:
         refuse_existing(output)
-    if not 0.0 < error < inf:
-        raise InputError(f"--error: expected a positive number of mm, got {error}")
     described_sensor = load_sensor(sensor)
     smallest_N, largest_N = force
     if smallest_N == largest_N and described_sensor.film.pretension > 0.0:

@@ -35,7 +35,7 @@ def point_command(
     force: ForceOption = 1.0,
     accuracy: Annotated[
         float,
-        typer.Option(help="Allowed relative error of the charges, 1e-6 to 1. It determines the mesh."),
+        typer.Option(min=1e-6, max=1.0, help="Allowed relative error of the charges. It determines the mesh."),
     ] = 1e-3,
     theory: Annotated[
         str,
@@ -66,8 +66,6 @@ def point_command(
 
     Example: isocharge simulate point three-25um-biaxial --probe triangle:4.0@30 --at 3,-2 --force 1.0
     """
-    if not 1e-6 <= accuracy <= 1.0:
-        raise InputError(f"--accuracy: expected a relative error from 1e-6 to 1, got {accuracy}")
     if not math.isfinite(temperature):
         raise InputError(f"--temperature: expected a finite number of kelvin, got {temperature}")
 

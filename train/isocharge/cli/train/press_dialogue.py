@@ -8,7 +8,7 @@ sequence.
 """
 
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from io import FileIO
 from queue import Queue
 from typing import Self
@@ -142,17 +142,15 @@ PHASE_TEXTS = {
 class Dialogue:
     """Dialogue of one session, from the first press to the last. Its messages are sentences on stderr."""
 
-    def __init__(self, session: PressSession, events: PressEvents, electrodes: Sequence[str]) -> None:
+    def __init__(self, session: PressSession, events: PressEvents) -> None:
         """Set up the dialogue.
 
         Args:
             session: Session that proposes and records presses.
             events: Readings of the port, and lines of the keyboard.
-            electrodes: Names of the electrodes, in the order of the charges.
         """
         self._session = session
         self._events = events
-        self._electrodes = electrodes
         self._shown_phase = ""  # instruction that was printed last for the present press
 
     def _say_phase(self, watched: WatchResult) -> None:
@@ -169,9 +167,8 @@ class Dialogue:
 
     def _say_steady(self, press: SteadyPress) -> None:
         """Print the charges of a steady press."""
-        charges = ", ".join(
-            f"{name} {charge:.1f}" for name, charge in zip(self._electrodes, press.charge_pC, strict=True)
-        )
+        electrodes = self._session.presses.electrodes
+        charges = ", ".join(f"{name} {charge:.1f}" for name, charge in zip(electrodes, press.charge_pC, strict=True))
         flags = f" [{', '.join(press.flags)}]" if press.flags else ""
         say(f"   steady after {press.held_s:.1f} s: {charges} pC{flags}")
 
