@@ -127,8 +127,8 @@ def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Cont
 
     Args:
         predictor: Predictor with the model.
-        charge_pC: Charges of presses, shape (n, electrodes), pC. Each call for one press uses the next row. Batch sizes
-            larger than n are left out.
+        charge_pC: Charges of presses, shape (n, electrodes), pC, at least as many as in the largest batch. Each call
+            for one press uses the next row.
     """
     # These functions return the charges of the next press, and begin again with the first press after the last one.
     next_array = partial(next, cycle(charge_pC))
@@ -139,9 +139,8 @@ def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Cont
         Contender("predict, list of numbers", 1, lambda: predictor.predict(next_list())),
     ]
     for batch_size in BATCH_SIZES:
-        if batch_size <= len(charge_pC):
-            predict_batch = partial(predictor.predict_batch, charge_pC[:batch_size])
-            contenders.append(Contender(f"predict_batch, {batch_size}", batch_size, predict_batch))
+        predict_batch = partial(predictor.predict_batch, charge_pC[:batch_size])
+        contenders.append(Contender(f"predict_batch, {batch_size}", batch_size, predict_batch))
     return contenders
 
 

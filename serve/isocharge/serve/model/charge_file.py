@@ -54,8 +54,7 @@ def charge_map_bytes(series: ChargeSeries) -> bytes:
         "is_folded": np.array(int(series.is_folded)),
     }
     arrays |= {name: np.array(getattr(series, name)) for name in NUMBERS}
-    if series.direction_count > 0:
-        assert series.directions is not None
+    if series.directions is not None:
         arrays["directions"] = series.directions.astype(np.float32)
     if series.log_size is not None:
         arrays["log_size"] = series.log_size

@@ -216,9 +216,8 @@ class _Problem:
         # One over the standard deviations of the measured coordinates; 0 where a coordinate was not measured
         self._contact_weight = np.zeros((n_press, 3))
         if measured is not None:
-            is_measured = np.isfinite(measured.std)
-            self._contact_weight[is_measured] = 1.0 / measured.std[is_measured]
-            self._measured = np.where(is_measured, measured.coordinates, 0.0)
+            self._measured = np.nan_to_num(measured.coordinates)
+            self._contact_weight = np.nan_to_num(1.0 / measured.std)
         measured_count = np.count_nonzero(self._contact_weight, axis=1)
         self._degrees = n_electrode + measured_count - 3.0
 
