@@ -7,7 +7,7 @@ from pyarrow.parquet import write_table
 
 from isocharge.common.errors import InputError, RecordingError
 from isocharge.serve import Port, Recorder, Recording, open_source
-from isocharge.serve.port.file_source import Chunk, FileSource, check_file
+from isocharge.serve.port.file_source import Chunk, FileSource
 from isocharge.serve.record.formats import csv_header
 
 
@@ -48,26 +48,25 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-@pytest.mark.parametrize("make", [open_source, Port])
-def test_foreign_file_as_a_port_is_refused_with_the_command_that_reads_it(name, make, tmp_path):
+def test_foreign_file_as_a_port_is_refused_with_the_command_that_reads_it(name, tmp_path):
     write, message = FOREIGN[name]
     write(tmp_path / name)
-    with pytest.raises(InputError, match=message), make(str(tmp_path / name)):
+    with pytest.raises(InputError, match=message), open_source(str(tmp_path / name)):
         pass
 
 
 def test_recording_on_stdin_is_refused(tmp_path):
     recording(tmp_path / "touch.rec")
     with (tmp_path / "touch.rec").open("rb") as file, pytest.raises(InputError, match="got a recording"):
-        next(iter(FileSource(file.fileno(), "-")))
+        FileSource(file.fileno(), "-")
 
 
 def test_lines_of_a_board_with_a_name_of_a_table_are_read_from_stdin(tmp_path):
     """The error of the file advises this."""
     path = tmp_path / "board.csv"
     path.write_text("A,B,C,flags\n1,2,3,0\n")
-    with pytest.raises(InputError, match="--port - <"):
-        check_file(path)
+    with pytest.raises(InputError, match="--port - <"), open_source(str(path)):
+        pass
     with path.open("rb") as file:
         assert next(iter(FileSource(file.fileno(), "-"))).data == path.read_bytes()
 

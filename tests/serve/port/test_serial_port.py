@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.common.errors import InputError, PortError, PortLost
+from isocharge.common.errors import PortError, PortLost
 from isocharge.serve import Chunk, Port, open_source
 from isocharge.serve.port.serial_line import QUIET_TIME_s, REPEAT_TIME_s, Request, Requester
 from isocharge.serve.virtual_sensor.sensor import PseudoPort
@@ -135,9 +135,8 @@ def test_second_program_that_reads_the_port_is_named(board, monkeypatch):
     """The bytes arrive, but the other program reads them first."""
     with Port(board.url) as port:
         monkeypatch.setattr("select.select", lambda read, *_: (read, [], []))
-        with pytest.raises(PortLost, match="another program reads this port") as caught:
+        with pytest.raises(PortLost, match="end other programs that read it"):
             next(iter(port))
-    assert "cable" not in str(caught.value)
 
 
 def test_bytes_that_waited_during_a_stall_are_few_chunks(board, address):
@@ -280,10 +279,9 @@ BYTES = (b"\xaa\x00", b"\xaa\x55", b"1\x002", b"\x7f")
         ((b"\x00\xff" * 20, b"\x01", b"\x02\n" * 700), (b"\x00\xff" * 20, b"\x01", b"\x02\n" * 700)),
         ((*TEXT, *BYTES), (*(line + b"\n" for line in TEXT), *BYTES)),
         ((b"1,2\n", b"3,", b"4\n"), (b"1,2\n", b"3,", b"4\n")),
-        ((b"tared\n", *[b"1,2"] * 10), (b"tared\n", *[b"1,2"] * 8, *[b"1,2\n"] * 2)),
         ((b"1,2\0",), (b"1,2\0\n",)),
     ],
-    ids=["each is a chunk", "lines without an end get one", "a board ends its lines itself", "a message", "C string"],
+    ids=["each is a chunk", "lines without an end get one", "a board ends its lines itself", "C string"],
 )
 def test_datagrams_are_chunks(address, sent, chunks):
     assert received(address, *sent) == [*chunks]
@@ -376,20 +374,11 @@ def test_installed_package_adds_a_source(monkeypatch):
 
     def entry_points(group, name):
         assert group == "isocharge.sources"
-        is_added = name in ("can", "broken", "lost")
-        load = {
-            "can": lambda: lambda url: nullcontext(Bus([chunk, url])),
-            "broken": dict.clear,
-            "lost": lambda: lambda _: nullcontext(SimpleNamespace(is_live=True)),  # which cannot be iterated
-        }
-        return [SimpleNamespace(value="my_package:open_bus", load=load[name])] if is_added else []
+        added = SimpleNamespace(load=lambda: lambda url: nullcontext(Bus([chunk, url])))
+        return [added] if name == "can" else []
 
     monkeypatch.setattr("isocharge.serve.port.source.entry_points", entry_points)
     with open_source("can://vcan0") as source:
         assert list(source) == [chunk, "can://vcan0"]
-    with pytest.raises(InputError, match=r"broken://x: cannot be read by my_package:open_bus \(TypeError"):
-        open_source("broken://x")
-    with open_source("lost://x") as source, pytest.raises(InputError, match=r"lost://x: .* not iterable"):
-        list(source)
     with open_source("loop://") as source:
         assert source.is_live
