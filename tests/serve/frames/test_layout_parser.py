@@ -3,7 +3,6 @@
 The folder tests/data/frames contains the layouts of three sensors, as their makers document them.
 """
 
-import binascii
 import math
 import struct
 import tomllib
@@ -15,7 +14,6 @@ from crcmod.predefined import mkPredefinedCrcFun
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from frame_formats import STUFFINGS
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Frame, device_from_table
 from isocharge.serve.frames.frame_layout import SyncParser
@@ -136,66 +134,33 @@ def test_numbers_of_three_bytes(a, b, c, order):
     assert encode_layout(described, frame) == data
 
 
-def stuffed(framing, **others):
-    """Return the layout of frames with a byte stuffing, a counter, one channel and a CRC-32."""
+def datagram_parser(**others):
+    """Return the parser of datagrams whose frames have six bytes, with a counter and one channel."""
     fields = [{"name": "seq", "type": "u8"}, {"name": "A", "type": "f32"}]
-    return layout({"framing": framing, "length": 9, "checksum": "crc-32", "fields": fields} | others)
-
-
-@pytest.mark.parametrize("framing", STUFFINGS)
-def test_cobs_slip_and_hdlc_frames_are_read(framing):
-    """A frame with a wrong checksum and a piece of another length are dropped without damage to other frames."""
-
-    def stuff(data):
-        delimiter, encode = STUFFINGS[framing]
-        return encode(data) + delimiter
-
-    bodies = [struct.pack("<Bf", seq, 0.1 * seq) for seq in range(256)]
-    sent = [stuff(body + struct.pack("<I", binascii.crc32(body))) for body in bodies]
-    with_wrong_checksum = stuff(bodies[0] + struct.pack("<I", binascii.crc32(bodies[1])))
-    too_short = stuff(b"123")
-    stream = b"".join([*sent[:9], with_wrong_checksum, too_short, *sent[9:]])
-    parser = stuffed(framing).parser()
-    frames = []
-    for start in range(0, len(stream), 7):
-        frames += parser.feed(stream[start : start + 7])
-    assert [frame.seq for frame in frames] == list(range(256))
-    assert frames[3].values == struct.unpack("<f", struct.pack("<f", 0.1 * 3))
-
-    dropped_bytes = len(with_wrong_checksum) + len(too_short)
-    counts = parser.counts
-    assert (counts.crc_errors, counts.malformed, counts.bytes_dropped) == (1, 1, dropped_bytes)
+    return layout({"framing": "datagram", "length": 6, "fields": fields} | others).parser()
 
 
 def test_damaged_frame_in_a_datagram_makes_no_other_frame():
-    parser = stuffed("datagram", length=6, checksum="sum-8").parser()
+    parser = datagram_parser(checksum="sum-8")
     rng = np.random.default_rng(0)
-    for _ in range(2000):
+    for _ in range(200):
         frames = [struct.pack("<Bf", seq, rng.normal()) for seq in range(4)]
         frames = [bytearray(frame + bytes([sum(frame) % 256])) for frame in frames]
         frames[2][3] ^= 0x55
         assert [frame.seq for frame in parser.feed(b"".join(frames))] == [0, 1, 3]
-    assert (parser.counts.crc_errors, parser.counts.bytes_dropped) == (2000, 12_000)
-
-
-def test_line_feed_after_a_datagram_of_printable_bytes_is_ignored():
-    parser = stuffed("datagram", sync="41", length=6, checksum="none").parser()
-    data = struct.pack("<BBf", 0x41, 0x42, 0.5)
-    assert [frame.values for frame in parser.feed(data + b"\n")] == [(0.5,)]
+    assert (parser.counts.crc_errors, parser.counts.bytes_dropped) == (200, 1200)
 
 
 def test_datagrams_contain_whole_frames():
-    parser = stuffed("datagram", sync="A5", length=6, checksum="none").parser()
+    parser = datagram_parser(sync="A5")
     first = struct.pack("<BBf", 0xA5, 1, 0.5)
     second = struct.pack("<BBf", 0xA5, 2, 1.0)
     first_with_another_sync = b"\x5a" + first[1:]
     assert [frame.values for frame in parser.feed(first + second)] == [(0.5,), (1.0,)]
+    assert [frame.values for frame in parser.feed(first + b"\n")] == [(0.5,)]  # as a UDP socket adds it to text
     assert parser.feed(first[:3]) == []
     assert [frame.values for frame in parser.feed(first_with_another_sync + second)] == [(1.0,)]
     assert (parser.counts.malformed, parser.counts.bytes_dropped) == (2, 9)
-    assert parser.sequence_flags(1) == ()
-    parser.feed(first + second)
-    assert parser.sequence_flags(4) == ("gap",)
 
 
 def test_constant_bytes_are_checked():
