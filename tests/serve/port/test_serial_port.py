@@ -84,24 +84,17 @@ def test_port_opened_by_another_program_is_refused(board):
         pass
 
 
-def test_silent_port_is_lost_after_the_timeout(board):
-    with Port(board.url, silence_s=0.05) as port:
-        board.write_whole(b"x")
-        chunks = iter(port)
-        assert next(chunks).data == b"x"
-        with pytest.raises(PortLost, match=r"no data for 0.05 s; check that"):
-            next(chunks)
-
-
 @pytest.mark.parametrize(("wait", "start_up"), [(0.0, "0.06"), (0.1, "0.1")])
-def test_board_that_restarts_when_the_port_is_opened_may_be_silent_longer_at_first(board, monkeypatch, wait, start_up):
+def test_silent_port_is_lost_after_the_timeout_which_is_longer_at_first(board, monkeypatch, wait, start_up):
     """An Arduino restarts when DTR rises. The option `wait` also sets the time for the first byte."""
     monkeypatch.setattr("isocharge.serve.port.source.START_UP_s", 0.06)
-    with (
-        Port(board.url, silence_s=0.03, wait=wait) as port,
-        pytest.raises(PortLost, match=f"no data for {start_up} s"),
-    ):
-        next(iter(port))
+    with Port(board.url, silence_s=0.03, wait=wait) as port:
+        with pytest.raises(PortLost, match=f"no data for {start_up} s; check that"):
+            next(iter(port))
+        board.write_whole(b"x")
+        assert next(iter(port)).data == b"x"
+        with pytest.raises(PortLost, match=r"no data for 0.03 s"):
+            next(iter(port))
 
 
 def test_silent_port_is_opened_again_after_growing_pauses(board, monkeypatch):
@@ -280,17 +273,12 @@ BYTES = (b"\xaa\x00", b"\xaa\x55", b"1\x002", b"\x7f")
         ((*TEXT, *BYTES), (*(line + b"\n" for line in TEXT), *BYTES)),
         ((b"1,2\n", b"3,", b"4\n"), (b"1,2\n", b"3,", b"4\n")),
         ((b"1,2\0",), (b"1,2\0\n",)),
+        ((b"\x01", b"", b"\x02"), (b"\x01", b"\x02")),
     ],
-    ids=["each is a chunk", "lines without an end get one", "a board ends its lines itself", "C string"],
+    ids=["each is a chunk", "lines without an end get one", "a board ends its lines itself", "C string", "empty"],
 )
 def test_datagrams_are_chunks(address, sent, chunks):
     assert received(address, *sent) == [*chunks]
-
-
-def test_empty_datagram_is_ignored(address):
-    assert received(address, b"\x01", b"", b"\x02") == [b"\x01", b"\x02"]
-    with udp_port(address, b"") as port:
-        assert port.read(0.01) is None
 
 
 def test_udp_address_in_use_is_refused(address):

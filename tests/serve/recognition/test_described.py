@@ -130,14 +130,24 @@ def test_frames_are_recognised_in_a_damaged_stream():
     assert board.is_read_by(recognise([stream.tobytes()], FRAMES / RATE_HZ))
 
 
+def recognised_fields(number_formats, head, values):
+    """Return the recognised fields of frames that begin with AA 55, followed by a number and the values of channels."""
+    rows = np.column_stack([head, values]).astype(int).tolist()
+    data = b"".join(b"\xaa\x55" + struct.pack(number_formats, *numbers) for numbers in rows)
+    return recognise([data], FRAMES / RATE_HZ)["fields"]
+
+
+VALUES = np.random.default_rng(0).normal(0.0, 300.0, (FRAMES, 4)).round()
+"""Values of four channels, shape (FRAMES, 4)."""
+
+
 @pytest.mark.parametrize(("channel", "constant"), [(1, 0), (1, -7), (3, 0)])
 def test_channel_that_never_changes_is_kept_beside_the_others(channel, constant):
     """The doctor can only report a dead channel that the description contains."""
-    values = np.random.default_rng(0).normal(0.0, 300.0, (FRAMES, 4)).round().astype(int)
+    values = VALUES.copy()
     values[:, channel] = constant
-    data = b"".join(b"\xaa\x55" + struct.pack("<H4h", row, *numbers) for row, numbers in enumerate(values.tolist()))
-    table = recognise([data], FRAMES / RATE_HZ)
-    assert [field["name"] for field in table["fields"]] == ["seq", "ch1", "ch2", "ch3", "ch4"]
+    fields = recognised_fields("<H4h", np.arange(FRAMES), values)
+    assert [field["name"] for field in fields] == ["seq", "ch1", "ch2", "ch3", "ch4"]
 
 
 def test_checksum_covers_at_least_two_bytes():
@@ -162,13 +172,9 @@ def test_constant_bytes_and_nothing_are_not_recognised():
 
 @pytest.mark.parametrize("tick_rate_Hz", [31250.0, 32768.0])
 def test_clock_has_the_nearest_usual_tick_rate(tick_rate_Hz):
-    ticks = np.round(np.arange(FRAMES) * tick_rate_Hz / RATE_HZ).astype(int)
-    charges = np.random.default_rng(0).normal(800.0, 9.0, (FRAMES, 3)).round().astype(int)
-    rows = zip(ticks.tolist(), charges.tolist(), strict=True)
-    stream = b"".join(b"\xaa\x55" + struct.pack("<I3h", tick, *charge) for tick, charge in rows)
-    section = described_frames_section([stream], FRAMES / RATE_HZ)
-    clocks = [field for field in section["fields"] if field["name"] == "t_us"]
-    assert [clock["scale"] for clock in clocks] == pytest.approx([1e6 / tick_rate_Hz])
+    ticks = np.round(np.arange(FRAMES) * tick_rate_Hz / RATE_HZ)
+    clock, *_ = recognised_fields("<I4h", ticks, VALUES)
+    assert (clock["name"], clock["scale"]) == ("t_us", pytest.approx(1e6 / tick_rate_Hz))
 
 
 @pytest.mark.parametrize(
@@ -226,8 +232,5 @@ def test_printable_bytes_are_never_a_binary_format(line):
 
 
 def test_counter_of_one_byte_that_restarts_is_recognised():
-    values = np.random.default_rng(1).normal(0.0, 300.0, (FRAMES, 3)).round().astype(int)
-    rows = enumerate(values.tolist())
-    data = b"".join(b"\xaa\x55" + struct.pack("<B3h", row % 256, *numbers) for row, numbers in rows)
-    first_field = recognise([data], FRAMES / RATE_HZ)["fields"][0]
-    assert (first_field["name"], first_field["type"]) == ("seq", "u8")
+    counter, *_ = recognised_fields("<B4h", np.arange(FRAMES) % 256, VALUES)
+    assert (counter["name"], counter["type"]) == ("seq", "u8")
