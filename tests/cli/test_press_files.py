@@ -1,6 +1,7 @@
 """Commands that read a file of presses: names of rows and columns in messages, and long files."""
 
 import pyarrow
+import pytest
 from pyarrow.parquet import write_table
 
 from isocharge.common.defaults import MAX_BATCH
@@ -45,3 +46,11 @@ def test_a_long_table_is_predicted_in_pieces(command, tmp_path, monkeypatch):
     names, *rows = out.splitlines()
     assert out_of_empty.splitlines() == [names]
     assert (len(rows), len(set(rows))) == (MAX_BATCH + 1, 1)
+
+
+@pytest.mark.parametrize("setting", ['noise = "measured"', "hold_out = 0.2"])
+def test_a_setting_without_effect_on_measured_presses_is_refused(refused, tmp_path, setting):
+    (tmp_path / "p.csv").write_text("x_mm,y_mm,force_N,A,B,C\n1,2,1,100,200,300\n")
+    (tmp_path / "c.toml").write_text(f"[training]\n{setting}\n")
+    words = "train", "fit", tmp_path / "p.csv", "--config", tmp_path / "c.toml", "-o", tmp_path / "models" / "pad"
+    refused(*words, message=f"training.{setting.split()[0]} has no effect on measured presses")

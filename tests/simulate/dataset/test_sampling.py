@@ -74,6 +74,7 @@ def test_presses_depend_on_seed_and_probe():
     [
         ({"radius": np.nan}, "radius: expected a positive number"),
         ({"samples": 0}, "samples: expected at least 1, got 0"),
+        ({"seed": -1}, "seed: expected 0 or more, got -1"),
         ({"samples": 10_000_001}, "samples: expected at most 10000000, got 10000001"),
         ({"orientation": "Random"}, "orientation: expected 'fixed' or 'random', got 'Random'"),
         ({"force_range": (0.0, 1.0)}, "force: expected 0 < smallest <= largest force"),

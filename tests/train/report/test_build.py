@@ -185,3 +185,4 @@ def test_report_command_takes_the_model_of_the_sensor_unless_another_is_given(
     assert command(*words, "--model", f"{NAME}-student")[0] == 0
     assert evaluated_models == [find_model(NAME), find_model(f"{NAME}-student")]
     refused(*words, "--model", NAME, "--model", NAME, message="expected one model for each of 1 datasets, got 2")
+    refused(*words, "--sensor", NAME, message="contain their sensors; leave --sensor out")

@@ -120,6 +120,8 @@ class Sweep:
         if not 1 <= self.samples <= MAX_SAMPLES:
             bound = "at least 1" if self.samples < 1 else f"at most {MAX_SAMPLES}"
             raise SceneError(f"samples: expected {bound}, got {self.samples}")
+        if self.seed < 0:
+            raise SceneError(f"seed: expected 0 or more, got {self.seed}")
         if not 0 <= self.outside <= MAX_SAMPLES:
             raise SceneError(f"outside: expected 0 to {MAX_SAMPLES} presses outside the radius, got {self.outside}")
         min_force, max_force = self.force_range

@@ -28,7 +28,7 @@ from isocharge.simulate import (
     parse_probe,
     read_dataset,
 )
-from isocharge.train import FitConfig, Fitted, TrainingData, fit, fit_presses, load_config, release
+from isocharge.train import FitConfig, Fitted, TrainingConfig, TrainingData, fit, fit_presses, load_config, release
 from isocharge.train.data.presses import is_measured, measured_presses_of
 
 
@@ -118,6 +118,12 @@ def fit_command(
         train = partial(_fit_dataset, loaded_dataset)
     else:  # a file or a pipe
         _refuse_options(context, "measured presses", "probe", "position_std_mm", "force_std")
+        for setting in ("noise", "hold_out"):
+            if getattr(fit_config.training, setting) != getattr(TrainingConfig(), setting):
+                raise InputError(
+                    f"{config}: training.{setting} has no effect on measured presses, whose noise is estimated, and "
+                    "whose errors are measured by cross-validation; leave it out"
+                )
         presses = read_presses(dataset, position_std_mm=position_std_mm, force_std=force_std)
         electrodes = presses.electrodes
         say(f"{dataset}: {len(presses)} presses of the channels {', '.join(electrodes)}")

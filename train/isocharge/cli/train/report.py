@@ -62,6 +62,8 @@ def report_command(
     # Find the datasets and, for each of them, the model to compare.
     if model and len(model) != len(datasets):
         raise InputError(f"--model: expected one model for each of {len(datasets)} datasets, got {len(model)}")
+    if sensor is not None and not any(path.is_file() for path in datasets):
+        raise InputError(f"--sensor {sensor}: the dataset folders contain their sensors; leave --sensor out")
     loaded_datasets = [_read_dataset(path, sensor, probe) for path in datasets]
     model_names = model or [dataset.sensor.name for dataset in loaded_datasets]
     model_folders = [find_model(name, models) for name in model_names]
