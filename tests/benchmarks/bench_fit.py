@@ -33,7 +33,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.simulate import ChargeMap, Circle, Domain, NoiseModel, Sweep, load_sensor, noise_model
 from isocharge.train import LabelledPresses, NetworkConfig, TrainingConfig
-from isocharge.train.data.contact_errors import ContactErrorStatistics
+from isocharge.train.data.contact_errors import contact_error_statistics
 from isocharge.train.data.presses import LOWEST_CHARGE
 from isocharge.train.training.contact_training import LinearTargets, contact_stage
 from isocharge.train.training.fit import threads_and_seed
@@ -97,16 +97,16 @@ class Case:
         started = time.process_time()
         predict = fit()
         seconds = time.process_time() - started
-        limit = ContactErrorStatistics.of(self.estimate, self.truth)
+        limit = contact_error_statistics(self.estimate, self.truth)
         contact = predict(self.charge)
         difference = contact - self.estimate
         position_mm = np.sqrt(np.mean(np.sum(difference[:, :2] ** 2, axis=1)))
         force_percent = 100.0 * np.sqrt(np.mean((difference[:, 2] / self.truth[:, 2]) ** 2))
         return {
             "cpu_s": round(seconds, 2),
-            "position_rms_mm": round(ContactErrorStatistics.of(contact, self.truth).position_rms_mm, 4),
-            "position_over_limit": round(float(np.hypot(1.0, position_mm / limit.position_rms_mm)), 4),
-            "force_over_limit": round(float(np.hypot(1.0, force_percent / limit.force_rms_percent)), 4),
+            "position_rms_mm": round(contact_error_statistics(contact, self.truth)["position_rms_mm"], 4),
+            "position_over_limit": round(float(np.hypot(1.0, position_mm / limit["position_rms_mm"])), 4),
+            "force_over_limit": round(float(np.hypot(1.0, force_percent / limit["force_rms_percent"])), 4),
         }
 
     @cached_property

@@ -18,7 +18,7 @@ from shared import arguments, print_results
 from isocharge.serve import Predictor
 from isocharge.simulate import Circle, ForwardMap, Sweep, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
-from isocharge.train.data.contact_errors import ContactErrorStatistics
+from isocharge.train.data.contact_errors import contact_error_statistics
 
 RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial"
 MARGIN_mm = 0.01
@@ -71,14 +71,14 @@ def errors_over_limit(case: ModelCase, count: int) -> dict[str, Any]:
     problem = BayesProblem(case.film.sensor, case.film.probe, case.radius, case.film.domain.force_range, NOISE)
     bayes_contact, _ = bayes_estimate(problem, charge, charge_map=case.film)
     contact, _ = case.estimate(charge)
-    limit = ContactErrorStatistics.of(bayes_contact, truth)
-    errors = ContactErrorStatistics.of(contact, truth)
+    limit = contact_error_statistics(bayes_contact, truth)
+    errors = contact_error_statistics(contact, truth)
     return {
         "presses": count,
-        "position_rms_mm": errors.position_rms_mm,
-        "position_over_bayes": errors.position_rms_mm / limit.position_rms_mm,
-        "force_rms_percent": errors.force_rms_percent,
-        "force_over_bayes": errors.force_rms_percent / limit.force_rms_percent,
+        "position_rms_mm": errors["position_rms_mm"],
+        "position_over_bayes": errors["position_rms_mm"] / limit["position_rms_mm"],
+        "force_rms_percent": errors["force_rms_percent"],
+        "force_over_bayes": errors["force_rms_percent"] / limit["force_rms_percent"],
     }
 
 

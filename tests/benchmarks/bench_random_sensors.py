@@ -33,7 +33,7 @@ from isocharge.simulate import (
     noise_model,
 )
 from isocharge.train import LabelledPresses, TrainingData, fit
-from isocharge.train.data.contact_errors import ContactErrorStatistics
+from isocharge.train.data.contact_errors import contact_error_statistics
 
 NOISE = noise_model("reference")
 LARGEST_RATIO = 1.08
@@ -103,15 +103,15 @@ def measure(sensor: Sensor, probe: Circle, n_sample: int, n_press: int) -> dict[
     charge = NOISE.add(charge_map.charges(truth), np.random.default_rng(2))
     estimate, std, _ = fitted.predict(charge)
     limit_estimate, _ = bayes_estimate(BayesProblem(sensor, probe, radius), charge, charge_map=charge_map)
-    errors = ContactErrorStatistics.of(estimate, truth)
-    limit = ContactErrorStatistics.of(limit_estimate, truth)
+    errors = contact_error_statistics(estimate, truth)
+    limit = contact_error_statistics(limit_estimate, truth)
     deviation = np.abs(estimate - truth) / std
     return {
         "radius_mm": radius,
-        "limit_mm": round(limit.position_rms_mm, 4),
-        "position_over_limit": round(errors.position_rms_mm / limit.position_rms_mm, 3),
-        "limit_percent": round(limit.force_rms_percent, 3),
-        "force_over_limit": round(errors.force_rms_percent / limit.force_rms_percent, 3),
+        "limit_mm": round(limit["position_rms_mm"], 4),
+        "position_over_limit": round(errors["position_rms_mm"] / limit["position_rms_mm"], 3),
+        "limit_percent": round(limit["force_rms_percent"], 3),
+        "force_over_limit": round(errors["force_rms_percent"] / limit["force_rms_percent"], 3),
         "coverage_68": round(float(np.mean(deviation < 1.0)), 3),
         "training_cpu_s": round(seconds, 1),
         "cautions": len(fitted.made_with.get("cautions", ())),

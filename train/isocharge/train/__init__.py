@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from isocharge.train.calibration.problem import CalibrationProblem
     from isocharge.train.calibration.result import CalibrationResult
     from isocharge.train.calibration.session import PressSession
-    from isocharge.train.data.contact_errors import ContactErrorStatistics
     from isocharge.train.data.presses import LabelledPresses
     from isocharge.train.model_release.evaluate import evaluate
     from isocharge.train.model_release.release import Release, release
@@ -43,7 +42,6 @@ else:  # hidden from type checkers, which would otherwise accept every misspelt 
 __all__ = [
     "CalibrationProblem",
     "CalibrationResult",
-    "ContactErrorStatistics",
     "FilmEstimate",
     "FitConfig",
     "Fitted",

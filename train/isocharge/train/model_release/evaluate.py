@@ -10,7 +10,7 @@ from isocharge.serve.flags import STRESS
 from isocharge.serve.model.contact import Contacts, Validity
 from isocharge.serve.model.metadata import ModelMetadata, UnnoticedPresses
 from isocharge.train.data.channel_noise import Noise, misfit_noise
-from isocharge.train.data.contact_errors import ContactErrorStatistics, position_error, rounded
+from isocharge.train.data.contact_errors import contact_error_statistics, position_error, rounded
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.fit import Fitted
 
@@ -106,9 +106,7 @@ def contact_errors(contact: Array, std: Array, truth: Array) -> dict[str, float]
     Returns:
         Errors by name, as `evaluate` returns them.
     """
-    errors = ContactErrorStatistics.of(contact, truth).rounded()
-    del errors["presses"]  # the number of presses is not an error
-    return errors | _coverages(contact, std, truth)
+    return contact_error_statistics(contact, truth) | _coverages(contact, std, truth)
 
 
 def _coverages(estimate: Array, std: Array, truth: Array) -> dict[str, float]:

@@ -25,7 +25,7 @@ from isocharge.simulate.identifiability.nearest_contact import search
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.calibration.folder import PRESSES
 from isocharge.train.data.charge_fit import fit_charge_series
-from isocharge.train.data.contact_errors import ContactErrorStatistics, rms, rounded
+from isocharge.train.data.contact_errors import contact_error_statistics, rms, rounded
 from isocharge.train.data.presses import (
     FEWEST_PLACES,
     HELD_PARTS,
@@ -168,8 +168,8 @@ class MethodRecord:
         name: Name of the method.
         library: Library that computes the estimates.
         answered: Fraction of the presses for which the method returned an estimate, 0 to 1.
-        errors: Statistics of the errors on these presses, by the names of `ContactErrorStatistics`; empty if there are
-            no such presses.
+        errors: Statistics of the errors on these presses, by the names of `contact_error_statistics`; empty if there
+            are no such presses.
         single_press_us: Median duration of the estimate for one press, us.
     """
 
@@ -412,10 +412,9 @@ def contact_errors(estimate: Array, truth: Array) -> tuple[float, dict[str, floa
 
     Returns:
         The fraction of the presses with an estimate; and the statistics of the errors on these presses, by the names of
-        `ContactErrorStatistics`. Without any estimate, there are no statistics.
+        `contact_error_statistics`. Without any estimate, there are no statistics.
     """
     has_estimate = np.isfinite(estimate).all(axis=1)
     if not has_estimate.any():
         return 0.0, {}
-    statistics = ContactErrorStatistics.of(estimate[has_estimate], truth[has_estimate])
-    return float(np.mean(has_estimate)), statistics.rounded()
+    return float(np.mean(has_estimate)), contact_error_statistics(estimate[has_estimate], truth[has_estimate])
