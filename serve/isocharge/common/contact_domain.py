@@ -84,11 +84,6 @@ class Domain:
         contact[..., 2] = np.exp(contact[..., 2])
         return contact
 
-    @property
-    def _allowed_positions(self) -> str:
-        """Description of the allowed positions for error messages."""
-        return f"at most {self.radius:g} mm from the centre"
-
     def within(self, radius: float) -> "Domain":
         """Return a copy of the domain with another radius (mm) and the same range of forces."""
         return Domain(radius, self.force_range)
@@ -127,7 +122,7 @@ class Domain:
             low, high = self.force_range
             raise SceneError(
                 f"press {first_outside} at ({x:.4g}, {y:.4g}) mm with {force:.4g} N is outside the {source}: expected "
-                f"{self._allowed_positions} and {low:g} to {high:g} N"
+                f"at most {self.radius:g} mm from the centre and {low:g} to {high:g} N"
             )
         return contact
 

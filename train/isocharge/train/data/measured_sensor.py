@@ -68,13 +68,9 @@ class PressedArea(Domain):
             # Both ends are moved by the same factor, so that their geometric mean remains.
             min_force /= LEAST_RANGE**0.5
             max_force *= LEAST_RANGE**0.5
-        return cls.of_corners(corners, (min_force, max_force))
-
-    @classmethod
-    def of_corners(cls, corners: Array, force_range: tuple[float, float]) -> "PressedArea":
-        """Return the domain with the given corners (x, y), shape (n, 2), mm, and the given range of forces, N."""
         distance_from_middle = np.linalg.norm(corners - _box_middle(corners), axis=1)
-        return cls(float(distance_from_middle.max()), force_range, tuple((x, y) for x, y in corners.tolist()))
+        corner_places = tuple((x, y) for x, y in corners.tolist())
+        return cls(float(distance_from_middle.max()), (min_force, max_force), corner_places)
 
     @cached_property
     def centre(self) -> Array:
@@ -85,13 +81,6 @@ class PressedArea(Domain):
     def scale(self) -> Array:
         """Half widths of the ranges of x, y and ln F, shape (3,), with x and y in mm and F in N."""
         return np.append(0.5 * np.ptp(np.array(self.corners), axis=0), super().scale[2])
-
-    @property
-    def _allowed_positions(self) -> str:
-        """Description of the allowed positions for error messages."""
-        left, bottom = np.min(self.corners, axis=0)
-        right, top = np.max(self.corners, axis=0)
-        return f"a place in the pressed area, x from {left:g} to {right:g} mm and y from {bottom:g} to {top:g} mm,"
 
     def is_outside(self, contact: Array) -> Booleans:
         """Return whether each contact lies outside the area or has a force outside the range of forces.
