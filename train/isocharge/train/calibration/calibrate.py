@@ -8,6 +8,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.presses.measured_presses import MeasuredPresses, row_words
+from isocharge.simulate import FilmSlopes
 from isocharge.simulate.solver.assembly import single_threaded_blas
 from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.diagnosis import (
@@ -19,7 +20,7 @@ from isocharge.train.calibration.diagnosis import (
     unexplained_error,
 )
 from isocharge.train.calibration.estimator import Estimation, estimate
-from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.calibration.film_charges import PROBE_RADIUS, STEP, FilmCharges, solve_even_map
 from isocharge.train.calibration.press_data import PressData
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.calibration.result import CalibrationResult
@@ -119,7 +120,7 @@ def calibrate(
 def solve_even(
     problem: CalibrationProblem, executor: Executor | None = None, values: Array | None = None
 ) -> FilmCharges:
-    """Solve the axisymmetric film with given properties under an axisymmetric probe.
+    """Solve the axisymmetric film with given properties under an axisymmetric probe, at a few presses.
 
     Args:
         problem: The calibration problem.
@@ -128,12 +129,15 @@ def solve_even(
             which a calibration begins.
     """
     layout = problem.prior.layout
-    return FilmCharges.solve_roughly(
-        layout.prior,
-        problem.prior.mean[layout.film] if values is None else values,
-        problem.solved_domain,
-        executor,
-    )
+    prior = layout.prior
+    even_values = prior.even(problem.prior.mean[layout.film] if values is None else values)
+    film = solve_even_map(prior, even_values, problem.solved_domain, executor)
+    larger_probe = None
+    if PROBE_RADIUS in prior.names:
+        is_radius = np.arange(len(even_values)) == prior.index(PROBE_RADIUS)
+        larger_values = even_values + STEP * prior.std * is_radius
+        larger_probe = solve_even_map(prior, larger_values, problem.solved_domain, executor)
+    return FilmCharges(prior, even_values, film, FilmSlopes.build(film, executor=executor), larger_probe)
 
 
 def _fit_even_film(
@@ -168,10 +172,9 @@ def _fit_uneven_film(
 def _solved_distance(estimation: Estimation) -> float:
     """Return the largest distance of the even properties from those of the solved film, in standard deviations."""
     film, charges = estimation.film, estimation.charges
-    names = ("pretension", "young", "thickness", "probe_radius")
-    rows = [charges.prior.index(name) for name in names if name in charges.prior.names]
-    std = np.sqrt(np.diagonal(film.covariance)[rows])
-    return float(np.abs((film.film_values - charges.values)[rows] / std).max())
+    is_even = charges.prior.changes_stress & ~charges.prior.is_imperfection
+    std = np.sqrt(np.diagonal(film.covariance)[film.layout.film])
+    return float(np.abs((film.film_values - charges.values) / std)[is_even].max())
 
 
 def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:

@@ -85,8 +85,8 @@ class ContactSensitivity:
             unknowns: Unknowns of the film, shape (n_unknown,).
         """
         domain = problem.domain
-        data, contact = _ideal_presses(problem, charges, unknowns, spread_contacts(domain))
-        linearised = linearise(charges, problem.prior.layout, data, unknowns, contact)
+        data = _ideal_presses(problem, charges, unknowns, spread_contacts(domain))
+        linearised = linearise(charges, problem.prior.layout, data, unknowns, data.contact)
         slopes = linearised.contact_jacobian[:, :-3]
         domain_precision = np.diag(3.0 / domain.scale**2)  # the variance of a uniform distribution from -1 to 1 is 1/3
         noise_covariance = np.linalg.inv(slopes.swapaxes(1, 2) @ slopes + domain_precision)
@@ -161,8 +161,8 @@ def next_presses(
     unknowns = problem.prior.mean if film is None else film.values
     covariance = problem.prior.covariance(PLANNED) if film is None else film.covariance
     candidates = _candidates(problem)
-    data, contact = _ideal_presses(problem, charges, unknowns, candidates, position_std_mm, force_std)
-    _, information_root = linearise(charges, problem.prior.layout, data, unknowns, contact).eliminated()
+    data = _ideal_presses(problem, charges, unknowns, candidates, position_std_mm, force_std)
+    _, information_root = linearise(charges, problem.prior.layout, data, unknowns, data.contact).eliminated()
     sensitivity = ContactSensitivity.of(problem, charges, unknowns)
 
     # The errors of position and force count relative to those of the noise.
@@ -210,11 +210,11 @@ def _ideal_presses(
     contact: Array,
     position_std_mm: float = POSITION_STD_MM,
     force_std: float = FORCE_STD,
-) -> tuple[PressData, Array]:
-    """Return presses whose charges are exactly those of a film, and their contacts (x, y, ln F)."""
+) -> PressData:
+    """Return presses with given contacts (x, y, F), shape (n, 3), whose charges are exactly those of a film."""
     charge = charges.charges(unknowns[problem.prior.layout.film], contact)
     count = len(contact)
-    data = PressData(
+    return PressData(
         charge=charge,
         charge_std=problem.noise.sigma(charge),
         noise=problem.noise,
@@ -222,4 +222,3 @@ def _ideal_presses(
         contact_std=np.tile([position_std_mm, position_std_mm, force_std], (count, 1)),
         time=np.linspace(-0.5, 0.5, count),
     )
-    return data, data.contact

@@ -22,7 +22,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import chdtrc, chdtri, softmax
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.serve.model.robust_estimate import MeasuredContacts, ModelValues, RobustEstimate, robust_estimate
+from isocharge.serve.model.robust_estimate import MeasuredContacts, ModelValues, robust_estimate
 from isocharge.serve.model.robust_estimate import Prior as StatePrior
 from isocharge.simulate import NoiseModel, noise_model
 from isocharge.train.calibration.film_charges import FilmCharges
@@ -268,7 +268,17 @@ def _estimate_with_errors(
     if previous is not None:
         unknowns = previous.film.values
         log_contact = np.column_stack([previous.contact[:, :2], np.log(previous.contact[:, 2])])
-    found = _search(charges, data, prior, unknowns, log_contact)
+    charge_variance = np.nan_to_num(data.charge_std**2)  # the largest number for a charge that was not measured
+    found = robust_estimate(
+        lambda contacts, state: model_values(charges, layout, data, state, contacts),
+        data.charge,
+        charge_variance[:, :, None] * np.eye(charge_variance.shape[1]),
+        StatePrior(prior.mean, prior.covariance(TYPICAL)),
+        unknowns,
+        log_contact,
+        measured=MeasuredContacts(data.contact, data.contact_std),
+        state_bounds=prior.bounds,
+    )
     unknowns, log_contact = found.state, found.contacts.copy()
     redundancy = _redundancy(data)
     is_bad = (redundancy > 0) & (chdtrc(np.maximum(redundancy, 1), found.chi2) < BAD_PROBABILITY)
@@ -316,29 +326,6 @@ def _estimate_with_errors(
         chi2=fits[best].chi2,
         redundancy=float(redundancy[is_used].sum()),
         hypothesis=probable[best],
-    )
-
-
-def _search(charges: FilmCharges, data: PressData, prior: Prior, unknowns: Array, contact: Array) -> RobustEstimate:
-    """Search for the most probable unknowns and contacts under the typical hypothesis, with robust weights.
-
-    Args:
-        charges: Charges of a solved film and of similar films.
-        data: The presses.
-        prior: Prior distribution.
-        unknowns: Unknowns from which the search begins.
-        contact: Contacts (x, y, ln F) from which it begins.
-    """
-    variance = np.nan_to_num(data.charge_std**2)  # the largest number for a charge that was not measured
-    return robust_estimate(
-        lambda contacts, state: model_values(charges, prior.layout, data, state, contacts),
-        data.charge,
-        variance[:, :, None] * np.eye(variance.shape[1]),
-        StatePrior(prior.mean, prior.covariance(TYPICAL)),
-        unknowns,
-        contact,
-        measured=MeasuredContacts(data.contact, data.contact_std),
-        state_bounds=prior.bounds,
     )
 
 

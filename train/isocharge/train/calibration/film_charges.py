@@ -52,41 +52,6 @@ class FilmCharges:
     slopes: FilmSlopes
     larger_probe: ForwardMap | None
 
-    @classmethod
-    def solve_roughly(
-        cls,
-        prior: FilmPrior,
-        values: Array,
-        domain: Domain,
-        executor: Executor | None,
-    ) -> "FilmCharges":
-        """Solve the axisymmetric film with the mean properties, under an axisymmetric probe, at a few presses.
-
-        Args:
-            prior: Declarations of the properties, with the described sensor and probe.
-            values: Properties of the film, shape (n_property,). Imperfections are ignored.
-            domain: Contacts for which the charges are needed.
-            executor: Executor that runs the solves; None for this process.
-
-        Raises:
-            SceneError: If some presses of the domain cannot exist.
-            SolveError: If a press has no equilibrium.
-        """
-        even_values = prior.even(values)
-        same_probe = solve_even_map(prior, even_values, domain, executor)
-        larger_probe = None
-        if PROBE_RADIUS in prior.names:
-            is_radius = np.arange(len(values)) == prior.index(PROBE_RADIUS)
-            larger_values = even_values + STEP * prior.std * is_radius
-            larger_probe = solve_even_map(prior, larger_values, domain, executor)
-        return cls(
-            prior=prior,
-            values=even_values,
-            film=same_probe,
-            slopes=FilmSlopes.build(same_probe, executor=executor),
-            larger_probe=larger_probe,
-        )
-
     def solved(self, values: Array, executor: Executor | None) -> "FilmCharges":
         """Solve a similar film under the probe itself, even if the probe is not circular, and return its charges.
 
@@ -143,8 +108,21 @@ class FilmCharges:
         solved_charge = _read(self.film, sensor).charges(contact)
         stress_derivatives = self._stress_derivatives(sensor, contact, solved_charge)
         charge, factor = self._changed(values, solved_charge, stress_derivatives)
-        jacobian = self._jacobian(values, sensor, contact, solved_charge, stress_derivatives)
-        return charge, factor[:, :, None] * jacobian
+
+        derivatives = {**stress_derivatives, "crosstalk": solved_charge.sum(axis=1, keepdims=True) - solved_charge}
+        for name in UNEVEN_TENSIONS:  # shares of the pretension
+            share = values[self.prior.index(name)]
+            derivatives[PRETENSION.name] = derivatives[PRETENSION.name] + share * derivatives[name]
+            derivatives[name] = values[self.prior.index(PRETENSION.name)] * derivatives[name]
+        for electrode, name in enumerate(sensor.electrode_names):
+            own_charge = np.zeros_like(solved_charge)
+            own_charge[:, electrode] = solved_charge[:, electrode]
+            derivatives[f"gain {name}"] = own_charge
+        columns = [
+            derivatives[one.name] if one.name in derivatives else self._read_difference(sensor, one, contact)
+            for one in self.prior.properties
+        ]
+        return charge, factor[:, :, None] * np.stack(columns, axis=2)
 
     def _changed(
         self, values: Array, solved_charge: Array, stress_derivatives: dict[str, Array]
@@ -200,36 +178,6 @@ class FilmCharges:
         uneven = {name: described_MPa + value[name] * pretension for name, described_MPa in described}
         return {PRETENSION.name: pretension} | uneven
 
-    def _jacobian(
-        self, values: Array, sensor: Sensor, contact: Array, charge: Array, stress_derivatives: dict[str, Array]
-    ) -> Array:
-        """Compute the derivatives of the charges with respect to all properties.
-
-        Args:
-            values: Properties of the film, shape (n_property,).
-            sensor: Sensor with the electrodes and the coefficients.
-            contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            charge: Charges of the solved film at these contacts, shape (n, n_electrode), pC.
-            stress_derivatives: See `_stress_derivatives`.
-
-        Returns:
-            Derivatives, shape (n, n_electrode, n_property), pC per unit.
-        """
-        derivatives = {**stress_derivatives, "crosstalk": charge.sum(axis=1, keepdims=True) - charge}
-        for name in UNEVEN_TENSIONS:  # shares of the pretension
-            share = values[self.prior.index(name)]
-            derivatives[PRETENSION.name] = derivatives[PRETENSION.name] + share * derivatives[name]
-            derivatives[name] = values[self.prior.index(PRETENSION.name)] * derivatives[name]
-        for electrode, name in enumerate(sensor.electrode_names):
-            own_charge = np.zeros_like(charge)
-            own_charge[:, electrode] = charge[:, electrode]
-            derivatives[f"gain {name}"] = own_charge
-        columns = [
-            derivatives[one.name] if one.name in derivatives else self._read_difference(sensor, one, contact)
-            for one in self.prior.properties
-        ]
-        return np.stack(columns, axis=2)
-
     def _stress_derivatives(self, sensor: Sensor, contact: Array, charge: Array) -> dict[str, Array]:
         """Compute the derivatives with respect to the properties that change the stress, by the name of the property.
 
@@ -270,7 +218,15 @@ class FilmCharges:
 def solve_even_map(prior: FilmPrior, values: Array, domain: Domain, executor: Executor | None) -> ForwardMap:
     """Solve the axisymmetric film with the mean properties, under an axisymmetric probe, at a few presses.
 
-    See `FilmCharges.solve_roughly`, which also computes the derivatives with respect to the properties.
+    Args:
+        prior: Declarations of the properties, with the described sensor and probe.
+        values: Properties of the film, shape (n_property,).
+        domain: Contacts for which the charges are needed.
+        executor: Executor that runs the solves; None for this process.
+
+    Raises:
+        SceneError: If some presses of the domain cannot exist.
+        SolveError: If a press has no equilibrium.
     """
     sensor, probe = prior.film(values)
     nodes = few_nodes(sensor.film, domain)

@@ -102,7 +102,6 @@ class SessionProperty:
 
     Attributes:
         name: Name of the unknown.
-        unit: Unit of its value.
         stds: Standard deviations of the prior distribution that are considered, with their probabilities.
         effect: Function that computes the derivatives of the charges, shape (n, n_electrode). Its arguments are the
             times of the presses, shape (n,), and the charges of the film, shape (n, n_electrode).
@@ -110,7 +109,6 @@ class SessionProperty:
     """
 
     name: str
-    unit: str
     stds: tuple[tuple[float, float], ...]
     effect: Callable[[Array, Array], Array]
     caution: str
@@ -119,7 +117,6 @@ class SessionProperty:
 SESSION = (
     SessionProperty(
         "offset",
-        "pC",
         ((1e-6, 0.9), (30.0, 0.1)),
         lambda _, charge: np.ones_like(charge),
         "all charges of all presses contain an offset of {value:.2g} +- {std:.2g} pC: is the tare right? The model "
@@ -127,7 +124,6 @@ SESSION = (
     ),
     SessionProperty(
         "drift",
-        "1",
         ((1e-6, 0.95), (0.15, 0.05)),
         lambda time, charge: time[:, None] * charge,
         "the charges change by a share of {value:.2g} +- {std:.2g} from the first press to the last: does an amplifier "
@@ -157,13 +153,6 @@ class Layout:
         degrees_of_terms = ["".join(map(str, degrees)) for degrees in _degrees().tolist()]  # of x, y and ln F
         coefficients = [f"discrepancy {term} {name}" for term in degrees_of_terms for name in electrodes]
         return (*self.prior.names, *(one.name for one in SESSION), *coefficients)
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """Units of all unknowns."""
-        count = self.coefficients.stop - self.coefficients.start
-        named = (*(one.unit for one in self.prior.properties), *(one.unit for one in SESSION))
-        return (*named, *("1",) * count)
 
     @property
     def film(self) -> slice:

@@ -14,9 +14,10 @@ models. Programs only read the version folders, and the copies above the version
 calibration, the copies are written again from the last version, because an earlier process may have been killed before
 it wrote the copies.
 
-The file `calibration.json` contains the value, the standard deviation and the unit of each unknown. `correlations` is
-the lower triangle of the correlation matrix of all unknowns, in this order: one row for each unknown, without the
-diagonal, rounded to six digits. The correlations of an unknown whose standard deviation is zero are zero.
+The file `calibration.json` contains the value and the standard deviation of each unknown, in the unit of the property
+of the same name, in pC (offset), or without a unit. `correlations` is the lower triangle of the correlation matrix of
+all unknowns, in this order: one row for each unknown, without the diagonal, rounded to six digits. The correlations of
+an unknown whose standard deviation is zero are zero.
 """
 
 import json
@@ -62,7 +63,7 @@ Correlation = Annotated[float, Meta(ge=-1.0, le=1.0)]
 
 
 class _Unknown(Struct, frozen=True):
-    """Value and standard deviation of an unknown. The unit in the file is for people."""
+    """Value and standard deviation of an unknown."""
 
     value: Number
     std: Std
@@ -79,7 +80,7 @@ class _CalibrationFile(Struct, frozen=True):
     unknowns: dict[str, _Unknown]
     noise: NoiseModel
     correlations: list[list[Correlation]]
-    described_sensor: dict[str, Any] | None = None  # None in files of earlier releases of isocharge
+    described_sensor: dict[str, Any]
 
 
 def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any]:
@@ -102,8 +103,8 @@ def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any
         "force_range_N": list(problem.force_range),
         "noise": vars(film.noise),
         "unknowns": {
-            name: {"value": value, "std": one_std, "unit": unit}
-            for name, value, one_std, unit in zip(layout.names, film.values, std, layout.units, strict=True)
+            name: {"value": value, "std": one_std}
+            for name, value, one_std in zip(layout.names, film.values, std, strict=True)
         },
         "correlations": [row[:index] for index, row in enumerate(rounded)],
         "described_sensor": sensor_to_dict(problem.sensor),
@@ -166,8 +167,7 @@ def _check_same_problem(path: Path, content: _CalibrationFile, problem: Calibrat
             )
     # The properties are deviations from the sensor file, so that they would be wrong with another one.
     described = plain_values(sensor_to_dict(problem.sensor))
-    earlier = described if content.described_sensor is None else content.described_sensor
-    differences = [key for key in described if described[key] != earlier.get(key)]
+    differences = [key for key in described if described[key] != content.described_sensor.get(key)]
     if differences:
         raise PressError(
             f"{path}: expected the sensor file from which this calibration began, got one with another "

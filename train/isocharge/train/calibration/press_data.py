@@ -178,15 +178,3 @@ def in_domain(contact: Array, charges: FilmCharges) -> Array:
     """Convert contacts (x, y, ln F) to (x, y, F), and move contacts outside the domain to its nearest contact."""
     log_force = np.clip(contact[:, 2], *np.log(charges.domain.force_range))  # no number overflows
     return charges.into_domain(np.column_stack([contact[:, :2], np.exp(log_force)]))
-
-
-def no_presses(electrodes: tuple[str, ...]) -> MeasuredPresses:
-    """Create an empty list of presses for electrodes with the given names."""
-    return MeasuredPresses(
-        contact=np.empty((0, 3)),
-        charge_pC=np.empty((0, len(electrodes))),
-        position_std_mm=np.empty(0),
-        force_std=np.empty(0),
-        electrodes=electrodes,
-        lines=(),
-    )

@@ -21,7 +21,6 @@ from isocharge.train.calibration.calibrate import calibrate, solve_even
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
 from isocharge.train.calibration.estimator import FEW_PRESSES
 from isocharge.train.calibration.film_charges import FilmCharges
-from isocharge.train.calibration.press_data import no_presses
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.calibration.result import CalibrationResult
 
@@ -126,7 +125,9 @@ class PressSession:
         self._save = save
         self._until = until
         self._stds = {"position_std_mm": position_std_mm, "force_std": force_std}
-        self._fit(presses or no_presses(problem.electrodes))
+        no_charges = np.empty((0, len(problem.electrodes)))
+        no_presses = MeasuredPresses(np.empty((0, 3)), no_charges, np.empty(0), np.empty(0), problem.electrodes, ())
+        self._fit(presses or no_presses)
 
     def __len__(self) -> int:
         return len(self.presses)

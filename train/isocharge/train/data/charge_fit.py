@@ -173,7 +173,7 @@ def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
     return coefficients
 
 
-def determined_degree(coordinate: Array, largest: int, smallest_singular_value: float = 0.1) -> int:
+def determined_degree(coordinate: Array, largest: int) -> int:
     """Return the largest degree of a polynomial that values at the given coordinates determine.
 
     For example, values at three coordinates, or close to them, determine a polynomial of the degree 2. They do not
@@ -182,9 +182,10 @@ def determined_degree(coordinate: Array, largest: int, smallest_singular_value: 
     Args:
         coordinate: Coordinates, scaled to [-1, 1], shape (n,).
         largest: Upper bound of the result.
-        smallest_singular_value: Smallest singular value of the matrix of the Chebyshev polynomials, divided by the root
-            of n, with which a degree counts as determined. For evenly distributed coordinates, it is above 0.3.
     """
+    # Smallest singular value of the matrix of the Chebyshev polynomials, divided by the root of n, with which a degree
+    # counts as determined. For evenly distributed coordinates, it is above 0.3.
+    smallest_singular_value = 0.1
     terms = chebyshev.chebvander(coordinate, largest)
     moments = terms.T @ terms / len(coordinate)
     smallest_eigenvalues = [np.linalg.eigvalsh(moments[:count, :count])[0] for count in range(1, largest + 2)]
