@@ -18,7 +18,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
-from bayes.limit import BayesProblem, bayes_estimate
+from bayes.posterior import Posterior
 from shared import arguments, print_results
 from sklearn.compose import TransformedTargetRegressor
 from sklearn.decomposition import PCA
@@ -30,8 +30,18 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isocharge.common.arrays import Array
-from isocharge.common.defaults import FEW_ELECTRODES
-from isocharge.simulate import ChargeMap, Circle, Domain, NoiseModel, Sweep, load_sensor, noise_model
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE, FEW_ELECTRODES
+from isocharge.simulate import (
+    ChargeMap,
+    ChargeSpline,
+    Circle,
+    Domain,
+    ForwardMap,
+    NoiseModel,
+    Sweep,
+    load_sensor,
+    noise_model,
+)
 from isocharge.train import LabelledPresses, NetworkConfig, TrainingConfig
 from isocharge.train.data.contact_errors import contact_error_statistics
 from isocharge.train.data.presses import LOWEST_CHARGE
@@ -71,14 +81,14 @@ class Case:
     @classmethod
     def simulate(cls, sensor_name: str, radius: float, n_sample: int, n_press: int, noise: NoiseModel) -> "Case":
         """Simulate the presses and compute the limit."""
-        problem = BayesProblem(load_sensor(sensor_name), Circle(1.0), radius, noise=noise)
-        charge_map = problem.forward_map()
-        contact = Sweep(radius, problem.force_range, n_sample, 0).contacts()
-        truth = Sweep(radius, problem.force_range, n_press, 1).contacts()
+        domain = Domain(radius, DEFAULT_FORCE_RANGE)
+        charge_map = ForwardMap.build(load_sensor(sensor_name), Circle(1.0), radius, domain.force_range)
+        contact = Sweep(radius, domain.force_range, n_sample, 0).contacts()
+        truth = Sweep(radius, domain.force_range, n_press, 1).contacts()
         charge = noise.add(charge_map.charges(truth), np.random.default_rng(2))
-        estimate, _ = bayes_estimate(problem, charge, charge_map=charge_map)
+        estimate, _ = Posterior(ChargeSpline.of(charge_map), noise, radius).mean_and_std(charge)
         return cls(
-            domain=Domain(radius, problem.force_range),
+            domain=domain,
             train=LabelledPresses(contact, charge_map.charges(contact)),
             truth=truth,
             charge=charge,

@@ -18,17 +18,16 @@ import time
 from typing import NamedTuple
 
 import numpy as np
-from shared import options, print_results
+from shared import model_film, options, print_results
 
 from isocharge.serve import Contact, Predictor
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.charge_file import read_charge_map
 from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.tracking.tracker import Tracker, TrackRule
-from isocharge.simulate import Circle, ForwardMap, noise_model
+from isocharge.simulate import noise_model
 from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
-from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 
 RISE_TIME_s = 0.03
 """Time in which the force rises, s."""
@@ -63,22 +62,6 @@ class Slide(NamedTuple):
     t_s: np.ndarray
     contact: np.ndarray
     side: np.ndarray
-
-
-class CountedFrame(NamedTuple):
-    """Result of a counted frame.
-
-    Attributes:
-        is_known: Whether the tracker reports a single contact.
-        is_right: Whether the tracked contact is on the right side of the folds.
-        is_one_right: Whether the tracked contact or the other reported contact is on the right side.
-        error_mm: Distance of the tracked contact from the true one, mm.
-    """
-
-    is_known: bool
-    is_right: bool
-    is_one_right: bool
-    error_mm: float
 
 
 def sides(film: ChargeMap, contact: np.ndarray) -> np.ndarray:
@@ -133,7 +116,7 @@ def into_map(contact: np.ndarray, film: ChargeMap) -> np.ndarray:
 
 def examine_frame(
     film: ChargeMap, tracked: Contact, other: Contact | None, truth: np.ndarray, side: float
-) -> CountedFrame:
+) -> tuple[bool, bool, bool, float]:
     """Compare the contacts that the tracker reports with the true contact.
 
     Args:
@@ -142,13 +125,17 @@ def examine_frame(
         other: The other possible contact; None if there is none.
         truth: The true contact (x, y, F), shape (3,), mm and N.
         side: Side of the folds of the true contact.
+
+    Returns:
+        Whether the tracker reports a single contact; whether the tracked contact is on the right side of the folds;
+        whether it or the other contact is on the right side; and the distance of the tracked contact from the true one,
+        mm.
     """
     contacts = [contact for contact in (tracked, other) if contact is not None]
-    reported = np.array([(contact.x_mm, contact.y_mm, contact.force_N) for contact in contacts])
+    reported = np.array([contact[:3] for contact in contacts])
     is_right_side = sides(film, into_map(reported, film)) == side
-    true_x, true_y, _ = truth
-    error_mm = float(np.hypot(tracked.x_mm - true_x, tracked.y_mm - true_y))
-    return CountedFrame(other is None, bool(is_right_side[0]), bool(is_right_side.any()), error_mm)
+    error_mm = float(np.hypot(*(reported[0] - truth)[:2]))
+    return other is None, bool(is_right_side[0]), bool(is_right_side.any()), error_mm
 
 
 def main() -> None:
@@ -162,9 +149,7 @@ def main() -> None:
         raise SystemExit(f"{asked.model}: no charges.npz: its map does not fold; give the model of the lines above")
     tracker = Tracker(Setup(metadata.electrodes, Device(rules={TrackRule: TrackRule()}), predictor=predictor))
     radius = charges.domain.radius
-    sensor = sensor_from_dict(dict(metadata.sensor))
-    forward_map = ForwardMap.build(sensor, Circle(1.0), radius + MAP_MARGIN_mm, metadata.force_range_N)
-    film = with_fast_derivatives(forward_map)
+    film = with_fast_derivatives(model_film(predictor, radius + MAP_MARGIN_mm))
 
     counted_frames = []
     tracking_s = 0.0
@@ -187,16 +172,14 @@ def main() -> None:
             tracked, other = reports[number]
             counted_frames.append(examine_frame(film, tracked, other, slide.contact[number], slide.side[number]))
 
-    is_known = np.array([frame.is_known for frame in counted_frames])
-    is_right = np.array([frame.is_right for frame in counted_frames])
-    known_errors_mm = [frame.error_mm for frame in counted_frames if frame.is_known]
+    is_known, is_right, is_one_right, error_mm = map(np.array, zip(*counted_frames, strict=True))
     results = {
         "known_percent": 100.0 * is_known.mean(),
         "right_percent": 100.0 * is_right.mean(),
         "right_of_known_percent": 100.0 * is_right[is_known].mean(),
-        "right_or_said_percent": 100.0 * float(np.mean([frame.is_one_right for frame in counted_frames])),
-        "error_of_known_median_mm": float(np.median(known_errors_mm)),
-        "error_of_known_95_percent_mm": float(np.quantile(known_errors_mm, 0.95)),
+        "right_or_said_percent": 100.0 * is_one_right.mean(),
+        "error_of_known_median_mm": float(np.median(error_mm[is_known])),
+        "error_of_known_95_percent_mm": float(np.quantile(error_mm[is_known], 0.95)),
         "step_us": tracking_s / frame_count * 1e6,
     }
     print_results("folds", asked, {"frames": len(counted_frames), "slides": results})

@@ -7,17 +7,15 @@ and the forces of the model. Computing the Bayes limit takes half a minute
 for a thousand presses.
 """
 
-import math
 from typing import Any
 
 import numpy as np
-from bayes.limit import BayesProblem, bayes_estimate
+from bayes.posterior import Posterior
 from scipy.stats import norm
-from shared import arguments, print_results
+from shared import arguments, inner_radius_mm, model_film, print_results
 
 from isocharge.serve import Predictor
-from isocharge.simulate import Circle, ForwardMap, Sweep, noise_model
-from isocharge.simulate.sensor.sensor_file import sensor_from_dict
+from isocharge.simulate import ChargeSpline, Sweep, noise_model
 from isocharge.train.data.contact_errors import contact_error_statistics
 
 RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial"
@@ -46,12 +44,9 @@ class ModelCase:
     def __init__(self, model: str, seed: int) -> None:
         self.predictor = Predictor(model)
         self.rng = np.random.default_rng([seed, 1])
-        metadata = self.predictor.metadata
-        self.radius = math.sqrt(self.predictor.validity.inscribed_radius_squared_mm2)
-        sweep = Sweep(self.radius, metadata.force_range_N, MAX_PRESSES, seed)
-        self.presses = sweep.contacts()
-        sensor = sensor_from_dict(metadata.sensor)
-        self.film = ForwardMap.build(sensor, Circle(1.0), self.radius + MARGIN_mm, metadata.force_range_N)
+        self.radius = inner_radius_mm(self.predictor)
+        self.film = model_film(self.predictor, self.radius + MARGIN_mm)
+        self.presses = Sweep(self.radius, self.film.domain.force_range, MAX_PRESSES, seed).contacts()
 
     def noisy_charge(self, contact: np.ndarray) -> np.ndarray:
         """Return the charges of contacts with noise, shape (n, n_electrode), pC."""
@@ -68,8 +63,7 @@ def errors_over_limit(case: ModelCase, count: int) -> dict[str, Any]:
     """Compare the errors of the model with those of the posterior mean on the same charges."""
     truth = case.presses[:count]
     charge = case.noisy_charge(truth)
-    problem = BayesProblem(case.film.sensor, case.film.probe, case.radius, case.film.domain.force_range, NOISE)
-    bayes_contact, _ = bayes_estimate(problem, charge, charge_map=case.film)
+    bayes_contact, _ = Posterior(ChargeSpline.of(case.film), NOISE, case.radius).mean_and_std(charge)
     contact, _ = case.estimate(charge)
     limit = contact_error_statistics(bayes_contact, truth)
     errors = contact_error_statistics(contact, truth)

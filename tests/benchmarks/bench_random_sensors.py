@@ -15,12 +15,13 @@ import time
 from typing import Any
 
 import numpy as np
-from bayes.limit import BayesProblem, bayes_estimate
+from bayes.posterior import Posterior
 from shared import arguments, print_results
 
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import IsochargeError
 from isocharge.simulate import (
+    ChargeSpline,
     Circle,
     Domain,
     Electrode,
@@ -102,7 +103,7 @@ def measure(sensor: Sensor, probe: Circle, n_sample: int, n_press: int) -> dict[
     truth = Sweep(radius, DEFAULT_FORCE_RANGE, n_press, 1).contacts()
     charge = NOISE.add(charge_map.charges(truth), np.random.default_rng(2))
     estimate, std, _ = fitted.predict(charge)
-    limit_estimate, _ = bayes_estimate(BayesProblem(sensor, probe, radius), charge, charge_map=charge_map)
+    limit_estimate, _ = Posterior(ChargeSpline.of(charge_map), NOISE, radius).mean_and_std(charge)
     errors = contact_error_statistics(estimate, truth)
     limit = contact_error_statistics(limit_estimate, truth)
     deviation = np.abs(estimate - truth) / std

@@ -9,23 +9,21 @@ the device file have errors of up to 0.5 %, and the gains of up to 0.2 %; in one
 With `--hand`, a hand that is 2 K warmer than the film comes or goes during a press.
 """
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from shared import options, percentiles, print_results
+from shared import inner_radius_mm, model_film, options, percentiles, print_results
 
 from isocharge.cli.shared.virtual_sensor import film_charges
 from isocharge.common.arrays import Array
 from isocharge.serve import Chunk, Frame, Predictor, Script, TouchStream, device_from_table, encode_frame
 from isocharge.serve.record.record import PredictionRecord
 from isocharge.serve.virtual_sensor.script import VirtualScript
-from isocharge.simulate import Circle, ForwardMap, load_amplifier
+from isocharge.simulate import ForwardMap, load_amplifier
 from isocharge.simulate.measuring_chain import Amplifier
-from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 
 PERCENTILES = (50, 95, 100)
 RATE_Hz = 200.0
@@ -129,18 +127,10 @@ def held_presses(predictor: Predictor, amplifier: Amplifier, seed: int) -> dict[
     All electrodes have 400 pC for 8 s and later 300 pC for 10 s. The result has percentiles of the largest error of an
     electrode over both presses and eight boards, pC, for each leak, with and without thermal drift.
     """
-    presses = ((6.0, 8.0, 400.0), (20.0, 10.0, 300.0))  # begin and duration, s, and charge, pC
-    corners = [
-        (6.0, 0.0),
-        (6.1, 400.0),
-        (13.9, 400.0),
-        (14.0, 0.0),
-        (20.0, 0.0),
-        (20.1, 300.0),
-        (29.9, 300.0),
-        (30.0, 0.0),
-    ]
-    total = np.interp(np.arange(round(36.0 * RATE_Hz)) / RATE_Hz, *np.transpose(corners))
+    presses = [Press(0.0, 6.0, 14.0), Press(0.0, 20.0, 30.0)]
+    charges_pC = (400.0, 300.0)
+    scripts = [script_of([press], 36.0) for press in presses]
+    total = sum(charge_pC * script.force_N for charge_pC, script in zip(charges_pC, scripts, strict=True))
     charge = np.repeat(total[:, None], len(predictor.metadata.electrodes), axis=1)
     results = {}
     for tau_s in (10.0, 1.0):
@@ -149,8 +139,8 @@ def held_presses(predictor: Predictor, amplifier: Amplifier, seed: int) -> dict[
             errors_pC = []
             for number in range(8):
                 records = stream_records(predictor, charge, board, GAIN_ERROR, seed + number)
-                for begin_s, duration_s, charge_pC in presses:
-                    end = round((begin_s + duration_s - 0.2) * RATE_Hz)
+                for press, charge_pC in zip(presses, charges_pC, strict=True):
+                    end = round((press.end_s - 0.2) * RATE_Hz)
                     last_charges = [list(record.charge_pC.values()) for record in records[end - 20 : end]]
                     errors_pC.append(np.abs(np.mean(last_charges, axis=0) - charge_pC).max())
                 assert not records[-1].contact
@@ -174,23 +164,20 @@ def accuracy(
     rng = np.random.default_rng(seed)
     phase = 2j * np.pi * rng.uniform(size=count)
     position = film.domain.radius * np.sqrt(rng.uniform(size=count)) * np.exp(phase)
-    begin_s = REST_s + (PRESS_s + PAUSE_s) * np.arange(count + 1)
-    presses = [Press(position[number], begin_s[number], begin_s[number] + PRESS_s) for number in range(count)]
-    script = script_of(presses, begin_s[count])
+    *begins_s, end_s = REST_s + (PRESS_s + PAUSE_s) * np.arange(count + 1)
+    presses = [Press(place, begin_s, begin_s + PRESS_s) for place, begin_s in zip(position, begins_s, strict=True)]
+    script = script_of(presses, end_s)
     records = stream_records(predictor, touch_charges(film, script), amplifier, gain_error, seed)
 
     full_force_frames = np.flatnonzero(script.force_N >= 1.0)
-    contact_frames = [frame for frame in full_force_frames if records[frame].contact]
-    error_mm = np.array(
-        [
-            np.hypot(records[frame].x_mm - script.x_mm[frame], records[frame].y_mm - script.y_mm[frame])
-            for frame in contact_frames
-        ]
-    )
-    force_error_percent = [100.0 * abs(records[frame].force_N - 1.0) for frame in contact_frames]
-    is_saturated = np.array(["saturated" in records[frame].flags for frame in contact_frames])
-
     is_contact = np.array([record.contact for record in records])
+    contact_frames = full_force_frames[is_contact[full_force_frames]]
+    contact_records = [records[frame] for frame in contact_frames]
+    x_mm, y_mm, force_N = np.transpose([(record.x_mm, record.y_mm, record.force_N) for record in contact_records])
+    error_mm = np.hypot(x_mm - script.x_mm[contact_frames], y_mm - script.y_mm[contact_frames])
+    force_error_percent = 100.0 * np.abs(force_N - 1.0)
+    is_saturated = np.array(["saturated" in record.flags for record in contact_records])
+
     first_frames = np.flatnonzero(np.diff(script.touching.astype(int)) == 1) + 1
     delays_ms = [1e3 / RATE_Hz * int(is_contact[first:].argmax()) for first in first_frames]
     return {
@@ -269,8 +256,7 @@ def main() -> None:
     asked = options(__doc__, presses=100, hand=False)
     predictor = Predictor(asked.model)
     amplifier = load_amplifier("bench")
-    radius_mm = math.sqrt(predictor.validity.inscribed_radius_squared_mm2)
-    film = ForwardMap.build(sensor_from_dict(dict(predictor.metadata.sensor)), Circle(1.0), radius_mm)
+    film = model_film(predictor, inner_radius_mm(predictor))
     if asked.hand:
         print_results("hand", asked, warm_hand(predictor, film, asked.seed))
         return

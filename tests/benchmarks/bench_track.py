@@ -19,20 +19,17 @@ The first three filters have the best setting for each speed. The tracker of iso
 import argparse
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from shared import options, print_results
+from shared import draw_lines, model_film, options, print_results
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve import Contact, Predictor
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.tracking.tracker import Tracker
-from isocharge.simulate import Circle, ForwardMap, noise_model
-from isocharge.simulate.plots.figure import new_figure
-from isocharge.simulate.sensor.sensor_file import sensor_from_dict
+from isocharge.simulate import ForwardMap, noise_model
 
 SPEEDS_mm_per_s = (0.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
 """Speeds of the moving contacts, mm/s."""
@@ -268,28 +265,19 @@ def measure_speed(asked: argparse.Namespace, predictor: Predictor, film: Forward
     return row
 
 
-def draw(rows: list[dict[str, float]], path: Path) -> None:
-    """Draw the error against the lag, with a line for each filter and a point for each speed."""
-    figure = new_figure(7.0, 4.5)
-    axes = figure.add_subplot()
-    moving = [row for row in rows if row["speed_mm_s"]]
-    for name in (NO_FILTER, "moving average", "1 euro", "plain Kalman", OURS):
-        lags_ms = [row[f"{name}_lag_ms"] for row in moving]
-        errors_mm = [row[f"{name}_mm"] for row in moving]
-        axes.plot(lags_ms, errors_mm, "o-", label=name, ms=4)
-    axes.set(xlabel="mean lag of a slide, ms", ylabel="error, rms, mm", title="slides of 5 to 200 mm/s")
-    axes.legend()
-    figure.savefig(path, dpi=120)
-
-
 def main() -> None:
     asked = options(__doc__, paths=40, rate_hz=1000.0, force=1.0, noise="reference", plot=None)
     predictor = Predictor(asked.model)
-    metadata = predictor.metadata
-    film = ForwardMap.build(sensor_from_dict(dict(metadata.sensor)), Circle(1.0), 8.0, metadata.force_range_N)
+    film = model_film(predictor, 8.0)
     rows = [measure_speed(asked, predictor, film, speed) for speed in SPEEDS_mm_per_s]
     if asked.plot:
-        draw(rows, asked.plot)
+        moving = [row for row in rows if row["speed_mm_s"]]
+        names = (NO_FILTER, "moving average", "1 euro", "plain Kalman", OURS)
+        lines = {
+            name: ([row[f"{name}_lag_ms"] for row in moving], [row[f"{name}_mm"] for row in moving]) for name in names
+        }
+        title = "slides of 5 to 200 mm/s"
+        draw_lines(asked.plot, lines, xlabel="mean lag of a slide, ms", ylabel="error, rms, mm", title=title)
     print_results("track", asked, {"slides": rows})
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -9,7 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.serve import Predictor
 from isocharge.serve.benchmark import Contender, machine, take_turns
+from isocharge.simulate import Circle, ForwardMap
+from isocharge.simulate.plots.figure import new_figure
+from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 
 
 def options(page: str, model: str = "three-25um-biaxial", **more: Any) -> argparse.Namespace:
@@ -65,6 +70,18 @@ def print_results(name: str, asked: argparse.Namespace, results: dict[str, Any])
             print(f"{title}: {rows}")
 
 
+def model_film(predictor: Predictor, radius_mm: float) -> ForwardMap:
+    """Simulate the charges of a circle of 1 mm on the sensor of a model, up to a distance from the centre."""
+    metadata = predictor.metadata
+    sensor = sensor_from_dict(dict(metadata.sensor))
+    return ForwardMap.build(sensor, Circle(1.0), radius_mm, metadata.force_range_N)
+
+
+def inner_radius_mm(predictor: Predictor) -> float:
+    """Return the radius of the largest disk within the working area of a model, mm."""
+    return math.sqrt(predictor.validity.inscribed_radius_squared_mm2)
+
+
 def markdown_table(corner: str, results: dict[str, dict[str, Any]], cell: Callable[[Any], str]) -> list[str]:
     """Return the lines of a Markdown table with a column for each model.
 
@@ -80,6 +97,23 @@ def markdown_table(corner: str, results: dict[str, dict[str, Any]], cell: Callab
         cells = [cell(results[model].get(row)) for model in models]
         lines.append(f"| {row} | " + " | ".join(cells) + " |")
     return lines
+
+
+def draw_lines(path: Path, lines: dict[str, tuple[list[float], list[float]]], **labels: str) -> None:
+    """Draw lines with a point for each measurement, and save the picture.
+
+    Args:
+        path: The picture.
+        lines: Coordinates x and y of the points of each line, by its name in the legend.
+        labels: Title, names and scales of the axes, as `Axes.set` expects them.
+    """
+    figure = new_figure(7.0, 4.5)
+    axes = figure.add_subplot()
+    for name, (x, y) in lines.items():
+        axes.plot(x, y, "o-", label=name, ms=4)
+    axes.set(**labels)
+    axes.legend(fontsize=8)
+    figure.savefig(path, dpi=120)
 
 
 def report_progress(title: str, result: dict[str, float]) -> None:
