@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 from bayes.posterior import Posterior
 from scipy.stats import norm
-from shared import arguments, inner_radius_mm, model_film, print_results
+from shared import arguments, errors_over_limit, inner_radius_mm, model_film, print_results
 
 from isocharge.serve import Predictor
 from isocharge.simulate import ChargeSpline, Sweep, noise_model
-from isocharge.train.data.contact_errors import contact_error_statistics
 
 RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial"
 MARGIN_mm = 0.01
@@ -59,21 +58,13 @@ class ModelCase:
         return contact, std
 
 
-def errors_over_limit(case: ModelCase, count: int) -> dict[str, Any]:
+def measure_errors(case: ModelCase, count: int) -> dict[str, Any]:
     """Compare the errors of the model with those of the posterior mean on the same charges."""
     truth = case.presses[:count]
     charge = case.noisy_charge(truth)
     bayes_contact, _ = Posterior(ChargeSpline.of(case.film), NOISE, case.radius).mean_and_std(charge)
     contact, _ = case.estimate(charge)
-    limit = contact_error_statistics(bayes_contact, truth)
-    errors = contact_error_statistics(contact, truth)
-    return {
-        "presses": count,
-        "position_rms_mm": errors["position_rms_mm"],
-        "position_over_bayes": errors["position_rms_mm"] / limit["position_rms_mm"],
-        "force_rms_percent": errors["force_rms_percent"],
-        "force_over_bayes": errors["force_rms_percent"] / limit["force_rms_percent"],
-    }
+    return {"presses": count, **errors_over_limit(contact, bayes_contact, truth)}
 
 
 def interval_coverage(estimate: np.ndarray, std: np.ndarray, truth: np.ndarray, levels: np.ndarray) -> np.ndarray:
@@ -122,7 +113,7 @@ def main() -> None:
     results = {}
     for model in asked.models.split(","):
         case = ModelCase(model, asked.seed)
-        results[f"{model}, within {case.radius:.2f} mm"] = errors_over_limit(case, asked.presses) | coverage(
+        results[f"{model}, within {case.radius:.2f} mm"] = measure_errors(case, asked.presses) | coverage(
             case, asked.draws
         )
     print_results("model", asked, results)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from bayes.posterior import Posterior
-from shared import arguments, print_results
+from shared import arguments, errors_over_limit, print_results
 
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import IsochargeError
@@ -34,7 +34,6 @@ from isocharge.simulate import (
     noise_model,
 )
 from isocharge.train import LabelledPresses, TrainingData, fit
-from isocharge.train.data.contact_errors import contact_error_statistics
 
 NOISE = noise_model("reference")
 LARGEST_RATIO = 1.08
@@ -104,15 +103,10 @@ def measure(sensor: Sensor, probe: Circle, n_sample: int, n_press: int) -> dict[
     charge = NOISE.add(charge_map.charges(truth), np.random.default_rng(2))
     estimate, std, _ = fitted.predict(charge)
     limit_estimate, _ = Posterior(ChargeSpline.of(charge_map), NOISE, radius).mean_and_std(charge)
-    errors = contact_error_statistics(estimate, truth)
-    limit = contact_error_statistics(limit_estimate, truth)
     deviation = np.abs(estimate - truth) / std
     return {
         "radius_mm": radius,
-        "limit_mm": round(limit["position_rms_mm"], 4),
-        "position_over_limit": round(errors["position_rms_mm"] / limit["position_rms_mm"], 3),
-        "limit_percent": round(limit["force_rms_percent"], 3),
-        "force_over_limit": round(errors["force_rms_percent"] / limit["force_rms_percent"], 3),
+        **errors_over_limit(estimate, limit_estimate, truth),
         "coverage_68": round(float(np.mean(deviation < 1.0)), 3),
         "training_cpu_s": round(seconds, 1),
         "cautions": len(fitted.made_with.get("cautions", ())),
@@ -130,7 +124,7 @@ def main() -> None:
         row = describe(sensor, probe)
         try:
             row |= measure(sensor, probe, options.samples, options.presses)
-            n_good += max(row["position_over_limit"], row["force_over_limit"]) <= LARGEST_RATIO
+            n_good += max(row["position_rms_mm_over_limit"], row["force_rms_percent_over_limit"]) <= LARGEST_RATIO
         except IsochargeError as error:
             row["refused"] = str(error)
             n_refused += 1

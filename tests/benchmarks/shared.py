@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from isocharge.common.arrays import Array
 from isocharge.serve import Predictor
 from isocharge.serve.benchmark import Contender, machine, take_turns
 from isocharge.simulate import Circle, ForwardMap
 from isocharge.simulate.plots.figure import new_figure
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
+from isocharge.train.data.contact_errors import contact_error_statistics
 
 
 def options(page: str, model: str = "three-25um-biaxial", **more: Any) -> argparse.Namespace:
@@ -80,6 +82,22 @@ def model_film(predictor: Predictor, radius_mm: float) -> ForwardMap:
 def inner_radius_mm(predictor: Predictor) -> float:
     """Return the radius of the largest disk within the working area of a model, mm."""
     return math.sqrt(predictor.validity.inscribed_radius_squared_mm2)
+
+
+def errors_over_limit(contact: Array, limit: Array, truth: Array) -> dict[str, float]:
+    """Return the rms errors of contacts, and their ratios to those of the posterior means of the same presses.
+
+    Args:
+        contact: Estimated contacts (x, y, F), shape (n, 3), mm and N.
+        limit: Posterior means, shape (n, 3).
+        truth: True contacts, shape (n, 3).
+    """
+    errors = contact_error_statistics(contact, truth)
+    limits = contact_error_statistics(limit, truth)
+    ratios = {}
+    for name in ("position_rms_mm", "force_rms_percent"):
+        ratios |= {name: errors[name], f"{name}_over_limit": round(errors[name] / limits[name], 3)}
+    return ratios
 
 
 def markdown_table(corner: str, results: dict[str, dict[str, Any]], cell: Callable[[Any], str]) -> list[str]:

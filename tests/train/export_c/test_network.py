@@ -15,7 +15,8 @@ from tests.train.random_networks import (
 
 from isocharge.serve import find_model, load_model
 from isocharge.serve.model.session import COLUMNS
-from isocharge.train.model_release.onnx_graph import write_graph
+from isocharge.train.model_release.onnx_graph import read_graph, write_graph
+from isocharge.train.training.folded_network import ACTIVATIONS
 from isocharge.train.training.network import signed_features
 
 MODELS = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial", "four-25um-biaxial-student")
@@ -42,6 +43,7 @@ def test_extreme_charges_are_finite_as_in_onnxruntime_and_nan_is_nan(model, buil
     assert np.isnan(exported.predict(one_nan)).all()
 
 
+@pytest.mark.parametrize("activation", ACTIVATIONS.values(), ids=ACTIVATIONS)
 @pytest.mark.parametrize(
     ("electrodes", "hidden", "misfit_hidden", "is_int8", "arrays"),
     [
@@ -51,13 +53,19 @@ def test_extreme_charges_are_finite_as_in_onnxruntime_and_nan_is_nan(model, buil
         (8, (24,), (16,), False, ["float contact_0_weights[192]", "float contact_last_weights[336]"]),
     ],
 )
-def test_any_width_and_number_of_electrodes(electrodes, hidden, misfit_hidden, is_int8, arrays, build, tmp_path):
+def test_any_width_number_of_electrodes_and_activation(
+    electrodes, hidden, misfit_hidden, is_int8, arrays, activation, build, tmp_path
+):
     """The zeros beside the two blocks of a layer of the graph are left out, and weights of 8 bits take one byte."""
-    network = random_network(electrodes, hidden, misfit_hidden, is_int8=is_int8)
+    network = random_network(electrodes, hidden, misfit_hidden, is_int8=is_int8, activation=activation)
     names = tuple(f"E{number} */" for number in range(electrodes))  # they could end a comment in C
-    exported = build(write_random_model(tmp_path / "random", network, electrodes=names))
+    folder = write_random_model(tmp_path / "random", network, electrodes=names)
+    exported = build(folder)
     charge_pC = np.random.default_rng(2).uniform(50.0, 5000.0, (500, electrodes)).astype(np.float32)
-    check_agreement(exported.predict(charge_pC), double_precision_answers(network, charge_pC))
+    expected = double_precision_answers(network, charge_pC)
+    check_agreement(exported.predict(charge_pC), expected)
+    read_network = read_graph((folder / "model.onnx").read_bytes(), "graph")
+    check_agreement(double_precision_answers(read_network, charge_pC), expected)
     assert all(f"static const {array}" in exported.source for array in arrays)
     assert ("signed char" in exported.source) == is_int8
 

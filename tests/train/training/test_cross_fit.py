@@ -318,15 +318,6 @@ def test_presses_of_one_force_or_without_forces_train_x_and_y(
     assert Predictor(folder).flags(Predictor(folder).predict(presses.charge_pC[0])) == ()
 
 
-def test_a_real_pad_is_trained_in_a_short_form():
-    """Every fold of an earlier version diverged to NaN or to errors of 70 mm after the warm-up."""
-    presses = read_presses(ROOT / "tests" / "data" / "tactile_fsi.csv")
-    errors = evaluate(fit_presses(presses, "pad", short_training(24, 24, 300, 50, 1_000)))
-    assert errors["position_rms_mm"] < 8.0
-    assert errors["force_rms_percent"] < 30.0
-    assert 0.65 <= errors["coverage_68"] <= 0.71
-
-
 def test_intact_presses_are_accepted_without_a_warning(caplog):
     """Charges in other units, channels that are mostly zero, similar channels, and presses on a real pad."""
     usable_presses(read_presses(ROOT / "tests" / "data" / "tactile_fsi.csv"))
