@@ -6,7 +6,6 @@ import pytest
 
 from isocharge.simulate import Circle, Film, ForwardMap, Resolution, SolveSettings, Sweep, Theory, load_sensor
 from isocharge.simulate.dataset.sweep import write_sweep
-from isocharge.simulate.forward.derivative_maps import SideForceMap
 from kept import kept
 from solved_charges import with_film
 
@@ -34,12 +33,6 @@ def taut_map() -> ForwardMap:
     """
     sensor = with_film(load_sensor("four-25um-biaxial"), pretension=0.8)
     return kept(ForwardMap.build, sensor, Circle(1.0), 8.0, (0.2, 1.0))
-
-
-@pytest.fixture(scope="session")
-def side_force_map(taut_map: ForwardMap) -> SideForceMap:
-    """Derivatives of the charges of `taut_map` with respect to side forces."""
-    return kept(SideForceMap.build, taut_map)
 
 
 @pytest.fixture(scope="session")

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from isocharge.simulate.execution import dask_workers, local_workers
     from isocharge.simulate.forward.charge_map import ChargeMap, FunctionMap
     from isocharge.simulate.forward.charge_spline import ChargeSpline
-    from isocharge.simulate.forward.derivative_maps import FilmSlopes, SideForceMap
+    from isocharge.simulate.forward.derivative_maps import FilmSlopes
     from isocharge.simulate.forward.forward_map import ForwardMap
     from isocharge.simulate.forward.readout import touch_charge
     from isocharge.simulate.identifiability.cramer_rao import limits_at
@@ -76,7 +76,6 @@ __all__ = [
     "Resolution",
     "Samples",
     "Sensor",
-    "SideForceMap",
     "SolveSettings",
     "Sweep",
     "Theory",

@@ -35,7 +35,7 @@ the lifting.
 
 import cmath
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -149,55 +149,24 @@ FILM_IS_ODD = np.array([field.odd for field in FILM_FIELDS])
 """Whether each of `FILM_FIELDS` is odd about the direction of the press, shape (n_field,)."""
 
 
-def _add_side_load(solved: Equilibrium, value: float, direction: tuple[float, float]) -> Equilibrium:
-    """Add a side load to a press.
-
-    The unit of the side load is E h a A^2, with Young's modulus E, the thickness h, the film radius a and the amplitude
-    A.
-
-    Args:
-        solved: The press.
-        value: Number of units.
-        direction: Unit vector (x, y) of the side load.
-    """
-    if solved.force == 0.0:  # before the contact, there is no probe
-        return solved
-    load_x, load_y = solved.groups.side_load
-    direction_x, direction_y = direction
-    side_load = (load_x + value * direction_x, load_y + value * direction_y)
-    return replace(solved, groups=replace(solved.groups, side_load=side_load))
-
-
-SIDE_FORCE_FIELDS = (
-    StressField(partial(_add_side_load, direction=(1.0, 0.0)), odd=False),
-    StressField(partial(_add_side_load, direction=(0.0, 1.0)), odd=True),
-)
-"""Stress fields of a side force along the direction of the press (even), and across this direction (odd)."""
-
-SIDE_FORCE_IS_ODD = np.array([field.odd for field in SIDE_FORCE_FIELDS])
-"""Whether each of `SIDE_FORCE_FIELDS` is odd, shape (2,)."""
-
-
-def stress_changes(solved: Equilibrium, surface: Surface, fields: Sequence[StressField]) -> Array:
-    """Compute the changes of the scaled stress that a changed film property or a side force causes at the nodes.
+def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
+    """Compute the changes of the scaled stress that a changed film causes at the nodes.
 
     The film is rotated such that the press lies on the positive x axis. The changes refer to fixed points of the
-    rotated film. The unit of a
-    tension is the sum of E A^2 and the mean pretension, where E is Young's modulus and A is the amplitude of the press.
-    The function `theory.side_force_unit` returns the unit of a side force.
+    rotated film. The unit of a tension is the sum of E A^2 and the mean pretension, where E is Young's modulus and A is
+    the amplitude of the press.
 
     Args:
         solved: Press with a circular probe.
         surface: Surface of the film at which the stress is computed; see `touch_stress`.
-        fields: Kinds of changes to be computed, such as `FILM_FIELDS` or `SIDE_FORCE_FIELDS`.
 
     Returns:
         Changes per unit, shape (n_element, n_local, n_field, 3), in the order of the table of a `ForwardMap` with
-        several fields. The last two axes are the field and the stress component (S11, S22, S12).
+        several fields. The last two axes are the field of `FILM_FIELDS` and the stress component (S11, S22, S12).
     """
     if solved.rest is not None:  # the touch stress is the difference from the stress before the contact
-        before_contact = stress_changes(solved.rest, surface, fields)
-        return stress_changes(replace(solved, rest=None), surface, fields) - before_contact
+        before_contact = stress_changes(solved.rest, surface)
+        return stress_changes(replace(solved, rest=None), surface) - before_contact
 
     # Even and odd fields have different fixed displacements on the line of symmetry. Therefore the tangent is
     # factorised once for all even fields, and once for all odd fields.
@@ -207,7 +176,7 @@ def stress_changes(solved: Equilibrium, surface: Surface, fields: Sequence[Stres
             factor_tangent(elastic, assembly(solved.mesh.template, elastic.unknowns_per_node, odd), solved.field)
             for odd in (False, True)
         ]
-        changes = [_change_by_imperfection(solved, field.add, solves[field.odd], surface) for field in fields]
+        changes = [_change_by_imperfection(solved, field.add, solves[field.odd], surface) for field in FILM_FIELDS]
         return np.stack(changes, axis=2)
 
 
@@ -331,36 +300,9 @@ def friction_force(solved: Equilibrium, coefficient: float) -> tuple[float, floa
     Raises:
         SceneError: If the coefficient is not between 0 and `MAX_FRICTION`.
     """
-    check_friction(coefficient)
-    holding = np.array([holding_force(solved)])  # shape (1, 2)
-    largest_friction = np.array([coefficient * solved.force])  # shape (1,)
-    ((side_x, side_y),) = limit_to_friction(holding, largest_friction).tolist()
-    return side_x, side_y
-
-
-def check_friction(coefficient: float) -> None:
-    """Raise an error if a coefficient of friction is not between 0 and `MAX_FRICTION`.
-
-    Args:
-        coefficient: Coefficient of friction, dimensionless.
-
-    Raises:
-        SceneError: If the coefficient is outside this range.
-    """
     if not 0.0 <= coefficient <= MAX_FRICTION:
         raise SceneError(f"friction: expected a coefficient from 0 to {MAX_FRICTION:g}, got {coefficient}")
-
-
-def limit_to_friction(holding: Array, largest_friction: Array) -> Array:
-    """Limit the magnitudes of holding forces to the largest friction. The directions of the forces do not change.
-
-    Args:
-        holding: Side forces (Fx, Fy) that would prevent the slip, shape (n, 2), N.
-        largest_friction: Largest friction, shape (n,), N.
-
-    Returns:
-        Side forces, shape (n, 2), N.
-    """
-    magnitude = np.maximum(np.hypot(holding[:, 0], holding[:, 1]), 1e-300)  # the limit avoids a division by zero
-    reduction = np.minimum(1.0, largest_friction / magnitude)
-    return np.asarray(holding * reduction[:, None])
+    holding_x, holding_y = holding_force(solved)
+    magnitude = max(math.hypot(holding_x, holding_y), 1e-300)  # the limit avoids a division by zero
+    reduction = min(1.0, coefficient * solved.force / magnitude)
+    return reduction * holding_x, reduction * holding_y
