@@ -13,7 +13,8 @@ from solves import FINEST, FORCE, MESHES, Solves
 
 from isocharge.common.arrays import Array
 from isocharge.simulate import Equilibrium, Sensor
-from isocharge.simulate.forward.readout import contact_charge
+from isocharge.simulate.forward import readout
+from isocharge.simulate.numerics.disk import contacts_at
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.plots.figure import COLOURS, FELT, INK, PRESSED
 from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
@@ -183,7 +184,7 @@ def contact_charges(solves: Solves, sensor: Sensor, points: Array, d33: float) -
         Charges, shape (n, n_electrode), pC.
     """
     sensor_with_d33 = replace(sensor, piezo=replace(sensor.piezo, d33=d33))
-    return np.array([contact_charge(sensor_with_d33, solves.choices.triangle, (x, y), FORCE) for x, y in points])
+    return readout.contact_charges(sensor_with_d33, solves.choices.triangle, contacts_at(points, FORCE))
 
 
 def fig_5(solves: Solves) -> Entry:

@@ -14,6 +14,7 @@ from isocharge.simulate import (
     Equilibrium,
     Piezo,
     Polygon,
+    Probe,
     Sensor,
     load_sensor,
     press,
@@ -24,7 +25,6 @@ from isocharge.simulate.forward.readout import (
     MAP_COUNTS,
     NEAR_DISTANCE,
     ElectrodePieces,
-    contact_charge,
     contact_charges,
     stress_charge,
     thermal_charge,
@@ -44,6 +44,12 @@ def charge_of(sensor: Sensor, stress, per_side: int = 12) -> np.ndarray:
     for rule in pieces.rules(Circle(1.0), np.zeros(1), (per_side, per_side)):
         values = np.broadcast_arrays(*stress(rule.points.real, rule.points.imag))
         np.add.at(charge, pieces.electrode[rule.piece], pieces.charge(rule, np.stack(values, axis=-1)))
+    return charge
+
+
+def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float) -> np.ndarray:
+    """Charges of the contact pressure under one press."""
+    (charge,) = contact_charges(sensor, probe, np.array([[*at, force]]))
     return charge
 
 

@@ -18,7 +18,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes
-from isocharge.common.contact_domain import Domain, as_contacts
+from isocharge.common.contact_domain import Domain
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate.execution import in_order
@@ -38,9 +38,9 @@ from isocharge.simulate.forward.family import (
 from isocharge.simulate.forward.readout import (
     ElectrodePieces,
     PieceRule,
-    PressChunk,
     PressMeshes,
     contact_charges,
+    integrate_fields,
 )
 from isocharge.simulate.mechanics.theory import Theory, amplitude_squared
 from isocharge.simulate.mesh.blocks import Resolution
@@ -223,7 +223,7 @@ class ForwardMap:
         """Compute the touch charges of presses.
 
         Args:
-            contact: Presses (x, y, F), shape (n, 3), mm and N. If F is zero, the charges are zero.
+            contact: Presses (x, y, F), shape (n, 3), mm and N.
             orientation: Anticlockwise rotation of the probe in addition to its own orientation, shape (n,) or a number,
                 rad.
 
@@ -231,21 +231,10 @@ class ForwardMap:
             Charges, shape (n, n_electrode), pC.
 
         Raises:
-            SceneError: If a press with a force lies outside the domain.
+            SceneError: If a press lies outside the domain.
         """
-        contact = as_contacts(contact, "forward map")
-
-        # A press without a force may lie anywhere. Only for the check of the domain, it is replaced by a valid press.
-        has_no_force = contact[:, 2] == 0.0
-        min_force, _ = self.domain.force_range
-        valid_contact = (0.0, 0.0, min_force)
-        self.domain.check(np.where(has_no_force[:, None], valid_contact, contact), "forward map")
-
-        orientation = np.broadcast_to(orientation, len(contact))
-        charge = np.zeros((len(contact), len(self.electrodes)))
-        pressed = np.flatnonzero(~has_no_force)
-        charge[pressed] = self._unchecked_charges(contact[pressed], orientation[pressed])
-        return charge
+        contact = self.domain.check(contact, "forward map")
+        return self._unchecked_charges(contact, np.broadcast_to(orientation, len(contact)))
 
     def derivatives(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to x, y and ln F by central differences.
@@ -446,29 +435,25 @@ class ForwardMap:
         Returns:
             Charges, shape (n, n_electrode, n_field), pC.
         """
-        film = self.sensor.film
-        presses = self._interpolated_presses(position, force, orientation)
-        scaled_charge = presses.charges(pieces, rules, film.radius, is_odd)
-
-        # Multiply by the unit of the scaled stress in the table.
-        stress_unit = film.young * amplitude_squared(film, force)
-        return np.asarray(scaled_charge * stress_unit[:, None, None])
-
-    def _interpolated_presses(self, position: Complexes, force: Array, orientation: Array) -> PressChunk:
-        """Interpolate the stress fields at the nodes of the mesh for one chunk of presses.
-
-        Args:
-            position: Positions x + iy, shape (n,), mm.
-            force: Forces, shape (n,), N.
-            orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
-        """
         direction = np.angle(position)  # from the centre of the film to the press, rad
         # The stress refers to the probe or, if the probe is axisymmetric, to the direction of the press.
         rotation = np.zeros_like(direction) if self.probe.is_axisymmetric else orientation - direction
         weights = self.family.weights(position, force, rotation)
         nodal_fields = weights.astype(self.table.dtype) @ self.table  # in the precision of the table
-        frame_angle = direction + rotation + self.probe.angle
-        return PressChunk(self.meshes_under(position, rotation), nodal_fields, frame_angle)
+        scaled_charge = integrate_fields(
+            nodal_fields,
+            self.meshes_under(position, rotation),
+            direction + rotation + self.probe.angle,
+            is_odd,
+            pieces,
+            rules,
+            self.sensor.film.radius,
+        )
+
+        # Multiply by the unit of the scaled stress in the table.
+        film = self.sensor.film
+        stress_unit = film.young * amplitude_squared(film, force)
+        return np.asarray(scaled_charge * stress_unit[:, None, None])
 
     def meshes_under(self, position: Complexes, rotation: Array) -> PressMeshes:
         """Return the meshes under several presses.

@@ -209,9 +209,9 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
             f"surface {sensor.surface!r} needs bending, but the film was solved as a {equilibrium.theory.name}; solve "
             "it with SolveSettings(theory=Theory(bending=True))"
         )
-    charge = stress_charge(sensor, equilibrium)
-    charge += contact_charge(sensor, equilibrium.probe, equilibrium.at, equilibrium.force)
-    return sensor.calibration.read(charge)
+    contact = np.array([[*equilibrium.at, equilibrium.force]])
+    (pressure_charge,) = contact_charges(sensor, equilibrium.probe, contact)
+    return sensor.calibration.read(stress_charge(sensor, equilibrium) + pressure_charge)
 
 
 def stress_charge(sensor: Sensor, equilibrium: Equilibrium, counts: tuple[int, int] = DIRECT_COUNTS) -> Array:
@@ -235,30 +235,8 @@ def stress_charge(sensor: Sensor, equilibrium: Equilibrium, counts: tuple[int, i
     return charge
 
 
-def relative_distances(
-    part_circles: Sequence[tuple[Complexes, Array]], probe_reach: float, position: Complexes
-) -> Array:
-    """Compute the distance between each press and each electrode.
-
-    A distance is measured between the centres of the footprint and of a circle around a part of the electrode. The unit
-    is the sum of the radii of the circles around the footprint and the part. The nearest part of an electrode counts.
-
-    Args:
-        part_circles: Centres x + iy and radii of the circles around the parts of each electrode, mm.
-        probe_reach: Radius of the circle around the footprint, mm.
-        position: Positions x + iy of the presses, shape (n,), mm.
-
-    Returns:
-        Distances, shape (n, n_electrode), dimensionless.
-    """
-    distances = np.empty((position.size, len(part_circles)))
-    for index, (centres, radii) in enumerate(part_circles):
-        distances[:, index] = (np.abs(position[:, None] - centres) / (radii + probe_reach)).min(axis=1)
-    return distances
-
-
-def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float) -> Array:
-    """Compute the charge that the contact pressure of a probe induces on the electrodes.
+def contact_charges(sensor: Sensor, probe: Probe, contact: Array, orientation: Array | float = 0.0) -> Array:
+    """Compute the charges that the contact pressure of a probe induces on the electrodes.
 
     The charge per area is the coefficient d33 times the mean of the stress s33 over the thickness. The stress s33 is
     minus the contact pressure at the probe, and zero at the free back of the film. Its mean over the thickness is
@@ -268,50 +246,29 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     Args:
         sensor: Sensor with the electrodes.
         probe: Probe that presses the film.
-        at: Centroid (x, y) of the footprint, mm.
-        force: Force of the press, N.
-
-    Returns:
-        Charges, shape (n_electrode,), pC.
-    """
-    if sensor.piezo.d33 == 0.0:
-        return np.zeros(len(sensor.electrodes))
-    position = complex(*at)  # x + iy
-    force_shares = []  # fraction of the force that acts on each electrode
-    for electrode, (part_centres, part_radii) in zip(sensor.electrodes, sensor.part_circles, strict=True):
-        # Only parts whose enclosing circle meets the footprint can contribute.
-        near_parts = np.flatnonzero(np.abs(position - part_centres) < part_radii + probe.reach)
-        placed_parts = [sensor.calibration.place(electrode.parts[part]) for part in near_parts]
-        force_shares.append(sum(probe.force_share(corners, position) for corners in placed_parts))
-    return np.asarray(-0.5 * sensor.piezo.d33 * force * sensor.gains * np.array(force_shares))
-
-
-def contact_charges(sensor: Sensor, probe: Probe, contact: Array, orientation: Array) -> Array:
-    """Compute the charges that the contact pressure of several presses induces on the electrodes; see `contact_charge`.
-
-    Args:
-        sensor: Sensor with the electrodes.
-        probe: Probe that presses the film.
         contact: Presses (x, y, F), shape (n, 3), mm and N.
-        orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
+        orientation: Rotation of the probe in addition to its own orientation, shape (n,) or a number, rad.
 
     Returns:
         Charges without crosstalk, shape (n, n_electrode), pC.
     """
-    charge = np.zeros((len(contact), len(sensor.electrodes)))
+    force_shares = np.zeros((len(contact), len(sensor.electrodes)))  # fraction of the force that acts on each electrode
     if sensor.piezo.d33 == 0.0 or not len(contact):
-        return charge
-
-    # The contact pressure acts only on electrodes under the probe. Presses far from all electrodes cause no charge.
-    position = contact[:, 0] + 1j * contact[:, 1]
-    largest_reach = probe.under(float(contact[:, 2].max())).reach
-    distances = relative_distances(sensor.part_circles, largest_reach, position)
-    presses_near_electrodes = np.flatnonzero((distances < 1.0).any(axis=1))
-    for press_index in presses_near_electrodes:
-        x, y, force = contact[press_index].tolist()
-        pressed_probe = probe.under(force).rotated(float(orientation[press_index]))
-        charge[press_index] = contact_charge(sensor, pressed_probe, (x, y), force)
-    return charge
+        return force_shares
+    position = to_complex(contact[:, :2])
+    force = contact[:, 2]
+    rotation = np.broadcast_to(orientation, len(contact))
+    largest_reach = probe.under(float(force.max())).reach
+    for electrode_index, electrode in enumerate(sensor.electrodes):
+        for part in electrode.parts:
+            corners = sensor.calibration.place(part)
+            distance_from_part = np.abs(position - to_complex(corners.mean(axis=0)))
+            part_radius = np.linalg.norm(corners - corners.mean(axis=0), axis=1).max()
+            # Only presses whose footprint meets the circle around the part can contribute.
+            for press in np.flatnonzero(distance_from_part < part_radius + largest_reach):
+                pressed_probe = probe.under(float(force[press])).rotated(float(rotation[press]))
+                force_shares[press, electrode_index] += pressed_probe.force_share(corners, complex(position[press]))
+    return np.asarray(-0.5 * sensor.piezo.d33 * force[:, None] * sensor.gains * force_shares)
 
 
 def thermal_charge(sensor: Sensor, step: float) -> Array:
@@ -415,86 +372,45 @@ class PressMeshes:
         return element, basis_values.reshape(*points.shape, mesh.xi.size), is_mirrored
 
 
-@dataclass(frozen=True)
-class PressChunk:
-    """Stress fields under several presses, interpolated at the nodes of the mesh.
+def integrate_fields(
+    fields: Array,
+    meshes: PressMeshes,
+    frame_angle: Array,
+    is_odd: Booleans,
+    pieces: ElectrodePieces,
+    rules: Iterable[PieceRule],
+    film_radius: float,
+) -> Array:
+    """Integrate stress fields over the electrodes to obtain charges.
 
-    Attributes:
+    Args:
+        fields: Scaled stresses of all fields at the nodes of every element for each press, shape (n, n_element *
+            n_local * n_field * 3), dimensionless. The values of all fields at one node are adjacent.
         meshes: Meshes under the presses.
-        field: Scaled stresses of all fields at the nodes of every element, shape (n, n_element * n_local * n_field *
-            3), dimensionless. The values of all fields at one node are adjacent.
         frame_angle: Angle of axis 1 of the stress fields from the x axis, shape (n,), rad.
+        is_odd: Whether each field is odd, shape (n_field,). A reflection in the direction of the press leaves an even
+            field unchanged, and changes the sign of an odd field.
+        pieces: Pieces of the electrodes.
+        rules: Integration points of the pairs of a press and a piece.
+        film_radius: Radius of the film, mm.
+
+    Returns:
+        Charges divided by the unit of the scaled stress, shape (n, n_electrode, n_field), pC/MPa.
     """
+    # At reflected points, s12 of an even field changes its sign, and s11 and s22 of an odd field change theirs.
+    changes_sign = np.stack([is_odd, is_odd, ~is_odd], axis=1)  # shape (n_field, 3)
+    nodal_fields = fields.reshape(len(fields), meshes.template.n_element, -1, changes_sign.size)
+    charge = np.zeros((len(fields), pieces.electrode.max() + 1, is_odd.size))
+    for rule in rules:
+        element, basis_values, is_mirrored = meshes.locate(rule.press, rule.points / film_radius)
+        element_fields = nodal_fields[rule.press[:, None], element]  # shape (n_pair, n_point, n_local, n_field * 3)
+        stress = (basis_values[..., None, :].astype(fields.dtype) @ element_fields)[..., 0, :]
 
-    meshes: PressMeshes
-    field: Array
-    frame_angle: Array
-
-    def charges(
-        self,
-        pieces: ElectrodePieces,
-        rules: Iterable[PieceRule],
-        film_radius: float,
-        is_odd: Booleans,
-    ) -> Array:
-        """Compute the charges of all electrodes under all presses.
-
-        Args:
-            pieces: Pieces of the electrodes.
-            rules: Integration points of the pairs of a press and a piece.
-            film_radius: Radius of the film, mm.
-            is_odd: Whether each field is odd, shape (n_field,); see `scaled_charges`.
-
-        Returns:
-            Charges divided by the unit of the scaled stress, shape (n, n_electrode, n_field), pC/MPa.
-        """
-        scaled_charge = np.zeros((len(self.field), pieces.electrode.max() + 1, is_odd.size))
-        for rule in rules:
-            pair_charge = self.scaled_charges(pieces, rule, film_radius, is_odd)
-            np.add.at(scaled_charge, (rule.press, pieces.electrode[rule.piece]), pair_charge)
-        return scaled_charge
-
-    def scaled_charges(self, pieces: ElectrodePieces, rule: PieceRule, film_radius: float, is_odd: Booleans) -> Array:
-        """Compute the charge of each pair of a press and a piece of an electrode, by integration of the stress fields.
-
-        Args:
-            pieces: Pieces of the electrodes.
-            rule: Integration points of the pairs.
-            film_radius: Radius of the film, mm.
-            is_odd: Whether each field is odd, shape (n_field,). A reflection in the direction of the press leaves an
-                even field unchanged, and changes the sign of an odd field.
-
-        Returns:
-            Charges divided by the unit of the scaled stress, shape (n_pair, n_field), pC/MPa.
-        """
-        stress, is_mirrored = self._interpolated_stress(rule.press, rule.points / film_radius, is_odd.size)
-
-        frame_angle = self.frame_angle[rule.press]
-        charge = np.empty((len(stress), is_odd.size))
-        for field_index, is_field_odd in enumerate(is_odd):
-            field_stress = stress[:, :, field_index]  # shape (n_pair, n_point, 3)
-            # At reflected points, s12 of an even field changes its sign, and s11 and s22 of an odd field change theirs.
-            reversed_components = slice(0, 2) if is_field_odd else slice(2, 3)
-            field_stress[is_mirrored, reversed_components] *= -1.0
-            film_stress = rotate_stress(field_stress, frame_angle[:, None])
-            charge[:, field_index] = pieces.charge(rule, film_stress)
-        return charge
-
-    def _interpolated_stress(self, press_index: Integers, points: Complexes, n_field: int) -> tuple[Array, Booleans]:
-        """Interpolate the stress of all fields from the nodes of the mesh to the integration points.
-
-        Args:
-            press_index: Index of the press of each pair, shape (n_pair,).
-            points: Integration points x + iy, shape (n_pair, n_point), in film radii.
-            n_field: Number of fields.
-
-        Returns:
-            Scaled stress (s11, s22, s12) in the frame of the mesh, shape (n_pair, n_point, n_field, 3), dimensionless.
-            Whether each point was reflected, shape (n_pair, n_point).
-        """
-        element, basis_values, is_mirrored = self.meshes.locate(press_index, points)
-        n_value = 3 * n_field  # number of values at a node
-        field_by_element = self.field.reshape(len(self.field), self.meshes.template.n_element, -1, n_value)
-        nodal_stress = field_by_element[press_index[:, None], element]  # shape (n_pair, n_point, n_local, n_value)
-        stress = basis_values[..., None, :].astype(self.field.dtype) @ nodal_stress
-        return stress.reshape(*points.shape, n_field, 3), is_mirrored
+        # Integrate the stress of each pair with and without the change of its sign at reflected points.
+        weights = np.stack([rule.area, np.where(is_mirrored, -rule.area, rule.area)], axis=1)
+        integrals = (weights @ stress).reshape(-1, 2, *changes_sign.shape)
+        integral = np.where(changes_sign, integrals[:, 1], integrals[:, 0])  # shape (n_pair, n_field, 3)
+        film_integral = rotate_stress(integral, frame_angle[rule.press, None])
+        pair_charge = (film_integral @ pieces.charge_per_stress[rule.piece][..., None])[..., 0]
+        np.add.at(charge, (rule.press, pieces.electrode[rule.piece]), pair_charge)
+    return charge

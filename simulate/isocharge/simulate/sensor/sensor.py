@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import shapely
 
-from isocharge.common.arrays import Array, Complexes
+from isocharge.common.arrays import Array
 from isocharge.common.errors import SensorError, cut, is_printable, shown
 from isocharge.simulate.numerics.polygon import (
     area_of,
@@ -191,13 +191,6 @@ class Electrode:
             return self.collecting_polygons
         return tuple(piece for polygon in self.collecting_polygons for piece in subdivide(polygon, MAX_PART_SIDE))
 
-    @cached_property
-    def part_circles(self) -> tuple[Array, Array]:
-        """Centres (x, y) of circles that enclose the parts, shape (n_part, 2), and their radii, shape (n_part,), mm."""
-        centres = np.array([part.mean(axis=0) for part in self.parts])
-        distances = [np.linalg.norm(part - centre, axis=1) for part, centre in zip(self.parts, centres, strict=True)]
-        return centres, np.array([distance.max() for distance in distances])
-
     @property
     def _is_convex(self) -> bool:
         """Whether the pad is convex and the collecting area is the whole pad."""
@@ -339,16 +332,6 @@ class Sensor:
     def electrode_names(self) -> tuple[str, ...]:
         """Names of the electrodes, in the order of the charges."""
         return tuple(electrode.name for electrode in self.electrodes)
-
-    @cached_property
-    def part_circles(self) -> tuple[tuple[Complexes, Array], ...]:
-        """Circles that enclose the parts of each electrode at their calibrated positions.
-
-        Returns:
-            For each electrode, the centres x + iy and the radii of the circles, each of shape (n_part,), mm.
-        """
-        circles = [electrode.part_circles for electrode in self.electrodes]
-        return tuple((to_complex(self.calibration.place(centres)), radii) for centres, radii in circles)
 
     @property
     def gains(self) -> Array:
