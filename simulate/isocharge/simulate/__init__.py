@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from isocharge.simulate.dataset.shards import Dataset, Samples, read_dataset, write_dataset
     from isocharge.simulate.dataset.sweep import Sweep, run_sweep
     from isocharge.simulate.execution import dask_workers, local_workers
-    from isocharge.simulate.forward.charge_map import ChargeMap, FunctionMap
+    from isocharge.simulate.forward.charge_map import ChargeMap
     from isocharge.simulate.forward.charge_spline import ChargeSpline
     from isocharge.simulate.forward.derivative_maps import FilmSlopes
     from isocharge.simulate.forward.forward_map import ForwardMap
@@ -67,7 +67,6 @@ __all__ = [
     "FilmSlopes",
     "Finger",
     "ForwardMap",
-    "FunctionMap",
     "GrowingFinger",
     "NoiseModel",
     "Piezo",

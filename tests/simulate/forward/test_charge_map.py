@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from function_map import FunctionMap
 from isocharge.common.errors import ChargeError, SceneError
-from isocharge.simulate import ChargeMap, Domain, FunctionMap
+from isocharge.simulate import ChargeMap, Domain
 from isocharge.simulate.forward.charge_map import as_charges, check_radius, within
 from isocharge.simulate.numerics.disk import sunflower
 from solved_charges import relative_error

@@ -7,7 +7,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from isocharge.simulate import ChargeSpline, Domain, Electrode, FunctionMap, NoiseModel, limits_at, noise_model
+from function_map import FunctionMap
+from isocharge.simulate import ChargeSpline, Domain, Electrode, NoiseModel, limits_at, noise_model
 from isocharge.simulate.identifiability.cramer_rao import cramer_rao
 
 REFERENCE = noise_model("reference")

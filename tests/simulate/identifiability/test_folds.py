@@ -7,13 +7,13 @@ from functools import cache
 import numpy as np
 import pytest
 
+from function_map import FunctionMap
 from isocharge.simulate import (
     ChargeSpline,
     Circle,
     Domain,
     Electrode,
     ForwardMap,
-    FunctionMap,
     load_sensor,
     noise_model,
     working_area,

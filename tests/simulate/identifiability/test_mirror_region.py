@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from function_map import FunctionMap
 from isocharge.common.contact_domain import Domain
-from isocharge.simulate import Circle, ForwardMap, FunctionMap, load_sensor, noise_model
+from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
 from isocharge.simulate.forward.charge_map import within
 from isocharge.simulate.identifiability.mirror_region import MirrorRegion, has_mirror, mirror_region
 from isocharge.simulate.identifiability.nearest_contact import search

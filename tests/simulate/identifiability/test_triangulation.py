@@ -6,13 +6,13 @@ from scipy.optimize import least_squares
 from tests.simulate.conftest import COARSE
 
 from drawn_contacts import draw_contacts
+from function_map import FunctionMap
 from isocharge.common.errors import SceneError
 from isocharge.simulate import (
     ChargeSpline,
     Circle,
     Domain,
     ForwardMap,
-    FunctionMap,
     Polygon,
     Triangulation,
     load_sensor,

@@ -46,7 +46,6 @@ def test_new_squares_are_named_anticlockwise_with_unused_letters(sensor):
         ({"keep": ("A", "A")}, "expected different names"),
         ({"keep": ("A", "B", "C", "D")}, "nothing to place"),
         ({"keep": ("Q",)}, "no electrode 'Q'"),
-        ({"gap": -1.0}, "gap: expected at least 0 mm, got -1 mm"),
         ({"side": 0.0}, "side: expected at least 0.01 mm, got 0 mm"),
         ({"noise": NoiseModel("mine", 0.0, 1e-3)}, "expected white noise above 0"),
         ({"goal": "best"}, "goal: expected worst or rms, got 'best'"),

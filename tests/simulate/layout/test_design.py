@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from function_map import FunctionMap
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import SolveError
-from isocharge.simulate import Domain, ForwardMap, FunctionMap, limits_at
+from isocharge.simulate import Domain, ForwardMap, limits_at
 from isocharge.simulate.layout import case as case_module
 from isocharge.simulate.layout import design as design_module
 from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase

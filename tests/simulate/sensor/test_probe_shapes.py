@@ -62,7 +62,9 @@ def shape(request) -> ShapeCase:
 
 
 def boundary_points(probe: Probe, count: int) -> np.ndarray:
-    """Return boundary points at evenly spaced parameters, shape (count,), mm."""
+    """Return the corners of a polygon, or points of a curve at evenly spaced parameters, shape (n,), mm."""
+    if not probe.topology.is_curved:
+        return probe.outline
     return probe.boundary(2.0 * np.pi * np.arange(count) / count)
 
 

@@ -5,7 +5,8 @@ import pytest
 from bayes.posterior import Posterior
 from scipy import stats
 
-from isocharge.simulate import Domain, FunctionMap, NoiseModel
+from function_map import FunctionMap
+from isocharge.simulate import Domain, NoiseModel
 from isocharge.train.data.presses import draw_contacts
 
 ONE_FORCE = Domain(1.0, (1.0, 1.0 + 1e-9))

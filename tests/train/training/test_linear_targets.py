@@ -5,8 +5,8 @@ import pytest
 import torch
 from scipy.optimize import least_squares
 
+from function_map import FunctionMap
 from isocharge.simulate import Domain, NoiseModel
-from isocharge.simulate.forward.charge_map import FunctionMap
 from isocharge.train import LabelledPresses
 from isocharge.train.training.contact_training import (
     LARGEST_LINEAR_STD,

@@ -88,31 +88,6 @@ def linearised(charge_map: ChargeMap, contact: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class FunctionMap:
-    """Charge map that computes charges with a given function, and derivatives of the charges by central differences.
-
-    Attributes:
-        function: Function of contacts (x, y, F), shape (n, 3), mm and N. It returns charges, shape (n, n_electrode),
-            pC.
-        electrodes: Names of the electrodes.
-        domain: Contacts for which the map is valid. For the central differences, the function must also accept contacts
-            that lie outside the domain by up to `STEPS`.
-    """
-
-    function: Callable[[Array], Array]
-    electrodes: tuple[str, ...]
-    domain: Domain
-
-    def charges(self, contact: Array) -> Array:
-        """See `ChargeMap`."""
-        return np.asarray(self.function(contact))
-
-    def derivatives(self, contact: Array) -> Array:
-        """See `ChargeMap`."""
-        return differences(self.function, contact)
-
-
-@dataclass(frozen=True)
 class _RestrictedMap:
     """Charge map that computes the same charges as another map, but has a smaller domain.
 
@@ -155,39 +130,15 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: tuple
     Returns:
         Derivatives with respect to (x, y, ln F), shape (n, k, 3), in the unit of the values per mm, per mm and per 1.
     """
-    contact = np.asarray(contact, dtype=float)
+    # Step each variable up and down, and evaluate the function once. The axes are direction, variable and contact.
     variable_steps = np.array(steps)
-    contacts_up = _step_each_variable(contact, variable_steps)  # shape (3, n, 3), one block per stepped variable
-    contacts_down = _step_each_variable(contact, -variable_steps)
-
-    # Evaluate the function once, for the stepped contacts in the order (stepped variable, up or down, contact).
-    stepped_contacts = np.stack([contacts_up, contacts_down], axis=1)
-    stepped_values = np.asarray(function(stepped_contacts.reshape(-1, 3)))
-    values = stepped_values.reshape(3, 2, len(contact), stepped_values.shape[1])
-    values_up = values[:, 0]
-    values_down = values[:, 1]
+    changes = np.stack([np.diag(variable_steps), -np.diag(variable_steps)])[:, :, None]
+    stepped = np.column_stack([contact[:, :2], np.log(contact[:, 2])]) + changes
+    stepped[..., 2] = np.exp(stepped[..., 2])
+    stepped_values = function(stepped.reshape(-1, 3))
+    values_up, values_down = stepped_values.reshape(2, 3, len(contact), stepped_values.shape[1])
     derivatives = (values_up - values_down) / (2.0 * variable_steps)[:, None, None]  # shape (3, n, k)
     return np.moveaxis(derivatives, 0, 2)
-
-
-def _step_each_variable(contact: Array, steps: Array) -> Array:
-    """Return three copies of the contacts: one shifted in x, one shifted in y, and one shifted in ln F.
-
-    Args:
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        steps: Steps in x and y, mm, and in ln F, shape (3,).
-
-    Returns:
-        Contacts (x, y, F), shape (3, n, 3), mm and N.
-    """
-    x_step, y_step, log_force_step = steps
-    x_stepped = contact.copy()
-    x_stepped[:, 0] += x_step
-    y_stepped = contact.copy()
-    y_stepped[:, 1] += y_step
-    force_stepped = contact.copy()
-    force_stepped[:, 2] *= np.exp(log_force_step)
-    return np.stack([x_stepped, y_stepped, force_stepped])
 
 
 def check_radius(radius: float, largest: float, source: str) -> None:

@@ -25,6 +25,12 @@ MAX_ELECTRODES = 8
 DEFAULT_SIDE = 3.0
 """Side of new squares if the sensor has no square electrodes, mm."""
 
+GAP = 0.5
+"""Smallest allowed gap between two electrodes, mm. It is sufficient if the gap along x or along y is large enough."""
+
+RIM_DISTANCE = 1.0
+"""Smallest allowed distance of an electrode from the rim of the film, mm."""
+
 NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 """Names of new electrodes. New electrodes get the first of these names that no kept electrode has."""
 
@@ -82,9 +88,6 @@ class DesignCase:
         noise: Noise of the readings.
         nuisances: Standard deviations of the parameters that are not known exactly.
         side: Side of the new squares, mm; None for the side of the squares of the sensor.
-        gap: Smallest allowed gap between two electrodes, mm. It is sufficient if the gap along x or the gap along y is
-            large enough.
-        rim: Smallest allowed distance of an electrode from the rim of the film, mm.
         seed: Seed of the random layouts from which the search starts.
 
     Raises:
@@ -103,8 +106,6 @@ class DesignCase:
     noise: NoiseModel = NOISE_LEVELS["reference"]
     nuisances: Nuisances = Nuisances()
     side: float | None = None
-    gap: float = 0.5
-    rim: float = 1.0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -123,8 +124,6 @@ class DesignCase:
                 "of a press are three unknowns"
             )
         check_family(self.sensor.film, self.probe, Domain(self.radius, (self.force, self.force)))
-        check_range("gap", self.gap, (0.0, np.inf), "mm", InputError)
-        check_range("rim", self.rim, (0.0, np.inf), "mm", InputError)
         check_range("side", self.square_side, (1e-2, np.inf), "mm", InputError)
         if not self.noise.white > 0.0:
             raise InputError(
@@ -200,8 +199,8 @@ class DesignCase:
     def clearance(self, positions: Array) -> Array:
         """Compute the margin with which each square satisfies the distance rules.
 
-        The distance between a square and the rim of the film must be at least `self.rim`. The gap between a square and
-        the bounding box of each part of a kept electrode must be at least `self.gap`.
+        The distance between a square and the rim of the film must be at least `RIM_DISTANCE`. The gap between a square
+        and the bounding box of each part of a kept electrode must be at least `GAP`.
 
         Args:
             positions: Centres (x, y) of the squares, shape (n, 2), mm.
@@ -214,14 +213,14 @@ class DesignCase:
         half_side = 0.5 * self.square_side
         corner_x, corner_y = (np.abs(positions) + half_side).T
         corner_distance = np.hypot(corner_x, corner_y)
-        clearances = [self.sensor.film.inner_radius - self.rim - corner_distance]
+        clearances = [self.sensor.film.inner_radius - RIM_DISTANCE - corner_distance]
 
         for electrode in self.kept_electrodes:
             for part in electrode.metal:
                 # Compute the gaps along x and y, shape (n, 2). A gap is negative if the square and the part overlap
                 # along this axis. It is sufficient if one gap is large enough, so the larger gap counts.
                 axis_gaps = np.maximum(part.min(axis=0) - positions, positions - part.max(axis=0)) - half_side
-                clearances.append(axis_gaps.max(axis=1) - self.gap)
+                clearances.append(axis_gaps.max(axis=1) - GAP)
         return np.asarray(np.min(clearances, axis=0))
 
     def pair_clearance(self, positions: Array, others: Array) -> Array:
@@ -237,7 +236,7 @@ class DesignCase:
         # The gap between two squares along an axis is the distance of their centres along this axis, minus one side. It
         # is sufficient if the gap along x or the gap along y is large enough, so the larger distance counts.
         distance = np.abs(positions[:, None] - others).max(axis=2)
-        return np.asarray(distance - self.square_side - self.gap)
+        return np.asarray(distance - self.square_side - GAP)
 
     def all_clearances(self, positions: Array) -> Array:
         """Compute the margins with which a layout satisfies all distance rules.
@@ -306,7 +305,7 @@ class DesignCase:
                 "gain": self.nuisances.gain,
             },
             "side_mm": self.square_side,
-            "gap_mm": self.gap,
-            "rim_mm": self.rim,
+            "gap_mm": GAP,
+            "rim_mm": RIM_DISTANCE,
             "seed": self.seed,
         }

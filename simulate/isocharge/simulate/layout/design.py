@@ -26,7 +26,7 @@ from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.working_area import working_area
-from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase
+from isocharge.simulate.layout.case import GAP, NO_NUISANCES, RIM_DISTANCE, DesignCase
 from isocharge.simulate.layout.stress_fields import PressedFilm, rows_of, solve_fields
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.sensor.sensor import Electrode, Sensor
@@ -85,7 +85,7 @@ def random_layouts(case: DesignCase) -> list[Array]:
         InputError: If the squares do not fit.
     """
     useful_radius = case.radius + EXTENT * case.sensor.film.radius
-    allowed_radius = case.sensor.film.inner_radius - case.rim - 0.5 * case.square_side
+    allowed_radius = case.sensor.film.inner_radius - RIM_DISTANCE - 0.5 * case.square_side
     radius = min(useful_radius, allowed_radius)
     grid = radius * sunflower(1000)
     grid = grid[case.clearance(grid) >= 0.0]
@@ -100,7 +100,7 @@ def random_layouts(case: DesignCase) -> list[Array]:
         if len(positions) < case.new_count:
             raise InputError(
                 f"{case.new_count} new squares of {case.square_side:g} mm do not fit within {radius:.3g} mm of the "
-                f"centre, with gaps of {case.gap:g} mm; ask for fewer, smaller or nearer electrodes"
+                f"centre, with gaps of {GAP:g} mm; ask for fewer, smaller or nearer electrodes"
             )
         layouts.append(positions)
     return layouts

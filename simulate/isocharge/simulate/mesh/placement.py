@@ -28,7 +28,7 @@ from isocharge.simulate.mesh.conformal_map import (
     sector_angles,
     stretch_on_circle,
 )
-from isocharge.simulate.sensor.footprint import Probe
+from isocharge.simulate.sensor.footprint import CurvedProbe, Probe
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Placement:
             outline = centroid[..., None] + probe.outline / film_radius * rotation_factor[..., None]
             centre, radius = enclosing_circle(outline, centroid)
             inner_extent = np.abs(outline - centre[..., None]).max(axis=-1)
-            if probe.topology.is_curved:
+            if isinstance(probe, CurvedProbe) and probe.topology.is_curved:
                 boundary = probe.boundary(blocks.boundary_parameter[:: blocks.n_half_edge])
                 inner_points = np.asarray(centroid[..., None] + boundary / film_radius * rotation_factor[..., None])
 
@@ -177,6 +177,7 @@ class Placement:
         Returns:
             Film points x + iy, shape (..., n), in film radii.
         """
+        assert isinstance(self.probe, CurvedProbe)
         centroid = self.corners[..., -1:]
         return np.asarray(centroid + self.rotation_and_scale[..., None] * self.probe.boundary(parameter))
 

@@ -17,7 +17,7 @@ from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.simulate.mesh.blocks import Blocks, Resolution
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.footprint import FootprintTopology, Probe
-from isocharge.simulate.sensor.probe import Circle, Polygon, RoundProbe
+from isocharge.simulate.sensor.probe import RoundProbe
 
 SAMPLE_REACH = 0.1
 """Reach of the footprint of the sample press, in film radii.
@@ -68,8 +68,8 @@ class Template(Blocks):
 
 
 @dataclass(frozen=True)
-class SampleCurve(RoundProbe):
-    """Circular footprint that replaces another curved footprint in the sample press.
+class SampleProbe(RoundProbe):
+    """Probe of the sample press, whose circular footprint replaces another footprint with the same topology.
 
     Attributes:
         radius: Radius of the circle, mm.
@@ -98,23 +98,10 @@ def sample_points(blocks: Blocks) -> Complexes:
     Returns:
         Film points x + iy, shape (n_element, (order + 1)^2), in film radii.
     """
-    probe = _sample_probe(blocks.topology)
-    placement = Placement.of(blocks, probe, np.array(SAMPLE_DISTANCE), 1.0, SAMPLE_LAYER)
+    placement = Placement.of(
+        blocks, SampleProbe(SAMPLE_REACH, blocks.topology), np.array(SAMPLE_DISTANCE), 1.0, SAMPLE_LAYER
+    )
     return placement.element_points(blocks)
-
-
-def _sample_probe(topology: FootprintTopology) -> Probe:
-    """Create a probe whose footprint has a given topology. The sample press uses this probe on a film of radius 1 mm.
-
-    Args:
-        topology: Number and kind of the blocks in and around the footprint.
-    """
-    if topology.fills_circle:
-        return Circle(SAMPLE_REACH)
-    if topology.is_curved:
-        return SampleCurve(SAMPLE_REACH, topology)
-    angle = np.linspace(0.0, 2.0 * np.pi, topology.n_corner, endpoint=False)
-    return Polygon.of(SAMPLE_REACH * np.stack([np.cos(angle), np.sin(angle)], axis=1))
 
 
 @lru_cache(maxsize=16)

@@ -122,18 +122,6 @@ class Probe(ABC):
             Corners, shape (topology.n_corner,), in multiples of `unit`.
         """
 
-    @abstractmethod
-    def boundary(self, parameter: Array) -> Complexes:
-        """Return points on the boundary of the footprint, including the rotation by `angle`.
-
-        Args:
-            parameter: Values from 0 to 2 pi, any shape. If the parameter increases, the point moves anticlockwise along
-                the boundary. An increase of the parameter by `period` must rotate the point by `period`.
-
-        Returns:
-            Points x + iy relative to the centroid, of the shape of `parameter`, mm.
-        """
-
     def rotated(self, angle: float) -> Self:
         """Return a copy of the probe that is rotated further about its centroid.
 
@@ -198,6 +186,18 @@ class CurvedProbe(Probe):
     A subclass has a field `angle` and implements `boundary`, `notation`, `area`, `reach` and `period`. The class
     `CurvedProbe` implements all other methods of `Probe`. A subclass may override these methods with closed formulas.
     """
+
+    @abstractmethod
+    def boundary(self, parameter: Array) -> Complexes:
+        """Return points on the boundary of the footprint, including the rotation by `angle`.
+
+        Args:
+            parameter: Values from 0 to 2 pi, any shape. If the parameter increases, the point moves anticlockwise along
+                the boundary. An increase of the parameter by `period` must rotate the point by `period`.
+
+        Returns:
+            Points x + iy relative to the centroid, of the shape of `parameter`, mm.
+        """
 
     @property
     def topology(self) -> FootprintTopology:

@@ -352,19 +352,6 @@ class Polygon(Probe):
         """Return the corners x + iy of the rotated polygon in multiples of `unit` (mm), shape (n_corner,)."""
         return np.asarray(self.outline / unit)
 
-    def boundary(self, parameter: Array) -> Complexes:
-        """Return points x + iy of the boundary, mm.
-
-        The parameter 0 is the middle of the edge that ends at the first corner. Each edge covers the same range of the
-        parameter.
-
-        Args:
-            parameter: Values from 0 to 2 pi, any shape.
-        """
-        corners = np.append(self.outline, self.outline[:1])  # the first corner is repeated, which closes the boundary
-        corner_parameter = 2.0 * np.pi * (np.arange(corners.size) + 0.5) / (corners.size - 1)
-        return np.asarray(np.interp(parameter, corner_parameter, corners, period=2.0 * np.pi))
-
 
 def _as_tuples(corners: Array) -> tuple[tuple[float, float], ...]:
     """Convert corners (x, y) of shape (n, 2) into nested tuples, which can be compared and hashed."""
