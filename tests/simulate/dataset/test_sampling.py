@@ -77,9 +77,9 @@ def test_presses_depend_on_seed_and_probe():
         ({"seed": -1}, "seed: expected 0 or more, got -1"),
         ({"samples": 10_000_001}, "samples: expected at most 10000000, got 10000001"),
         ({"orientation": "Random"}, "orientation: expected 'fixed' or 'random', got 'Random'"),
-        ({"force_range": (0.0, 1.0)}, "force: expected 0 < smallest <= largest force"),
-        ({"force_range": (2.0, 1.0)}, "force: expected 0 < smallest <= largest force"),
-        ({"force_range": (1.0, np.inf)}, "force: expected 0 < smallest <= largest force"),
+        ({"force_range": (0.0, 1.0)}, "force range: expected 0 < MIN <= MAX in N"),
+        ({"force_range": (2.0, 1.0)}, "force range: expected 0 < MIN <= MAX in N"),
+        ({"force_range": (1.0, np.inf)}, "force range: expected 0 < MIN <= MAX in N"),
         ({}, "probes: expected at least one, got none"),
     ],
 )

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from function_map import FunctionMap
-from isocharge.common.errors import ChargeError, SceneError
+from isocharge.common.errors import SceneError
 from isocharge.simulate import ChargeMap, Domain
-from isocharge.simulate.forward.charge_map import as_charges, check_radius, within
+from isocharge.simulate.forward.charge_map import within
 from isocharge.simulate.numerics.disk import sunflower
 from solved_charges import relative_error
 
@@ -81,16 +81,3 @@ def test_domain_to_unit_and_to_contact_are_inverse_and_accept_the_edge():
     np.testing.assert_allclose(DOMAIN.to_contact(unit), contact, rtol=1e-12)
     for rounding in (1.0 - 1e-12, 1.0 + 1e-12):
         DOMAIN.check(np.array([[3.0, 4.0, 2.0], [0.0, 0.0, 0.1]]) * rounding, "map")
-        check_radius(5.0 * rounding, 5.0, "map")
-
-
-@pytest.mark.parametrize(
-    ("check", "message"),
-    [
-        (lambda: as_charges(np.ones(3), ("A", "B", "C")), r"shape \(n, 3\) for .'A', 'B', 'C'., got shape \(3,\)"),
-        (lambda: as_charges(np.array([[1, np.nan]]), ("A", "B")), "charge of 'B' in press 0: expected a finite number"),
-    ],
-)
-def test_invalid_arguments_raise_error_with_their_names(check, message):
-    with pytest.raises((SceneError, ChargeError), match=message):
-        check()

@@ -7,7 +7,7 @@ from tests.simulate.conftest import COARSE
 
 from drawn_contacts import draw_contacts
 from function_map import FunctionMap
-from isocharge.common.errors import SceneError
+from isocharge.common.errors import ChargeError, SceneError
 from isocharge.simulate import (
     ChargeSpline,
     Circle,
@@ -116,3 +116,9 @@ def test_charge_map_with_folds_has_two_positions():
 def test_impossible_triangulation_raises_an_error(count, tolerance, message):
     with pytest.raises(SceneError, match=message):
         Triangulation(round_map(CENTRES["three"][:count]), tolerance=tolerance)
+
+
+@pytest.mark.parametrize("charge", [np.ones(3), np.ones((2, 4)), [[1.0, np.nan, 1.0]]])
+def test_wrong_charges_raise_a_charge_error(charge):
+    with pytest.raises(ChargeError, match=r"expected finite charges of shape \(n, 3\) for .*, got shape"):
+        Triangulation(round_map(CENTRES["three"])).locate(charge)

@@ -25,6 +25,7 @@ import numpy as np
 import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.common.contact_domain import Domain
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.common.files import new_folder, refuse_existing
@@ -32,10 +33,10 @@ from isocharge.common.progress import report, second_thread
 from isocharge.simulate.dataset.shards import (
     MAX_SHARD_BYTES,
     Samples,
-    write_dataset,
     write_files,
 )
 from isocharge.simulate.execution import in_order
+from isocharge.simulate.forward.charge_map import check_domain
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.footprint import Probe
@@ -115,8 +116,7 @@ class Sweep:
         Raises:
             SceneError: If a value is not allowed.
         """
-        if not 0.0 < self.radius < np.inf:
-            raise SceneError(f"radius: expected a positive number of mm, got {self.radius:g}")
+        check_domain(Domain(self.radius, self.force_range))
         if not 1 <= self.samples <= MAX_SAMPLES:
             bound = "at least 1" if self.samples < 1 else f"at most {MAX_SAMPLES}"
             raise SceneError(f"samples: expected {bound}, got {self.samples}")
@@ -124,9 +124,6 @@ class Sweep:
             raise SceneError(f"seed: expected 0 or more, got {self.seed}")
         if not 0 <= self.outside <= MAX_SAMPLES:
             raise SceneError(f"outside: expected 0 to {MAX_SAMPLES} presses outside the radius, got {self.outside}")
-        min_force, max_force = self.force_range
-        if not 0.0 < min_force <= max_force < np.inf:
-            raise SceneError(f"force: expected 0 < smallest <= largest force in N, got {min_force:g} and {max_force:g}")
         if self.orientation not in get_args(Orientation):
             raise SceneError(f"orientation: expected 'fixed' or 'random', got {self.orientation!r}")
 
@@ -246,6 +243,7 @@ def run_sweep(
     settings: SolveSettings = SolveSettings(),
     *,
     executor: Executor | None = None,
+    maps: Sequence[ForwardMap] = (),
     shard: int = SHARD_SIZE,
 ) -> Path:
     """Compute the charges of the presses of a sweep, and write them as a dataset.
@@ -258,6 +256,7 @@ def run_sweep(
         settings: Accuracy, theory and mesh of the solver.
         executor: Executor that runs the tasks, such as a process pool or the executor of a Dask cluster; None for this
             process. The files do not depend on the executor.
+        maps: Forward map of each probe; empty if they are to be built.
         shard: Number of samples in a shard, which is one file of the dataset.
 
     Returns:
@@ -282,7 +281,7 @@ def run_sweep(
     with new_folder(folder) as draft, single_threaded_blas(), second_thread(thread_title) as thread:
         # The solves of the whole film keep the workers busy while this thread fits the maps of the probes.
         outside_job = thread.submit(outside_map, sensor, probes, sweep, executor=executor)
-        maps = solve_maps(sensor, probes, sweep, settings, executor=executor)
+        maps = maps or solve_maps(sensor, probes, sweep, settings, executor=executor)
         whole_film = outside_job.result()
         shards = _shards(sweep, presses, _shard_size(probes, shard), whole_film)
         samples = _samples(maps, whole_film, shards, executor)
@@ -342,9 +341,7 @@ def outside_map(
 
 
 def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
-    """Compute the charges of a sweep with given forward maps, and write them as a dataset.
-
-    In contrast to `run_sweep`, the charges are computed in this process.
+    """Compute the charges of a sweep with given forward maps in this process, and write them as a dataset.
 
     Args:
         folder: Folder that is created. It must not exist yet.
@@ -354,12 +351,8 @@ def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
     Returns:
         Path of the folder.
     """
-    sensor = maps[0].sensor
     probes = [forward_map.probe for forward_map in maps]
-    whole_film = outside_map(sensor, probes, sweep)
-    shards = _shards(sweep, sweep.over(probes), _shard_size(probes, SHARD_SIZE), whole_film)
-    samples = _samples(maps, whole_film, shards, None)
-    return write_dataset(folder, sensor, samples, _manifest_entries(maps, whole_film, sweep))
+    return run_sweep(folder, maps[0].sensor, probes, sweep, maps=maps, shard=SHARD_SIZE)
 
 
 def _manifest_entries(maps: Sequence[ForwardMap], whole_film: ForwardMap | None, sweep: Sweep) -> dict[str, Any]:

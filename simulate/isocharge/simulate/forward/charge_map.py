@@ -10,8 +10,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.contact_domain import LIMIT_TOLERANCE, Domain
-from isocharge.common.errors import ChargeError, SceneError
+from isocharge.common.contact_domain import Domain
+from isocharge.common.errors import SceneError
 
 STEPS = (0.05, 0.05, 1e-3)
 """Steps of the central differences in x and y (mm) and in ln F (dimensionless), where F is the force.
@@ -141,19 +141,20 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: tuple
     return np.moveaxis(derivatives, 0, 2)
 
 
-def check_radius(radius: float, largest: float, source: str) -> None:
-    """Raise an error if a radius is not positive or exceeds the radius for which a map is valid.
+def check_domain(domain: Domain) -> None:
+    """Raise an error if the radius or the forces of a domain are not positive numbers.
 
     Args:
-        radius: Radius to be checked, mm.
-        largest: Largest allowed radius, mm. Rounding errors are allowed.
-        source: Name of the map in the error message, such as "forward map".
+        domain: Presses that are to be simulated.
 
     Raises:
-        SceneError: If the radius is not positive or exceeds the largest one.
+        SceneError: If a value is not positive or not finite, or if the smallest force exceeds the largest force.
     """
-    if not 0.0 < radius <= largest * LIMIT_TOLERANCE:
-        raise SceneError(f"radius: expected up to the {source}'s {largest:g} mm, got {radius:g} mm")
+    min_force, max_force = domain.force_range
+    if not 0.0 < min_force <= max_force < np.inf:
+        raise SceneError(f"force range: expected 0 < MIN <= MAX in N, got {min_force:g} to {max_force:g}")
+    if not 0.0 < domain.radius < np.inf:
+        raise SceneError(f"radius: expected a positive number, got {domain.radius:g} mm")
 
 
 def check_electrode_count(n_electrode: int) -> None:
@@ -170,30 +171,3 @@ def check_electrode_count(n_electrode: int) -> None:
             f"expected at least three electrodes, got {n_electrode}: x, y and the force are three unknowns, so with "
             "fewer charges a whole line of contacts has the same charges; add an electrode"
         )
-
-
-def as_charges(charge: Array, electrode_names: tuple[str, ...]) -> Array:
-    """Convert charges into an array of floats, and check that it contains one finite value for each electrode.
-
-    Args:
-        charge: Charges, shape (n, n_electrode), pC.
-        electrode_names: Names of the electrodes, in the order of the charges.
-
-    Returns:
-        The same charges as an array of floats, shape (n, n_electrode), pC.
-
-    Raises:
-        ChargeError: If the array does not have one column for each electrode, or a charge is not finite.
-    """
-    charge = np.asarray(charge, dtype=float)
-    n_electrode = len(electrode_names)
-    if charge.ndim != 2 or charge.shape[1] != n_electrode:
-        raise ChargeError(
-            f"expected charges of shape (n, {n_electrode}) for {electrode_names}, got shape {charge.shape}"
-        )
-    if not np.isfinite(charge).all():
-        row, column = np.argwhere(~np.isfinite(charge))[0]  # position of the first charge that is not finite
-        raise ChargeError(
-            f"charge of {electrode_names[column]!r} in press {row}: expected a finite number, got {charge[row, column]}"
-        )
-    return charge

@@ -20,8 +20,9 @@ from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 from scipy.sparse.linalg import splu
 
 from isocharge.common.arrays import Array
-from isocharge.common.contact_domain import Domain
-from isocharge.simulate.forward.charge_map import ChargeMap, check_radius
+from isocharge.common.contact_domain import LIMIT_TOLERANCE, Domain
+from isocharge.common.errors import SceneError
+from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.readout import contact_charges
 from isocharge.simulate.mechanics.theory import amplitude_squared
@@ -101,7 +102,10 @@ class ChargeSpline:
         """
         map_domain = forward_map.domain
         domain = map_domain if radius is None else map_domain.within(radius)
-        check_radius(domain.radius, map_domain.radius, "forward map")
+        if not 0.0 < domain.radius <= map_domain.radius * LIMIT_TOLERANCE:
+            raise SceneError(
+                f"radius: expected up to the forward map's {map_domain.radius:g} mm, got {domain.radius:g} mm"
+            )
         spacing = spacing or min(MAX_KNOT_SPACING, RELATIVE_KNOT_SPACING * forward_map.probe.reach)
 
         sensor = forward_map.sensor
@@ -192,16 +196,13 @@ class ChargeSpline:
         forces of the splines. The squared amplitude at the given force converts the scaled charge into a charge.
 
         Args:
-            log_force: Natural logarithms of the given forces in N, shape (...).
+            log_force: Natural logarithms of the given forces in N, shape (n,).
 
         Returns:
-            Weights, shape (..., n_force).
+            Weights, shape (n, n_force).
         """
-        nodes = np.log(self.force)
-        flat_log_force = log_force.ravel()
-        weights = lagrange_values(nodes, flat_log_force)
-        weights *= amplitude_squared(self.film, np.exp(flat_log_force))[:, None]
-        return weights.reshape(*log_force.shape, nodes.size)
+        weights = lagrange_values(np.log(self.force), log_force)
+        return np.asarray(weights * amplitude_squared(self.film, np.exp(log_force))[:, None])
 
     def scaled_charges(self, position: Array) -> Array:
         """Compute the scaled charges for all forces at which splines were fitted.

@@ -21,16 +21,13 @@ from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import SceneError
 from isocharge.common.progress import track
 from isocharge.simulate.execution import in_order
+from isocharge.simulate.forward.charge_map import check_domain
 from isocharge.simulate.forward.readout import touch_charge
 from isocharge.simulate.mechanics.theory import rotate_stress
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import distance_coordinate
 from isocharge.simulate.mesh.template import Template
-from isocharge.simulate.numerics.interpolation import (
-    Turns,
-    chebyshev_nodes,
-    lagrange_values,
-)
+from isocharge.simulate.numerics.interpolation import Turns, chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.sensor import Sensor
@@ -283,33 +280,7 @@ def node_counts(film: Film) -> tuple[NodeCount, ...]:
     return ASYMMETRIC_NODE_COUNTS[1:] if is_taut else ASYMMETRIC_NODE_COUNTS
 
 
-class CheckPress(NamedTuple):
-    """A press at which the interpolation of a family is compared with a direct solve.
-
-    Attributes:
-        distance: Distance of the press from the centre of the film, mm.
-        angle: Direction from the centre of the film to the press, rad.
-        force: Force of the press, N.
-        rotation: Rotation of the probe in addition to its own orientation, rad.
-    """
-
-    distance: float
-    angle: float
-    force: float
-    rotation: float
-
-    @property
-    def position(self) -> tuple[float, float]:
-        """Position (x, y) of the press, mm."""
-        return self.distance * math.cos(self.angle), self.distance * math.sin(self.angle)
-
-    @property
-    def contact(self) -> Array:
-        """The press as an array of one contact (x, y, F), shape (1, 3), mm and N."""
-        return np.array([[*self.position, self.force]])
-
-
-def spread_check_presses(domain: Domain, count: int) -> list[CheckPress]:
+def spread_check_presses(domain: Domain, count: int) -> tuple[Array, Array]:
     """Return presses, distributed over the distances and forces of a domain, at which an interpolation is checked.
 
     The last press lies at the largest distance. The distances of the other presses are the square roots of Chebyshev
@@ -318,26 +289,24 @@ def spread_check_presses(domain: Domain, count: int) -> list[CheckPress]:
     Args:
         domain: Domain of the family that is checked.
         count: Number of presses to be returned, including the last press.
+
+    Returns:
+        Contacts (x, y, F), shape (count, 3), mm and N. Rotations of the probe in addition to its own orientation, shape
+        (count,), rad.
     """
-    relative_distances = np.sqrt(chebyshev_nodes(count - 1, 0.0, 1.0))
-    min_force, max_force = domain.force_range
+    number = np.arange(float(count))
+    distance = domain.radius * np.append(np.sqrt(chebyshev_nodes(count - 1, 0.0, 1.0)), 1.0)
+
+    # Multiples of the golden ratio (0.618), modulo 1, distribute the logarithms of the forces evenly. Rounding must
+    # not move a force out of the range.
     min_log_force, max_log_force = np.log(domain.force_range)
-    presses = []
-    for index, relative_distance in enumerate([*relative_distances, 1.0]):
-        distance = float(domain.radius * relative_distance)
+    log_force = min_log_force + (max_log_force - min_log_force) * ((0.5 + 0.618 * number) % 1.0)
+    force = np.clip(np.exp(log_force), *domain.force_range)
 
-        # Multiples of the golden ratio (0.618), modulo 1, distribute the logarithms of the forces evenly. Rounding must
-        # not move a force out of the range.
-        log_force_fraction = (0.5 + 0.618 * index) % 1.0
-        force = np.exp(min_log_force + (max_log_force - min_log_force) * log_force_fraction)
-        force_in_range = float(np.clip(force, min_force, max_force))
-
-        # The golden angle (2.4 rad) distributes the directions evenly. The rotation of the probe changes by a different
-        # angle, so that the rotation and the direction are independent.
-        angle = 2.4 * index
-        rotation = 0.7 * index
-        presses.append(CheckPress(distance, angle, force_in_range, rotation))
-    return presses
+    # The golden angle (2.4 rad) distributes the directions evenly. The rotation of the probe changes by a different
+    # angle, so that the rotation and the direction are independent.
+    position = distance * np.exp(2.4j * number)
+    return np.column_stack([position.real, position.imag, force]), 0.7 * number
 
 
 def check_family(film: Film, probe: Probe, domain: Domain) -> None:
@@ -355,12 +324,9 @@ def check_family(film: Film, probe: Probe, domain: Domain) -> None:
         SceneError: If the radius or the forces are not positive numbers, or if the outermost press with the largest
             force cannot exist.
     """
+    check_domain(domain)
     radius = domain.radius
-    min_force, max_force = domain.force_range
-    if not (0.0 < min_force <= max_force and np.isfinite(max_force)):
-        raise SceneError(f"force range: expected 0 < MIN <= MAX in N, got {min_force} to {max_force}")
-    if not (np.isfinite(radius) and radius > 0.0):
-        raise SceneError(f"radius: expected a positive number, got {radius} mm")
+    _, max_force = domain.force_range
     largest_probe = probe.under(max_force)
     if radius + largest_probe.reach >= film.radius:
         raise SceneError(
@@ -403,21 +369,22 @@ def family_mesh(film: Film, probe: Probe, domain: Domain, settings: SolveSetting
     return resolution, layer
 
 
-def direct_charges(sensor: Sensor, probe: Probe, settings: SolveSettings, check: CheckPress) -> Array:
+def direct_charges(
+    sensor: Sensor, probe: Probe, settings: SolveSettings, check: tuple[float, float, float, float]
+) -> Array:
     """Compute the charges of one press by a direct solve, without interpolation.
 
     Args:
         sensor: Sensor whose charges are computed.
         probe: Probe in its own orientation, to which the rotation of the press is added.
         settings: Theory and mesh of the solve.
-        check: Position, force and rotation of the press.
+        check: Position (x, y), mm, force, N, and rotation of the probe, rad.
 
     Returns:
         Charges, shape (n_electrode,), pC.
     """
-    rotated_probe = probe.rotated(check.rotation)
-    equilibrium = press(sensor.film, rotated_probe, check.position, check.force, settings)
-    return touch_charge(sensor, equilibrium)
+    x, y, force, rotation = check
+    return touch_charge(sensor, press(sensor.film, probe.rotated(rotation), (x, y), force, settings))
 
 
 CHARGE_FLOOR = 0.1
@@ -425,17 +392,18 @@ CHARGE_FLOOR = 0.1
 
 
 def relative_error(charge: Array, direct_charge: Array) -> float:
-    """Compute the largest relative difference between the interpolated and the directly solved charges of a press.
+    """Compute the largest relative difference between interpolated and directly solved charges.
 
     The difference at each electrode is divided by the directly solved charge of the electrode. The divisor is at least
     `CHARGE_FLOOR` times the largest charge of the press.
 
     Args:
-        charge: Interpolated charges, shape (n_electrode,), pC.
-        direct_charge: Directly solved charges, shape (n_electrode,), pC.
+        charge: Interpolated charges, shape (n, n_electrode), pC.
+        direct_charge: Directly solved charges, shape (n, n_electrode), pC.
 
     Returns:
         The largest relative difference of an electrode, dimensionless.
     """
-    divisor = np.maximum(np.abs(direct_charge), CHARGE_FLOOR * np.abs(direct_charge).max())
+    magnitude = np.abs(direct_charge)
+    divisor = np.maximum(magnitude, CHARGE_FLOOR * magnitude.max(axis=1, keepdims=True))
     return float((np.abs(charge - direct_charge) / divisor).max())

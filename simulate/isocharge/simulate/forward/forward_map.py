@@ -137,7 +137,8 @@ class ForwardMap:
         # Increase the number of nodes until the interpolated charges are sufficiently accurate. They are compared at
         # the check presses, which are solved directly in the first pass of the loop. If the error is very large, the
         # next number of nodes would not suffice either and is skipped.
-        checks = spread_check_presses(domain, CHECK_COUNT)
+        contact, rotation = spread_check_presses(domain, CHECK_COUNT)
+        checks = np.column_stack([contact, rotation]).tolist()
         check_charges: list[Array] = []
         error = np.inf
         remaining_counts = list(node_counts(film))
@@ -148,8 +149,7 @@ class ForwardMap:
             if not check_charges:
                 solve_directly = partial(direct_charges, sensor, probe, forward_map.settings)
                 check_charges = list(in_order(executor, solve_directly, checks))
-            charges = (forward_map.charges(check.contact, check.rotation)[0] for check in checks)
-            error = max(map(relative_error, charges, check_charges))
+            error = relative_error(forward_map.charges(contact, rotation), np.array(check_charges))
             if error <= INTERPOLATION_ERROR:
                 return replace(forward_map, error=error)
             if error > SKIP_RATIO * INTERPOLATION_ERROR and len(remaining_counts) > 1:

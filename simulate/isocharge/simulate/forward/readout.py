@@ -28,7 +28,6 @@ from isocharge.simulate.mesh.template import Template, locate_points
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.numerics.polygon import (
     gauss_quadrilaterals,
-    gauss_square_weights,
     halve_quadrilaterals,
     to_complex,
     to_corners,
@@ -163,9 +162,7 @@ class ElectrodePieces:
                 block = 50_000 // count**2  # with more points, the working arrays would exceed 100 MB
                 for start in range(0, indices.size, block):
                     used = indices[start : start + block]
-                    points, area = gauss_quadrilaterals(corners[used], count)
-                    # A line has no area of its own, so the area that it represents is added.
-                    area += line_area[used, None] * gauss_square_weights(count)
+                    points, area = gauss_quadrilaterals(corners[used], line_area[used], count)
                     yield PieceRule(press[used], piece[used], points, area)
 
             press = np.tile(press[is_halved], 2)

@@ -13,8 +13,8 @@ from functools import cached_property
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.common.errors import SceneError
-from isocharge.simulate.forward.charge_map import ChargeMap, as_charges, check_electrode_count, linearised
+from isocharge.common.errors import ChargeError, SceneError
+from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count, linearised
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.identifiability.nearest_contact import explain, starting_contacts
 
@@ -90,7 +90,13 @@ class Triangulation:
         Raises:
             ChargeError: If there is not one finite charge for each electrode.
         """
-        charge = as_charges(charge, self.charge_map.electrodes)
+        charge = np.asarray(charge, dtype=float)
+        names = self.charge_map.electrodes
+        if charge.ndim != 2 or charge.shape[1] != len(names) or not np.isfinite(charge).all():
+            raise ChargeError(
+                f"expected finite charges of shape (n, {len(names)}) for {names}, got shape {charge.shape} with "
+                f"{np.count_nonzero(~np.isfinite(charge))} charges that are not finite"
+            )
 
         # Search from several starting points for each press, which do not lie close together.
         largest_charge = np.abs(charge).max(axis=1, keepdims=True, initial=1.0)

@@ -182,11 +182,9 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
 
     def stress_of(equilibrium: Equilibrium) -> tuple[Array, Complexes]:
         """Return the stress at the nodes in the frame of the given press, MPa, and the nodes, in film radii."""
-        x, y = equilibrium.at
-        angle = math.atan2(y, x)
         stress_unit = film.young * equilibrium.groups.squared_amplitude
-        stress = stress_unit * rotate_stress(nodal_stress(equilibrium, surface), angle)
-        return stress, equilibrium.mesh.points * np.exp(1j * angle)
+        stress = stress_unit * rotate_stress(nodal_stress(equilibrium, surface), equilibrium.direction)
+        return stress, equilibrium.mesh.points * np.exp(1j * equilibrium.direction)
 
     def changed(column: str, change: float) -> Equilibrium:
         """Return the equilibrium if the quantity of one column changes."""

@@ -104,16 +104,8 @@ def sample_points(blocks: Blocks) -> Complexes:
     return placement.element_points(blocks)
 
 
-@lru_cache(maxsize=16)
-def template(resolution: Resolution, topology: FootprintTopology, whole: bool = False) -> Template:
-    """Return the template for a given resolution and topology. Templates are cached.
-
-    Args:
-        resolution: Fineness of the mesh.
-        topology: Number and kind of the blocks in and around the footprint.
-        whole: Whether to mesh the whole film although the footprint is symmetric.
-    """
-    return Template(resolution, topology, whole)
+template = lru_cache(maxsize=16)(Template)
+"""Function that returns the template for a given resolution and topology. Templates are cached."""
 
 
 def template_for(probe: Probe, resolution: Resolution, whole: bool = False) -> Template:

@@ -114,34 +114,24 @@ def area_in_disk(corners: Complexes, centre: complex, radius: Array | float) -> 
     return np.asarray((triangle_area + sector_area).sum(axis=-1))
 
 
-def gauss_square_weights(count: int) -> Array:
-    """Return the weights of the Gauss rule of the unit square, which `gauss_quadrilaterals` uses.
-
-    Args:
-        count: Number of points along a side.
-
-    Returns:
-        Weights, shape (count^2,). Their sum is 1.
-    """
-    _, line_weights = gauss_line(count)
-    return np.outer(line_weights, line_weights).ravel()
-
-
-def gauss_quadrilaterals(corners: Complexes, count: int) -> tuple[Complexes, Array]:
+def gauss_quadrilaterals(corners: Complexes, line_area: Array, count: int) -> tuple[Complexes, Array]:
     """Compute the points and weights of a Gauss rule for quadrilaterals.
 
     A bilinear function maps the rule of the unit square into each quadrilateral.
 
     Args:
-        corners: Corners x + iy, anticlockwise, shape (n, 4). The last two corners of a triangle are equal.
+        corners: Corners x + iy, anticlockwise, shape (n, 4). The last two corners of a triangle are equal. In a line,
+            the first and the last corner are equal, and so are the second and the third.
+        line_area: Area that a line represents, shape (n,). Zero for a quadrilateral.
         count: Number of points along a side.
 
     Returns:
-        Points x + iy, and weights, each of shape (n, count^2). The weights add up to the area of the quadrilateral.
+        Points x + iy, and weights, each of shape (n, count^2). The weights add up to the area of the quadrilateral or
+        to the area that the line represents.
     """
     # The digits in the name of a corner are its coordinates s and t in the unit square.
     z00, z10, z11, z01 = corners.T[:, :, None]  # each of shape (n, 1)
-    line_points, _ = gauss_line(count)
+    line_points, line_weights = gauss_line(count)
     s = np.repeat(line_points, count)
     t = np.tile(line_points, count)
     s_derivative = (z10 - z00) * (1.0 - t) + (z11 - z01) * t
@@ -149,7 +139,8 @@ def gauss_quadrilaterals(corners: Complexes, count: int) -> tuple[Complexes, Arr
     points = z00 * (1.0 - t) + z01 * t + s * s_derivative
     # The determinant of the Jacobian is the cross product of the derivatives of the points.
     determinant = (np.conj(s_derivative) * t_derivative).imag
-    return points, gauss_square_weights(count) * determinant
+    weights = np.outer(line_weights, line_weights).ravel()  # of the unit square
+    return points, weights * (determinant + line_area[:, None])
 
 
 def halve_quadrilaterals(corners: Complexes) -> Complexes:

@@ -277,17 +277,8 @@ def _free_unknowns(mesh: Template, unknowns_per_node: int, odd: bool) -> np.ndar
     return free
 
 
-@lru_cache(maxsize=16)
-def assembly(mesh: Template, unknowns_per_node: int, odd: bool = False) -> Assembly:
-    """Return the linear solver for the mesh of a template. Linear solvers are cached.
-
-    Args:
-        mesh: Template of the mesh.
-        unknowns_per_node: Number of unknowns per node: 3 without bending, 4 with bending.
-        odd: Whether the fields are odd about the line of symmetry.
-    """
-    return Assembly(mesh, unknowns_per_node, odd)
-
+assembly = lru_cache(maxsize=16)(Assembly)
+"""Function that returns the linear solver for the mesh of a template. Linear solvers are cached."""
 
 SolveTangent = Callable[[Array], Array]
 """Function that solves a linear system with a factorised tangent for the displacements at the nodes.

@@ -6,6 +6,7 @@ the same equilibrium is valid for presses in all directions from the centre. An 
 electrode layouts and all piezoelectric coefficients.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -76,6 +77,12 @@ class Equilibrium:
     seconds: float
     proven_error: float | None = None
     rest: "Equilibrium | None" = None
+
+    @property
+    def direction(self) -> float:
+        """Direction from the centre of the film to the press, rad."""
+        x, y = self.at
+        return math.atan2(y, x)
 
     def __repr__(self) -> str:
         """Return a summary of the press, the deflection and the largest stress.
@@ -152,8 +159,7 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
 
     # Rotate the stress into the axes of the film, and subtract the stress of the film before the contact, which is zero
     # without a static pressure.
-    x, y = equilibrium.at
-    film_stress = rotate_stress(press_frame_stress, np.arctan2(y, x))
+    film_stress = rotate_stress(press_frame_stress, equilibrium.direction)
     if equilibrium.rest is None:
         return film_stress
     return np.asarray(film_stress - touch_stress(equilibrium.rest, points, surface))
@@ -314,5 +320,4 @@ def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, A
         raise SceneError(f"point ({x:.4g}, {y:.4g}) mm is off the film of radius {film.radius:.4g} mm")
 
     # Rotate the points, x + iy in film radii, into the frame in which the press lies on the positive x axis.
-    press_x, press_y = equilibrium.at
-    return equilibrium.mesh.locate(to_complex(points) / film.radius * np.exp(-1j * np.arctan2(press_y, press_x)))
+    return equilibrium.mesh.locate(to_complex(points) / film.radius * np.exp(-1j * equilibrium.direction))

@@ -99,12 +99,10 @@ def _add_stiffness(solved: Equilibrium, log_ratio: float, angle: float) -> Equil
         angle: Angle from the direction of the press to axis 1 of the addition, rad.
     """
     film = solved.film
-    x, y = solved.at
-    direction = math.atan2(y, x)
-    addition = cmath.rect(log_ratio, 2.0 * (direction + angle))
+    addition = cmath.rect(log_ratio, 2.0 * (solved.direction + angle))
     new_log_ratio, axis = increased(math.log(film.young_ratio), film.axis, addition)
     changed_film = replace(film, young_ratio=math.exp(new_log_ratio), axis=axis)
-    moduli = press_frame_anisotropy(changed_film, solved.groups.squared_amplitude, direction).moduli
+    moduli = press_frame_anisotropy(changed_film, solved.groups.squared_amplitude, solved.direction).moduli
     return _with_anisotropy(solved, replace(solved.groups.anisotropy, moduli=moduli))
 
 
@@ -277,11 +275,9 @@ def holding_force(solved: Equilibrium) -> tuple[float, float]:
     scaled_force[:n_direction] = -np.linalg.solve(compliance, slip)
 
     # Convert the side load to N, and rotate it from the frame of the press to the axes x and y.
-    x, y = solved.at
-    rotation = np.exp(1j * np.arctan2(y, x))
     force_unit = side_force_unit(solved.film, groups.squared_amplitude)
-    force = complex(*scaled_force) * force_unit * rotation  # Fx + i Fy
-    return float(force.real), float(force.imag)
+    force = complex(*scaled_force) * force_unit * cmath.rect(1.0, solved.direction)  # Fx + i Fy
+    return force.real, force.imag
 
 
 def friction_force(solved: Equilibrium, coefficient: float) -> tuple[float, float]:
