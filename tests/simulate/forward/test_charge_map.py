@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from function_map import FunctionMap
 from isocharge.common.errors import SceneError
 from isocharge.simulate import ChargeMap, Domain
 from isocharge.simulate.forward.charge_map import within
@@ -13,22 +12,14 @@ from solved_charges import relative_error
 DOMAIN = Domain(5.0, (0.1, 2.0))
 
 
-def linear(contact: np.ndarray) -> np.ndarray:
-    """Two charges with known derivatives: x + 2 y + 3 ln F and x y."""
-    x, y, force = contact.T
-    return np.stack([x + 2.0 * y + 3.0 * np.log(force), x * y], axis=1)
-
-
 CHECKED = ("forward map", "spline")
-"""Maps that refuse contacts outside their domain. Other maps evaluate their function there."""
+"""Maps that refuse contacts outside their domain."""
 
 
 @pytest.fixture
 def charge_map(request) -> ChargeMap:
     if request.param == "forward map":
         return request.getfixturevalue("three_map")
-    if request.param == "function":
-        return FunctionMap(linear, ("A", "B"), DOMAIN)
     spline = request.getfixturevalue("near_spline")
     return spline if request.param == "spline" else within(spline, 4.0)
 
@@ -40,7 +31,7 @@ def contacts(domain: Domain, count: int = 60, share: float = 0.97) -> np.ndarray
     return domain.to_contact(np.column_stack([at, unit]))
 
 
-@pytest.mark.parametrize("charge_map", [*CHECKED, "within", "function"], indirect=True)
+@pytest.mark.parametrize("charge_map", [*CHECKED, "within"], indirect=True)
 def test_maps_implement_the_charge_map_protocol(charge_map):
     """The derivatives agree with finite differences of the charges with another step.
 

@@ -27,15 +27,6 @@ def test_spline_charges_equal_those_of_the_forward_map(near_map, near_spline):
     assert ChargeSpline.of(near_map, spacing=0.6).error > 2.0 * near_spline.error
 
 
-def test_gradients_equal_differences_of_the_charges(near_spline):
-    position = spread(40)[:, :2]
-    gradients = near_spline.scaled_gradients(position)
-    for axis, step in enumerate(1e-4 * np.eye(2)):
-        above, below = (near_spline.scaled_charges(position + sign * step) for sign in (1.0, -1.0))
-        slope = (above - below) / 2e-4
-        assert relative_error(gradients[..., axis], slope) <= 1e-5
-
-
 def test_spline_includes_the_charge_of_contact_pressure(near_map):
     """The charges of d33 are proportional to the force, while those of the stress depend on the squared amplitude.
 

@@ -12,7 +12,6 @@ from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate import (
     ChargeSpline,
     Circle,
-    Domain,
     Electrode,
     Ellipse,
     Finger,
@@ -25,7 +24,7 @@ from isocharge.simulate import (
     load_sensor,
 )
 from isocharge.simulate.forward import forward_map as forward_map_module
-from isocharge.simulate.forward.family import NODE_COUNTS, Family, NodeCount
+from isocharge.simulate.forward.family import NODE_COUNTS, NodeCount
 from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR
 from kept import kept
 from solved_charges import solved_charge, with_film
@@ -70,8 +69,11 @@ def test_forward_map_agrees_with_direct_solves_between_the_nodes(three_map, near
     """One map has all terms up to 8 mm. The other is a membrane with half of the presses on an electrode."""
     contact, _ = draw(near_map, 8, seed=1)
     contact[:4, :2] = [(4.9, 0.3), (0.2, 4.5), (-4.2, 0.0), (1.2, -4.5)]
-    for error in (errors(three_map, draw(three_map, 6, seed=0)[0]), errors(near_map, contact)):
-        assert error.max() < 1e-3
+    (low, high), radius = near_map.domain.force_range, near_map.domain.radius
+    ends = [[radius, 0.0, low], [-radius, 0.0, high], [0.0, 0.0, low]]
+    near_error = errors(near_map, np.concatenate([contact, ends]))
+    assert max(near_error.max(), errors(three_map, draw(three_map, 6, seed=0)[0]).max()) < 1e-3
+    assert near_error.max() / 3.0 < near_map.error <= INTERPOLATION_ERROR
 
 
 def test_forward_map_agrees_with_direct_solves_for_random_orientations(oriented_map):
@@ -102,14 +104,6 @@ def test_footprint_grows_with_the_cube_root_of_the_force(near_electrodes):
     assert (np.abs(ChargeSpline.of(growing).charges(contact) - expected) / largest).max() < 1e-3
     fixed = ForwardMap.build(sensor, Finger(2.0), **wide_range)
     assert (np.abs(fixed.charges(contact) - expected) / largest).max() > 0.01, "the radius does not matter"
-
-
-def test_forward_map_error_at_the_ends_of_the_domain(near_map):
-    radius, (low, high) = near_map.domain.radius, near_map.domain.force_range
-    ends = np.array([[radius, 0.0, low], [-radius, 0.0, high], [0.0, 0.0, low], [0.0, 0.0, high]])
-    assert errors(near_map, ends).max() < 1e-3
-    assert 0.0 < near_map.error <= INTERPOLATION_ERROR
-    assert errors(near_map, draw(near_map, 6, seed=3)[0]).max() < 3.0 * near_map.error
 
 
 @pytest.mark.parametrize(
@@ -255,21 +249,6 @@ def test_taut_film_with_a_ratio_of_three_between_its_pretensions_is_interpolated
     """Under a small force, the pretension alone determines the charges, and they contain many harmonics."""
     taut = with_film(load_sensor("four-25um-biaxial"), pretension=2.4, deviator=(1.2, 0.0))
     assert ForwardMap.build(taut, Circle(1.0), 8.0, (0.05, 0.05)).error <= INTERPOLATION_ERROR
-
-
-# Where a family is solved
-
-FILM = load_sensor("three-25um-biaxial").film
-
-
-def test_family_interpolates_fields_that_change_over_the_distance_to_the_clamp():
-    """The function depends on the distance to the clamp, as the image of a point load in the clamped circle does."""
-    domain = Domain(41.0, (1.0, 1.0))
-    family = Family.spread(domain, FILM, Circle(1.0), NodeCount(12, 1))
-    distance = np.linspace(0.0, 41.0, 300)
-    weights = family.weights(distance.astype(complex), np.ones(300), np.zeros(300))
-    found = weights @ np.log(1.0 - (family.distance / 45.0) ** 2)
-    np.testing.assert_allclose(found, np.log(1.0 - (distance / 45.0) ** 2), atol=1e-5)
 
 
 def test_derivatives_of_a_small_sensor_are_those_of_a_large_one_in_other_units(near_map):

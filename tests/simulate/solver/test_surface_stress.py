@@ -83,9 +83,8 @@ def test_bending_stress_under_the_centre_of_the_probe(thick, share):
 def test_charge_of_a_surface_is_the_integral_of_its_stress(thick):
     """The charge of a small electrode is A (d31 s11 + d32 s22) with the stress at its surface."""
     probe = Circle(2.0)
-    corner = np.array([(12.0, 0.0), (12.1, 0.0), (12.1, 0.1), (12.0, 0.1)])
-    sensor = replace(load_sensor("four-25um-uniaxial"), film=thick)
-    sensor = replace(sensor, electrodes=(Electrode("A", tuple((float(x), float(y)) for x, y in corner)),))
+    electrode = Electrode.of_square("A", (12.05, 0.05), 0.1)
+    sensor = replace(load_sensor("four-25um-uniaxial"), film=thick, electrodes=(electrode,))
     solved = press(thick, probe, (0.0, 0.0), FORCE, SolveSettings(theory=PLATE, resolution=FINE))
     for surface, sign in (("top", 1.0), ("bottom", -1.0)):
         charge = touch_charge(replace(sensor, surface=surface), solved) - touch_charge(sensor, solved)
