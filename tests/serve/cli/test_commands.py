@@ -95,8 +95,8 @@ def test_check_prints_a_table_of_the_presses(measured, models, command):
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
-        ("--force-std", "0", "column 'force_std': expected a positive share"),
-        ("--position-std", "-1", "column 'position_std_mm': expected a positive"),
+        ("--force-std", "0", "force_std: expected a positive share"),
+        ("--position-std", "nan", "position_std_mm: expected"),
     ],
 )
 def test_check_refuses_with_the_reason(measured, models, refused, option, value, message):

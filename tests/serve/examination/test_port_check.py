@@ -95,7 +95,7 @@ def test_a_board_that_only_sends_nan_is_not_taken_for_counts():
 @pytest.mark.parametrize(
     ("board", "message"),
     [
-        (charges(), "the model expects 4 charges ('A', 'B', 'C', 'D'), frame 399 has 3 ('1', '2', '3'); choose"),
+        (charges(), "3 of 3 channels, but the model has the electrodes ('A', 'B', 'C', 'D')"),
         (charges(hum=9.0), "channel 1 has a hum of 9 pC: set [hum] frequency_Hz = 50"),
         (charges(drift=-4.0), "channel 1 drifts by -4 pC/s"),
         (charges(offset=(0.0, 120.0, 0.0)), "channel 2 has 120 pC at rest, but a tare accepts at most 100 pC"),

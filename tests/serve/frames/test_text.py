@@ -127,6 +127,8 @@ NOTATIONS = {
     "A = {a} | B = {b} | C = {c} |": "ABC",
     "A -> {a}, B -> {b}, C -> {c}": "ABC",
     "A: {a} nC, B: {b} nC, C: {c} nC": ("A_nC", "B_nC", "C_nC"),
+    "A={a}C B={b}C C={c}C": ("A_coulomb", "B_coulomb", "C_coulomb"),
+    "A: {a} C, B: {b} C, C: {c} C": ("A_coulomb", "B_coulomb", "C_coulomb"),
     "A nC: {a} B nC: {b} C nC: {c}": ("A_nC", "B_nC", "C_nC"),
     "A [nC]: {a}, B [nC]: {b}, C [nC]: {c}": ("ch1_nC", "ch2_nC", "ch3_nC"),
     "A,{a},B,{b},C,{c}": "ABC",

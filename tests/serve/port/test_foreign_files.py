@@ -1,51 +1,73 @@
 """Recordings, records, tables, MCAP and Parquet files given as a port, whose messages state the right command."""
 
+import pyarrow as pa
 import pytest
+from mcap.writer import Writer
+from pyarrow.parquet import write_table
 
 from isocharge.common.errors import InputError, RecordingError
-from isocharge.serve import Port, Recording, open_source
-from isocharge.serve.port.file_source import FileSource
+from isocharge.serve import Port, Recorder, Recording, open_source
+from isocharge.serve.port.file_source import Chunk, FileSource, check_file
 from isocharge.serve.record.formats import csv_header
 
-RECORDING = b'{"isocharge_recording": 1, "model": "linear/1", "device": {}}\n'
+
+def recording(path):
+    with Recorder(path, "linear/1", {}) as recorder:
+        recorder.chunk(Chunk(b"A:1,B:2,C:3\n", 1.7e9, 0), [])
+
+
+def mcap(path):
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.finish()
+
+
+def table(text):
+    return lambda path: path.write_text(text)
+
 
 FOREIGN = {
-    "touch.rec": (RECORDING, r"got a recording; play it with: isocharge serve replay \S*touch.rec$"),
+    "touch.rec": (recording, r"got a recording; play it with: isocharge serve replay \S*touch.rec$"),
     "touch.jsonl": (
-        b'{"timestamp": 1.0, "charge_pC": {}, "tare_pC": {}, "frame_id": "film"}\n',
+        table('{"timestamp": 1.0, "charge_pC": {}, "tare_pC": {}, "frame_id": "film"}\n'),
         r"got records of `serve stream`; .*--record touch\.rec",
     ),
-    "touch.mcap": (b"\x89MCAP0\r\n", "got an MCAP file; .*isocharge serve replay touch.rec"),
-    "presses.parquet": (b"PAR1", "got a Parquet file; .*isocharge serve predict MODEL"),
+    "touch.mcap": (mcap, "got an MCAP file; .*isocharge serve replay touch.rec"),
+    "presses.parquet": (
+        lambda path: write_table(pa.table({"A": [1.0]}), path),
+        "got a Parquet file; .*isocharge serve predict MODEL",
+    ),
     "measured.txt": (
-        b"x_mm,y_mm,force_N,A,B,C\n1,2,3,4,5,6\n",
+        table("x_mm,y_mm,force_N,A,B,C\n1,2,3,4,5,6\n"),
         "got a table of presses; .*isocharge serve predict MODEL .*--port - <",
     ),
-    "semicolons.csv": (b"x_mm;y_mm;force_N;A;B;C\n1;2;0,5;4;5;6\n", "got a table of presses"),
-    "touch.csv": (csv_header(("A", "B", "C")).encode(), "got a table of presses"),
+    "semicolons.csv": (table("x_mm;y_mm;force_N;A;B;C\n1;2;0,5;4;5;6\n"), "got a table of presses"),
+    "touch.csv": (table(csv_header(("A", "B", "C")) + "\n"), "got a table of presses"),
 }
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-def test_foreign_file_as_a_port_is_refused_with_the_command_that_reads_it(name, tmp_path):
-    content, message = FOREIGN[name]
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(InputError, match=message), open_source(str(tmp_path / name)):
+@pytest.mark.parametrize("make", [open_source, Port])
+def test_foreign_file_as_a_port_is_refused_with_the_command_that_reads_it(name, make, tmp_path):
+    write, message = FOREIGN[name]
+    write(tmp_path / name)
+    with pytest.raises(InputError, match=message), make(str(tmp_path / name)):
         pass
 
 
 def test_recording_on_stdin_is_refused(tmp_path):
-    (tmp_path / "touch.rec").write_bytes(RECORDING)
+    recording(tmp_path / "touch.rec")
     with (tmp_path / "touch.rec").open("rb") as file, pytest.raises(InputError, match="got a recording"):
-        FileSource(file.fileno(), "-")
+        next(iter(FileSource(file.fileno(), "-")))
 
 
 def test_lines_of_a_board_with_a_name_of_a_table_are_read_from_stdin(tmp_path):
     """The error of the file advises this."""
     path = tmp_path / "board.csv"
     path.write_text("A,B,C,flags\n1,2,3,0\n")
-    with pytest.raises(InputError, match="--port - <"), open_source(str(path)):
-        pass
+    with pytest.raises(InputError, match="--port - <"):
+        check_file(path)
     with path.open("rb") as file:
         assert next(iter(FileSource(file.fileno(), "-"))).data == path.read_bytes()
 

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from isocharge.common.errors import PortError, PortLost
+from isocharge.common.errors import InputError, PortError, PortLost
 from isocharge.serve import Chunk, Port, open_source
 from isocharge.serve.port.serial_line import QUIET_TIME_s, REPEAT_TIME_s, Request, Requester
 from isocharge.serve.virtual_sensor.sensor import PseudoPort
@@ -84,17 +84,24 @@ def test_port_opened_by_another_program_is_refused(board):
         pass
 
 
+def test_silent_port_is_lost_after_the_timeout(board):
+    with Port(board.url, silence_s=0.05) as port:
+        board.write_whole(b"x")
+        chunks = iter(port)
+        assert next(chunks).data == b"x"
+        with pytest.raises(PortLost, match=r"no data for 0.05 s; check that"):
+            next(chunks)
+
+
 @pytest.mark.parametrize(("wait", "start_up"), [(0.0, "0.06"), (0.1, "0.1")])
-def test_silent_port_is_lost_after_the_timeout_which_is_longer_at_first(board, monkeypatch, wait, start_up):
+def test_board_that_restarts_when_the_port_is_opened_may_be_silent_longer_at_first(board, monkeypatch, wait, start_up):
     """An Arduino restarts when DTR rises. The option `wait` also sets the time for the first byte."""
     monkeypatch.setattr("isocharge.serve.port.source.START_UP_s", 0.06)
-    with Port(board.url, silence_s=0.03, wait=wait) as port:
-        with pytest.raises(PortLost, match=f"no data for {start_up} s; check that"):
-            next(iter(port))
-        board.write_whole(b"x")
-        assert next(iter(port)).data == b"x"
-        with pytest.raises(PortLost, match=r"no data for 0.03 s"):
-            next(iter(port))
+    with (
+        Port(board.url, silence_s=0.03, wait=wait) as port,
+        pytest.raises(PortLost, match=f"no data for {start_up} s"),
+    ):
+        next(iter(port))
 
 
 def test_silent_port_is_opened_again_after_growing_pauses(board, monkeypatch):
@@ -128,8 +135,9 @@ def test_second_program_that_reads_the_port_is_named(board, monkeypatch):
     """The bytes arrive, but the other program reads them first."""
     with Port(board.url) as port:
         monkeypatch.setattr("select.select", lambda read, *_: (read, [], []))
-        with pytest.raises(PortLost, match="end other programs that read it"):
+        with pytest.raises(PortLost, match="another program reads this port") as caught:
             next(iter(port))
+    assert "cable" not in str(caught.value)
 
 
 def test_bytes_that_waited_during_a_stall_are_few_chunks(board, address):
@@ -272,13 +280,19 @@ BYTES = (b"\xaa\x00", b"\xaa\x55", b"1\x002", b"\x7f")
         ((b"\x00\xff" * 20, b"\x01", b"\x02\n" * 700), (b"\x00\xff" * 20, b"\x01", b"\x02\n" * 700)),
         ((*TEXT, *BYTES), (*(line + b"\n" for line in TEXT), *BYTES)),
         ((b"1,2\n", b"3,", b"4\n"), (b"1,2\n", b"3,", b"4\n")),
+        ((b"tared\n", *[b"1,2"] * 10), (b"tared\n", *[b"1,2"] * 8, *[b"1,2\n"] * 2)),
         ((b"1,2\0",), (b"1,2\0\n",)),
-        ((b"\x01", b"", b"\x02"), (b"\x01", b"\x02")),
     ],
-    ids=["each is a chunk", "lines without an end get one", "a board ends its lines itself", "C string", "empty"],
+    ids=["each is a chunk", "lines without an end get one", "a board ends its lines itself", "a message", "C string"],
 )
 def test_datagrams_are_chunks(address, sent, chunks):
     assert received(address, *sent) == [*chunks]
+
+
+def test_empty_datagram_is_ignored(address):
+    assert received(address, b"\x01", b"", b"\x02") == [b"\x01", b"\x02"]
+    with udp_port(address, b"") as port:
+        assert port.read(0.01) is None
 
 
 def test_udp_address_in_use_is_refused(address):
@@ -362,11 +376,20 @@ def test_installed_package_adds_a_source(monkeypatch):
 
     def entry_points(group, name):
         assert group == "isocharge.sources"
-        added = SimpleNamespace(load=lambda: lambda url: nullcontext(Bus([chunk, url])))
-        return [added] if name == "can" else []
+        is_added = name in ("can", "broken", "lost")
+        load = {
+            "can": lambda: lambda url: nullcontext(Bus([chunk, url])),
+            "broken": dict.clear,
+            "lost": lambda: lambda _: nullcontext(SimpleNamespace(is_live=True)),  # which cannot be iterated
+        }
+        return [SimpleNamespace(value="my_package:open_bus", load=load[name])] if is_added else []
 
     monkeypatch.setattr("isocharge.serve.port.source.entry_points", entry_points)
     with open_source("can://vcan0") as source:
         assert list(source) == [chunk, "can://vcan0"]
+    with pytest.raises(InputError, match=r"broken://x: cannot be read by my_package:open_bus \(TypeError"):
+        open_source("broken://x")
+    with open_source("lost://x") as source, pytest.raises(InputError, match=r"lost://x: .* not iterable"):
+        list(source)
     with open_source("loop://") as source:
         assert source.is_live

@@ -165,18 +165,33 @@ def transmission_sentences(capture: Capture, received: ReceivedData) -> Iterator
         yield f"{capture.parser.counts.lost} frames were lost: send fewer frames per second, or use a faster link"
 
 
-def assignment_sentences(capture: Capture, device: Device, electrodes: tuple[str, ...]) -> Iterator[str]:
-    """Yield a sentence if a stream could not assign a channel to each electrode of the model.
+def channel_count_sentences(
+    capture: Capture, device: Device, channel_count: int, electrodes: tuple[str, ...]
+) -> Iterator[str]:
+    """Yield a sentence if the board has more or fewer channels than the model has electrodes.
+
+    No sentence is needed without a model, or if the device file assigns a channel to every electrode. If the names of
+    the channels are nearly those of the electrodes, the sentence names the difference.
 
     Args:
         capture: The frames, at least one.
         device: Settings of the board.
+        channel_count: Number of channels that are used.
         electrodes: Electrodes of the model; empty for any model.
     """
+    if set(electrodes) <= set(device.channels):  # also without a model
+        return
     try:
-        Channels(Setup(electrodes, device, reader="the model"), any_unit=True).channel_indices(capture.frames[-1])
+        Channels(Setup(electrodes, reader="the model"), any_unit=True).indices_by_name_or_order(capture.frames[-1])
     except ChargeError as error:
         yield str(error)
+        return
+    if channel_count != len(electrodes):
+        yield (
+            f"the board uses {channel_count} of {len(capture.names)} channels, but the model has the electrodes "
+            f"{electrodes}: choose another model with --model, or assign the channels in the section [channels] of a "
+            "device file"
+        )
 
 
 def unit_sentences(unit: str) -> Iterator[str]:

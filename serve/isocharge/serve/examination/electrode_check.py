@@ -157,14 +157,16 @@ def corrected_table(table: Mapping[str, Any], check: ElectrodeCheck) -> dict[str
     source_electrode = {electrode: expected_electrode[channel] for electrode, channel in check.found.items()}
 
     def moved(setting: Any) -> Any:
-        """Return a section or a setting, with the values of single electrodes moved to other electrodes."""
-        if not isinstance(setting, Mapping):
+        """Return a setting of a section, with the values of single electrodes moved to other electrodes."""
+        if not isinstance(setting, Mapping) or set(setting) != set(source_electrode):
             return setting
-        if set(setting) == set(source_electrode):
-            return {electrode: setting[source] for electrode, source in source_electrode.items()}
-        return {key: moved(value) for key, value in setting.items()}
+        return {electrode: setting[source] for electrode, source in source_electrode.items()}
 
-    return {**moved(table), "channels": dict(check.found)}
+    sections = {name: section for name, section in table.items() if isinstance(section, Mapping)}
+    moved_sections = {
+        name: {key: moved(setting) for key, setting in section.items()} for name, section in sections.items()
+    }
+    return {**table, **moved_sections, "channels": dict(check.found)}
 
 
 def _charge_frames(

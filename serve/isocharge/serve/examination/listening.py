@@ -185,8 +185,9 @@ class Capture:
         channel_count = len(self.frames[-1].values)
         frames = [frame for frame in self.frames if len(frame.values) == channel_count]
         values = np.array([frame.values for frame in frames], dtype=float)
-        values[np.abs(values) > LARGEST] = np.inf
         times_s = np.array([frame.clock_s for frame in frames])
+        is_too_large = np.abs(values) > LARGEST
+        values[is_too_large] = np.copysign(np.inf, values[is_too_large])
         return values, times_s - times_s[0]
 
 

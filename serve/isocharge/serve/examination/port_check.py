@@ -14,7 +14,7 @@ import numpy as np
 from isocharge.common.errors import printable
 from isocharge.serve.examination.board_health import (
     ChannelHealth,
-    assignment_sentences,
+    channel_count_sentences,
     channel_sentences,
     held_press_sentences,
     measure_channel_health,
@@ -200,8 +200,7 @@ def examine_received(
     )
 
     touch = ""
-    # With a noise of 1 pC, the smallest touch is 20 pC. A press of 0.01 N on a film of 25 um causes 40 pC.
-    found = find_touch(charges, times_s[is_rest], 1.0 if unit == "pC" else 0.0) if channels else None
+    found = find_touch(charges, times_s[is_rest], unit_is_pC=unit == "pC") if channels else None
     if found is not None:
         touch = (
             f"an untouched film: channel {printable(channels[found.column].name)} changes by {found.total_change:.4g} "
@@ -211,7 +210,7 @@ def examine_received(
         missing.insert(0, touch)
     if held_press is not None and held_press.tau_s is not None:
         table = {"leak": {"tau_s": held_press.tau_s}} | table  # keeps a section that the device file already has
-    missing += assignment_sentences(capture, device, electrodes)
+    missing += channel_count_sentences(capture, device, len(channels), electrodes)
     missing += unit_sentences(unit)
     if not touch:  # the offset, the noise and the drift of a pressed film say nothing about the board
         missing += channel_sentences(channels, unit, device)
@@ -240,10 +239,10 @@ def electrodes_by_position(capture: Capture, device: Device) -> dict[int, str]:
     Electrodes whose channel is missing in the frames are left out.
 
     Args:
-        capture: The frames, at least one.
+        capture: The frames. Without frames, the result is empty.
         device: Settings of the board. `channels` contains the name of the channel of each electrode.
     """
-    if not device.channels:
+    if not device.channels or not capture.frames:
         return dict(enumerate(capture.names))
     electrode_at_position = {}
     for electrode, channel in device.channels.items():

@@ -86,21 +86,33 @@ class TouchFound(NamedTuple):
     time_s: float
 
 
-def find_touch(values: Array, times_s: Array, min_noise: float = 0.0) -> TouchFound | None:
+def find_touch(
+    values: Array, times_s: Array, unit_is_pC: bool, min_noise_pC: float = 1.0, max_slow_change_pC: float = 100.0
+) -> TouchFound | None:
     """Search for a touch in the values of a film that should be at rest.
+
+    If the values are in pC, a large slow change is a touch, too.
 
     Args:
         values: Values of the channels, shape (n, channels).
         times_s: Times since the first frame, shape (n,), s.
-        min_noise: Smallest noise of a channel, in the unit of the values.
+        unit_is_pC: Whether the values are charges in pC. Otherwise the smallest change of a touch is derived from the
+            noise only.
+        min_noise_pC: Smallest noise of a channel in pC. With the default, the smallest touch is 20 pC. A press of 0.01
+            N on a film of 25 um causes 40 pC.
+        max_slow_change_pC: Largest change during the whole time without a touch, pC. The default is the largest offset
+            that a tare accepts.
 
     Returns:
         The channel with the largest total change. None if the film is not touched, or if the time is too short.
     """
-    levels, is_touched = touched_blocks(values, times_s, min_noise)
-    if not is_touched.any():
+    levels, is_touched = touched_blocks(values, times_s, min_noise_pC if unit_is_pC else 0.0)
+    if len(levels) == 0:
         return None
     total_changes = np.ptp(levels, axis=0)
+    is_slow_touch = unit_is_pC and bool((total_changes > max_slow_change_pC).any())
+    if not (is_touched.any() or is_slow_touch):
+        return None
     column = int(np.argmax(total_changes))
     begin_block = int(np.argmax(is_touched))
     return TouchFound(column, float(total_changes[column]), BLOCK_S * begin_block)
@@ -163,8 +175,10 @@ def estimate_noise(values: Array) -> float:
     differences = np.abs(np.diff(finite_values))
     if len(differences) == 0:
         return 0.0
-    noise = float(np.median(differences)) / (0.6745 * math.sqrt(2.0))
-    return noise or float(differences.mean()) * math.sqrt(math.pi) / 2.0
+    median_difference = float(np.median(differences))
+    if median_difference > 0.0:
+        return median_difference / (0.6745 * math.sqrt(2.0))
+    return float(differences.mean()) * math.sqrt(math.pi) / 2.0
 
 
 MIN_HELD_S = 4.0

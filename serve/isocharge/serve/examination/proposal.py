@@ -100,8 +100,9 @@ def _choose_channels(
     """Choose the channel of each electrode.
 
     If there are channels with the names of the electrodes, or as many channels as electrodes, the channels are chosen
-    as in a stream. Otherwise the electrodes are assigned, in their order, to the first channels whose values vary.
-    Without a model, each varying channel is an electrode.
+    as in a stream. Otherwise the electrodes are assigned, in their order, to the channels whose values vary. If there
+    are more such channels, the adjacent channels with the most similar noise are chosen. Without a model, each varying
+    channel is an electrode.
 
     Args:
         capture: The frames.
@@ -126,9 +127,13 @@ def _choose_channels(
         return {}
     if positions is not None:  # perhaps with a channel that never changes, which is reported later
         return dict(zip(electrodes, positions, strict=True))
-    if len(candidates) < len(electrodes):
-        return {}
-    return dict(zip(electrodes, candidates, strict=False))
+    first = 0
+    if len(candidates) > len(electrodes):
+        # Compare the groups of adjacent channels by their largest noise over the smallest one, in powers of ten.
+        groups = np.lib.stride_tricks.sliding_window_view(np.log10(noise[candidates]), len(electrodes))
+        first = int(np.argmin(np.round(np.ptp(groups, axis=1))))
+    chosen = candidates[first : first + len(electrodes)]
+    return dict(zip(electrodes, chosen, strict=True)) if len(chosen) == len(electrodes) else {}
 
 
 def _rest_level(values: Array) -> float:

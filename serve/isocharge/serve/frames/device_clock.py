@@ -53,6 +53,8 @@ class DeviceClock:
     def __init__(self) -> None:
         """Start without a reading."""
         self.rate = 1.0
+        self._latest_chunk: Chunk | None = None
+        self._monotonic_s = 0.0  # arrival of the latest chunk; it does not jump if the wall clock is set
         self.reset()
 
     def reset(self) -> None:
@@ -63,8 +65,7 @@ class DeviceClock:
         """
         self._sent_us: int | None = None  # clock of the latest reading as the device sent it
         self._device_us = 0  # clock of the latest reading after the wraps were removed
-        self._latest_chunk: Chunk | None = None
-        self._monotonic_s = 0.0  # arrival of the latest chunk; it does not jump if the wall clock is set
+        self._chunk_arrival_s: float | None = None  # arrival of the latest chunk
 
         # According to the fit, the host time was `_fitted_host_s` when the clock of the device was `_fitted_us`. If
         # `_fitted_us` is None, there is no fit.
@@ -88,8 +89,9 @@ class DeviceClock:
         """
         if not frames:  # the time is shared by the frames of the next chunk
             return
+        is_first_chunk = self._chunk_arrival_s is None
         elapsed_s = self._enter_chunk(chunk)
-        share_s = elapsed_s / len(frames)
+        share_s = 0.0 if is_first_chunk else elapsed_s / len(frames)
         for n_later, frame in zip(reversed(range(len(frames))), frames, strict=True):
             if frame.t_us is None:
                 before_arrival_s = n_later * share_s
@@ -97,17 +99,13 @@ class DeviceClock:
                 frame.dt_s = share_s
                 frame.clock_s = self._monotonic_s - before_arrival_s
             else:
-                self._stamp_with_device(frame, frame.t_us, modulus, chunk.timestamp, is_new_arrival=elapsed_s > 0.0)
-        # All chunks of a file have the same arrival time, which contains no information about the clock. The first
-        # arrival may be that of a file.
-        if self._fitted_us is not None and elapsed_s > 0.0:
-            self._correct_fit(chunk.timestamp, self._fitted_us)
+                self._stamp_with_device(frame, frame.t_us, modulus, chunk.timestamp)
+        self._end_chunk(chunk.timestamp)
 
     def _enter_chunk(self, chunk: Chunk) -> float:
         """Return the time from the previous chunk to this chunk, s, and advance the monotonic time of the host.
 
-        The result is 0 for the first chunk, and for all chunks of a file. If the wall clock was set between the chunks,
-        all stored host times are changed by the same amount.
+        If the wall clock was set between the chunks, all stored host times are changed by the same amount.
         """
         previous = self._latest_chunk
         self._latest_chunk = chunk
@@ -120,11 +118,11 @@ class DeviceClock:
         if abs(wall_jump_s) > MAX_DELAY_s:
             self._fitted_host_s += wall_jump_s
             self._latest_host_s += wall_jump_s
+            if self._chunk_arrival_s is not None:
+                self._chunk_arrival_s += wall_jump_s
         return elapsed_s
 
-    def _stamp_with_device(
-        self, frame: Frame, t_us: int, modulus: int, arrival_s: float, *, is_new_arrival: bool
-    ) -> None:
+    def _stamp_with_device(self, frame: Frame, t_us: int, modulus: int, arrival_s: float) -> None:
         """Write the time of a frame from the clock of the device.
 
         Args:
@@ -132,13 +130,13 @@ class DeviceClock:
             t_us: Clock as the device sent it, us.
             modulus: Time at which the clock wraps to 0, us.
             arrival_s: Arrival of the chunk that contains the reading, unix seconds.
-            is_new_arrival: Whether the chunk arrived later than the previous chunk.
         """
         step_us = self._unwrap(t_us, modulus)  # time since the previous reading
         predicted_s = self._predict(self._device_us)
 
-        # No reading can be taken long after its arrival, so a clock was set. A provisional fit may be early by the
-        # length of a chunk.
+        # No reading can be taken long after its arrival, so a clock was set. All chunks of a file have the same arrival
+        # time, which contains no information about the clock. A provisional fit may be early by the length of a chunk.
+        is_new_arrival = self._chunk_arrival_s not in (None, arrival_s)
         has_fit = self._fitted_us is not None and not self._is_fit_provisional
         if has_fit and is_new_arrival and predicted_s - arrival_s > MAX_LEAD_s:
             self._fitted_us = None  # discards the fit
@@ -159,13 +157,22 @@ class DeviceClock:
         frame.dt_s = step_us * 1e-6
         frame.clock_s = self._device_us * 1e-6
 
-    def _correct_fit(self, arrival_s: float, fitted_us: int) -> None:
+    def _end_chunk(self, arrival_s: float) -> None:
         """Fit the clock of the device to the arrival time of a chunk, whose readings have been processed.
+
+        If the readings come from a file, all chunks have the same arrival time, which contains no information about the
+        clock. An arrival time is therefore used only if it differs from the previous arrival time.
 
         Args:
             arrival_s: Arrival of the chunk, unix seconds.
-            fitted_us: Clock of the device at the previous correction of the fit, us.
         """
+        previous_arrival_s = self._chunk_arrival_s
+        self._chunk_arrival_s = arrival_s
+        is_first_arrival = previous_arrival_s is None
+        is_repeated = previous_arrival_s == arrival_s
+        if self._fitted_us is None or is_first_arrival or is_repeated:  # the first arrival may be that of a file
+            return  # the provisional fit of `stamp` remains
+
         delay_s = arrival_s - self._predict(self._device_us)  # positive if the chunk arrived later than predicted
         was_clock_set = abs(delay_s) > MAX_DELAY_s
         if was_clock_set and not self._is_fit_provisional:
@@ -177,7 +184,8 @@ class DeviceClock:
             self.rate = 1.0
             self._is_fit_provisional = False
         else:
-            self._continue_fit(delay_s, step_s=(self._device_us - fitted_us) * 1e-6)
+            step_s = (self._device_us - self._fitted_us) * 1e-6  # since the previous correction of the fit
+            self._continue_fit(delay_s, step_s)
         self._fitted_us = self._device_us
 
     def _continue_fit(self, delay_s: float, step_s: float) -> None:

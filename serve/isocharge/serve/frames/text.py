@@ -19,10 +19,9 @@ Text has no checksum, except for sentences in the style of NMEA 0183. The parser
 in an otherwise intact line.
 
 A column with the name `seq` is the frame counter. A column with the name `t_us`, `t_ms` or `t_s` is the clock of the
-device. A column with the name `flags` contains bits such as `SATURATED_BIT`. All other columns are channels. A frame
-counter wraps at one of `SEQ_MODULI`: at 256 until it exceeds 255, and then at 65536, unless it returns to a small
-number after 99, 999 or 9999. A clock in us or ms is assumed to have 32 bits, and a clock in s is assumed to be a time
-of day.
+device. A column with the name `flags` contains bits such as `SATURATED_BIT`. All other columns are channels. A frame counter wraps at one of `SEQ_MODULI`: at 256 until it exceeds 255, and
+then at 65536, unless it returns to a small number after 99, 999 or 9999. A clock in us or ms is assumed to have 32
+bits, and a clock in s is assumed to be a time of day.
 """
 
 from collections import deque

@@ -77,6 +77,8 @@ _NUMBER_KINDS = ("time", "uptime", "hexadecimal", "number")
 _NAMES_OF_TIMES = {"time": "t_s", "uptime": "t_ms"}
 """Names of a time of day, in seconds since midnight, and of the time in a log prefix such as `I (1234)`."""
 
+_CHARGE_UNITS = {unit for unit in OTHER_CHARGE_UNITS if unit != "C"}  # C may be the name of an electrode
+
 _SIGNED_NUMBERS = r"(?:[-+][0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?){2,}"
 """Regular expression of a line of numbers with nothing but their signs between them, such as `+003.5-003.4+005.8`."""
 
@@ -231,7 +233,7 @@ def parse_line(text: str, *, has_header: bool = False, counters: Collection[str]
     begins_with_address = "hexadecimal" in kinds and "number" in kinds[kinds.index("hexadecimal") :]
     names, names_with_units = _names(tokens, counters)
 
-    units = {"pC", *OTHER_CHARGE_UNITS}
+    units = {"pC", *_CHARGE_UNITS}
     skeleton = ""
     word_count = 0
     for previous, token in zip([None, *tokens], tokens, strict=False):
@@ -321,10 +323,13 @@ def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], 
         for token, following in pairwise([*parts, _Token("mark", "", 0, False)])
         if token.kind in _NUMBER_KINDS
     ]
+    # A word such as `C` may be the name of an electrode, but a word behind several numbers is no name.
+    repeated_units = {unit for unit in OTHER_CHARGE_UNITS if following_units.count(unit) > 1}
+    known_units = _CHARGE_UNITS | repeated_units
     # The first word after the previous number is a name, or the unit of the previous number.
     preceding_units = [[token.name.strip("[]") for token in path[1:]] for path in _paths(tokens)]
     units = [
-        next((unit for unit in (following, *preceding) if unit in OTHER_CHARGE_UNITS), "")
+        next((unit for unit in (following, *preceding) if unit in known_units), "")
         for following, preceding in zip(following_units, preceding_units, strict=True)
     ]
 
@@ -337,9 +342,10 @@ def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], 
     alternating_names = (token.name for token in tokens if token.kind == "name")
     if any(token.kind == "name" for token in tokens):
         names = [_NAMES_OF_TIMES.get(kind) or next(alternating_names) for kind in kinds]
+    full_units = ["coulomb" if unit == "C" else unit for unit in units]  # `A_C` would be an electrode with the name C
     names_with_units = [
         f"{name or f'ch{number}'}_{unit}" if unit and unit not in names else name
-        for number, (name, unit) in enumerate(zip(names, units, strict=True), start=1)
+        for number, (name, unit) in enumerate(zip(names, full_units, strict=True), start=1)
     ]
     return names, names_with_units
 
@@ -359,7 +365,7 @@ def _with_alternating_names(tokens: list[_Token]) -> list[_Token]:
         paths = _paths(ordered_tokens)
         named = [path[-1] for path in paths if path]
         names = {token.name for token in named}
-        if len(names) == len(paths) > 1 and names.isdisjoint(OTHER_CHARGE_UNITS):
+        if len(names) == len(paths) > 1 and _CHARGE_UNITS.isdisjoint(names):
             return [token._replace(kind="name") if token in named else token for token in tokens]
     return tokens
 

@@ -12,7 +12,7 @@ import shlex
 import stat
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -66,6 +66,35 @@ class Chunk(NamedTuple):
         return max(0.0, monotonic_ns * 1e-9)
 
 
+def check_bytes(name: str, head: bytes) -> None:
+    """Raise an error if a file does not contain the bytes that a board sends.
+
+    Args:
+        name: Path of the file, or - for the standard input.
+        head: First bytes of the file.
+
+    Raises:
+        InputError: If the file is of another kind. The message states the kind, and how to use such a file.
+    """
+    kind = foreign_kind(name, head)
+    if kind:
+        raise InputError(f"{name}: expected a port, or a file of bytes from a board, got {kind}")
+
+
+def check_file(path: Path) -> None:
+    """Raise an error if a file on the disk does not contain the bytes that a board sends.
+
+    The first bytes of a pipe cannot be read twice, so only `FileSource` checks them.
+
+    Raises:
+        InputError: If the file is of another kind.
+    """
+    with suppress(OSError):  # reading the file reports the error
+        if path.is_file():
+            with path.open("rb") as file:
+                check_bytes(str(path), file.read(HEAD_BYTES))
+
+
 def foreign_kind(name: str, head: bytes) -> str:
     """Return the kind of a file that does not come from a board, with advice; empty if it may come from a board.
 
@@ -117,26 +146,26 @@ class FileSource:
     is_live = False
 
     def __init__(self, descriptor: int, name: str) -> None:
-        """Check the first bytes of a file on a disk. The bytes of a pipe cannot be read before they are used.
-
-        Raises:
-            InputError: If the file is a recording, a table or another file that does not come from a board.
-        """
+        """Store the file descriptor and the name."""
         self._descriptor = descriptor
+        self._name = name
         self.is_on_disk = stat.S_ISREG(os.fstat(descriptor).st_mode)
-        head = os.pread(descriptor, HEAD_BYTES, 0) if self.is_on_disk else b""
-        kind = foreign_kind(name, head)
-        if kind:
-            raise InputError(f"{name}: expected a port, or a file of bytes from a board, got {kind}")
 
     def __iter__(self) -> Iterator[Chunk]:
         """Yield chunks until the file ends.
 
         For a file on a disk, the arrival time of all chunks is the time at which reading began. For a pipe, the arrival
         time of a chunk is the time at which the chunk was read.
+
+        Raises:
+            InputError: If the file is a recording, a table or another file that does not come from a board.
         """
         start_s = time.time()
+        is_first_chunk = True
         while data := os.read(self._descriptor, HEAD_BYTES):
+            if is_first_chunk:
+                check_bytes(self._name, data)
+            is_first_chunk = False
             arrival_s = start_s if self.is_on_disk else time.time()
             yield Chunk(data, arrival_s, time.perf_counter_ns())
 
@@ -154,6 +183,7 @@ def open_file(path: Path) -> Iterator[FileSource]:
     Raises:
         InputError: If the file cannot be read, or does not come from a board.
     """
+    check_file(path)
     try:
         file = path.open("rb", buffering=0)
     except OSError as error:

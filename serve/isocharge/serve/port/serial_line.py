@@ -140,6 +140,10 @@ def _keep_ready_signal(descriptor: int) -> None:
     termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
 
 
+class OtherReader(OSError):
+    """Bytes arrived at a line, but another program has read them."""
+
+
 class SerialLine:
     """An open connection to a board through a serial port or another port that pyserial supports.
 
@@ -176,6 +180,10 @@ class SerialLine:
         if self._descriptor is not None and os.isatty(self._descriptor):
             _keep_ready_signal(self._descriptor)
 
+    def reset_input_buffer(self) -> None:
+        """Discard the bytes that have arrived and were not read."""
+        self._serial.reset_input_buffer()
+
     def write(self, data: bytes) -> None:
         """Send bytes to the board."""
         self._serial.write(data)
@@ -202,8 +210,13 @@ class SerialLine:
         if not readable:
             return b""
         # `os.read` needs one system call. pyserial would need five, or one for each byte of a socket.
-        data = os.read(self._descriptor, MAX_READ_BYTES)
+        try:
+            data = os.read(self._descriptor, MAX_READ_BYTES)
+        except BlockingIOError:
+            data = b""
         if not data:  # `select` also reports the end of a stream as readable
+            if os.isatty(self._descriptor):  # false if the terminal was unplugged
+                raise OtherReader
             raise OSError("it is readable and has no data: it was unplugged, or the other end has closed")
         return data
 
@@ -236,6 +249,9 @@ UDP_SCHEME = "udp://"
 The URL contains the address on which the socket receives datagrams.
 """
 
+MAX_LINE_DATAGRAMS = 8
+"""Largest number of datagrams over which a serial bridge divides a line."""
+
 _CONTROL_CHARACTER = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
 
@@ -266,8 +282,14 @@ class UdpSocket:
             self._socket.close()
             raise
         self._board_ends_lines = False  # whether the board ends its lines, although a line may need several datagrams
+        self._datagrams_without_end = 0  # number of successive datagrams without a line feed
         self._is_text = False  # whether the latest datagram is valid UTF-8 without control characters
         self._peer: tuple[str, int] | None = None  # sender of the latest datagram, to which answers are sent
+
+    def reset_input_buffer(self) -> None:
+        """Discard the datagrams that have arrived and were not read."""
+        while self._is_ready(0.0):
+            self._socket.recv(MAX_READ_BYTES)
 
     def receive(self, timeout_s: float) -> bytes:
         """Wait for a datagram that is not empty, and return it.
@@ -313,11 +335,15 @@ class UdpSocket:
     def _with_line_feed(self, data: bytes) -> bytes:
         """Return a datagram of text with a line feed at its end.
 
-        If this datagram or an earlier datagram of the board ends with a line feed, the datagram is returned unchanged.
-        A datagram that is no text is also returned unchanged.
+        If this datagram or one of the latest datagrams of the board ends with a line feed, the datagram is returned
+        unchanged. A datagram that is no text is also returned unchanged.
 
         Args:
             data: The datagram.
         """
-        self._board_ends_lines |= data.endswith(b"\n")
+        self._datagrams_without_end = 0 if b"\n" in data else self._datagrams_without_end + 1
+        if self._datagrams_without_end > MAX_LINE_DATAGRAMS:
+            self._board_ends_lines = False
+        elif data.endswith(b"\n"):
+            self._board_ends_lines = True
         return data + b"\n" if self._is_text and not self._board_ends_lines else data

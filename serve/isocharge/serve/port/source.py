@@ -25,17 +25,18 @@ import stat
 import sys
 import time
 from collections.abc import Iterator
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-from isocharge.common.errors import InputError, PortError, PortLost
-from isocharge.serve.port.file_source import STDIN, Chunk, FileSource, open_file
+from isocharge.common.errors import InputError, IsochargeError, PortError, PortLost
+from isocharge.serve.port.file_source import STDIN, Chunk, FileSource, check_file, open_file
 from isocharge.serve.port.serial_line import (
     MAX_READ_BYTES,
     OPEN_ERRORS,
     READ_ERRORS,
     UDP_SCHEME,
+    OtherReader,
     Request,
     Requester,
     SerialLine,
@@ -103,7 +104,7 @@ class Port:
         self._is_starting_up = True  # whether no byte has arrived since the port was opened
 
     def __enter__(self) -> Self:
-        """Open the port. The system discards the bytes that have arrived at a serial port before.
+        """Open the port, and discard the bytes in its buffer.
 
         If the port cannot be opened, try again until `wait` seconds have passed. A wrong URL is not tried again.
 
@@ -123,7 +124,7 @@ class Port:
                 time.sleep(RETRY_PAUSE_s)
 
     def _open(self) -> None:
-        """Open the line to the board.
+        """Open the line to the board, and discard the bytes in its buffer.
 
         Raises:
             PortError: If the line cannot be opened.
@@ -133,6 +134,7 @@ class Port:
         if is_path and not Path(self.url).exists():
             raise PortError(f"{self.url}: there is no such port: plug the board in, check the name, or wait for it")
         if is_path and Path(self.url).is_file():
+            check_file(Path(self.url))
             raise InputError(
                 f"{self.url}: expected a port, got a file; only `isocharge serve stream` reads the bytes of a board "
                 "from a file"
@@ -142,6 +144,7 @@ class Port:
                 self._line = UdpSocket(self.url)
             else:
                 self._line = SerialLine(self.url, self._baud)
+            self._line.reset_input_buffer()  # needed for a socket; opening a terminal has discarded the bytes already
         except OPEN_ERRORS as error:
             self._close()
             raise self._opening_error(error, is_path=is_path) from error
@@ -279,10 +282,14 @@ class Port:
             if self._requester is None:
                 return self._line.receive(timeout_s)
             return self._receive_answer(self._line, self._requester, timeout_s)
+        except OtherReader as error:
+            raise PortLost(
+                f"{self.url}: another program reads this port, too, and takes some of its bytes; end that program (on "
+                f"Linux, `fuser {self.url}` shows its number)"
+            ) from error
         except READ_ERRORS as error:
             raise PortLost(
-                f"{self.url}: the port disappeared while it was read ({error}); check the plug and the cable, and end "
-                "other programs that read it (on Linux, `fuser` shows their numbers)"
+                f"{self.url}: the port disappeared while it was read ({error}); check the plug and the cable"
             ) from error
 
     def _receive_answer(self, line: SerialLine | UdpSocket, requester: Requester, timeout_s: float) -> bytes:
@@ -332,6 +339,58 @@ class Source(Protocol):
         """Yield chunks as they arrive, until the source ends."""
 
 
+class AddedSource:
+    """Source of another package, as a context manager whose errors name the package.
+
+    Attributes:
+        is_live: Whether bytes are lost if they are not read in time.
+    """
+
+    def __init__(self, url: str, entry_point: EntryPoint) -> None:
+        """Call the function with which another package opens this URL.
+
+        Args:
+            url: URL of the source.
+            entry_point: Entry point of the function.
+        """
+        self._name = f"{url}: cannot be read by {entry_point.value}"
+        with self._errors_named():
+            self._opened = entry_point.load()(url)
+
+    def __enter__(self) -> Self:
+        """Open the source."""
+        with self._errors_named():
+            self._source: Source = self._opened.__enter__()
+            self.is_live = self._source.is_live
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Close the source."""
+        with self._errors_named():
+            self._opened.__exit__(*error)
+
+    def __iter__(self) -> Iterator[Chunk]:
+        """Yield chunks as they arrive, until the source ends."""
+        with self._errors_named():
+            yield from self._source
+
+    @contextlib.contextmanager
+    def _errors_named(self) -> Iterator[None]:
+        """Convert errors of the other package in a `with` block, except errors of isocharge (context manager).
+
+        Raises:
+            InputError: If the block raises another error.
+        """
+        try:
+            yield
+        except IsochargeError:
+            raise
+        except Exception as error:
+            raise InputError(
+                f"{self._name} ({type(error).__name__}: {error}); correct or remove the package that adds these sources"
+            ) from error
+
+
 def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> contextlib.AbstractContextManager[Source]:
     """Return a context manager that opens a port, a file or the standard input as a source of chunks.
 
@@ -344,15 +403,14 @@ def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> context
 
     Raises:
         InputError: If the file cannot be read, or is a recording, a table or another file that does not come from a
-            board.
+            board; or if a package that adds sources cannot open the URL.
     """
     if url == STDIN:
         return contextlib.nullcontext(FileSource(sys.stdin.fileno(), STDIN))
 
     scheme, _, _address = url.partition("://")
     for entry_point in entry_points(group=ENTRY_POINTS, name=scheme):
-        added_source: contextlib.AbstractContextManager[Source] = entry_point.load()(url)
-        return added_source
+        return AddedSource(url, entry_point)
 
     # Wait until the path exists, because the type of a missing path (a file or a port) is unknown.
     is_path = "://" not in url

@@ -219,18 +219,26 @@ def read_presses(
         MissingExtra: If the file is Parquet and pyarrow is not installed.
     """
     path = Path(path)
+    default_stds = {"position_std_mm": position_std_mm, "force_std": force_std}
+    for name, std in default_stds.items():
+        is_allowed = 0.0 < std <= PRESS_RULES[name].maximum  # false for NaN
+        if not is_allowed:
+            raise PressError(f"{name}: expected {PRESS_RULES[name].description}, got {std:g}")
+
     # Read the columns of the file that are electrodes or have another meaning for a press (`PRESS_RULES`).
     expected_electrodes = "the electrodes' names" if electrodes is None else f"the electrodes {tuple(electrodes)}"
     expected_header = f"a header with {', '.join(CONTACT)} and {expected_electrodes} (charges in pC)"
     with open_table(path, (*(electrodes or ()), *PRESS_RULES), PressError, expected_header) as table:
         electrode_names = _electrode_columns(table) if electrodes is None else tuple(electrodes)
+        with error_prefix(f"{path}: ", PressError):
+            _check_electrodes(electrode_names)
         chosen_rules = table.choose_columns(dict.fromkeys(electrode_names, CHARGE_RULE), optional=PRESS_RULES)
         columns = _read_rows(table, chosen_rules)
 
     # Columns that the file does not have are filled with NaN. Missing standard deviations get their default values.
     unknown_values = np.full(len(columns.row_numbers), np.nan)
     values = {name: columns.values.get(name, unknown_values) for name in (*electrode_names, *PRESS_RULES)}
-    for name, std in zip(UNCERTAINTY, (position_std_mm, force_std), strict=True):
+    for name, std in default_stds.items():
         values[name] = np.where(np.isnan(values[name]), std, values[name])
     with error_prefix(f"{path}, ", PressError):
         return MeasuredPresses(

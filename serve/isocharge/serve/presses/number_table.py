@@ -84,18 +84,22 @@ class NumberColumns:
             error_class: Class of the error that is raised.
 
         Raises:
-            error_class: If a value violates its rule. The message names the first wrong column, its first wrong row,
-                the rule and the value.
+            error_class: If a value violates its rule. The message names the first wrong row, the column, the rule and
+                the value.
         """
-        for name, column in self.values.items():
-            is_violation = rules[name].violations(column)
-            if is_violation.any():
-                row = int(is_violation.argmax())  # the first violation
-                text = "an empty cell" if np.isnan(column[row]) else f"{column[row]:.15g}"
-                raise error_class(
-                    f"{where}{self.row_noun} {self.row_numbers[row]}, column {shown(name)}: expected "
-                    f"{rules[name].description}, got {text}"
-                )
+        violations_of_columns = [rules[name].violations(column) for name, column in self.values.items()]
+        is_violation = np.column_stack(violations_of_columns)  # shape (n, n_column)
+        positions = np.argwhere(is_violation)  # row and column of each violation, ordered by rows
+        if not positions.size:
+            return
+        row, column_index = positions[0]  # the first violation
+        name = list(self.values)[column_index]
+        value = float(self.values[name][row])
+        text = "an empty cell" if np.isnan(value) else f"{value:.15g}"
+        raise error_class(
+            f"{where}{self.row_noun} {self.row_numbers[row]}, column {shown(name)}: expected "
+            f"{rules[name].description}, got {text}"
+        )
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,7 @@ class CsvTable(NumberTable):
             raise source.error(f": empty; expected {source.expected}")
         super().__init__(header_row[1], source)
         self._mark = ""  # decimal mark; empty until it is known
-        self._is_mark_certain = False  # whether a number has shown that the mark is no separator of thousands
+        self._is_mark_certain = False
 
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
         """Convert the cells of the requested columns to numbers, row by row.
@@ -101,25 +101,27 @@ class CsvTable(NumberTable):
         line_numbers = array("q")
         numbers = array("d")  # the numbers of the first row, then the numbers of the second row, and so on
         for index, (line_number, cells) in enumerate(self._rows):
-            self._check_cell_count(line_number, cells)
-            if index == 0 and _is_row_of_units(cells[column_index] for column_index in column_indices.values()):
+            if index == 0 and _is_row_of_units([cells[i] for i in column_indices.values() if i < len(cells)]):
                 continue
             if len(line_numbers) == max_rows:  # this row is one row too many
                 self._refuse_row_count(max_rows)
+            self._check_cell_count(line_number, cells)
             line_numbers.append(line_number)
             for name, column_index in column_indices.items():
-                cell = cells[column_index].strip()
-                number = self._number(cell)
+                number = self._number(cells[column_index].strip())
                 if number is None:
-                    advice = f"; the decimal mark is {self._mark!r}" if self._mark else ""
+                    cell = cells[column_index].strip()
+                    has_other_mark = self._mark != "" and any(mark in cell for mark in ",." if mark != self._mark)
+                    advice = f"; the decimal mark is {self._mark!r}" if has_other_mark else ""
                     raise self.source.error(
                         f", line {line_number}, column {shown(name)}: expected {rules[name].description}, got "
                         f"{shown(cell)}{advice}"
                     )
                 numbers.append(number)
-            if self._mark and not self._is_mark_certain:
+            if not self._is_mark_certain:
                 is_point_between_commas = (self._separator, self._mark) == (",", ".")
-                self._is_mark_certain = is_point_between_commas or any(map(self._has_decimal_mark, cells))
+                has_evidence = any(_has_decimal_mark(cell.strip(), self._mark) for cell in cells)
+                self._is_mark_certain = is_point_between_commas or has_evidence
         if self._mark and not self._is_mark_certain:
             raise self.source.error(
                 f": every number with the mark {self._mark!r} may have a decimal mark or a separator of thousands; "
@@ -149,12 +151,6 @@ class CsvTable(NumberTable):
             self._mark = mark
         number = float(text.replace(",", "."))
         return number if math.isfinite(number) else None
-
-    def _has_decimal_mark(self, cell: str) -> bool:
-        """Return whether a cell is a number with the decimal mark, which cannot be a separator of thousands."""
-        match = _NUMBER.fullmatch(cell.strip())
-        has_mark = match is not None and self._mark in (match[1], match[2])
-        return has_mark and _THOUSANDS.fullmatch(cell.strip()) is None
 
     def _check_cell_count(self, line_number: int, cells: list[str]) -> None:
         """Check that a row has as many cells as the header. Additional blank cells are accepted.
@@ -189,10 +185,16 @@ def csv_text(columns: Mapping[str, Array]) -> str:
     return buffer.getvalue()
 
 
-def _is_row_of_units(cells: Iterable[str]) -> bool:
+def _is_row_of_units(cells: list[str]) -> bool:
     """Return whether cells are the units of charges and other known columns, with or without brackets."""
     units = {cell.strip().strip("[]()") for cell in cells}
     return "pC" in units and units <= _UNITS
+
+
+def _has_decimal_mark(text: str, mark: str) -> bool:
+    """Return whether a text is a number with the given mark, which cannot be a separator of thousands."""
+    is_number_with_mark = mark != "" and mark in text and _NUMBER.fullmatch(text) is not None
+    return is_number_with_mark and _THOUSANDS.fullmatch(text) is None
 
 
 def _checked_lines(lines: Iterable[str], source: TableSource) -> Iterator[str]:
@@ -238,7 +240,7 @@ def _numbered_rows(
         lines: Lines of the text, each with its line end.
         lines_above: Number of lines above these lines.
         separator: Character between the columns.
-        source: Name of the file, and the class of errors.
+        source: Name of the file, its known columns, and the class of errors.
 
     Raises:
         InputError: If the lines are not CSV text.
@@ -247,7 +249,8 @@ def _numbered_rows(
     try:
         for cells in reader:
             first_cell = cells[0].strip() if cells else ""
-            if any(cell.strip() for cell in cells) and not first_cell.startswith("#"):
+            is_comment = first_cell.startswith("#") and first_cell not in source.names
+            if any(cell.strip() for cell in cells) and not is_comment:
                 yield lines_above + reader.line_num, cells
     except csv.Error as cause:
         raise source.error(f", line {lines_above + reader.line_num}: not CSV text ({cause})") from cause

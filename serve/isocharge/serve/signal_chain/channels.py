@@ -221,7 +221,7 @@ def stated_unit(name: str) -> str:
     A final `C` is no unit, because C may be the name of an electrode. The case of the unit does not matter.
     """
     *other_words, last_word = _words_of(name) or [""]
-    units = {unit.casefold(): unit for unit in ("pC", *OTHER_CHARGE_UNITS)}
+    units = {unit.casefold(): unit for unit in ("pC", *OTHER_CHARGE_UNITS) if unit != "C"}
     return units.get(last_word.casefold(), "") if other_words else ""
 
 
