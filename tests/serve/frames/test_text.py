@@ -101,7 +101,7 @@ def test_layout_is_recognised_from_the_first_good_lines():
     assert [frame.values[0] for frame in frames] == [801.0, 801.1, 801.2, 801.3]
     assert parser.format == "text: 3 columns without names"
     counts = parser.counts
-    assert (counts.frames, counts.malformed) == (4, 1)
+    assert (counts.frames, counts.malformed) == (4, 2)
 
 
 NOTATIONS = {
@@ -230,6 +230,7 @@ MESSAGES = ["Sensor 1 ready", "Sensor 2 ready", "Sensor 3 ready", "load:0x3fff00
     [
         (["A,B", "1,2", "3,4", "5,6", "A,B", "7,8"], [(1, 2), (3, 4), (5, 6), (7, 8)]),
         ([*MESSAGES, "1,2,3", "4,5,6", "7,8,9"], [(1, 2, 3), (4, 5, 6), (7, 8, 9)]),
+        (["READ 1", "0,2", "READ 1", "1,2", "READ 1", "2,2"], [(0, 2), (1, 2), (2, 2)]),
         (["0x7FF0 0x8001", "0x7FF1 0x8001", "0x7FF2 0x8011"], [(0x7FF0, 0x8001), (0x7FF1, 0x8001), (0x7FF2, 0x8011)]),
         (["7,0x1F", "8,-0x20", "9,0x0"], [(7, 31), (8, -32), (9, 0)]),
         ([f"seq=0x{n:X} A=-{n}" for n in range(12)], [(-n,) for n in range(12)]),
@@ -238,6 +239,7 @@ MESSAGES = ["Sensor 1 ready", "Sensor 2 ready", "Sensor 3 ready", "load:0x3fff00
     ids=[
         "a header after a reset",
         "messages of a board that starts",
+        "an echo",
         "hexadecimal",
         "mixed",
         "a hexadecimal counter",

@@ -171,38 +171,53 @@ class Columns:
     Args:
         names: Names of all columns; an empty text for a column without a name.
         scales: Factor by which the numbers of each column are multiplied.
+        flags_column: Index of the column with the flags; None if there is no such column.
         words: Words in the line of text.
 
     Attributes:
         seq_column: Index of the column with the frame counter; None if there is no such column.
-        flags_column: Index of the column with the flags; None if there is no such column.
         clock_column: Index of the column with the clock; None if there is no such column.
         clock_unit_us: Duration of one count of the clock, us.
         channels: For each channel, the index of its column and the factor by which its numbers are multiplied.
         names: Names of the channels; empty if they have no names.
     """
 
-    def __init__(self, names: Sequence[str], scales: Sequence[float], words: tuple[str, ...] = ()) -> None:
-        """Use the column names to find the columns of the frame counter, the clock, the flags and the channels.
+    def __init__(
+        self,
+        names: Sequence[str],
+        scales: Sequence[float],
+        flags_column: int | None = None,
+        words: tuple[str, ...] = (),
+    ) -> None:
+        """Use the column names to find the columns of the frame counter, the clock and the channels.
 
         If there are several clocks, the first clock in the order of `TIMES_US` is used, and the other clocks are
         ignored. A column is a channel if it contains neither the counter, nor a clock, nor the flags.
+
+        Args:
+            names: Names of all columns; an empty text for a column without a name.
+            scales: Factor by which the numbers of each column are multiplied.
+            flags_column: Index of the column with the flags; None if there is no such column.
+            words: Words in the line of text.
         """
         self._words = words
-        first_columns = {name: names.index(name) for name in names}
-        self.seq_column = first_columns.get(SEQ)
-        self.flags_column = first_columns.get(FLAGS)
+        self.seq_column = names.index(SEQ) if SEQ in names else None
+        self.flags_column = flags_column
 
         # `TIMES_US` contains the unit of each clock, us, by the name of the clock, such as "t_ms".
-        clock_names = [name for name in TIMES_US if name in names]
-        self.clock_column = first_columns[clock_names[0]] if clock_names else None
+        clock_columns = [names.index(name) for name in TIMES_US if name in names]
+        self.clock_column = clock_columns[0] if clock_columns else None
         self.clock_unit_us = 1.0
         if self.clock_column is not None:
-            self.clock_unit_us = TIMES_US[clock_names[0]] * scales[self.clock_column]
+            clock_name = names[self.clock_column]
+            self.clock_unit_us = TIMES_US[clock_name] * scales[self.clock_column]
 
         # All other columns are channels.
-        other_names = (SEQ, FLAGS, *TIMES_US)
-        self.channels = [(column, scale) for column, scale in enumerate(scales) if names[column] not in other_names]
+        self.channels = [
+            (column, scale)
+            for column, scale in enumerate(scales)
+            if names[column] not in (SEQ, *TIMES_US) and column != flags_column
+        ]
         channel_names = tuple(names[column] for column, _ in self.channels)
         self.names = channel_names if any(channel_names) else ()
 

@@ -37,7 +37,14 @@ from typing import Annotated, Any, Final, Literal
 from msgspec import Meta, field
 
 from isocharge.common.structs import Finite, Positive, Settings, WrongKey
-from isocharge.serve.frames.frame import ChecksumError, Columns, Frame, Parser, StuffedParser
+from isocharge.serve.frames.frame import (
+    FLAGS,
+    ChecksumError,
+    Columns,
+    Frame,
+    Parser,
+    StuffedParser,
+)
 from isocharge.serve.frames.transmission import CHECKSUMS, STUFFINGS, SUMS, Checksum
 
 FieldType = Literal["pad", "u8", "u16", "u24", "u32", "i8", "i16", "i24", "i32", "f32", "f64"]
@@ -237,7 +244,9 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
     def columns(self) -> Columns:
         """Meanings of the fields. Each field is the frame counter, a clock, the flags or a channel."""
         names = [field.name for field in self.fields]
-        return Columns(names, [field.scale for field in self.fields])
+        scales = [field.scale for field in self.fields]
+        flags_column = names.index(FLAGS) if FLAGS in names else None
+        return Columns(names, scales, flags_column)
 
     @cached_property
     def three_byte_fields(self) -> tuple[tuple[int, bool], ...]:

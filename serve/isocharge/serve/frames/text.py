@@ -16,10 +16,11 @@ from `cat /dev/ttyACM0`. A program that begins with a complete line can send a h
 No frame is then dropped.
 
 Text has no checksum, except for sentences in the style of NMEA 0183. The parser therefore cannot detect a damaged digit
-in an otherwise intact line.
+in an otherwise intact line. Lines between the frames that never change, such as the echo of a request, do not prevent
+the recognition of the layout.
 
 A column with the name `seq` is the frame counter. A column with the name `t_us`, `t_ms` or `t_s` is the clock of the
-device. A column with the name `flags` contains bits such as `SATURATED_BIT`. All other columns are channels. A frame counter wraps at one of `SEQ_MODULI`: at 256 until it exceeds 255, and
+device. All other columns are channels. A frame counter wraps at one of `SEQ_MODULI`: at 256 until it exceeds 255, and
 then at 65536, unless it returns to a small number after 99, 999 or 9999. A clock in us or ms is assumed to have 32
 bits, and a clock in s is assumed to be a time of day.
 """
@@ -69,14 +70,8 @@ class Layout:
         columns: Meanings of the values as frame counter, clock or channels.
     """
 
-    def __init__(self, lines: Sequence[Line], meanings: Mapping[str, str]) -> None:
-        """Determine the layout from the lines of one frame.
-
-        Args:
-            lines: The lines.
-            meanings: Meaning of names that the device uses for its counter and its clock; see `TextParser`.
-        """
-        self._meanings = meanings
+    def __init__(self, lines: Sequence[Line]) -> None:
+        """Determine the layout from the lines of one frame."""
         self.example = lines[0]
         self.patterns = [skeleton_pattern(line) for line in lines]
         names = [name for line in lines for name in line.names]
@@ -85,11 +80,8 @@ class Layout:
         self.set_names(names)
 
     def set_names(self, names: Sequence[str]) -> None:
-        """Store the names of all values, and find the columns of the frame counter, the clock and the channels.
-
-        Names that the device uses for its counter and its clock are replaced by their meanings.
-        """
-        self.names = tuple(self._meanings.get(name, name) for name in names)
+        """Store the names of all values, and find the columns of the frame counter, the clock and the channels."""
+        self.names = tuple(names)
         scales = (1.0,) * len(self.names)  # values in text have no scale
         self.columns = Columns(self.names, scales, words=self._words)
 
@@ -172,6 +164,10 @@ class TextParser(DelimitedParser):
         except ValueError:
             return self._reject(size)
 
+    def _meant(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Replace the names that the device uses for its counter and its clock by their meanings."""
+        return tuple(self._meanings.get(name, name) for name in names)
+
     def _reject(self, size: int) -> list[Frame]:
         """Count a rejected line, and return an empty list, because a rejected line completes no frame."""
         self.counts.count_rejected(size)
@@ -199,8 +195,10 @@ class TextParser(DelimitedParser):
             return self._recognise_layout(line, size) if layout is None else self._reject(size)
         if layout is None:
             self._headers.append(text)
-            return []  # not counted as rejected
-        if all(layout.names) or not layout.name_unnamed(header_names(text, layout.example)):
+            columns = text.replace(",", " ").replace(";", " ").split()
+            is_plain_header = all(column[0].isalpha() for column in columns)
+            return [] if is_plain_header else self._reject(size)
+        if all(layout.names) or not layout.name_unnamed(self._meant(header_names(text, layout.example))):
             return self._reject(size)
         self._describe_layout(layout)
         return []
@@ -226,32 +224,34 @@ class TextParser(DelimitedParser):
         Returns:
             The frames of all equal cycles; an empty list if no layout is recognised yet.
         """
-        self._collected_lines.append((line, size))
+        self._collected_lines.append((line._replace(names=self._meant(line.names)), size))
         repeats = MESSAGE_REPEATS if line.is_prose else RECOGNITION_REPEATS
-        frame_lines = _frame_lines(self._repeated_cycle(repeats))
+        cycle_length = self._repeated_cycle_length(repeats)
+        repeated_lines = self._collected_lines[-repeats * cycle_length :] if cycle_length > 0 else []
+        frame_lines = _frame_lines([line for line, _ in repeated_lines], cycle_length)
         if not frame_lines:
             # Keep as many lines as the longest cycles need, and reject the older lines.
             while len(self._collected_lines) > RECOGNITION_REPEATS * MAX_CYCLE_LINES:
                 self._reject(self._collected_lines.pop(0)[1])
             return []
 
-        repeated_lines = self._collected_lines[-repeats * len(frame_lines) :]
         for _, rejected_size in self._collected_lines[: -len(repeated_lines)]:
             self._reject(rejected_size)
         self._collected_lines = []
-        layout = Layout(frame_lines, self._meanings)
-        is_named = layout.name_unnamed(self._columns)
+        layout = Layout(frame_lines)
+        is_named = layout.name_unnamed(self._meant(self._columns))
         while self._headers and not is_named:
-            is_named = layout.name_unnamed(header_names(self._headers.pop(), layout.example))
+            is_named = layout.name_unnamed(self._meant(header_names(self._headers.pop(), layout.example)))
         self.layout = layout
         self._describe_layout(layout)
         frames = []
         for repeated_line, repeated_size in repeated_lines:
-            frames += self._read_line(repeated_line.text, repeated_size) or []
+            frames_of_line = self._read_line(repeated_line.text, repeated_size)
+            frames += self._reject(repeated_size) if frames_of_line is None else frames_of_line
         return frames
 
-    def _repeated_cycle(self, repeats: int) -> list[Line]:
-        """Return the last lines that make a cycle; empty if the collected lines do not repeat regularly.
+    def _repeated_cycle_length(self, repeats: int) -> int:
+        """Return the number of lines in a cycle, or 0 if the collected lines do not repeat regularly.
 
         A cycle is a sequence of lines that repeats. It is recognised if the last lines consist of several equal cycles.
         Lines are equal if their skeletons are equal. The length of the cycle is the distance from the last line to the
@@ -260,14 +260,13 @@ class TextParser(DelimitedParser):
         Args:
             repeats: Number of equal cycles that are needed.
         """
-        lines = [line for line, _ in self._collected_lines]
-        skeletons = [line.skeleton for line in lines]
+        skeletons = [line.skeleton for line, _ in self._collected_lines]
         *earlier_skeletons, last_skeleton = skeletons
         if last_skeleton not in earlier_skeletons:
-            return []
+            return 0
         cycle_length = earlier_skeletons[::-1].index(last_skeleton) + 1
         is_repeated = skeletons[-repeats * cycle_length :] == skeletons[-cycle_length:] * repeats
-        return lines[-cycle_length:] if is_repeated else []
+        return cycle_length if is_repeated else 0
 
     def _read_line(self, text: str, size: int) -> list[Frame] | None:
         """Return a list with the frame that a line completes.
@@ -318,18 +317,23 @@ class TextParser(DelimitedParser):
             self.seq_modulus = SEQ_MODULI[0] if seq < SEQ_MODULI[0] else SEQ_MODULUS
 
 
-def _frame_lines(cycle: list[Line]) -> list[Line]:
-    """Return the lines of a cycle in the order in which they make a frame.
+def _frame_lines(lines: Sequence[Line], cycle_length: int) -> Sequence[Line]:
+    """Return the lines of one frame in repeated cycles of lines; empty if it is not clear which lines are frames.
 
-    The result is empty if a cycle of several lines has a value without a name.
+    If every value has a name, a frame consists of all lines of a cycle. Otherwise, a frame is a single line, and the
+    other lines of the cycle never change.
 
     Args:
-        cycle: Lines of a cycle, which may begin with any of them; may be empty.
+        lines: Lines of whole cycles; may be empty.
+        cycle_length: Number of lines in a cycle.
     """
-    if len(cycle) <= 1:
+    cycle = lines[:cycle_length]
+    if cycle_length <= 1:
         return cycle
-    names_of_lines = [line.names for line in cycle]
-    if not all(map(all, names_of_lines)):
-        return []
-    first = names_of_lines.index(min(names_of_lines, key=lambda names: (SEQ not in names, names)))
-    return cycle[first:] + cycle[:first]
+    line_names = [next((name for name in line.names if name not in TIMES_US), "") for line in cycle]
+    if all(line_names) and all(all(line.names) for line in cycle):
+        first = min(range(cycle_length), key=lambda position: (line_names[position] != SEQ, line_names[position]))
+        return lines[first : first + cycle_length]
+    texts = [{line.text for line in lines[position::cycle_length]} for position in range(cycle_length)]
+    varying = [line for line, texts_of_line in zip(cycle, texts, strict=True) if len(texts_of_line) > 1]
+    return varying if len(varying) == 1 else []

@@ -291,6 +291,15 @@ def _tokens(text: str, number_kind: str) -> list[_Token]:
         content = match[2] if kind == "time" else match[0]  # the second group is a time without its date
         is_after_blank = text[match.start() - 1 : match.start()].isspace()
         tokens.append(_Token(kind, content.strip(), match.start(), is_after_blank))
+
+    # In pairs of numbers, such as `1:801,2:799`, the first number of each pair is a name.
+    shape = "".join("#" if token.kind in _NUMBER_KINDS else token.content for token in tokens)
+    if re.fullmatch(r"(?:#[:=]#[,;]*)+", shape):
+        is_name = [token.content in ":=" for token in tokens[1:]] + [False]
+        tokens = [
+            token._replace(kind="key") if is_name_of_next else token
+            for token, is_name_of_next in zip(tokens, is_name, strict=True)
+        ]
     return tokens
 
 
@@ -302,6 +311,7 @@ def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], 
 
     - If several numbers have the same name, the word or key before it is the name, as in `{"A": {"pC": 3.5}}`. A name
       that still occurs several times is removed.
+    - If no word precedes the first number, but a word follows the last number, the words are units and no names.
     - If only one of several numbers has a name, the name is a label of the line and is removed. This applies if the
       name is a word or belongs to the first number. Names of counters and clocks are kept.
 
@@ -335,6 +345,9 @@ def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], 
 
     names = [name or outer_name for name, outer_name in zip(_unique(inner_names), _unique(outer_names), strict=True)]
     channels = [index for index, name in enumerate(names) if name not in TIMES_US]
+    contents = [token for token in tokens if token.kind != "mark"]
+    are_units = bool(channels) and not names[channels[0]] and contents[-1].kind == "word"
+    names = ["" if are_units and name in words else name for name in names]
     named = [index for index in channels if names[index]]
     is_single = len(channels) > 1 and len(named) == 1 and names[named[0]] not in counters
     if is_single and (named[0] == channels[0] or names[named[0]] in words):
@@ -419,8 +432,9 @@ def line_values(pattern: re.Pattern[str], text: str) -> tuple[float, ...] | None
 def _value(number: str) -> float:
     """Return the value of a number, which is NaN for `ovf`, or the seconds since midnight of a time of day."""
     if ":" in number:
-        hours, minutes, seconds, *fraction = re.split("[:.,]", number)
-        return 3600.0 * int(hours) + 60.0 * int(minutes) + float(f"{seconds}.{''.join(fraction)}")
+        hours, minutes, seconds = number.split(":")
+        whole, _, fraction = seconds.replace(",", ".").partition(".")
+        return 3600.0 * int(hours) + 60.0 * int(minutes) + float(f"{whole}.{fraction.replace('.', '')}")
     if "x" in number.lower():
         return float(int(number, 16))
     if number[-3:].lower() == "ovf":
@@ -470,10 +484,10 @@ def encode_text(frame: Frame, notation: Literal["csv", "json"]) -> bytes:
         notation: Whether the line is a CSV row that contains only the channels, or a JSON object that also contains the
             frame counter and the clock.
     """
-    values = [float(f"{value:.7g}") for value in frame.values]
+    values = [f"{value:.7g}" for value in frame.values]
     if notation == "csv":
-        return (",".join(map(str, values)) + "\n").encode()
+        return (",".join(values) + "\n").encode()
     names = frame.names or ascii_uppercase
     fields = {SEQ: frame.seq, "t_us": frame.t_us, **dict(zip(names, values, strict=False))}
-    present_fields = {name: value for name, value in fields.items() if value is not None}
-    return (json.dumps(present_fields) + "\n").encode()
+    members = (f"{json.dumps(name)}: {value}" for name, value in fields.items() if value is not None)
+    return ("{" + ", ".join(members) + "}\n").encode()
