@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from functools import partial
 
 from msgspec import structs
@@ -47,12 +48,11 @@ class RecordedStream:
         """
         self._stream = stream
         self.recorder = recorder
-        self._caller_recorder = recorder  # the caller closes this recorder, and all others are closed here
+        self._opened_recorder = ExitStack()  # closes the present recorder if it was opened on request
         # A chunk and its records that are not recorded yet
         self._current_chunk: tuple[Chunk, list[PredictionRecord]] | None = None
         self._requests: deque[Callable[[], None]] = deque()
-        self._next_load: Load | None = None
-        self._loading_model: Future[Predictor] | None = None
+        self._loader = ThreadPoolExecutor(1, "model")  # loads one model at a time
 
     def request_tare(self) -> None:
         """Request a new measurement of the tare. A signal handler may also call this method."""
@@ -83,7 +83,7 @@ class RecordedStream:
         Args:
             load: Function that loads and returns the new model.
         """
-        self._next_load = load
+        self._requests.append(partial(self._begin_loading, load))
 
     def follow(self, chunks: Iterable[Chunk]) -> Generator[PredictionRecord]:
         """Process and record the chunks, and yield their prediction records.
@@ -103,7 +103,6 @@ class RecordedStream:
         """
         try:
             for chunk in chunks:
-                self._continue_loading()
                 while self._requests:
                     execute_request = self._requests.popleft()
                     execute_request()
@@ -142,7 +141,7 @@ class RecordedStream:
         if recorder is None:
             return
         try:
-            self.recorder = recorder.__enter__()  # opens the file; `_end_recording` closes it
+            self.recorder = self._opened_recorder.enter_context(recorder)
         except IsochargeError as error:
             log.error("no recording: %s", error)
             return
@@ -153,31 +152,18 @@ class RecordedStream:
 
     def _end_recording(self) -> None:
         """End the present recording, and close its recorder unless the caller has opened the recorder."""
-        recorder = self.recorder
         self.recorder = None
-        if recorder is not None and recorder is not self._caller_recorder:
-            recorder.close()
+        self._opened_recorder.close()
 
     def _record_event(self, **event: bool | str | Marker) -> None:
         """Write an event to the recording, if there is a recording; see `Recorder.event`."""
         if self.recorder is not None:
             self.recorder.event(**event)
 
-    def _continue_loading(self) -> None:
-        """Use a requested model if it has been loaded, and begin to load the next requested model if there is one.
-
-        Each model is loaded in a separate thread, so that the stream does not have to wait. Only one model is loaded at
-        a time.
-        """
-        if self._loading_model is not None and self._loading_model.done():
-            self._use_loaded_model(self._loading_model)
-            self._loading_model = None
-        if self._next_load is not None and self._loading_model is None:
-            load = self._next_load
-            self._next_load = None
-            loader = ThreadPoolExecutor(1, "model")
-            self._loading_model = loader.submit(load)
-            loader.shutdown(wait=False)  # the thread ends after this model
+    def _begin_loading(self, load: Load) -> None:
+        """Load a model in another thread, so that the stream does not have to wait, and then request its use."""
+        loading = self._loader.submit(load)
+        loading.add_done_callback(lambda loaded: self._requests.append(partial(self._use_loaded_model, loaded)))
 
     def _use_loaded_model(self, loading_result: "Future[Predictor]") -> None:
         """Use a newly loaded model for all later chunks, and write its label to the recording.
