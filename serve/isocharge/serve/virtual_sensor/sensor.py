@@ -115,7 +115,7 @@ MAX_RANDOM_OFFSET_pC = 20.0
 class VirtualSensor:
     """Context manager that plays a script repeatedly while the context is active.
 
-    Readers may open and close the port at any time. Entering the context resets the counters.
+    Readers may open and close the port at any time. The context can be entered only once.
 
     Attributes:
         script: The presses that are played.
@@ -136,7 +136,7 @@ class VirtualSensor:
         charges: Charges,
         script: Script,
         *,
-        noise: Noise | None = None,
+        noise: Noise = lambda charge_pC, _: charge_pC,
         offset_pC: Sequence[float] | None = None,
         seed: int = 0,
         encode: Encode = encode_frame,
@@ -148,7 +148,7 @@ class VirtualSensor:
         Args:
             charges: Forward map. It is called once, for the frames in which something touches.
             script: The presses.
-            noise: Amplifier; None for charges without noise.
+            noise: Amplifier. By default, the measured charges are the charges of the film.
             offset_pC: Constant charge on each electrode, pC, which the reader subtracts as its tare. By default the
                 charges are drawn at random.
             seed: Seed of noise, offset and faults.
@@ -176,7 +176,6 @@ class VirtualSensor:
         self.corrupted = 0
         self.paused_s = 0.0
         self._frame_count = 0
-        self._first_frame_of_script = 0  # number of the frame with which the script began
         self._stop = threading.Event()
         self._writer: threading.Thread | None = None
         self._port_stack = contextlib.ExitStack()  # closes the port and removes the link
@@ -215,39 +214,24 @@ class VirtualSensor:
     def frames(self) -> Iterator[bytes]:
         """Compute the frames of the script, and yield the bytes of each frame without waiting until the frame is due.
 
-        The bytes are empty if the frame is lost because of a fault. The counters of lost and corrupted frames are reset
-        to 0 at the beginning.
+        The bytes are empty if the frame is lost because of a fault.
 
         The charges are computed in blocks of frames. A new script takes effect at the beginning of a block. The script
         is repeated without end until another script is given.
         """
-        self.lost = 0
-        self.corrupted = 0
-        self._first_frame_of_script = 0
+        first_frame_of_script = 0
         block_size = max(1, round(BLOCK_S * self.script.rate_Hz))
         for first_frame_of_block in itertools.count(step=block_size):
             if self._next_script is not None:
                 self.script, self._clean_pC = self._next_script
                 self._next_script = None
-                self._first_frame_of_script = first_frame_of_block
-            first_row = first_frame_of_block - self._first_frame_of_script
+                first_frame_of_script = first_frame_of_block
+            first_row = first_frame_of_block - first_frame_of_script
             rows = range(first_row, first_row + block_size)
-            block_pC = self._measured_charges(rows) + self._offset_pC  # shape (block_size, electrodes)
+            clean_pC = self._clean_pC.take(rows, axis=0, mode="wrap")  # after its last row, the script begins again
+            block_pC = self._noise(clean_pC, self._rng) + self._offset_pC  # shape (block_size, electrodes)
             for frame_number, charge_pC in enumerate(block_pC.tolist(), start=first_frame_of_block):
                 yield self._frame_bytes(frame_number, tuple(charge_pC))
-
-    def _measured_charges(self, rows: range) -> Array:
-        """Return the output of the amplifier for a block of frames, shape (n, electrodes), pC.
-
-        If the sensor has no amplifier, the result is the touch charges without noise.
-
-        Args:
-            rows: Rows of the script for the n frames. After its last row, the script begins again at row 0.
-        """
-        clean_pC = self._clean_pC.take(rows, axis=0, mode="wrap")  # touch charges without noise
-        if self._noise is None:
-            return clean_pC
-        return self._noise(clean_pC, self._rng)
 
     def _frame_bytes(self, frame_number: int, charge_pC: tuple[float, ...]) -> bytes:
         """Encode a frame, and apply the faults of the transmission to its bytes. Count lost and damaged frames.
@@ -275,14 +259,11 @@ class VirtualSensor:
         return damaged_data
 
     def __enter__(self) -> Self:
-        """Reset the counters, open the port, and start the thread that writes the frames.
+        """Open the port, and start the thread that writes the frames.
 
         Raises:
             InputError: If the link cannot be created.
         """
-        self._frame_count = 0
-        self.withheld = 0
-        self.paused_s = 0.0
         port = PseudoPort()
         self._port_stack.callback(port.close)
         if self._link:
@@ -295,7 +276,6 @@ class VirtualSensor:
                 ) from error
             self._port_stack.callback(self._link.unlink, missing_ok=True)
         self.port_path = port.url
-        self._stop.clear()
         self._writer = threading.Thread(target=self._play, args=(port,), name="virtual sensor", daemon=True)
         self._writer.start()
         return self
