@@ -135,20 +135,6 @@ def contacts_of(states: Array) -> Array:
     return np.column_stack([states[:, POSITION], np.exp(states[:, 2])])
 
 
-def predict_components(components: Components, dt_s: float) -> Components:
-    """Predict the components at a later time, with constant rates and a random white acceleration.
-
-    Args:
-        components: Components after an update.
-        dt_s: Time between the update and the prediction, s.
-    """
-    transition = np.eye(components.mean.shape[1])
-    transition[VALUES, RATES] = dt_s * np.eye(3)
-    covariance = transition @ components.covariance @ transition.T
-    covariance[:, MOTION, MOTION] += process_noise(components.mean[:, VELOCITY], FORCE_ACCELERATION_DENSITY, dt_s)
-    return Components(components.mean @ transition.T, covariance, components.log_weight)
-
-
 class UpdatedComponents(NamedTuple):
     """Components after an update.
 
@@ -460,7 +446,9 @@ def _hypotheses_of(components: Components, is_across_fold: Booleans, misfit: flo
 
 
 def _predicted(components: Components, dt_s: float) -> Components:
-    """Predict the components, and add one component whose rates have changed to unknown values.
+    """Predict the components at a later time, and add one component whose rates have changed to unknown values.
+
+    The rates are constant except for a random white acceleration.
 
     Args:
         components: Components after the previous step. The added component has the contact of the first component,
@@ -473,4 +461,10 @@ def _predicted(components: Components, dt_s: float) -> Components:
     changed.covariance[:, :, RATES] = 0.0
     changed.covariance[:, RATES, RATES] = np.diag(INITIAL_RATE_STD**2)
     log_weight = changed.log_weight + math.log(dt_s / MEAN_MODE_TIME_s)
-    return predict_components(components.joined(changed._replace(log_weight=log_weight)), dt_s)
+    present = components.joined(changed._replace(log_weight=log_weight))
+
+    transition = np.eye(present.mean.shape[1])
+    transition[VALUES, RATES] = dt_s * np.eye(3)
+    covariance = transition @ present.covariance @ transition.T
+    covariance[:, MOTION, MOTION] += process_noise(present.mean[:, VELOCITY], FORCE_ACCELERATION_DENSITY, dt_s)
+    return present._replace(mean=present.mean @ transition.T, covariance=covariance)
