@@ -18,7 +18,7 @@ from isocharge.serve.live.device import ANY_BOARD, create_stages
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.file_source import Chunk
 from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, Charges, PredictionRecord
-from isocharge.serve.signal_chain.stage import Device, Setup, Stage
+from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.tracker import TrackRule
 
@@ -84,12 +84,12 @@ class ReadingStream:
         """Begin without any byte."""
         self.parser = self._device.parser()
         self.clock = DeviceClock()
-        self._charge_stages: list[Stage] = create_stages(self._setup)
+        self._stages = create_stages(self._setup)
         self._pending_flags: list[str] = []  # flags that the next frame gets
 
     def tare(self) -> None:
         """Discard the tare and the present touch, and measure the tare again from the next quiet frames."""
-        for stage in self._charge_stages:
+        for stage in self._stages:
             stage.reset()
 
     def restart(self) -> None:
@@ -105,7 +105,7 @@ class ReadingStream:
         return self._before_restart + self.parser.counts
 
     def frames(self, chunk: Chunk) -> Iterator[Frame]:
-        """Process a chunk, and yield each frame whose last byte is in the chunk, with its touch charges.
+        """Process a chunk, and yield each frame whose last byte is in the chunk, after all stages of the stream.
 
         If the chunk follows an outage of the port, the state before the outage is discarded first.
 
@@ -123,7 +123,7 @@ class ReadingStream:
         for frame in frames:
             frame.flags = [*self._pending_flags, *parser.sequence_flags(frame.seq)]
             self._pending_flags = []
-            for stage in self._charge_stages:
+            for stage in self._stages:
                 stage.step(frame)
             yield frame
 
@@ -193,9 +193,14 @@ class TouchStream(ReadingStream):
             ModelError: If the device file requires an estimate of the pretension, but the pretension of this film
                 cannot be estimated with the model.
         """
-        super().__init__(predictor.metadata.electrodes, device, predictor=predictor)
+        self.predictor = predictor
         self._given_name = frame_id
-        self._set_model(predictor)
+        super().__init__(predictor.metadata.electrodes, device, predictor=predictor)
+
+    def _begin(self) -> None:
+        """Begin without any byte, and with new stages that compute contacts."""
+        super()._begin()
+        self._set_model(self.predictor)
 
     def _set_model(self, predictor: Predictor) -> None:
         """Create the stages that compute contacts, and use them from the next frame on.
@@ -204,9 +209,10 @@ class TouchStream(ReadingStream):
             ModelError: If a stage cannot use the model. The present stages and their model then remain in use.
         """
         present_predictor = self._setup.model
+        charge_stages = [stage for stage in self._stages if not stage.needs_contact]
         self._setup.use(predictor)
         try:
-            self._contact_stages = create_stages(self._setup, needs_contact=True)
+            self._stages = charge_stages + create_stages(self._setup, needs_contact=True)
         except ModelError:
             self._setup.use(present_predictor)
             raise
@@ -246,20 +252,6 @@ class TouchStream(ReadingStream):
         """
         return self._device.rule(FollowRule) is not None
 
-    def tare(self) -> None:
-        """Discard the tare and the present touch, and measure the tare again from the next quiet frames."""
-        super().tare()
-        for stage in self._contact_stages:
-            stage.reset()
-
-    def restart(self) -> None:
-        """Return to the state of a new stream, so that all later records depend only on later bytes.
-
-        Only the counts that `totals` returns include the time before the restart.
-        """
-        super().restart()
-        self._set_model(self.predictor)
-
     def feed(self, chunk: Chunk) -> Iterator[PredictionRecord]:
         """Process a chunk, and yield the records of the frames whose last byte is in the chunk.
 
@@ -272,14 +264,12 @@ class TouchStream(ReadingStream):
             yield self._record(chunk, frame)
 
     def _record(self, chunk: Chunk, frame: Frame) -> PredictionRecord:
-        """Compute the contact of a frame, and return the prediction record of the frame.
+        """Return the prediction record of a frame.
 
         Args:
             chunk: The chunk that contains the last byte of the frame.
-            frame: The frame with its touch charges.
+            frame: The frame after all stages.
         """
-        for stage in self._contact_stages:
-            stage.step(frame)
         if frame.contact is not None:
             contact_fields = frame.contact._asdict()
         else:
