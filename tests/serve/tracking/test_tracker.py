@@ -65,25 +65,18 @@ def track_contacts(contacts, rate_Hz=1000.0):
     Returns:
         The tracked contacts, shape (n, 9), and the events with the numbers of their frames.
     """
-    tracker = new_tracker(lasting=0.0)
-    rows = []
-    events = []
-    for number, contact in enumerate(contacts):
-        tracked, event = track(tracker, contact, number / rate_Hz)
-        rows.append(structs.astuple(tracked))
-        if event is not None:
-            events.append((number, event))
-    return np.array(rows), events
+    results = update_all(new_tracker(lasting=0.0), contacts, 0.0, rate_Hz=rate_Hz)
+    return np.array([structs.astuple(tracked) for tracked, _ in results]), events_of(results)
 
 
-def update_all(tracker, contacts, begin_s, flags=()):
-    """Track contacts at 1 kHz from a time on, s; return the results of all updates."""
-    return [track(tracker, contact, begin_s + number / 1000.0, flags) for number, contact in enumerate(contacts)]
+def update_all(tracker, contacts, begin_s, flags=(), rate_Hz=1000.0):
+    """Track contacts from a time on, s; return the results of all updates."""
+    return [track(tracker, contact, begin_s + number / rate_Hz, flags) for number, contact in enumerate(contacts)]
 
 
 def events_of(results):
-    """Return the events among the results of updates."""
-    return [event for _, event in results if event is not None]
+    """Return the events among the results of updates, each after the number of its frame."""
+    return [(number, event) for number, (_, event) in enumerate(results) if event is not None]
 
 
 def position_errors(tracked, path):
@@ -188,34 +181,30 @@ def test_single_outlier_is_ignored():
     assert np.abs(tracked[50:, [X, Y]]).max() < 2.0 * STD
 
 
-def test_events_press_hold_slide_hold_of_a_slide():
-    path, _ = slide(50.0)
-    _, events = track_path(path)
-    assert [event for _, event in events] == ["press", "hold", "slide", "hold"]
-    assert [number / 1000.0 for number, _ in events] == pytest.approx([0.0, 0.2, 0.31, 0.8], abs=0.03)
-
-
-def test_velocity_of_a_slide_and_event_release():
+def test_velocity_and_events_of_a_slide():
     path, _ = slide(50.0, direction=math.radians(40.0))
     tracker = new_tracker()
     results = update_all(tracker, noisy_contacts(path), begin_s=0.0)
+    numbers, events = zip(*events_of(results), strict=True)
+    assert events == ("press", "hold", "slide", "hold")
+    assert np.array(numbers) / 1000.0 == pytest.approx([0.0, 0.2, 0.31, 0.8], abs=0.03)
     vx, vy = np.mean([(tracked.vx_mm_s, tracked.vy_mm_s) for tracked, _ in results[400:590]], axis=0)
     assert math.hypot(vx, vy) == pytest.approx(50.0, rel=0.03)
     assert math.degrees(math.atan2(vy, vx)) == pytest.approx(40.0, rel=0.03)
 
     last_tracked, _ = results[-1]
-    assert track(tracker, None, 0.85, (INVALID,)) == (last_tracked, None)
-    assert track(tracker, None, 0.9) == (None, "release")
-    assert track(tracker, None, 0.95) == (None, None)
+    assert track(tracker, None, 0.95, (INVALID,)) == (last_tracked, None)
+    assert track(tracker, None, 1.0) == (None, "release")
+    assert track(tracker, None, 1.05) == (None, None)
 
 
 def test_event_tap_of_a_short_press_and_event_release_of_a_short_slide():
     tracker = new_tracker()
     tap = update_all(tracker, noisy_contacts(np.zeros(100)), begin_s=1.0)
-    assert events_of(tap) == ["press"]
+    assert events_of(tap) == [(0, "press")]
     assert track(tracker, None, 1.1) == (None, "tap")
     swipe = update_all(tracker, noisy_contacts(0.1 * np.arange(100)), begin_s=2.0)
-    assert events_of(swipe) == ["press", "slide"]
+    assert [event for _, event in events_of(swipe)] == ["press", "slide"]
     assert track(tracker, None, 2.1) == (None, "release")
 
 
@@ -233,9 +222,9 @@ def test_touch_continues_if_the_clock_is_set_back():
     tracker = new_tracker()
     before = update_all(tracker, noisy_contacts(np.zeros(100)), begin_s=100.0)
     after = update_all(tracker, noisy_contacts(np.zeros(200)), begin_s=50.0)
-    assert events_of(before) == ["press"]
-    hold_frames = [number for number, (_, event) in enumerate(after) if event == "hold"]
-    assert hold_frames == pytest.approx([100], abs=30)
+    assert events_of(before) == [(0, "press")]
+    ((hold_frame, event),) = events_of(after)
+    assert (event, hold_frame) == ("hold", pytest.approx(100, abs=30))
     assert track(tracker, None, 50.2) == (None, "release")
 
 
