@@ -68,10 +68,10 @@ floor_pC = 10.0
 NOISE = 'like = "bench"\nwhite_pC = 0.5\ntau_s = 1.0\nlimit_pC = inf\nbits = 0\n'
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
+@pytest.fixture
+def files(tmp_path):
     """A folder of good files, which the functions of KINDS read."""
-    folder = tmp_path_factory.mktemp("files")
+    folder = tmp_path
     sensors = ROOT / "simulate/isocharge/simulate/sensors"
     shutil.copy(sensors / "three-25um-biaxial.toml", folder / "sensor.toml")
     (folder / "device.toml").write_text(DEVICE)
@@ -148,22 +148,35 @@ FAULTS = {
 """Number of inputs, and what makes one of them from a good file."""
 
 
+def json_with_junk(rng, good):
+    """Return a file of JSON with junk in one place of it."""
+    return json.dumps(with_junk(rng, json.loads(good))).encode()
+
+
+@pytest.fixture
+def attack_file(attack):
+    """Function that reads a good file, and then sends versions of it, which `make` returns, to the reader of a path."""
+
+    def send(name, path, read, make, count):
+        good = path.read_bytes()
+        read(path)
+
+        def read_bytes(data):
+            path.write_bytes(data)
+            read(path)
+
+        attack(name, read_bytes, lambda rng: make(rng, good), count)
+        path.write_bytes(good)
+
+    return send
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("faults", FAULTS)
-def test_settings_and_recordings(kind, faults, files, attack):
+def test_settings_and_recordings(kind, faults, files, attack_file):
     file, read = KINDS[kind]
-    path = files / file
-    good, (count, make) = path.read_bytes(), FAULTS[faults]
-    read(path)
-
-    def read_bytes(data):
-        path.write_bytes(data)
-        try:
-            read(path)
-        finally:
-            path.write_bytes(good)
-
-    attack(f"{kind} {faults}", read_bytes, lambda rng: make(rng, good), count)
+    count, make = FAULTS[faults]
+    attack_file(f"{kind} {faults}", files / file, read, make, count)
 
 
 def test_tables_with_junk(attack, model):
@@ -181,17 +194,16 @@ def test_tables_with_junk(attack, model):
     def read_props(value):
         ModelMetadata.from_props({str(name): json.dumps(item) for name, item in value.items()}, "junk")
 
+    def read_device(value):
+        create_stages(Setup(("A", "B", "C"), device_from_table(value, "junk")))
+
     def table(rng, good):
         return {name: with_junk(rng, item) if rng.random() < 0.3 else item for name, item in good.items()}
 
     attack("sensor tables", lambda value: sensor_from_dict(value, "junk"), lambda rng: table(rng, sensor), 12_000)
-    attack("device tables", lambda value: read_device(value, "junk"), lambda rng: table(rng, device), 12_000)
+    attack("device tables", read_device, lambda rng: table(rng, device), 12_000)
     attack("metadata", read_props, lambda rng: table(rng, props), 12_000)
     attack("golden vectors", read_golden, lambda rng: with_junk(rng, golden), 2_000)
-
-
-def read_device(value, where):
-    create_stages(Setup(("A", "B", "C"), device_from_table(value, where)))
 
 
 @pytest.fixture
@@ -234,9 +246,13 @@ def test_a_model_with_faults(model, attack):
         put_graph(model, data)
         check_golden(load_model(model))
 
-    head = 4000  # nodes and metadata; most of the rest is numbers
-    attack("files model", read, lambda rng: mutated(rng, good[:head]) + good[head:], 1_500)
+    attack("files model", read, lambda rng: mutated_head(rng, good), 1_500)  # nodes and metadata, not the numbers
     attack("files model", read, lambda rng: mutated(rng, good), 1_500)
+
+
+def mutated_head(rng, good):
+    """Return a file with faults among its first 4000 bytes."""
+    return mutated(rng, good[:4000]) + good[4000:]
 
 
 @pytest.fixture
@@ -248,28 +264,25 @@ def dataset(tmp_path):
     return write_dataset(tmp_path / "presses", load_sensor("three-25um-biaxial"), [samples], about)
 
 
-def test_calibrations_with_faults(tmp_path, attack):
+def test_calibrations_with_faults(tmp_path, attack_file):
     """A film that is taken from a file with faults is finite, and the next calibration can begin with it."""
     problem = CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))
     prior = problem.prior
-    good = film_table(problem, FilmEstimate(prior.layout, prior.mean, prior.covariance(PLANNED)))
-    text = json_text(good)
     path = tmp_path / "calibration.json"
+    path.write_text(json_text(film_table(problem, FilmEstimate(prior.layout, prior.mean, prior.covariance(PLANNED)))))
 
-    def read(data):
-        path.write_bytes(data)
+    def read(_):
         film = read_earlier(tmp_path, problem)
         assert np.isfinite(film.values).all()
         assert np.linalg.eigvalsh(film.covariance)[0] > -1e-6
 
-    read(text.encode())
-    plain = json.loads(text)
-    attack("calibration bytes", read, lambda rng: mutated(rng, text[:4000].encode()) + text[4000:].encode(), 2_000)
-    attack("calibration", read, lambda rng: json.dumps(with_junk(rng, plain)).encode(), 1_000)
-    attack("calibration numbers", read, lambda rng: number_bomb(rng, text).encode(), 500)
+    _, with_other_number = FAULTS["numbers"]
+    attack_file("calibration bytes", path, read, mutated_head, 2_000)
+    attack_file("calibration", path, read, json_with_junk, 1_000)
+    attack_file("calibration numbers", path, read, with_other_number, 500)
 
 
-def test_charge_maps_with_faults(model, attack):
+def test_charge_maps_with_faults(model, attack_file):
     """A file is accepted only with the checksum that `golden.json` contains."""
     series = ChargeSeries(
         domain=Domain(8.0, (0.05, 2.0)), electrodes=("A", "B", "C"), coefficients=np.ones((1, 2, 2, 2, 3))
@@ -277,22 +290,16 @@ def test_charge_maps_with_faults(model, attack):
     good = charge_map_bytes(series)
     put_charge_map(model, good)
 
-    def read(data):
-        (model / FILE).write_bytes(data)
+    def read(path):
         read_charge_map(model, series.electrodes)
-        assert data == good
+        assert path.read_bytes() == good
 
-    read(good)
-    attack("charges.npz bytes", read, lambda rng: mutated(rng, good), 3_000)
+    attack_file("charges.npz bytes", model / FILE, read, mutated, 3_000)
 
 
-def test_a_dataset_with_faults(dataset, attack):
+def test_a_dataset_with_faults(dataset, attack, attack_file):
     path, shard = dataset / "manifest.json", dataset / "shard-00000.npz"
     good, good_shard = path.read_bytes(), shard.read_bytes()
-
-    def read_manifest(data):
-        path.write_bytes(data)
-        read_dataset(dataset)
 
     def read_shard(data):
         shard.write_bytes(data)
@@ -301,9 +308,8 @@ def test_a_dataset_with_faults(dataset, attack):
         path.write_text(json.dumps(manifest))
         read_dataset(dataset)
 
-    attack("manifest bytes", read_manifest, lambda rng: mutated(rng, good), 5_000)
-    attack("manifest", read_manifest, lambda rng: json.dumps(with_junk(rng, json.loads(good))).encode(), 5_000)
-    path.write_bytes(good)
+    attack_file("manifest bytes", path, lambda _: read_dataset(dataset), mutated, 5_000)
+    attack_file("manifest", path, lambda _: read_dataset(dataset), json_with_junk, 5_000)
     attack("shard", read_shard, lambda rng: mutated(rng, good_shard), 5_000)
 
 
