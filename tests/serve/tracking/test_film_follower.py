@@ -191,21 +191,26 @@ def test_touches_that_agree_determine_the_pretension_better_than_touches_of_warm
         assert np.mean(np.abs(normalised) < 2.0) > 0.85
 
 
-def test_stage_counts_a_touch_with_invalid_frames_once_and_flags_the_corrected_contact(series, model):
+def test_stage_corrects_and_flags_contacts_and_counts_a_touch_with_invalid_frames_once(series, model):
+    """The records contain the estimate that the contacts were corrected for, which is that of the earlier touches."""
     rng = np.random.default_rng(1)
     _, charge = touches(series, [0.3, 0.0, 0.0], rng, 21)
     raw = model.predict(charge[20])
     model.validity = SimpleNamespace(flags=lambda contact: () if contact == raw else ("misfit",))
     stage = FollowFilm(Setup(ELECTRODES, Device(), model))
     stage._follower = followed(model, charge[:20], rng)
-    for number in range(52):
-        frame = Frame(None, None, (), clock_s=100.0 + 0.01 * number, is_valid=number % 20 != 10)
-        if frame.is_valid and number < 50:
-            frame.charge_pC = charge[20]
-            frame.set_contact(raw, model.validity)
-        stage.step(frame)
-        assert frame.contact_flags == (("misfit",) if frame.contact else ())
-    assert stage._follower.film.touches == 21
+    for is_lost in (False, True):
+        stage._follower.is_lost = is_lost
+        for number in range(52):
+            frame = Frame(None, None, (), clock_s=100.0 + 0.01 * number, is_valid=number % 20 != 10)
+            if frame.is_valid and number < 50:
+                frame.charge_pC = charge[20]
+                frame.set_contact(raw, model.validity)
+            stage.step(frame)
+            assert frame.contact_flags == (("misfit",) if frame.contact else ())
+            assert frame.flags == (["film"] if frame.contact and is_lost else [])
+            assert frame.film.touches == 20 + is_lost
+    assert stage._follower.film.touches == 22
 
 
 def test_film_that_is_lost_again_keeps_the_state_of_the_latest_touches(series, model):
