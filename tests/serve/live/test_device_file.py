@@ -88,19 +88,14 @@ def test_device_without_a_file_has_tare_and_touch(device):
     assert isinstance(ANY_BOARD.parser(), AutoParser)
 
 
-def converted(board, values):
-    """Return the charges of values that a board sends, shape (3,), pC."""
-    frame = Frame(None, None, ())
-    frame.sent = np.asarray(values)
-    Gain(Setup(ELECTRODES, board)).step(frame)
-    return frame.charge_pC
-
-
 def test_offset_is_subtracted_before_the_gain(device):
     """The offset is one number, such as half of the range of a converter, or one number for each electrode."""
     for offset, zero in (("8388608", [8388608] * 3), ("{A = 1, B = 2, C = 3}", [1, 2, 3])):
         board = device(f"[gain]\noffset = {offset}\npC_per_unit = {{A = 0.5, B = -0.5, C = 1}}\n")
-        np.testing.assert_array_equal(converted(board, np.array(zero) + 10.0), [5.0, -5.0, 10.0])
+        frame = Frame(None, None, ())
+        frame.sent = np.array(zero) + 10.0
+        Gain(Setup(ELECTRODES, board)).step(frame)
+        np.testing.assert_array_equal(frame.charge_pC, [5.0, -5.0, 10.0])
 
 
 def test_device_file_with_a_request(device):
@@ -216,27 +211,6 @@ def test_advice_for_the_channels_is_a_valid_device_file():
         Channels(Setup(electrodes)).step(Frame(0, 0, (1.0, 2.0)))
     advice = str(error.value).partition("[channels] ")[2]
     assert tuple(tomllib.loads(advice.replace(", ", "\n"))) == electrodes
-
-
-@pytest.mark.parametrize(
-    "notation",
-    [
-        "C,A,B: {c},{a},{b}",
-        "C A B {c} {a} {b}",
-        "C/A/B={c}/{a}/{b}",
-        '{{"electrodes": ["C", "A", "B"], "q": [{c}, {a}, {b}]}}',
-        '[{{"name": "C", "q": {c}}}, {{"name": "A", "q": {a}}}, {{"name": "B", "q": {b}}}]',
-        "{c} pC C, {a} pC A, {b} pC B",
-        "electrode,C,charge,{c},electrode,A,charge,{a},electrode,B,charge,{b}",
-        "C,{c},A,{a},B,{b},T,23",
-        "phase A: {a}, {b}, {c}",
-    ],
-)
-def test_names_in_a_line_of_text_are_not_ignored(notation):
-    lines = "".join("\n" + notation.format(a=100.5 + n, b=200.5 + n, c=300.5 + n) for n in range(12))
-    frame = TextParser().feed(lines.encode())[0]
-    Channels(Setup(ELECTRODES)).step(frame)
-    assert frame.sent.tolist() == [100.5, 200.5, 300.5]
 
 
 def test_tare_error_states_the_offset_for_the_device_file():

@@ -99,17 +99,10 @@ def test_certificate_that_is_a_pipe_is_refused(tmp_path):
         Tls(tmp_path / "cert.pem").context()
 
 
-@pytest.mark.parametrize("scheme", ["Bearer", "bearer", "BEARER", "bEaReR"])
-def test_scheme_of_the_token_is_case_insensitive(scheme):
+def test_token_needs_the_bearer_scheme_in_any_case():
     access = AccessCheck(token="sesame")
-    access.check_token(f"{scheme} sesame".encode())
-    access.check_token(f"{scheme}  sesame".encode())
-    for wrong in ("Sesame", "sesam", "", "sesame "):
-        with pytest.raises(TokenError):
-            access.check_token(f"{scheme} {wrong}".encode())
-
-
-@pytest.mark.parametrize("header", [b"sesame", b"Basic sesame", b"Bearersesame", b"Bearer", b" Bearer sesame", b""])
-def test_token_without_the_bearer_scheme_is_refused(header):
-    with pytest.raises(TokenError, match="`Authorization: Bearer TOKEN`"):
-        AccessCheck(token="sesame").check_token(header)
+    for accepted in (b"Bearer sesame", b"bEaReR sesame", b"bearer  sesame"):
+        access.check_token(accepted)
+    for wrong in (b"Bearer Sesame", b"Bearer sesam", b"Bearer ", b"Bearer sesame ", b"sesame", b"Basic sesame", b""):
+        with pytest.raises(TokenError, match="`Authorization: Bearer TOKEN`"):
+            access.check_token(wrong)

@@ -14,7 +14,7 @@ from isocharge.serve.live.device import device_from_table
 from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.model.metadata import ModelNoise
-from isocharge.serve.tracking.contact_mixture import GAIN_STD, Components, ContactMixture, _hypotheses_of
+from isocharge.serve.tracking.contact_mixture import GAIN_STD, ContactMixture
 from model_files import put_charge_map
 from stage_runner import new_tracker, recorded_lines
 from stage_runner import track as track_frame
@@ -131,15 +131,6 @@ def test_sliding_contact_is_followed_across_a_fold(rate_Hz, speed, gains):
     has_exact_gains = gains == (1.0, 1.0, 1.0)
     if has_exact_gains:
         assert len(end_errors_mm) == 1
-
-
-@pytest.mark.parametrize(("distance_mm", "count"), [(0.1, 1), (1.0, 2)])
-def test_components_at_different_places_are_different_contacts(distance_mm, count):
-    mean = np.zeros((2, 6))
-    mean[1, 0] = distance_mm
-    components = Components(mean, np.array([0.05**2 * np.eye(6)] * 2), np.log([0.6, 0.4]))
-    hypotheses = _hypotheses_of(components, np.zeros((2, 2), dtype=bool), misfit=1.0)
-    assert [hypothesis.probability for hypothesis in hypotheses] == pytest.approx([1.0] if count == 1 else [0.6, 0.4])
 
 
 def test_contact_that_turns_back_in_front_of_a_fold_stays_on_its_side():

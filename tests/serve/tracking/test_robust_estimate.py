@@ -1,10 +1,9 @@
 """Robust estimate of a state that presses share, compared with `scipy.optimize.least_squares`."""
 
 import numpy as np
-import pytest
 from scipy.optimize import least_squares
 
-from isocharge.serve.model.robust_estimate import MeasuredContacts, ModelValues, Prior, robust_estimate
+from isocharge.serve.model.robust_estimate import ModelValues, Prior, robust_estimate
 
 DIRECTION = 0.2 * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 STATE_EFFECT = np.array([[0.3, 0.1, 0.2, 0.15], [0.02, -0.05, 0.04, 0.01]])
@@ -18,20 +17,11 @@ def log_charge(contact, state):
 
 
 def model(contact, state):
-    """Charges and their derivatives by central differences, except for those of the state."""
-    charge = np.exp(log_charge(contact, state))
-    step = 1e-6
-    by_contact = np.stack(
-        [
-            (np.exp(log_charge(contact + step * unit, state)) - np.exp(log_charge(contact - step * unit, state)))
-            / (2.0 * step)
-            for unit in np.eye(3)
-        ],
-        axis=2,
-    )
-    shape = 1.0 + 0.2 * np.sin(contact[:, :1]) + 0.3 * contact[:, 2:]
-    by_state = charge[:, :, None] * shape[:, :, None] * STATE_EFFECT.T
-    return ModelValues(charge, by_contact, by_state)
+    """Charges, and their derivatives by complex steps."""
+    step = 1e-20
+    by_contact = [np.exp(log_charge(contact + 1j * step * unit, state)).imag / step for unit in np.eye(3)]
+    by_state = [np.exp(log_charge(contact, state + 1j * step * unit)).imag / step for unit in np.eye(2)]
+    return ModelValues(np.exp(log_charge(contact, state)), np.stack(by_contact, axis=2), np.stack(by_state, axis=2))
 
 
 def presses(rng, count, state):
@@ -46,22 +36,15 @@ def estimate(charge, start, **options):
     return robust_estimate(model, charge, covariance, prior, np.zeros(2), start, tolerance=1e-9, **options)
 
 
-@pytest.mark.parametrize("knows_place", [False, True])
-def test_gaussian_estimate_is_that_of_scipy(knows_place):
+def test_gaussian_estimate_is_that_of_scipy():
     """All unknowns are searched together there, and the covariance is the inverse of its normal matrix."""
     rng = np.random.default_rng(1)
     contact, charge = presses(rng, 12, np.array([0.4, -1.5]))
-    std = np.array([0.1, 0.1, np.inf])
-    measured = contact + np.where(np.isfinite(std), 0.1, 0.0) * rng.standard_normal(contact.shape)
-    options = {"measured": MeasuredContacts(measured, np.tile(std, (12, 1)))} if knows_place else {}
-    result = estimate(charge, contact, freedom=1e9, **options)
+    result = estimate(charge, contact, freedom=1e9)
 
     def residuals(unknowns):
         state, contacts = unknowns[:2], unknowns[2:].reshape(-1, 3)
-        parts = [(np.exp(log_charge(contacts, state)) - charge) / NOISE, state / [0.5, 2.0]]
-        if knows_place:
-            parts.append((contacts - measured)[:, :2] / 0.1)
-        return np.concatenate([np.ravel(part) for part in parts])
+        return np.concatenate([np.ravel(np.exp(log_charge(contacts, state)) - charge) / NOISE, state / [0.5, 2.0]])
 
     found = least_squares(residuals, np.concatenate([np.zeros(2), contact.ravel()]), xtol=1e-12, ftol=1e-12, gtol=1e-12)
     np.testing.assert_allclose(result.state, found.x[:2], atol=1e-4)
@@ -80,6 +63,3 @@ def test_presses_that_no_contact_explains_hardly_count():
     assert (np.delete(robust.chi2, np.s_[::6]) < 8.5).all()
     deviation = robust.state - state
     assert deviation @ np.linalg.solve(robust.covariance, deviation) < 13.8  # 99.9 % of a chi-square of 2 degrees
-    not_robust = estimate(charge, contact, freedom=1e9)
-    deviation = not_robust.state - state
-    assert deviation @ np.linalg.solve(not_robust.covariance, deviation) > 30.0

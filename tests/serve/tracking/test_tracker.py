@@ -9,7 +9,6 @@ from msgspec import structs
 
 from isocharge.serve import Contact, Predictor
 from isocharge.serve.flags import INVALID
-from isocharge.serve.live.device import device_from_table, with_settings
 from isocharge.serve.model.model_folder import find_model, load_model
 from isocharge.serve.record.record import TrackedContact
 from isocharge.serve.tracking.motion_filter import (
@@ -285,7 +284,3 @@ def test_records_with_track_only_add_fields(film, predictor):
         assert record["other"] is None
         added = {name: record[name] for name in ("tracked", "event", "other")}
         assert record == json.loads(plain_line) | added
-
-
-def test_option_track_adds_a_section_to_the_device_file():
-    assert with_settings(device_from_table({}, "b"), "track", on=True).table == {"track": {"on": True}}
