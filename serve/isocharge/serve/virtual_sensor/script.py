@@ -212,9 +212,9 @@ def corrupt(data: bytes, fraction: float, rng: np.random.Generator) -> bytes:
     Returns:
         The bytes after the damage.
     """
-    pieces = [bytes([byte]) for byte in data]  # for each byte, the bytes that replace it
-    for index in np.flatnonzero(rng.random(len(data)) < fraction).tolist():
+    damaged = bytearray(data)
+    for index in reversed(np.flatnonzero(rng.random(len(data)) < fraction).tolist()):  # later indices do not change
         flipped = data[index] ^ (1 << int(rng.integers(8)))
-        damages = (bytes([flipped]), b"", bytes([data[index], flipped]))
-        pieces[index] = damages[rng.integers(3)]
-    return b"".join(pieces)
+        replacements = (bytes([flipped]), b"", bytes([data[index], flipped]))
+        damaged[index : index + 1] = replacements[rng.integers(3)]
+    return bytes(damaged)

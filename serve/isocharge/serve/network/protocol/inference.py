@@ -233,6 +233,9 @@ def infer(
 def _output_tensor(name: str, rows: Rows, binary_tensors: list[bytes] | None) -> dict[str, Any]:
     """Return the JSON object that describes an output in the response.
 
+    In a binary tensor, numbers are little-endian float32. Each text is preceded by its length in bytes, a 32-bit
+    unsigned integer.
+
     Args:
         name: Name of the output.
         rows: Values of the output.
@@ -240,22 +243,15 @@ def _output_tensor(name: str, rows: Rows, binary_tensors: list[bytes] | None) ->
             values.
     """
     is_text = name == FLAGS
+    values = rows.ravel()
     tensor: dict[str, Any] = {"name": name, "datatype": "BYTES" if is_text else "FP32", "shape": rows.shape}
     if binary_tensors is None:
-        values = rows.ravel()
         tensor["data"] = values.tolist() if is_text else values  # orjson writes arrays of numbers only
+        return tensor
+    if is_text:
+        data = b"".join(struct.pack("<I", len(text)) + text.encode() for text in values)
     else:
-        binary_tensors.append(_binary_tensor(rows))
-        tensor["parameters"] = {"binary_data_size": len(binary_tensors[-1])}
+        data = values.astype("<f4", copy=False).tobytes()
+    binary_tensors.append(data)
+    tensor["parameters"] = {"binary_data_size": len(data)}
     return tensor
-
-
-def _binary_tensor(rows: Rows) -> bytes:
-    """Convert the values of an output to a little-endian binary tensor.
-
-    Numbers are written as float32. Each text is preceded by its length in bytes, which is written as a 32-bit unsigned
-    integer.
-    """
-    if not rows.dtype.hasobject:  # the values are numbers
-        return rows.astype("<f4", copy=False).tobytes()
-    return b"".join(struct.pack("<I", len(text)) + text.encode() for text in rows.ravel().tolist())
