@@ -30,12 +30,12 @@ def readings(charge_pC, *, flags=None):
 
     Args:
         charge_pC: Charges without noise, shape (n, 4), pC.
-        flags: Function from the number of a frame to its flags.
+        flags: Flags of some frames by their numbers.
     """
     rng = np.random.default_rng(1)
     for number, clean_pC in enumerate(charge_pC):
         noisy_pC = clean_pC + noise_std(clean_pC) * rng.standard_normal(4)
-        frame_flags = flags(number) if flags else ()
+        frame_flags = (flags or {}).get(number, ())
         has_tare = TARE not in frame_flags
         frame = Frame(number, round(1e6 * number / RATE_HZ), (), clock_s=number / RATE_HZ, flags=list(frame_flags))
         frame.charge_pC = noisy_pC if has_tare else None
@@ -142,25 +142,15 @@ def test_short_press_is_refused_and_a_very_short_touch_is_ignored():
 
 
 def test_saturated_press_is_refused_and_the_next_press_is_taken():
-    def flags(number):
-        return (SATURATED,) if number == 220 else ()
-
-    results = watch_presses(rest(1), held(2), rest(1), held(2), flags=flags)
+    results = watch_presses(rest(1), held(2), rest(1), held(2), flags={220: (SATURATED,)})
     assert phases_of(results) == ["waiting", "settling", "refused", "lift", "waiting", "settling", "taken", "lift"]
     assert reasons_of(results) == ["an amplifier is at its limit: press less hard"]
 
 
 def test_press_is_refused_after_the_port_was_lost():
     """The port is lost during a press. The film is then tared again, and the rest of this press is not taken."""
-
-    def flags(number):
-        frame_flags = []
-        if number == 220:
-            frame_flags.append(RECONNECTED)
-        if number < 50 or 220 <= number < 320:
-            frame_flags.append(TARE)
-        return tuple(frame_flags)
-
+    flags = dict.fromkeys((*range(50), *range(220, 320)), (TARE,))
+    flags[220] = (RECONNECTED, TARE)
     results = watch_presses(rest(1), held(0.5), rest(1), held(2), flags=flags)
     assert phases_of(results) == [
         "taring",

@@ -19,24 +19,12 @@ ELECTRODES = ("A", "B")
 
 
 def test_csv_has_the_fields_of_a_record(contract, record):
-    written = record(tare_pC={"A": 1.0, "B": -2.5}, contact=True, seq=7, flags=("gap", "outside"))
-    table = io.StringIO(csv_header(ELECTRODES) + "\n" + csv_row(written, ELECTRODES) + "\n")
-    (row,) = csv.DictReader(table)
-    single_fields = [name for name in contract if not name.endswith("_pC")]
-    assert [name for name in row if "." not in name] == single_fields
-    expected = {
-        "seq": "7",
-        "x_mm": "1.234568",
-        "y_mm": "",
-        "contact": "true",
-        "flags": "gap outside",
-        "charge_pC.A": "800.062500",
-        "charge_pC.B": "",
-        "charge_raw_pC.A": "",
-        "tare_pC.A": "1.000000",
-        "tare_pC.B": "-2.500000",
-    }
-    assert expected.items() <= row.items()
+    columns = [field for field in contract for _ in (ELECTRODES if field.endswith("_pC") else "_")]
+    assert [name.partition(".")[0] for name in csv_header(ELECTRODES).split(",")] == columns
+    written = record(tare_pC={"A": 1.0, "B": -2.5}, seq=7, flags=("gap", "outside"))
+    assert csv_row(written, ELECTRODES) == (
+        "1763600000.123457,,7,1.234568,,,,,,,,,,true,800.062500,,,,1.000000,-2.500000,gap outside,,linear/1,linear-film"
+    )
 
 
 @pytest.mark.parametrize("name", ["mine, left hand", 'the "good" one', "two\nlines", "cr\rlf", " blank "])
@@ -50,12 +38,6 @@ def test_csv_quotes_electrode_names(name, record):
     assert row[f"charge_pC.{name}"] == "2.000000"
     assert row["model"] == "linear/1"
     assert None not in row
-
-
-def test_csv_has_no_quotes_in_an_ordinary_row(record):
-    assert csv_row(record(charge_pC={"A": 1.0, "B": 2.0}), ELECTRODES) == (
-        "1763600000.123457,,,1.234568,,,,,,,,,,true,1.000000,2.000000,,,,,gap,,linear/1,linear-film"
-    )
 
 
 def test_tracked_contact_and_followed_film_are_the_last_columns(record):

@@ -58,29 +58,26 @@ def samples(times_s, force_N=0.0, bits=0):
     return rows
 
 
-@given(
-    force_N=st.lists(st.floats(0, 2), min_size=1, max_size=400),
-    max_samples=st.integers(1, 50),
-    seed=st.integers(0, 1000),
-)
-def test_coalesced_samples_represent_all_records(force_N, max_samples, seed):
-    bits = np.random.default_rng(seed).integers(0, 1 << 12, len(force_N))
-    shown = coalesce(samples(1e-3 * np.arange(len(force_N)), force_N, bits), max_samples)
-    assert len(shown) == min(max_samples, len(force_N))
-    assert shown["records"].sum() == len(force_N)
+@given(count=st.integers(1, 400), max_samples=st.integers(1, 50), seed=st.integers(0, 1000))
+def test_coalesced_samples_represent_all_records(count, max_samples, seed):
+    rng = np.random.default_rng(seed)
+    force_N = rng.choice([0.0, 0.5, 1.0], count)
+    bits = rng.integers(0, 1 << 12, count)
+    shown = coalesce(samples(1e-3 * np.arange(count), force_N, bits), max_samples)
+    assert len(shown) == min(max_samples, count)
+    assert shown["records"].sum() == count
     assert np.bitwise_or.reduce(shown["flags"].astype(int)) == np.bitwise_or.reduce(bits)
-    assert shown["latency_us"][-1] == len(force_N) - 1
+    assert shown["latency_us"][-1] == count - 1
     assert (np.diff(shown["timestamp"]) > 0).all()
-    assert set(shown["force_N"].tolist()) <= set(force_N)
+    assert shown["contact"].any() == (force_N > 0.0).any()
 
 
-@given(start=st.integers(0, 90), max_samples=st.integers(1, 30))
-def test_short_tap_is_not_lost_by_coalescing(start, max_samples):
+def test_short_tap_is_not_lost_by_coalescing():
+    """The contact with the largest force represents a run that ends without a contact."""
     force_N = np.zeros(100)
-    force_N[start : start + 3] = (0.5, 1.0, 0.4)
-    shown = coalesce(samples(np.arange(100.0), force_N), max_samples)
-    assert shown["contact"].any()
-    assert shown["force_N"].max() >= 0.4
+    force_N[40:43] = (0.5, 1.0, 0.4)
+    shown = coalesce(samples(np.arange(100.0), force_N), 2)
+    assert shown[["timestamp", "force_N"]].tolist() == [(41.0, 1.0), (99.0, 0.0)]
 
 
 def test_coalescing_shows_the_latest_contact_of_a_run():
