@@ -94,17 +94,21 @@ def touches(series, state, rng, count):
     return contact, series.changes(contact, np.array(state)).charge_pC
 
 
-def followed(model, charge, rng):
-    """Return a follower that has observed touches of four frames each."""
+def followed(model, charge, rng, frames=4, noise=NOISE):
+    """Return a follower that has observed touches, and whether the film was lost after each of them.
+
+    Args:
+        frames: Number of frames of a touch.
+        noise: Noise of the frames.
+    """
     follower = FilmFollower(model)
-    clock_s = 0.0
-    for row in charge:
-        for frame in NOISE.add(np.repeat(row[None], 4, axis=0), rng):
-            follower.observe_frame(frame, model.predict(frame), (), clock_s)
-            clock_s += 0.01
-        follower.observe_frame(None, None, (), clock_s)
-        clock_s += 1.0
-    return follower
+    was_lost = []
+    for number, row in enumerate(charge):
+        for frame in noise.add(np.repeat(row[None], frames, axis=0), rng):
+            follower.observe_frame(frame, model.predict(frame), (), float(number))
+        follower.observe_frame(None, None, (), number + 0.04)
+        was_lost.append(follower.is_lost)
+    return follower, was_lost
 
 
 def force_errors(follower, model, contact, charge):
@@ -122,8 +126,8 @@ def test_changes_of_the_film_and_of_a_gain_are_followed(series, model, change_MP
     rng = np.random.default_rng(4)
     contact, charge = touches(series, [change_MPa, 0.7, -0.8], rng, 80)
     charge[:, 0] *= gain
-    follower = followed(model, charge[:50], rng)
-    assert not follower.is_lost
+    follower, was_lost = followed(model, charge[:50], rng)
+    assert not was_lost[-1]
     assert abs(follower.film.pretension_MPa - 1.0 - change_MPa) < 3.0 * follower.film.pretension_std_MPa + 0.01
     relative, normalised = force_errors(follower, model, contact[50:], NOISE.add(charge[50:], rng))
     assert np.sqrt(np.mean(relative**2)) < largest_error
@@ -142,11 +146,8 @@ def test_film_is_followed_with_the_noise_that_the_device_file_states(series, tmp
     noise = NoiseModel("bench", 5.0, 0.02)
     model = model_in(tmp_path, series, noise)
     _, charge = touches(series, [0.3, 0.7, -0.8], rng, 80)
-    follower = FilmFollower(model)
-    for number, row in enumerate(noise.add(charge, rng)):
-        follower.observe_frame(row, model.predict(row), (), float(number))
-        follower.observe_frame(None, None, (), number + 0.5)
-        assert not follower.is_lost
+    follower, was_lost = followed(model, charge, rng, 1, noise)
+    assert not any(was_lost)
     assert abs(follower.film.pretension_MPa - 1.3) < 2.0 * follower.film.pretension_std_MPa
     assert follower.film.pretension_std_MPa < 0.2
 
@@ -157,7 +158,7 @@ def test_a_sudden_change_is_followed_after_twenty_touches(series, model, change_
     rng = np.random.default_rng(1)
     _, charge_before = touches(series, [0.0, 0.7, -0.8], rng, 40)
     contact, charge = touches(series, [change_MPa, 0.7, -0.8], rng, 60)
-    follower = followed(model, np.concatenate([charge_before, charge[:20]]), rng)
+    follower, _ = followed(model, np.concatenate([charge_before, charge[:20]]), rng)
     relative, normalised = force_errors(follower, model, contact[20:], NOISE.add(charge[20:], rng))
     assert np.sqrt(np.mean(relative**2)) < 0.05
     assert np.mean(np.abs(normalised) < 2.0) > 0.85
@@ -172,11 +173,8 @@ def test_nearly_slack_film_that_has_not_changed_is_not_lost(series, tmp_path):
     )
     model = model_in(tmp_path, slack)
     _, charge = touches(slack, np.zeros(3), rng, 100)
-    follower = FilmFollower(model)
-    for number, row in enumerate(NOISE.add(charge, rng)):
-        follower.observe_frame(row, model.predict(row), (), float(number))
-        follower.observe_frame(None, None, (), number + 0.5)
-        assert not follower.is_lost
+    _, was_lost = followed(model, charge, rng, 1)
+    assert not any(was_lost)
 
 
 def test_touches_that_agree_determine_the_pretension_better_than_touches_of_warm_fingers(series, model):
@@ -184,7 +182,8 @@ def test_touches_that_agree_determine_the_pretension_better_than_touches_of_warm
     rng = np.random.default_rng(3)
     contact, charge = touches(series, [0.3, 0.7, -0.8], rng, 100)
     warmth_pC = 10.0 * rng.standard_normal((60, 1))
-    agreeing, warm = followed(model, charge[:60], rng), followed(model, charge[:60] + warmth_pC, rng)
+    agreeing, _ = followed(model, charge[:60], rng)
+    warm, _ = followed(model, charge[:60] + warmth_pC, rng)
     assert agreeing.film.pretension_std_MPa < 0.85 * warm.film.pretension_std_MPa
     for follower in (agreeing, warm):
         _, normalised = force_errors(follower, model, contact[60:], NOISE.add(charge[60:], rng))
@@ -198,7 +197,7 @@ def test_stage_corrects_and_flags_contacts_and_counts_a_touch_with_invalid_frame
     raw = model.predict(charge[20])
     model.validity = SimpleNamespace(flags=lambda contact: () if contact == raw else ("misfit",))
     stage = FollowFilm(Setup(ELECTRODES, Device(), model))
-    stage._follower = followed(model, charge[:20], rng)
+    stage._follower, _ = followed(model, charge[:20], rng)
     for is_lost in (False, True):
         stage._follower.is_lost = is_lost
         for number in range(52):
@@ -217,8 +216,8 @@ def test_film_that_is_lost_again_keeps_the_state_of_the_latest_touches(series, m
     rng = np.random.default_rng(5)
     _, charge = touches(series, [0.4, 0.0, 0.0], rng, 40)
     wrong = charge[:2] * rng.uniform(0.7, 1.4, (2, 4))
-    follower = followed(model, np.concatenate([charge, wrong, charge[:10], wrong]), rng)
-    assert follower.is_lost
+    follower, was_lost = followed(model, np.concatenate([charge, wrong, charge[:10], wrong]), rng)
+    assert was_lost[-1]
     assert follower.film.pretension_MPa == pytest.approx(1.4, abs=0.1)
 
 
@@ -240,7 +239,8 @@ def test_contacts_are_corrected_from_the_first_touch(series, model):
     rng = np.random.default_rng(8)
     contact, charge = touches(series, [-0.4, 0.0, 0.0], rng, 31)
     before, normalised_before = force_errors(FilmFollower(model), model, contact[1:], charge[1:])
-    after, normalised_after = force_errors(followed(model, charge[:1], rng), model, contact[1:], charge[1:])
+    follower, _ = followed(model, charge[:1], rng)
+    after, normalised_after = force_errors(follower, model, contact[1:], charge[1:])
     assert np.mean(after**2) < np.mean(before**2)
     assert np.mean(np.abs(normalised_before) < 2.0) < 0.1
     assert np.mean(np.abs(normalised_after) < 2.0) > 0.85
@@ -249,5 +249,5 @@ def test_contacts_are_corrected_from_the_first_touch(series, model):
 def test_touches_that_no_film_explains_make_the_film_lost(series, model):
     rng = np.random.default_rng(5)
     _, charge = touches(series, series.calibrated_state, rng, 40)
-    assert followed(model, charge * rng.uniform(0.7, 1.4, charge.shape), rng).is_lost
-    assert not followed(model, charge, rng).is_lost
+    _, was_lost = followed(model, charge * rng.uniform(0.7, 1.4, charge.shape), rng)
+    assert was_lost[-1]
