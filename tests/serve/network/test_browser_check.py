@@ -169,7 +169,7 @@ def test_no_page_of_another_origin_operates_the_server_in_chromium(store, start_
     assert not any("unload" in sample.labels["route"] and sample.labels["status"] == "200" for sample in counts)
     statistics = store.get("linear", "").statistics.to_json()
     assert statistics["inference_count"] == 1  # the press of the server's own page
-    assert len(store.loaded_versions()) == 2
+    assert len(store.versions_of()) == 2
 
 
 def test_page_on_another_port_of_an_allowed_host_is_refused():

@@ -38,7 +38,7 @@ def states(store):
 
 
 def labels(store):
-    return [loaded.metadata.label for loaded in store.loaded_versions()]
+    return [loaded.metadata.label for loaded in store.versions_of()]
 
 
 def a_failing_graph(version):

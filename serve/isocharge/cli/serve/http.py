@@ -96,7 +96,7 @@ def http_command(
 
 def _log_loaded_models(store: ModelStore) -> None:
     """Log the labels of all loaded models, separated by commas."""
-    log.info("serving %s; Ctrl-C stops", ", ".join(loaded.metadata.label for loaded in store.loaded_versions()))
+    log.info("serving %s; Ctrl-C stops", ", ".join(loaded.metadata.label for loaded in store.versions_of()))
 
 
 def _load_all(store: ModelStore) -> None:

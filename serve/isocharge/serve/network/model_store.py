@@ -99,7 +99,7 @@ class ModelStore:
         self._versions: dict[str, list[Version]] = {}
         for name, folder in self._folders().items():
             self._load_versions(name, folder)
-        if not self.loaded_versions():
+        if not self.versions_of():
             searched = ", ".join(map(str, roots))
             missing = f"expected models, <name>/<version>/model.onnx, found none in {searched}; correct --models"
             raise ModelError(f"no model can be served: {'; '.join(self.refusals()) or missing}")
@@ -119,7 +119,7 @@ class ModelStore:
         if versions:
             return versions[-1]
         label = f"{name}/{version}" if version else name
-        available = ", ".join(loaded.metadata.label for loaded in self.loaded_versions()) or "no model"
+        available = ", ".join(loaded.metadata.label for loaded in self.versions_of()) or "no model"
         reasons = dict.fromkeys(row.reason for row in self._find(name, version) if row.reason)  # without repetitions
         raise ModelNotFound("; ".join([f"model {label!r:.200} is not found", f"serving: {available}", *reasons]))
 
@@ -128,26 +128,23 @@ class ModelStore:
         versions = self.versions_of(name, version)
         return versions[-1].metadata.label if versions else None
 
-    def loaded_versions(self) -> list[LoadedVersion]:
-        """Return all loaded versions of all models, sorted by name and version."""
-        return [row.loaded for row in chain(*self._versions.values()) if row.loaded]
-
-    def versions_of(self, name: str, version: str = "") -> list[LoadedVersion]:
-        """Return the loaded versions of one model, in ascending order of their numbers.
+    def versions_of(self, name: str | None = None, version: str = "") -> list[LoadedVersion]:
+        """Return loaded versions, sorted by name and number.
 
         Args:
-            name: Name of the model.
+            name: Name of the only model whose versions are returned. None selects all models.
             version: Number of the only version that is returned, as a text. An empty text selects all versions.
         """
         return [row.loaded for row in self._find(name, version) if row.loaded]
 
-    def _find(self, name: str, version: str = "") -> list[Version]:
-        """Return the versions of one model as `versions_of`, but also the versions that are not loaded."""
-        return [row for row in self._versions.get(name, []) if version in ("", str(row.number))]
-
     def refusals(self) -> list[str]:
         """Return the reasons why versions were refused or unloaded, sorted by name and version."""
-        return [row.reason for row in chain(*self._versions.values()) if row.reason]
+        return [row.reason for row in self._find() if row.reason]
+
+    def _find(self, name: str | None = None, version: str = "") -> list[Version]:
+        """Return versions as `versions_of`, but also the versions that are not loaded."""
+        rows = chain(*self._versions.values()) if name is None else self._versions.get(name, [])
+        return [row for row in rows if version in ("", str(row.number))]
 
     def index(self) -> list[dict[str, str]]:
         """Return one row for every version that is loaded, was refused or was unloaded, and for every other model.
@@ -163,7 +160,7 @@ class ModelStore:
                 "state": "READY" if row.loaded else "UNAVAILABLE",
                 "reason": row.reason,
             }
-            for row in sorted(chain(*self._versions.values(), (Version(name, 0, None, "") for name in new_names)))
+            for row in sorted([*self._find(), *(Version(name, 0, None, "") for name in new_names)])
         ]
 
     def load(self, name: str) -> None:

@@ -277,8 +277,8 @@ def test_internal_errors_are_logged_and_not_sent(ask, store, monkeypatch, caplog
     def fail(*_, **__):
         raise ZeroDivisionError("a secret")
 
-    monkeypatch.setattr(store, "loaded_versions", fail)
-    status, error = refusal(ask("GET", "/v2/health/ready"))
+    monkeypatch.setattr(store, "index", fail)
+    status, error = refusal(ask("POST", "/v2/repository/index"))
     assert (status, error) == (500, "internal error; the server's log says more")
     assert "a secret" in caplog.text
 

@@ -103,7 +103,7 @@ def _show_metrics(request: Request) -> Response:
 
 def _is_ready(request: Request) -> dict[str, bool]:
     """Check that a model is loaded. The error names no files, because it is also sent to clients without a token."""
-    if not request.store.loaded_versions():
+    if not request.store.versions_of():
         raise ModelError("not ready: no model is loaded; the repository's index has the reasons")
     return {"ready": True}
 
@@ -135,10 +135,9 @@ def _unload(request: Request) -> dict[str, Any]:
 
 def _show_statistics(request: Request) -> dict[str, Any]:
     """Return the counters of one version of a model, of all its versions, or of all versions of all models."""
-    selected = request.store.loaded_versions()
     if request.model:
         _ = request.loaded  # raises ModelNotFound
-        selected = request.store.versions_of(request.model, request.version)
+    selected = request.store.versions_of(request.model or None, request.version)
     rows = [
         {"name": loaded.metadata.name, "version": loaded.version, **loaded.statistics.to_json()} for loaded in selected
     ]
