@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from isocharge.simulate import Calibration, Circle, Electrode, load_sensor, press
-from isocharge.simulate.plots.film import FELT, INK, draw_electrodes, draw_layout, draw_section
+from isocharge.simulate.plots.film import FELT, INK, draw_deflection, draw_electrodes, draw_layout, draw_section
 
 
 def test_draw_electrodes_draws_front_and_back_at_their_positions():
@@ -36,6 +36,22 @@ def test_draw_layout_shows_all_electrodes_and_highlights_one():
     axes = Figure().subplots()
     draw_electrodes(axes, sensor, highlight="B")
     assert {text.get_text(): text.get_color() for text in axes.texts} == {"A": INK, "B": FELT, "C": INK, "D": INK}
+
+
+def test_pictures_of_an_oval_film_end_at_its_rim():
+    """The semi-axes of the oval are 48.6 mm along y and 41.4 mm along x."""
+    film = replace(load_sensor("three-25um-biaxial").film, oval=0.08, oval_axis=np.pi / 2.0)
+    solved = press(film, Circle(1.0), (0.0, 5.0), 1.0)
+    axes = Figure().subplots()
+    draw_deflection(axes, solved)
+    for drawn in (
+        axes.patches[-1].get_xy(),
+        np.concatenate([path.vertices for path in axes.collections[0].get_paths()]),
+    ):
+        np.testing.assert_allclose(np.abs(drawn).max(axis=0), [41.4, 48.6], rtol=1e-3)
+    axes = Figure().subplots()
+    draw_section(axes, solved)
+    np.testing.assert_allclose(axes.lines[0].get_xdata()[[0, -1]], [-48.6, 48.6])
 
 
 @pytest.mark.parametrize(("at", "distance"), [((3.0, -4.0), 5.0), ((0.0, 0.0), 0.0)])

@@ -13,7 +13,7 @@ from isocharge.simulate.identifiability.mirror_region import MirrorRegion
 from isocharge.simulate.layout.case import NO_NUISANCES
 from isocharge.simulate.layout.design import Design
 from isocharge.simulate.plots.figure import FELT, INK, new_figure
-from isocharge.simulate.plots.film import draw_circle, draw_electrodes, draw_working_area
+from isocharge.simulate.plots.film import draw_circle, draw_electrodes, draw_rim, draw_working_area
 from isocharge.simulate.sensor.sensor import Sensor
 
 MAX_ERROR_RATIO = 10.0
@@ -162,7 +162,7 @@ def mirror_picture(sensor: Sensor, mirror: MirrorRegion) -> Figure:
     shades = axes.pcolormesh(corners.real, corners.imag, mirror.share, vmin=0.0, vmax=1.0, cmap="Reds")
     figure.colorbar(shades, ax=axes, label="share of the forces that cannot be noticed", shrink=0.85)
 
-    draw_circle(axes, sensor.film.radius, color=INK, lw=2.0)
+    draw_rim(axes, sensor.film, color=INK, lw=2.0)
     draw_circle(axes, mirror.inner, color=INK, ls="--", lw=1.6)
     draw_electrodes(axes, sensor)
     title = (

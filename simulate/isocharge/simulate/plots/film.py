@@ -10,6 +10,7 @@ from matplotlib.patheffects import withStroke
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.plots.figure import FELT, INK
+from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, deflection
 
@@ -47,6 +48,19 @@ def draw_circle(axes: Any, radius: float, **style: Any) -> None:
         **style: Arguments that are passed to the patch of matplotlib.
     """
     axes.add_patch(Disk((0, 0), radius, fill=False, **style))
+
+
+def draw_rim(axes: Any, film: Film, **style: Any) -> None:
+    """Draw the rim of a film, which is a circle or an oval.
+
+    Args:
+        axes: Axes of matplotlib.
+        film: Film whose rim is drawn.
+        **style: Arguments that are passed to the patch of matplotlib.
+    """
+    angle = np.linspace(0.0, 2.0 * np.pi, 361)
+    rim = film.rim_distance(angle) * np.array([np.cos(angle), np.sin(angle)])
+    axes.add_patch(Patch(rim.T, fill=False, **style))
 
 
 def draw_working_area(axes: Any, radius: float, label: str = "") -> None:
@@ -100,13 +114,12 @@ def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
         axes: Axes of matplotlib.
         equilibrium: Equilibrium of the film under a press.
     """
-    radius = equilibrium.film.radius
-    x, y = _polar_grid(equilibrium.film.inner_radius, rings=240, angles=361)
+    x, y = _polar_grid(equilibrium.film, rings=240, angles=361)
     points = np.stack([x.ravel(), y.ravel()], axis=1)
     depth = deflection(equilibrium, points).reshape(x.shape)
     shades = axes.contourf(x, y, depth, levels=24, cmap="viridis_r")
     axes.figure.colorbar(shades, ax=axes, shrink=0.8, label="deflection, mm")
-    draw_circle(axes, radius, color=INK)
+    draw_rim(axes, equilibrium.film, color=INK)
     axes.set(title=f"the film under {equilibrium.force:g} N", xlabel="x, mm", ylabel="y, mm", aspect="equal")
 
 
@@ -120,8 +133,8 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
         equilibrium: Equilibrium of the film under a press.
     """
     # Draw the deflection downwards. The horizontal axis is the signed distance from the centre along the line.
-    distance_along_section = np.linspace(-1.0, 1.0, 801) * equilibrium.film.inner_radius
     distance, angle = cmath.polar(complex(*equilibrium.at))
+    distance_along_section = np.linspace(-1.0, 1.0, 801) * equilibrium.film.rim_distance(angle)
     section_points = np.outer(distance_along_section, [np.cos(angle), np.sin(angle)])
     depth = deflection(equilibrium, section_points)
     axes.plot(distance_along_section, -depth, color=INK, lw=1.5)
@@ -140,18 +153,18 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
     )
 
 
-def _polar_grid(radius: float, rings: int, angles: int) -> tuple[Array, Array]:
-    """Return the points of a polar grid on a disk. The areas between neighbouring rings are equal.
+def _polar_grid(film: Film, rings: int, angles: int) -> tuple[Array, Array]:
+    """Return the points of a polar grid on a film. The areas between neighbouring rings are equal.
 
     Args:
-        radius: Radius of the disk, mm.
+        film: The film.
         rings: Number of rings, including the centre.
         angles: Number of points on each ring.
 
     Returns:
         Coordinates x and y, each of shape (rings, angles), mm.
     """
-    distance = radius * np.sqrt(np.linspace(0.0, 1.0, rings))
+    share_of_rim = np.sqrt(np.linspace(0.0, 1.0, rings))
     angle = np.linspace(0.0, 2.0 * np.pi, angles)
-    points = np.outer(distance, np.exp(1j * angle))
+    points = np.outer(share_of_rim, film.rim_distance(angle) * np.exp(1j * angle))
     return points.real, points.imag
