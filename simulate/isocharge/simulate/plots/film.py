@@ -134,7 +134,8 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
     """
     # Draw the deflection downwards. The horizontal axis is the signed distance from the centre along the line.
     distance, angle = cmath.polar(complex(*equilibrium.at))
-    distance_along_section = np.linspace(-1.0, 1.0, 801) * equilibrium.film.rim_distance(angle)
+    rim_distance = equilibrium.film.rim_distance(np.array(angle))
+    distance_along_section = np.linspace(-1.0, 1.0, 801) * rim_distance
     section_points = np.outer(distance_along_section, [np.cos(angle), np.sin(angle)])
     depth = deflection(equilibrium, section_points)
     axes.plot(distance_along_section, -depth, color=INK, lw=1.5)
