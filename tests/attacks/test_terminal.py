@@ -88,12 +88,6 @@ def checked_terminal():
     check_terminal_text(stderr.getvalue())
 
 
-def json_lines(names):
-    for number in range(12):
-        values = {name: 1.5 * position + 0.1 * (number % 3) for position, name in enumerate(names)}
-        yield json.dumps({"seq": number} | values, ensure_ascii=number % 2 == 0).encode("utf-8") + b"\n"
-
-
 def without_separators(names):
     """The names as notations with separators can carry them, so that the lines are recognised."""
     for position, name in enumerate(names):
@@ -101,30 +95,35 @@ def without_separators(names):
         yield "A" + "".join(kept) + str(position)
 
 
-def teleplot_lines(names):
-    for number in range(12):
-        for name in without_separators(names):
-            yield f">{name}:{number}:{1.5 + 0.1 * (number % 3)}§{name}\n".encode()
+def json_line(number, names):
+    values = {name: 1.5 * position + 0.1 * (number % 3) for position, name in enumerate(names)}
+    return json.dumps({"seq": number} | values, ensure_ascii=number % 2 == 0)
 
 
-def csv_lines(names):
-    yield (",".join(names) + "\n").encode()
-    for number in range(12):
-        yield b"1.5,2.5,%d\n" % (number % 3)
+def teleplot_lines(number, names):
+    return "\n".join(f">{name}:{number}:{1.5 + 0.1 * (number % 3)}§{name}" for name in without_separators(names))
 
 
-def pair_lines(names):
-    for number in range(12):
-        yield (",".join(f"{name}:{1.5 + 0.1 * (number % 3)}" for name in without_separators(names)) + "\n").encode()
+def csv_line(number, names):
+    return f"1.5,2.5,{number % 3}" if number else ",".join(names)
 
 
-NOTATIONS = {"json": json_lines, "teleplot": teleplot_lines, "csv": csv_lines, "pairs": pair_lines}
+def pair_line(number, names):
+    return ",".join(f"{name}:{1.5 + 0.1 * (number % 3)}" for name in without_separators(names))
+
+
+NOTATIONS = {"json": json_line, "teleplot": teleplot_lines, "csv": csv_line, "pairs": pair_line}
+
+
+def sent(notation, names):
+    """Return the bytes of 13 readings with these names of channels."""
+    return [f"{NOTATIONS[notation](number, names)}\n".encode() for number in range(13)]
 
 
 @pytest.mark.parametrize("notation", NOTATIONS)
 def test_names_of_a_board_through_the_doctor(notation, attack):
     def read(names):
-        chunks = [Chunk(data, 1.7e9 + 0.005 * number, 0) for number, data in enumerate(NOTATIONS[notation](names))]
+        chunks = [Chunk(data, 1.7e9 + 0.005 * number, 0) for number, data in enumerate(sent(notation, names))]
         with checked_terminal():
             examination = examine_received(ReceivedData("/dev/ttyACM0", 115200, chunks=chunks, seconds=1.0))
             show_result(brief_report(examination), json=False)
@@ -144,7 +143,7 @@ def test_names_of_a_board_through_the_stream(notation, attack):
             channels = dict(zip("ABC", names, strict=True))
             device = device_from_table({"name": names[0], "channels": channels}, names[0])
             touch = TouchStream(predictor, device)
-            for data in NOTATIONS[notation](names[::-1] if len(names[0]) > 3 else names):
+            for data in sent(notation, names[::-1] if len(names[0]) > 3 else names):
                 for record in touch.feed(Chunk(data, 1.7e9, 0)):
                     show(record.to_json())
             logging.getLogger("isocharge.serve").warning("%s", names)

@@ -96,6 +96,7 @@ def test_moving_mode_equals_the_kalman_filter_with_constant_velocity():
     measured = RNG.standard_normal(30) * std + np.linspace(0.0, 1.0, 30)
     noise = np.diag([std**2, std**2, 1e-4])
     modes = MotionFilter(np.array([measured[0], 0.0, 0.0]), noise)
+    only_moving = np.array([0.0, 0.0, 1e-9, 1.0])
 
     transition = np.array([[1.0, dt], [0.0, 1.0]])
     process_noise = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
@@ -110,9 +111,9 @@ def test_moving_mode_equals_the_kalman_filter_with_constant_velocity():
         mean = mean + gain * (value - mean[0])
         covariance = covariance - np.outer(gain, covariance[0])
 
-        modes.probability = np.array([0.0, 0.0, 1e-9, 1.0])
+        modes.probability = only_moving
         modes.predict(dt)
-        modes.probability = np.array([0.0, 0.0, 1e-9, 1.0])
+        modes.probability = only_moving
         modes.update(np.array([value, 0.0, 0.0]), noise)
         assert modes.mean[3, [0, 3]] == pytest.approx(mean, rel=1e-6, abs=1e-6)
         np.testing.assert_allclose(modes.covariance[3][np.ix_([0, 3], [0, 3])], covariance, rtol=1e-6)
@@ -149,24 +150,15 @@ def test_irregular_times_and_the_beginning_of_a_slide_are_not_taken_for_noise(ra
     assert 0.4 < np.mean(np.square(normalised)) < 1.5
 
 
-@pytest.mark.parametrize("speed", [5.0, 50.0, 200.0])
-def test_slide_is_tracked_without_lag_and_better_than_by_any_moving_average(speed):
+@pytest.mark.parametrize(("speed", "largest_ratio"), [(5.0, 0.31), (50.0, 0.33), (200.0, 0.4)])
+def test_slide_is_tracked_without_lag_and_with_a_fraction_of_the_noise(speed, largest_ratio):
+    """The best moving average would leave 0.35, 0.67 and 0.99 of the noise."""
     path, t = slide(speed)
     is_moving = (t > 0.3) & (t < 0.6)
-    errors = []
-    measured = []
-    for _ in range(10):
-        errors.append(position_errors(track_path(path)[0], path))
-        measured.append([complex(contact.x_mm, contact.y_mm) for contact in noisy_contacts(path)])
-    errors = np.array(errors)
+    errors = np.array([position_errors(track_path(path)[0], path) for _ in range(10)])
     lag_ms = -1e3 * np.mean((errors[:, is_moving] / np.exp(0.7j)).real) / speed
     assert abs(lag_ms) < (5.0 if speed >= 20.0 else 10.0)
-
-    average_rms = []
-    for count in range(1, 50):
-        averages = np.array([np.convolve(row, np.ones(count) / count)[: len(t)] for row in measured])
-        average_rms.append(np.sqrt(np.mean(np.abs(averages - path)[:, 50:] ** 2)))
-    assert np.sqrt(np.mean(np.abs(errors[:, 50:]) ** 2)) < min(average_rms)
+    assert np.sqrt(np.mean(np.abs(errors[:, 50:]) ** 2)) < largest_ratio * math.hypot(STD, STD)
 
 
 def test_contact_that_is_lifted_and_pressed_elsewhere_is_tracked_within_three_frames():
