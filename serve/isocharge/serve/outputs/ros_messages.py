@@ -161,26 +161,11 @@ def pose_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
     xy_correlation = values.get("xy_correlation") or 0.0  # a record of an earlier version has none
     position = (1e-3 * x_mm, 1e-3 * y_mm, 0.0)
     no_rotation = (0.0, 0.0, 0.0, 1.0)  # a quaternion (x, y, z, w)
-    covariance = _pose_covariance(1e-3 * x_std_mm, 1e-3 * y_std_mm, xy_correlation)
-    return _stamped(values["frame_id"], time_ns, (*position, *no_rotation, *covariance))
-
-
-def _pose_covariance(x_std_m: float, y_std_m: float, xy_correlation: float) -> list[float]:
-    """Return the 36 elements of the covariance matrix of a pose, row by row, in m^2 and rad^2.
-
-    The matrix has 6 rows and 6 columns: x, y, z and the rotations about the axes x, y and z. Only x and y are
-    correlated.
-
-    Args:
-        x_std_m: Standard deviation of x, m.
-        y_std_m: Standard deviation of y, m.
-        xy_correlation: Correlation of the errors of x and y, dimensionless.
-    """
-    position_variances = [x_std_m**2, y_std_m**2, DEFLECTION_STD_m**2]
-    covariance = np.diag(position_variances + [ROTATION_VARIANCE_rad2] * 3)
-    covariance[[0, 1], [1, 0]] = x_std_m * y_std_m * xy_correlation  # of x and y
-    values: list[float] = covariance.ravel().tolist()
-    return values
+    # The covariance has 6 rows and columns: x, y, z and the rotations about x, y and z. Only x and y are correlated.
+    std_m = [1e-3 * x_std_mm, 1e-3 * y_std_mm, DEFLECTION_STD_m]
+    covariance = np.diag(np.append(np.square(std_m), [ROTATION_VARIANCE_rad2] * 3))
+    covariance[[0, 1], [1, 0]] = std_m[0] * std_m[1] * xy_correlation
+    return _stamped(values["frame_id"], time_ns, (*position, *no_rotation, *covariance.ravel().tolist()))
 
 
 def string_message(text: str) -> bytes:

@@ -9,14 +9,13 @@ every other number as a time series. The name of a time series is the path of th
 import socket
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from isocharge.common.errors import InputError, shown
 from isocharge.common.files import as_output_errors
-from isocharge.serve.outputs.output import FileOutput, Output, OutputContext, OutputKind, is_file_with
+from isocharge.serve.outputs.output import FileOutput, OutputContext, OutputKind, is_file_with
 from isocharge.serve.record.formats import csv_header, csv_row
 from isocharge.serve.record.record import PredictionRecord
 
@@ -94,22 +93,30 @@ class TextFile(FileOutput):
             self._file.write(text.encode())
 
 
-def _open_stdout(lines: Callable[[OutputContext], LineFormat], _: str, context: OutputContext) -> Output:
-    return StandardOutput(context.write_stdout, lines(context))
+def _text_kinds(name: str, suffix: str, lines: Callable[[OutputContext], LineFormat]) -> tuple[OutputKind, OutputKind]:
+    """Return the kinds of outputs that write lines to standard output and to a file.
+
+    Args:
+        name: Target of standard output.
+        suffix: End of the names of files.
+        lines: Function that returns the format of the lines of a stream.
+    """
+    standard_output = OutputKind(
+        form=name,
+        accepts=name.__eq__,
+        open=lambda _, context: StandardOutput(context.write_stdout, lines(context)),
+        is_standard_output=True,
+    )
+    file = OutputKind(
+        form=f"FILE{suffix}",
+        accepts=is_file_with(suffix),
+        open=lambda target, context: TextFile(Path(target), lines(context), is_live=context.is_live),
+    )
+    return standard_output, file
 
 
-def _open_file(lines: Callable[[OutputContext], LineFormat], target: str, context: OutputContext) -> Output:
-    return TextFile(Path(target), lines(context), is_live=context.is_live)
-
-
-STDOUT_JSON = OutputKind(
-    form="json", accepts="json".__eq__, open=partial(_open_stdout, json_lines), is_standard_output=True
-)
-STDOUT_CSV = OutputKind(
-    form="csv", accepts="csv".__eq__, open=partial(_open_stdout, csv_lines), is_standard_output=True
-)
-JSON_FILE = OutputKind(form="FILE.jsonl", accepts=is_file_with(".jsonl"), open=partial(_open_file, json_lines))
-CSV_FILE = OutputKind(form="FILE.csv", accepts=is_file_with(".csv"), open=partial(_open_file, csv_lines))
+STDOUT_JSON, JSON_FILE = _text_kinds("json", ".jsonl", json_lines)
+STDOUT_CSV, CSV_FILE = _text_kinds("csv", ".csv", csv_lines)
 
 
 SCHEME = "udp://"
