@@ -20,13 +20,13 @@ def describe_film(name: str, metadata: ModelMetadata) -> dict[str, Any]:
     """
     film = metadata.sensor.get("film")
     polygons_mm = _electrode_polygons(metadata.sensor, metadata.electrodes)  # the first one is the pad
-    leads_mm = {name: leads for name, (_, *leads) in polygons_mm.items() if leads}  # most electrodes have none
-    description = {
+    return {
         "name": name,
         "model": metadata.label,
         "sensor": metadata.frame_id,
         "electrodes": list(metadata.electrodes),
         "outlines_mm": {name: pad for name, (pad, *_) in polygons_mm.items()},
+        "more_mm": {name: leads for name, (_, *leads) in polygons_mm.items() if leads},  # most electrodes have none
         "film": film,
         "radius_mm": film.get("radius_mm") if isinstance(film, dict) else None,
         "working_area_mm": [[float(x), float(y)] for x, y in metadata.working_area_mm],
@@ -34,9 +34,6 @@ def describe_film(name: str, metadata: ModelMetadata) -> dict[str, Any]:
         "probes": list(metadata.probes),
         "unnoticed": to_builtins(metadata.unnoticed),
     }
-    if leads_mm:
-        description["more_mm"] = leads_mm
-    return description
 
 
 Polygon = list[list[float]]
