@@ -125,46 +125,47 @@ def test_reason_of_a_press_is_not_its_release():
     assert re.search(r"released after .* the charge of . changes by -\d+ pC per second", reason)
 
 
-def test_press_without_a_rest_before_it_is_refused():
-    """The charge at rest before the touch is unknown, so the touch charge could have any error."""
-    results = watch_presses(rest(1), held(2), rest(0.05), held(2), rest(1))
-    first_press = ["waiting", "settling", "taken", "lift"]
-    second_press = ["waiting", "settling", "refused", "lift", "waiting"]
-    assert phases_of(results) == first_press + second_press
-    (reason,) = reasons_of(results)
-    assert "too soon" in reason
+LOST_PORT = dict.fromkeys((*range(50), *range(220, 320)), (TARE,)) | {220: (RECONNECTED, TARE)}
+"""Flags of the frames if the port is lost during a press. The film is then tared again."""
 
 
-def test_short_press_is_refused_and_a_very_short_touch_is_ignored():
-    results = watch_presses(rest(1), held(0.3), rest(1), held(0.05), rest(1))
-    assert reasons_of(results) == ["released after 0.3 s, before it was steady: hold it longer"]
-    assert not taken_presses(results)
-
-
-def test_saturated_press_is_refused_and_the_next_press_is_taken():
-    results = watch_presses(rest(1), held(2), rest(1), held(2), flags={220: (SATURATED,)})
-    assert phases_of(results) == ["waiting", "settling", "refused", "lift", "waiting", "settling", "taken", "lift"]
-    assert reasons_of(results) == ["an amplifier is at its limit: press less hard"]
-
-
-def test_press_is_refused_after_the_port_was_lost():
-    """The port is lost during a press. The film is then tared again, and the rest of this press is not taken."""
-    flags = dict.fromkeys((*range(50), *range(220, 320)), (TARE,))
-    flags[220] = (RECONNECTED, TARE)
-    results = watch_presses(rest(1), held(0.5), rest(1), held(2), flags=flags)
-    assert phases_of(results) == [
-        "taring",
-        "waiting",
-        "settling",
-        "refused",
-        "taring",
-        "waiting",
-        "settling",
-        "taken",
-        "lift",
-    ]
-    (reason,) = reasons_of(results)
-    assert "the port was lost" in reason
+@pytest.mark.parametrize(
+    ("parts", "flags", "phases", "reason"),
+    [
+        # The charge at rest before the second touch is unknown, so its touch charge could have any error.
+        (
+            [rest(1), held(2), rest(0.05), held(2), rest(1)],
+            {},
+            "waiting settling taken lift waiting settling refused lift waiting",
+            "pressed too soon",
+        ),
+        # The second touch is very short and is ignored.
+        (
+            [rest(1), held(0.3), rest(1), held(0.05), rest(1)],
+            {},
+            "waiting settling refused waiting settling waiting",
+            "released after 0.3 s, before it was steady: hold it longer",
+        ),
+        (
+            [rest(1), held(2), rest(1), held(2)],
+            {220: (SATURATED,)},
+            "waiting settling refused lift waiting settling taken lift",
+            "an amplifier is at its limit: press less hard",
+        ),
+        (
+            [rest(1), held(0.5), rest(1), held(2)],
+            LOST_PORT,
+            "taring waiting settling refused taring waiting settling taken lift",
+            "the port was lost",
+        ),
+    ],
+    ids=["no rest before it", "short", "saturated", "lost port"],
+)
+def test_press_is_refused_and_the_other_press_is_not(parts, flags, phases, reason):
+    results = watch_presses(*parts, flags=flags)
+    assert phases_of(results) == phases.split()
+    (refusal,) = reasons_of(results)
+    assert refusal.startswith(reason)
 
 
 def test_an_armed_watch_takes_no_press_that_has_begun():
