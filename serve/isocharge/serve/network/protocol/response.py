@@ -68,22 +68,21 @@ class Response(NamedTuple):
     error: str | None = None
 
 
-def response_of(status: int, content_type: bytes, body: bytes, error: str | None = None) -> Response:
+def response_of(status: int, content_type: bytes, body: bytes) -> Response:
     """Return a response that has the headers `content-type` and `content-length`.
 
     Args:
         status: Status code.
         content_type: Value of the header `content-type`.
         body: Body of the response.
-        error: Name of the type of the error, for the log. None if no error occurred.
     """
     headers = [(b"content-type", content_type), (b"content-length", b"%d" % len(body))]
-    return Response(status, headers, body, error)
+    return Response(status, headers, body)
 
 
-def json_response(content: Any, status: int = 200, error: str | None = None) -> Response:
+def json_response(content: Any, status: int = 200) -> Response:
     """Return a response whose body is the given value in JSON. The body of a refusal is {"error": message}."""
-    return response_of(status, b"application/json", orjson.dumps(content), error)
+    return response_of(status, b"application/json", orjson.dumps(content))
 
 
 def error_response(error: Exception) -> Response:
@@ -94,12 +93,12 @@ def error_response(error: Exception) -> Response:
     authentication.
     """
     http_status, _ = statuses(error)  # the status of gRPC is not needed
-    response = json_response({"error": client_message(error)}, http_status, type(error).__name__)
+    response = json_response({"error": client_message(error)}, http_status)
     if isinstance(error, errors.WrongMethod):
         response.headers.append((b"allow", error.allowed.encode()))
     if isinstance(error, errors.TokenError):
         response.headers.append((b"www-authenticate", b"Bearer"))
-    return response
+    return response._replace(error=type(error).__name__)
 
 
 ENCODINGS = (b"gzip", b"x-gzip", b"deflate")
