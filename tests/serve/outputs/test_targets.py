@@ -1,6 +1,9 @@
 """Outputs by the form of their target, those of other packages among them."""
 
 import csv
+import json
+from contextlib import nullcontext
+from threading import Event
 from types import SimpleNamespace
 
 import pytest
@@ -155,6 +158,31 @@ def test_ctrl_c_while_an_output_closes_spoils_no_other_output(record, tmp_path, 
         outputs.__exit__(None, None, None)
     assert path.read_text("utf-8") == record().to_json() + "\n"
     assert outputs.not_written == {"mine": None}  # the command must not report success
+
+
+@live_and_replayed
+def test_added_output_that_never_closes_is_named(add_kind, caplog, monkeypatch, is_live):
+    monkeypatch.setattr("isocharge.serve.outputs.output.END_TIMEOUT_s", 0.05)
+    add_kind("mine".__eq__, Added(Event().wait))
+    outputs = Outputs(["mine"], context(is_live=is_live)).__enter__()
+    with nullcontext() if is_live else pytest.raises(OutputError, match=r"mine: the output failed .* still not closed"):
+        outputs.__exit__(None, None, None)
+    assert ("mine: the output failed (RuntimeError: it is still not closed" in caplog.text) == is_live
+
+
+class Changing(Added):
+    """An output that changes the records."""
+
+    def write(self, record):
+        record.charge_pC["A"] = 9.0
+
+
+def test_added_output_cannot_change_the_records_of_other_outputs(record, tmp_path, add_kind):
+    add_kind("mine".__eq__, Changing(lambda: None))
+    path = tmp_path / "touch.jsonl"
+    with Outputs(["mine", str(path)], context()) as outputs:
+        outputs.write(record(charge_pC={"A": 1.0}))
+    assert json.loads(path.read_text("utf-8"))["charge_pC"] == {"A": 1.0}
 
 
 def test_added_kind_that_cannot_tell_what_it_accepts_is_named(add_kind):

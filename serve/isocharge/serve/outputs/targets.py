@@ -9,6 +9,7 @@ from typing import Any, Self
 
 from isocharge.common.errors import InputError, shown
 from isocharge.serve.outputs.output import (
+    AddedOutput,
     Output,
     OutputContext,
     OutputKind,
@@ -137,6 +138,8 @@ class Outputs:
         for target, kind in self._kinds.items():
             try:
                 output = kind.open(target, self._context)
+                if kind not in OUTPUT_KINDS:
+                    output = AddedOutput(output)
             except BaseException as error:
                 self._is_discarded = True
                 self.close()
