@@ -125,7 +125,7 @@ def measure_mesh(
     return {
         "theory": theory.name,
         "mesh": mesh,
-        "unknowns": 3 * template_for(PROBE, settings.resolution).n_node,
+        "unknowns": 3 * template_for(settings.resolution, PROBE.topology).n_node,
         "cold_ms": np.quantile(cold_ms[1:], [0.5, 0.95]).tolist(),
         "warm_ms": np.quantile(warm_ms[1:], [0.5, 0.95]).tolist(),
         **{f"error_{name}": [float(np.median(values)), max(values)] for name, values in errors.items()},

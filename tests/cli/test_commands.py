@@ -189,7 +189,7 @@ def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
 
 
 BAD = [
-    ("simulate point SENSOR --force -1", "SceneError: force: expected a positive number of newtons"),
+    ("simulate point SENSOR --force -1", "SceneError: force: expected at least 1e-12 N"),
     ("simulate point SENSOR --side-force 0.1", "InputError: --side-force: expected two numbers in N"),
     (
         "simulate point SENSOR --friction 0.1 --side-force 0.1,0",

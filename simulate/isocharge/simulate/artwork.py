@@ -17,7 +17,7 @@ from isocharge.common.files import new_folder, write_whole
 from isocharge.simulate.layout.design import Design
 from isocharge.simulate.plots.error_maps import error_maps_picture
 from isocharge.simulate.plots.figure import picture_bytes
-from isocharge.simulate.sensor.sensor import Electrode, Sensor
+from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_to_toml
 
 with require("design"):
@@ -67,28 +67,16 @@ def draw_layout(sensor: Sensor) -> Drawing:
     for electrode in sensor.electrodes:
         for polygon in electrode.front:
             space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "ELECTRODES"})
-        _draw_name(space, electrode)
+        # The name is written at the rightmost corner of the pad. Characters that are not printable are replaced.
+        name = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in electrode.name)
+        rightmost_corner = max(electrode.corners)  # tuples (x, y) are compared by x first
+        space.add_text(name, dxfattribs={"layer": "NAMES"}).set_placement(rightmost_corner)
 
     # Draw the metal of the back. Electrodes may share it, so equal polygons are drawn only once.
     back_polygons = dict.fromkeys(polygon for electrode in sensor.electrodes for polygon in electrode.back)
     for polygon in back_polygons:
         space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "BACK"})
     return document
-
-
-def _draw_name(space: Any, electrode: Electrode) -> None:
-    """Write the name of an electrode at the rightmost corner of its pad, in the standard height of ezdxf (2.5 mm).
-
-    Characters that are not printable are replaced.
-
-    Args:
-        space: Model space of the drawing.
-        electrode: Electrode whose name is written.
-    """
-    letters = [letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in electrode.name]
-    text = space.add_text("".join(letters), dxfattribs={"layer": "NAMES"})
-    rightmost_corner = max(electrode.corners)  # tuples (x, y) are compared by x first
-    text.set_placement(rightmost_corner)
 
 
 def to_dxf(document: Drawing) -> str:

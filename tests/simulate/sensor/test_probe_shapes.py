@@ -1,6 +1,5 @@
 """Properties that every probe shape must have, compared with closed forms, grids of points and polygons."""
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,9 +15,7 @@ from isocharge.simulate import (
     Probe,
     SolveSettings,
     Theory,
-    deflection,
     load_sensor,
-    press,
 )
 from isocharge.simulate.numerics.polygon import area_of, to_corners
 from solved_charges import solved_charge
@@ -127,26 +124,3 @@ def test_curved_probe_has_the_charges_of_a_polygon_with_many_corners(shape):
     curved_charge = solved_charge(SENSOR, shape.probe, (5.0, 3.0), 1.0, settings)
     polygon_charge = solved_charge(SENSOR, polygon, (5.0, 3.0), 1.0, settings)
     np.testing.assert_allclose(curved_charge, polygon_charge, rtol=3e-4)
-
-
-@pytest.mark.parametrize("share_of_radius", [-0.9, -0.3, 0.0, 0.5, 0.99])
-def test_force_share_of_a_finger_on_a_half_plane_is_the_closed_form(share_of_radius):
-    """The share of the Hertzian pressure beyond a line at the distance c (in radii) is (2 - 3 c + c^3) / 4.
-
-    The integral of the pressure along such a line is proportional to 3/4 (1 - c^2).
-    """
-    finger = Finger(5.0)
-    edge = 5.0 * share_of_radius
-    beyond = np.array([(edge, -50.0), (50.0, -50.0), (50.0, 50.0), (edge, 50.0)])
-    expected = (2.0 - 3.0 * share_of_radius + share_of_radius**3) / 4.0
-    assert finger.force_share(beyond, 0.0) == pytest.approx(expected, abs=1e-5)
-
-
-def test_taut_membrane_under_a_finger_deflects_as_the_closed_form():
-    """The deflection at the centre is F / (2 pi T h) (ln(R / a) + H / 2) with the harmonic number H of 3/2."""
-    film = replace(SENSOR.film, pretension=2.0)
-    solved = press(film, Finger(6.0), (0.0, 0.0), 1e-4, SolveSettings(theory=Theory(bending=False)))
-    half_harmonic_number = 4.0 / 3.0 - np.log(2.0)
-    tension = film.pretension * film.thickness
-    expected = 1e-4 / (2.0 * np.pi * tension) * (np.log(film.radius / 6.0) + half_harmonic_number)
-    assert deflection(solved, np.zeros((1, 2)))[0] == pytest.approx(expected, rel=1e-5)

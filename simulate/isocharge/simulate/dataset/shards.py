@@ -223,8 +223,7 @@ def _check_samples(samples: Samples, n_electrode: int, shard_label: str) -> None
             not finite.
     """
     shapes = {name: column.shape for name, column in samples.columns().items()}
-    has_rows = samples.x_mm.ndim > 0  # an array without dimensions contains a single number and has no length
-    count = len(samples) if has_rows else 0
+    count = samples.x_mm.size
     expected_shapes = dict.fromkeys(COLUMNS, (count,)) | {"charge_pC": (count, n_electrode)}
     if shapes != expected_shapes or count == 0:
         raise DatasetError(

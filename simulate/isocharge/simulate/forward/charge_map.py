@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
@@ -118,7 +119,7 @@ def within(charge_map: ChargeMap, radius: float) -> ChargeMap:
     return _RestrictedMap(charge_map, charge_map.domain.within(radius))
 
 
-def differences(function: Callable[[Array], Array], contact: Array, steps: tuple[float, float, float] = STEPS) -> Array:
+def differences(function: Callable[[Array], Array], contact: Array, steps: ArrayLike = STEPS) -> Array:
     """Compute the derivatives of a function of contacts by central differences.
 
     Args:

@@ -191,7 +191,7 @@ class ForwardMap:
         resolution, layer = family_mesh(sensor.film, probe, domain, settings)
         same_mesh = SolveSettings(theory=settings.theory, resolution=resolution, layer=layer)
         family = Family.spread(domain, sensor.film, probe, count)
-        template = template_for(probe, resolution, whole=not sensor.film.is_axisymmetric)
+        template = template_for(resolution, probe.topology, not sensor.film.is_axisymmetric)
         table = family.unfold(family.solve(sensor, probe, same_mesh, executor, read), template)
         return cls(sensor, probe, family, settings.theory, resolution, layer, table, np.inf)
 
@@ -234,7 +234,7 @@ class ForwardMap:
             SceneError: If a press lies outside the domain.
         """
         contact = self.domain.check(contact, "forward map")
-        return self._unchecked_charges(contact, np.broadcast_to(orientation, len(contact)))
+        return self._unchecked_charges(contact, orientation)
 
     def derivatives(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to x, y and ln F by central differences.
@@ -259,13 +259,10 @@ class ForwardMap:
                 f"expected a forward map of different forces for derivatives, got one of the force {min_force:g} N; "
                 f"build a map from {0.9 * min_force:.3g} to {1.1 * min_force:.3g} N"
             )
-        n_stepped = len(contact) * 2 * contact.shape[1]  # two steps of each variable
-
         # The charges change within the width of the footprint, so the steps of a small probe are shorter.
         footprint_scale = min(1.0, self.probe.under(min_force).half_width)
-        x_step, y_step, log_force_step = STEPS
-        steps = (x_step * footprint_scale, y_step * footprint_scale, log_force_step)
-        return differences(partial(self._unchecked_charges, orientation=np.zeros(n_stepped)), contact, steps)
+        steps = np.multiply(STEPS, [footprint_scale, footprint_scale, 1.0])
+        return differences(self._unchecked_charges, contact, steps)
 
     def stress_charges_by_force(self, position: Array) -> Array:
         """Compute the charges that the stress causes at given positions, for all forces of the family at once.
@@ -330,7 +327,7 @@ class ForwardMap:
         family = replace(self.family, force=self.family.force[:1])
         return replace(self, family=family, table=table.astype(np.float32))
 
-    def _unchecked_charges(self, contact: Array, orientation: Array) -> Array:
+    def _unchecked_charges(self, contact: Array, orientation: Array | float = 0.0) -> Array:
         """Compute the charges of presses that lie in the domain or slightly outside the domain.
 
         The charges that the stress causes and the charges that the contact pressure causes are added. Then the
@@ -338,7 +335,7 @@ class ForwardMap:
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
-            orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
+            orientation: Rotation of the probe in addition to its own orientation, shape (n,) or a number, rad.
 
         Returns:
             Charges, shape (n, n_electrode), pC.
@@ -351,7 +348,7 @@ class ForwardMap:
         self,
         contact: Array,
         is_odd: Booleans,
-        orientation: Array | None = None,
+        orientation: Array | float = 0.0,
         chunk_size: int = CHUNK_SIZE,
     ) -> Array:
         """Compute the charges of each stress field in the table.
@@ -364,8 +361,7 @@ class ForwardMap:
             is_odd: Whether each field is odd with respect to a reflection in the direction of the press, shape
                 (n_field,). A row of the table contains the values of all fields at one node, then those at the next
                 node.
-            orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad; None for no
-                rotation.
+            orientation: Rotation of the probe in addition to its own orientation, shape (n,) or a number, rad.
             chunk_size: Number of presses that are evaluated at once.
 
         Returns:
@@ -374,8 +370,7 @@ class ForwardMap:
         if self.probe.grows:
             return self._field_charges_of_growing_footprint(contact, is_odd)
         position = to_complex(contact[:, :2])
-        if orientation is None:
-            orientation = np.zeros(len(contact))
+        orientation = np.broadcast_to(orientation, len(contact))
         charges = np.empty((len(contact), len(self.electrodes), is_odd.size))
         pieces = ElectrodePieces.of(self.sensor)
         with single_threaded_blas():  # faster for the many small matrices of a chunk
@@ -464,7 +459,7 @@ class ForwardMap:
         """
         film = self.sensor.film
         direction = np.angle(position)
-        template = template_for(self.probe, self.resolution, whole=not film.is_axisymmetric)
+        template = template_for(self.resolution, self.probe.topology, not film.is_axisymmetric)
         circular_distance = distance_on_circular_film(film, np.abs(position), direction)
         placement = Placement.of(template, self.probe, circular_distance, film.radius, self.layer, rotation)
         return PressMeshes(template, placement, direction, film_oval(film, direction))

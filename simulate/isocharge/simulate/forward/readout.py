@@ -361,9 +361,8 @@ class PressMeshes:
         # Rotate the film so that the press lies on the positive x axis.
         mesh = self.template
         rotated_points = points * np.exp(-1j * self.direction[press_index])[:, None]
-        if self.oval.any():
-            rotated_points = from_oval(rotated_points, self.oval[press_index, None])
-        position, is_mirrored = mesh.into_meshed_half(rotated_points)
+        circular_points = from_oval(rotated_points, self.oval[press_index, None])
+        position, is_mirrored = mesh.into_meshed_half(circular_points)
         element, xi, eta = locate_points(self.placement[press_index], mesh, position)
         basis_values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel())
         return element, basis_values.reshape(*points.shape, mesh.xi.size), is_mirrored

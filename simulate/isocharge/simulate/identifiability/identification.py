@@ -138,7 +138,6 @@ class Identification:
             noise: Noise of the readings. The white noise must be positive.
             error: Largest Cramer-Rao position error that is allowed in the working area, mm.
         """
-        check_electrode_count(len(forward_map.electrodes))
         charges = with_fast_derivatives(forward_map)
 
         # The limits are computed for the smallest and the largest force, and for 1 N if 1 N lies between both.

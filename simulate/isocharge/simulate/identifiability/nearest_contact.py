@@ -22,7 +22,7 @@ import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
-from isocharge.simulate.numerics.disk import INNER_RADIUS, ROUNDING
+from isocharge.simulate.numerics.disk import INNER_RADIUS, ROUNDING, onto_disk
 
 ResidualFunction = Callable[[Integers, Array], tuple[Array, Array]]
 """Function that evaluates the residuals of some of the problems.
@@ -152,9 +152,7 @@ def into_domain(point: Array) -> Array:
     Returns:
         Points of D, shape (n, 3).
     """
-    radius = np.hypot(point[:, 0], point[:, 1])
-    in_disk = point[:, :2] / np.maximum(radius, 1.0)[:, None]
-    return np.column_stack([in_disk, np.clip(point[:, 2], -1.0, 1.0)])
+    return np.column_stack([onto_disk(point[:, :2], 1.0), np.clip(point[:, 2], -1.0, 1.0)])
 
 
 CANDIDATES = 4096

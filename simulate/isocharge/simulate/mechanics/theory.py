@@ -98,21 +98,6 @@ def stress(strain: Array, poisson: float, moduli: Array | float = 0.0) -> Array:
     return np.asarray(strain @ (isotropic_moduli + moduli))
 
 
-def stress_rotation(angle: float) -> Array:
-    """Return the matrix that transforms stresses from a rotated frame to the unrotated frame.
-
-    Let C be the elasticity matrix of a material in the rotated frame, and let T be the returned matrix. The elasticity
-    matrix of the material in the unrotated frame is then T C T^T.
-
-    Args:
-        angle: Angle of the rotated frame, anticlockwise, rad.
-
-    Returns:
-        Matrix for the stress components (s11, s22, s12), shape (3, 3).
-    """
-    return rotate_stress(np.eye(3), angle).T
-
-
 def rotate_stress(rotated_frame_stress: Array, angle: float | Array) -> Array:
     """Transform stresses from a rotated frame to the unrotated frame.
 
@@ -365,7 +350,7 @@ def press_frame_anisotropy(film: Film, squared_amplitude: float, angle: float) -
     # The moduli refer to the axes of the material. The angle from the direction of the press to axis 1 of the material
     # is `material_angle`.
     material_angle = film.axis - angle
-    rotation = stress_rotation(material_angle)
+    rotation = rotate_stress(np.eye(3), material_angle).T  # matrix for the stress components (s11, s22, s12)
     moduli = rotation @ orthotropic_moduli(film) @ rotation.T
 
     # The pretension refers to the axes x and y. The angle from the direction of the press to the x axis is `-angle`.

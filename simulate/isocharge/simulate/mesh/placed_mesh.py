@@ -190,7 +190,7 @@ class PlacedMesh:
         meshed_points, is_reflected = self.template.into_meshed_half(circular_points)
 
         # `locate_points` expects one row of points for each placement. Here, there is a single placement.
-        (element,), (xi,), (eta,) = locate_points(self.placement.batch(), self.template, meshed_points[None])
+        (element,), (xi,), (eta,) = locate_points(self.placement[None], self.template, meshed_points[None])
         return element, xi, eta, is_reflected
 
     def gradient(self, element: Integers, xi: Array, eta: Array) -> Array:
@@ -253,7 +253,7 @@ def place(
         The mesh. It is rotated such that the press lies on the positive x axis.
     """
     needs_whole_mesh = whole or not film.is_axisymmetric
-    template = template_for(probe, resolution, whole=needs_whole_mesh)
+    template = template_for(resolution, probe.topology, needs_whole_mesh)
 
     # Rotate the press, the probe and the axis of an oval film such that the press lies on the positive x axis.
     x, y = at

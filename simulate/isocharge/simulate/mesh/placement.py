@@ -12,7 +12,6 @@ The class `Placement` combines these steps for one or several presses. The funct
 `template.locate_points` finds the element that contains a film point.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
@@ -125,22 +124,15 @@ class Placement:
             probe=probe,
         )
 
-    def __getitem__(self, indices: Integers) -> "Placement":
-        """Select placements by their indices along the first axis of the arrays."""
-        return self._with_arrays(lambda values: values[indices])
+    def __getitem__(self, indices: Integers | None) -> "Placement":
+        """Select placements by their indices along the first axis of the arrays.
 
-    def batch(self) -> "Placement":
-        """Return the placement with an additional first axis of length one in all arrays."""
-        return self._with_arrays(lambda values: np.asarray(values)[None])
-
-    def _with_arrays(self, convert: Callable[[Any], Any]) -> "Placement":
-        """Return a copy of the placement in which each array is replaced by the result of a function.
-
-        Args:
-            convert: Function that converts each array.
+        The index None adds a first axis of length one.
         """
         arrays: dict[str, Any] = {
-            field.name: convert(getattr(self, field.name)) for field in fields(self) if field.name != "probe"
+            field.name: np.asarray(getattr(self, field.name))[indices]
+            for field in fields(self)
+            if field.name != "probe"
         }
         return replace(self, **arrays)
 
@@ -206,7 +198,7 @@ class Placement:
             Film points x + iy, shape (n_inner, (order + 1)^2), in film radii.
         """
         radial, angular = _unit_coordinates(blocks)
-        placement_of_element = self.batch()[np.zeros(blocks.n_inner, dtype=np.intp)]
+        placement_of_element = self[None][np.zeros(blocks.n_inner, dtype=np.intp)]
         inner, outer = placement_of_element.sides(blocks, np.arange(blocks.n_inner), angular[None])
         return np.asarray((1.0 - radial) * inner + radial * outer)
 

@@ -16,7 +16,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.simulate.mesh.blocks import Blocks, Resolution
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.sensor.footprint import FootprintTopology, Probe
+from isocharge.simulate.sensor.footprint import FootprintTopology
 from isocharge.simulate.sensor.probe import RoundProbe
 
 SAMPLE_REACH = 0.1
@@ -104,23 +104,8 @@ def sample_points(blocks: Blocks) -> Complexes:
     return placement.element_points(blocks)
 
 
-template = lru_cache(maxsize=16)(Template)
+template_for = lru_cache(maxsize=16)(Template)
 """Function that returns the template for a given resolution and topology. Templates are cached."""
-
-
-def template_for(probe: Probe, resolution: Resolution, whole: bool = False) -> Template:
-    """Return the template for the footprint of a probe.
-
-    Args:
-        probe: The probe.
-        resolution: Fineness of the mesh.
-        whole: Whether to mesh the whole film although the footprint is symmetric.
-    """
-    topology = probe.topology
-    # Only the mesh of a circular footprint may be a half mesh. All other meshes are whole in any case. The arguments
-    # are the same for all of them, so that the cache contains their template only once.
-    is_whole_circular_mesh = whole and topology.fills_circle
-    return template(resolution, topology, is_whole_circular_mesh)
 
 
 def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:

@@ -260,19 +260,14 @@ def film_to_dict(film: Film) -> dict[str, Any]:
         "young": film.young if film.young_ratio == 1.0 else moduli,
         "pretension": tension if any(film.deviator) else film.pretension,
     }
-    table: dict[str, Any] = {}
-    for attribute, number in FILM_NUMBERS.items():
-        value = values[attribute]
-        if isinstance(value, tuple):
-            table[number.key] = [tidy(component * number.factor) for component in value]
-        elif value is not None:
-            table[number.key] = tidy(value * number.factor)
-
-    default_of_key = {field.name: field.default for field in msgspec.structs.fields(FilmTable)}
-    del default_of_key["pretension_MPa"]  # the pretension is always written
-    return {
-        key: table[key] for key in FilmTable.__struct_fields__ if key in table and table[key] != default_of_key.get(key)
+    table = {
+        number.key: _tidy_all(np.multiply(values[attribute], number.factor).tolist())
+        for attribute, number in FILM_NUMBERS.items()
+        if values[attribute] is not None
     }
+    defaults = {field.name: field.default for field in msgspec.structs.fields(FilmTable)}
+    defaults["pretension_MPa"] = None  # the pretension is always written
+    return {key: table[key] for key in defaults if key in table and table[key] != defaults[key]}
 
 
 def sensor_to_toml(sensor: Sensor, comment: Iterable[str] = ()) -> str:
@@ -349,8 +344,8 @@ def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
 
 
 def _tidy_all(values: Any) -> Any:
-    """Round all numbers of nested tuples, and return them as nested lists."""
-    return [_tidy_all(value) for value in values] if isinstance(values, tuple) else tidy(values)
+    """Round all numbers of nested tuples or lists, and return them as nested lists."""
+    return [_tidy_all(value) for value in values] if isinstance(values, tuple | list) else tidy(values)
 
 
 def _film(table: FilmTable) -> Film:

@@ -7,7 +7,8 @@ electrode layouts and all piezoelectric coefficients.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -143,18 +144,10 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
     groups = equilibrium.groups
     element, xi, eta, is_reflected = _locate(equilibrium, points)
 
-    # Strain of the mid-surface
-    gradient = mesh.gradient(element, xi, eta)  # derivatives of the basis functions, shape (n, 2, n_local)
-    nodal_displacement = equilibrium.field[mesh.template.nodes[element]]  # (U1, U2, W), shape (n, n_local, 3)
-    total_strain = strain(gradient @ nodal_displacement, groups.squared_amplitude)
-
-    # Strain by bending, from the second derivatives of W
-    if surface != "middle":
-        second_derivatives = gradient @ _continuous_slope(equilibrium)[element]
-        total_strain += _bending_strain(equilibrium, surface, second_derivatives)
-
     # Compute the stress in the frame of the press. The shear stress has the opposite sign in the reflected half.
-    press_frame_stress = equilibrium.film.young * groups.squared_amplitude * scaled_stress(total_strain, groups)
+    gradient = mesh.gradient(element, xi, eta)  # derivatives of the basis functions, shape (n, 2, n_local)
+    induced_stress = _induced_stress(equilibrium, surface, lambda values: gradient @ values[element])
+    press_frame_stress = equilibrium.film.young * groups.squared_amplitude * induced_stress
     press_frame_stress[is_reflected, 2] *= -1.0
 
     # Rotate the stress into the axes of the film, and subtract the stress of the film before the contact, which is zero
@@ -177,27 +170,30 @@ def nodal_stress(equilibrium: Equilibrium, surface: Surface = "middle") -> Array
     Returns:
         Stress (S11, S22, S12) in units of E_young A^2, shape (n_element, n_local, 3).
     """
+    stress = _induced_stress(equilibrium, surface, equilibrium.mesh.node_derivatives)
     if equilibrium.rest is None:
-        return _induced_stress(equilibrium, surface)
-    return np.asarray(_induced_stress(equilibrium, surface) - _induced_stress(equilibrium.rest, surface))
+        return stress
+    return np.asarray(stress - nodal_stress(equilibrium.rest, surface))
 
 
-def _induced_stress(equilibrium: Equilibrium, surface: Surface) -> Array:
-    """Compute the scaled induced stress at the nodes of every element.
+def _induced_stress(equilibrium: Equilibrium, surface: Surface, derivatives_of: Callable[[Array], Array]) -> Array:
+    """Compute the scaled induced stress at some points of the elements.
 
     The induced stress is the stress that the probe and the static pressure add to the pretension.
 
     Args:
         equilibrium: The solved press.
         surface: Surface of the film at which the stress is computed; see `touch_stress`.
+        derivatives_of: Function that computes the derivatives of fields with respect to (X1, X2) at the points, shape
+            (..., 2, k), from the values of the fields at the nodes of every element, shape (n_element, n_local, k).
 
     Returns:
-        Stress (S11, S22, S12) in units of E_young A^2, shape (n_element, n_local, 3).
+        Stress (S11, S22, S12) in units of E_young A^2, shape (..., 3).
     """
-    slopes = node_slopes(equilibrium)
-    total_strain = strain(slopes, equilibrium.groups.squared_amplitude)
+    nodal_displacement = equilibrium.field[equilibrium.mesh.template.nodes]  # (U1, U2, W)
+    total_strain = strain(derivatives_of(nodal_displacement), equilibrium.groups.squared_amplitude)
     if surface != "middle":
-        second_derivatives = equilibrium.mesh.node_derivatives(_continuous_slope(equilibrium))
+        second_derivatives = derivatives_of(_continuous_slope(equilibrium))  # of the deflection W
         total_strain += _bending_strain(equilibrium, surface, second_derivatives)
     return scaled_stress(total_strain, equilibrium.groups)
 
@@ -218,10 +214,11 @@ def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
     # because it changes the directions of the principal stresses.
     groups = equilibrium.groups
     deviator = groups.anisotropy.tension
-    smallest, largest = principal_stresses(_induced_stress(equilibrium, "middle") + deviator)
+    pressed = replace(equilibrium, rest=None)  # with the stress before the contact
+    smallest, largest = principal_stresses(nodal_stress(pressed) + deviator)
     if equilibrium.theory.bending:
         for surface in ("top", "bottom"):
-            _, largest_at_surface = principal_stresses(_induced_stress(equilibrium, surface) + deviator)
+            _, largest_at_surface = principal_stresses(nodal_stress(pressed, surface) + deviator)
             largest = max(largest, largest_at_surface)
 
     # Convert the stresses to MPa, and add the mean pretension, which is the same in all directions.

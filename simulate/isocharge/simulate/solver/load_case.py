@@ -115,11 +115,11 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
         force: Force, N.
 
     Raises:
-        SceneError: If the force is not positive and finite, if the footprint is too small, too close to the rim or not
-            completely on the film, or if the strains are not small.
+        SceneError: If the force is smaller than `MIN_FORCE_N` or not finite, if the footprint is too small, too close
+            to the rim or not completely on the film, or if the strains are not small.
     """
-    if not (np.isfinite(force) and force > 0.0):
-        raise SceneError(f"force: expected a positive number of newtons (F > 0 pushes), got {force}")
+    if not MIN_FORCE_N <= force < np.inf:
+        raise SceneError(f"force: expected at least {MIN_FORCE_N:g} N (F > 0 pushes), got {force:.4g} N")
     if probe.reach < MIN_PROBE_REACH * film.radius:
         raise SceneError(
             f"probe: expected a reach of at least {MIN_PROBE_REACH:g} of the film's radius ({film.radius:.4g} mm), got "
@@ -150,18 +150,15 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
 
 
 def check_strains(film: Film, force: float) -> None:
-    """Raise an error if a force is too small to be computed, or too large for Saint-Venant-Kirchhoff elasticity.
+    """Raise an error if a force is too large for Saint-Venant-Kirchhoff elasticity.
 
     Args:
         film: The film.
         force: Force of the press, N.
 
     Raises:
-        SceneError: If the force is smaller than `MIN_FORCE_N`, or if the squared amplitude exceeds `MAX_AMPLITUDE2` or
-            is not finite.
+        SceneError: If the squared amplitude exceeds `MAX_AMPLITUDE2` or is not finite.
     """
-    if force < MIN_FORCE_N:
-        raise SceneError(f"force: expected at least {MIN_FORCE_N:g} N, got {force:.4g} N")
     with np.errstate(over="ignore"):  # the amplitude of a huge force is infinite, and is refused
         squared_amplitude = amplitude_squared(film, force)
     if not squared_amplitude <= MAX_AMPLITUDE2:
