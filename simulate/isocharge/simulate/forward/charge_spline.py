@@ -253,7 +253,7 @@ def _force_nodes(forward_map: ForwardMap) -> Array:
     if forward_map.sensor.piezo.d33 == 0.0 or min_log_force == max_log_force:
         return solved_force
     log_force = chebyshev_nodes(solved_force.size + EXTRA_FORCE_NODES, min_log_force, max_log_force)
-    return np.asarray(np.exp(log_force))
+    return np.exp(log_force)
 
 
 def _scaled_charges(forward_map: ForwardMap, force: Array, position: Array) -> Array:

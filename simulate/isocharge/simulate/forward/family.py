@@ -177,7 +177,7 @@ class Family:
         # The weight of a node is the product of its weights along the axes (press, distance, force, turn).
         distance_force_weights = distance_weights[:, :, None, None] * force_weights[:, None, :, None]
         weights = distance_force_weights * turn_weights[:, None, None, :]
-        return np.asarray(weights.reshape(position.size, -1))
+        return weights.reshape(position.size, -1)
 
     def solve(
         self,
@@ -269,7 +269,7 @@ class Family:
             # The stress itself does not change, but its components refer to a frame that was rotated by `angle`.
             stress_of_periods.append(rotate_stress(reordered_stress, -angle))
         all_turns = np.concatenate(stress_of_periods, axis=2)
-        return np.asarray(all_turns.reshape(-1, n_value))
+        return all_turns.reshape(-1, n_value)
 
 
 def node_counts(film: Film) -> tuple[NodeCount, ...]:

@@ -265,7 +265,7 @@ def contact_charges(sensor: Sensor, probe: Probe, contact: Array, orientation: A
             for press in np.flatnonzero(distance_from_part < part_radius + largest_reach):
                 pressed_probe = probe.under(float(force[press])).rotated(float(rotation[press]))
                 force_shares[press, electrode_index] += pressed_probe.force_share(corners, complex(position[press]))
-    return np.asarray(-0.5 * sensor.piezo.d33 * force[:, None] * sensor.gains * force_shares)
+    return -0.5 * sensor.piezo.d33 * force[:, None] * sensor.gains * force_shares
 
 
 def thermal_charge(sensor: Sensor, step: float) -> Array:

@@ -96,7 +96,7 @@ class MirrorRegion:
     @property
     def distance(self) -> Array:
         """Distance from the centre of the film to the middle of each ring, shape (n_ring,), mm."""
-        return np.asarray(0.5 * (self.edges[1:] + self.edges[:-1]))
+        return 0.5 * (self.edges[1:] + self.edges[:-1])
 
     @property
     def total_share(self) -> float:

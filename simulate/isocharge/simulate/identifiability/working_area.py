@@ -67,7 +67,7 @@ def scaled_derivatives(charge_map: ChargeMap, contact: Array, noise: NoiseModel)
         Scaled derivatives with respect to x (1/mm), y (1/mm) and ln F (dimensionless), shape (n, n_electrode, 3).
     """
     charge, jacobian = linearised(charge_map, contact)
-    return np.asarray(jacobian / noise.sigma(charge)[..., None])
+    return jacobian / noise.sigma(charge)[..., None]
 
 
 def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseModel) -> Array:
@@ -111,7 +111,7 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
     jacobian = scaled_derivatives(charge_map, contacts(sides), noise)
     is_fold = has_reversed_orientation(*jacobian.reshape(*sides.shape[:3], -1, 3)).any(axis=1)
     folds = position[is_fold]
-    return np.asarray(folds[np.argsort(np.hypot(*folds.T), kind="stable")])
+    return folds[np.argsort(np.hypot(*folds.T), kind="stable")]
 
 
 def _starting_points(rings: Rings, precision: Array) -> tuple[Array, Array]:

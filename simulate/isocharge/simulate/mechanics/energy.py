@@ -253,7 +253,7 @@ class Membrane:
         weighted_traction = traction * geometry.weights[..., None, None]
         stacked_traction = weighted_traction.reshape(len(traction), -1, 3)  # shape (n_element, n_point * 2, 3)
         transposed_gradient = geometry.stacked.transpose(0, 2, 1)  # shape (n_element, n_local, n_point * 2)
-        return np.asarray(transposed_gradient @ stacked_traction)
+        return transposed_gradient @ stacked_traction
 
     def tangent(self, field: Array, added_tension: float = 0.0) -> Array:
         """Compute the second derivatives of the stretching energy of each element.
@@ -417,7 +417,7 @@ class Bending:
             Forces, shape (n_element, n_local).
         """
         laplacian_column = self.laplacian(deflection)[self.geometry.nodes][..., None]  # shape (n_element, n_local, 1)
-        return np.asarray(-self.stiffness * (self._laplace @ laplacian_column)[..., 0])
+        return -self.stiffness * (self._laplace @ laplacian_column)[..., 0]
 
     def extend(self, tangent: Array) -> Array:
         """Add bending to the element matrices K of the membrane.

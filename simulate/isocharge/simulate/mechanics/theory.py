@@ -95,7 +95,7 @@ def stress(strain: Array, poisson: float, moduli: Array | float = 0.0) -> Array:
     isotropic_moduli = np.array(
         [[plane_modulus, coupling, 0.0], [coupling, plane_modulus, 0.0], [0.0, 0.0, shear_modulus]]
     )
-    return np.asarray(strain @ (isotropic_moduli + moduli))
+    return strain @ (isotropic_moduli + moduli)
 
 
 def rotate_stress(rotated_frame_stress: Array, angle: float | Array) -> Array:

@@ -262,7 +262,7 @@ def stretch_on_circle(map_parameter: Array, template_radius: Array) -> Array:
         Factors for points on the innermost circle, shape (...), dimensionless.
     """
     product = map_parameter * template_radius
-    return np.asarray((1.0 + product) / (1.0 - product))
+    return (1.0 + product) / (1.0 - product)
 
 
 def stretch_angles(angle: Array, factor: Array) -> Array:
@@ -280,7 +280,7 @@ def stretch_angles(angle: Array, factor: Array) -> Array:
     """
     full_turns = 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
     half_angle = 0.5 * (angle - full_turns)
-    return np.asarray(full_turns + 2.0 * np.arctan(factor[..., None] * np.tan(half_angle)))
+    return full_turns + 2.0 * np.arctan(factor[..., None] * np.tan(half_angle))
 
 
 def ring_edges(resolution: Resolution, template_radius: Array, thin_ring_width: Array) -> Array:

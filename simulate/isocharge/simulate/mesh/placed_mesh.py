@@ -138,7 +138,7 @@ class PlacedMesh:
     @property
     def node_points(self) -> Complexes:
         """Film points x + iy of the nodes, shape (n_node,), in film radii."""
-        return np.asarray(self.points.ravel()[self.template.first_occurrence])
+        return self.points.ravel()[self.template.first_occurrence]
 
     @cached_property
     def geometry(self) -> Geometry:
@@ -307,7 +307,7 @@ def to_oval(points: Complexes, oval: complex | Complexes) -> Complexes:
         return points
     radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)  # the displacement ratio is zero at `UNDEFORMED_RADIUS`
     rim_displacement = (np.conj(oval) * (points / radius) ** 2).real  # e cos(2 (angle - alpha))
-    return np.asarray(points * (1.0 + _displacement_ratio(radius) * rim_displacement))
+    return points * (1.0 + _displacement_ratio(radius) * rim_displacement)
 
 
 def from_oval(points: Complexes, oval: complex | Complexes, newton_steps: int = 8) -> Complexes:
@@ -337,7 +337,7 @@ def from_oval(points: Complexes, oval: complex | Complexes, newton_steps: int = 
         # rim. The factor 7 is used for all radii, because an approximate slope is sufficient for the convergence.
         slope = 1.0 + 7.0 * rim_displacement * displacement_ratio
         radius = radius - residual / slope
-    return np.asarray(points * (radius / oval_radius))
+    return points * (radius / oval_radius)
 
 
 def _displacement_ratio(radius: Array) -> Array:
@@ -349,7 +349,7 @@ def _displacement_ratio(radius: Array) -> Array:
     Args:
         radius: Radii of at least `UNDEFORMED_RADIUS`, any shape, in film radii.
     """
-    return np.asarray(((radius - UNDEFORMED_RADIUS) / (1.0 - UNDEFORMED_RADIUS)) ** 3)
+    return ((radius - UNDEFORMED_RADIUS) / (1.0 - UNDEFORMED_RADIUS)) ** 3
 
 
 class _Quadrature(NamedTuple):
@@ -390,7 +390,7 @@ def _integrate_pressure(order: int, points: Complexes, pressure: Pressure, point
     film_weights = _determinant(derivatives[:, None], points) * reference_weights
     quadrature_points = points @ values.T  # film points, shape (n_element, n_point)
     force_at_points = pressure(quadrature_points) * film_weights
-    return np.asarray(force_at_points @ values)
+    return force_at_points @ values
 
 
 @lru_cache(maxsize=16)

@@ -146,7 +146,7 @@ class Placement:
             Film points, shape (..., n), in film radii.
         """
         map_parameter = self.map_parameter[..., None]
-        return np.asarray((z + map_parameter) / (1.0 + map_parameter * z))
+        return (z + map_parameter) / (1.0 + map_parameter * z)
 
     def to_template(self, points: Complexes) -> Complexes:
         """Convert film points into points of the template plane by the inverse of the conformal map.
@@ -158,7 +158,7 @@ class Placement:
             Points of the template plane, shape (..., n).
         """
         map_parameter = self.map_parameter[..., None]
-        return np.asarray((points - map_parameter) / (1.0 - map_parameter * points))
+        return (points - map_parameter) / (1.0 - map_parameter * points)
 
     def boundary(self, parameter: Array) -> Complexes:
         """Compute points of the boundary of a curved footprint on the film.
@@ -171,7 +171,7 @@ class Placement:
         """
         assert isinstance(self.probe, CurvedProbe)
         centroid = self.corners[..., -1:]
-        return np.asarray(centroid + self.rotation_and_scale[..., None] * self.probe.boundary(parameter))
+        return centroid + self.rotation_and_scale[..., None] * self.probe.boundary(parameter)
 
     def element_points(self, blocks: Blocks) -> Complexes:
         """Compute the film points of the nodes of all elements for a single placement.
@@ -200,7 +200,7 @@ class Placement:
         radial, angular = _unit_coordinates(blocks)
         placement_of_element = self[None][np.zeros(blocks.n_inner, dtype=np.intp)]
         inner, outer = placement_of_element.sides(blocks, np.arange(blocks.n_inner), angular[None])
-        return np.asarray((1.0 - radial) * inner + radial * outer)
+        return (1.0 - radial) * inner + radial * outer
 
     def sides(self, blocks: Blocks, element: Integers, angular: Array) -> tuple[Complexes, Complexes]:
         """Compute points of the inner and the outer side of elements inside the innermost circle.

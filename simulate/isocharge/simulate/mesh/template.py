@@ -213,7 +213,7 @@ def _side_angles(placement: Placement, side: Integers, depth: Array) -> Array:
     """
     circle_angle = np.take_along_axis(placement.circle_angles, side, axis=1)
     rim_angle = np.take_along_axis(placement.rim_angles, side, axis=1)
-    return np.asarray(circle_angle + depth * (rim_angle - circle_angle))
+    return circle_angle + depth * (rim_angle - circle_angle)
 
 
 def _locate_inside(
@@ -346,7 +346,7 @@ def _overshoot(radial: Array, angular: Array) -> Array:
         Larger excess of the two coordinates, shape (n,). It is negative if both coordinates lie within the range.
     """
     distance_from_middle = np.maximum(np.abs(radial - 0.5), np.abs(angular - 0.5))
-    return np.asarray(distance_from_middle - 0.5)
+    return distance_from_middle - 0.5
 
 
 def _distance_to_left(start: Complexes, end: Complexes, points: Complexes) -> Array:
@@ -360,4 +360,4 @@ def _distance_to_left(start: Complexes, end: Complexes, points: Complexes) -> Ar
     direction = end - start
     length = np.maximum(np.abs(direction), 1e-300)  # the limit avoids a division by zero
     cross_product = ((points - start) * np.conj(direction)).imag
-    return np.asarray(cross_product / length)
+    return cross_product / length

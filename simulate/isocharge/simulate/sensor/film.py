@@ -112,7 +112,7 @@ class Film:
         Args:
             angle: Angles from the x axis, anticlockwise, any shape, rad.
         """
-        return np.asarray(self.radius * (1.0 + self.oval * np.cos(2.0 * (angle - self.oval_axis))))
+        return self.radius * (1.0 + self.oval * np.cos(2.0 * (angle - self.oval_axis)))
 
     @property
     def expands_evenly(self) -> bool:

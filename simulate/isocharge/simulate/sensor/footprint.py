@@ -221,7 +221,7 @@ class CurvedProbe(Probe):
         """Return the corners x + iy of the core polygon in multiples of `unit` (mm), shape (n_corner,)."""
         n_corner = self.topology.n_corner
         parameter = 2.0 * np.pi * (np.arange(n_corner) + 0.5) / n_corner
-        return np.asarray(CORE_SHARE * self.boundary(parameter) / unit)
+        return CORE_SHARE * self.boundary(parameter) / unit
 
 
 def check_angle(angle: float) -> None:

@@ -134,7 +134,7 @@ class Finger(RoundProbe):
             Relative pressure, of the shape of `points`, dimensionless.
         """
         squared_ratio_to_peak = np.clip(1.0 - np.abs(points) ** 2 / self.radius**2, 0.0, None)
-        return np.asarray(FINGER_PEAK_PRESSURE * np.sqrt(squared_ratio_to_peak))
+        return FINGER_PEAK_PRESSURE * np.sqrt(squared_ratio_to_peak)
 
     def force_share(self, corners: Array, at: complex) -> float:
         """Return the fraction of the force that acts on a convex polygon of the film, from 0 to 1.
@@ -262,7 +262,8 @@ class Polygon(Probe):
         # Corners that are relative to their centroid are stored as they are, without further rounding errors.
         centroid = centroid_of(corners)
         if np.linalg.norm(centroid) > 1e-9 * self.reach:
-            object.__setattr__(self, "corners", _as_tuples(corners - centroid))  # the dataclass is frozen
+            relative_corners = (corners - centroid).tolist()
+            object.__setattr__(self, "corners", tuple(map(tuple, relative_corners)))  # the dataclass is frozen
         check_length("probe reach", self.reach)
 
     @classmethod
@@ -277,7 +278,7 @@ class Polygon(Probe):
         Raises:
             SceneError: If the corners do not form a convex polygon, or if the polygon is too small.
         """
-        return cls(_as_tuples(corners), angle, shape)
+        return cls(tuple(map(tuple, corners.tolist())), angle, shape)
 
     @classmethod
     def rectangle(cls, width: float, height: float, angle: float = 0.0) -> "Polygon":
@@ -350,12 +351,7 @@ class Polygon(Probe):
 
     def core(self, unit: float) -> Complexes:
         """Return the corners x + iy of the rotated polygon in multiples of `unit` (mm), shape (n_corner,)."""
-        return np.asarray(self.outline / unit)
-
-
-def _as_tuples(corners: Array) -> tuple[tuple[float, float], ...]:
-    """Convert corners (x, y) of shape (n, 2) into nested tuples, which can be compared and hashed."""
-    return tuple((float(x), float(y)) for x, y in corners)
+        return self.outline / unit
 
 
 NUMBER_PATTERN = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"

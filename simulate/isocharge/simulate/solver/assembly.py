@@ -321,7 +321,7 @@ def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, added
         """Solve for the displacements at the nodes; see `SolveTangent`."""
         field_without_air = solve_film(right)
         volume = float(weights @ field_without_air[:, 2])
-        return np.asarray(field_without_air - pressure_per_volume * volume * response)
+        return field_without_air - pressure_per_volume * volume * response
 
     return solve_with_air
 

@@ -155,7 +155,7 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
     film_stress = rotate_stress(press_frame_stress, equilibrium.direction)
     if equilibrium.rest is None:
         return film_stress
-    return np.asarray(film_stress - touch_stress(equilibrium.rest, points, surface))
+    return film_stress - touch_stress(equilibrium.rest, points, surface)
 
 
 def nodal_stress(equilibrium: Equilibrium, surface: Surface = "middle") -> Array:
@@ -173,7 +173,7 @@ def nodal_stress(equilibrium: Equilibrium, surface: Surface = "middle") -> Array
     stress = _induced_stress(equilibrium, surface, equilibrium.mesh.node_derivatives)
     if equilibrium.rest is None:
         return stress
-    return np.asarray(stress - nodal_stress(equilibrium.rest, surface))
+    return stress - nodal_stress(equilibrium.rest, surface)
 
 
 def _induced_stress(equilibrium: Equilibrium, surface: Surface, derivatives_of: Callable[[Array], Array]) -> Array:
@@ -263,7 +263,7 @@ def _continuous_slope(equilibrium: Equilibrium) -> Array:
     slope = slope_sum / element_count[:, None]
     slope[template.on_rim] = 0.0
     slope[template.on_axis, 1] = 0.0  # the deflection is symmetric about the axis of a half mesh
-    return np.asarray(slope[template.nodes])
+    return slope[template.nodes]
 
 
 def _bending_strain(equilibrium: Equilibrium, surface: Surface, second_derivatives: Array) -> Array:

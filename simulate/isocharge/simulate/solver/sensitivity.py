@@ -214,7 +214,7 @@ def _change_by_imperfection(
     if positive_press.mesh.oval != negative_press.mesh.oval:
         node_shift = (positive_press.mesh.points - negative_press.mesh.points) / (2.0 * STEP)
         change -= change_by_node_shift(solved.mesh, nodal_stress(solved, surface), node_shift)
-    return np.asarray(change)
+    return change
 
 
 def change_by_node_shift(mesh: PlacedMesh, stress: Array, node_shift: Complexes) -> Array:
@@ -231,7 +231,7 @@ def change_by_node_shift(mesh: PlacedMesh, stress: Array, node_shift: Complexes)
     stress_gradient = mesh.node_derivatives(stress)
     x_contribution = node_shift.real[..., None] * stress_gradient[..., 0, :]
     y_contribution = node_shift.imag[..., None] * stress_gradient[..., 1, :]
-    return np.asarray(x_contribution + y_contribution)
+    return x_contribution + y_contribution
 
 
 MAX_FRICTION = 1.0
