@@ -9,7 +9,7 @@ film with a closed cavity behind it. The benchmark takes about two minutes.
 from dataclasses import replace
 
 import numpy as np
-from shared import arguments, print_results
+from shared import arguments, percentiles, print_results
 
 from isocharge.common.arrays import Array
 from isocharge.simulate import Circle, ForwardMap, Sensor, Sweep, load_sensor, noise_model
@@ -30,19 +30,20 @@ def with_cavity(sensor: Sensor, depth_mm: float) -> Sensor:
     return replace(sensor, film=replace(sensor.film, back_volume=depth_mm * np.pi * sensor.film.radius**2))
 
 
-def errors(fitted: Fitted, contact: Array, charge: Array) -> str:
-    """Return the rms errors of a model, and the shares of presses with the flags `misfit` and `outside`."""
+def errors(fitted: Fitted, contact: Array, charge: Array) -> dict[str, float]:
+    """Return the errors of a model, and the shares of presses with the flags `misfit` and `outside`."""
     estimate, _, misfit = fitted.predict(charge)
     force_percent = force_error_percent(estimate, contact)
-    min_force, max_force = FORCE_RANGE_N
     is_misfit = misfit[:, 0] > MISFIT_LIMIT
-    is_far = np.hypot(estimate[:, 0], estimate[:, 1]) > fitted.domain.radius
-    is_outside = is_far | (estimate[:, 2] < min_force) | (estimate[:, 2] > max_force)
-    return (
-        f"{rms(position_error(estimate, contact)):.2f} mm, force {rms(force_percent):.1f} % rms, "
-        f"{np.mean(force_percent):+.1f} % on average, misfit {100.0 * np.mean(is_misfit):.0f} %, outside "
-        f"{100.0 * np.mean(is_outside):.0f} %, neither {100.0 * np.mean(~is_misfit & ~is_outside):.0f} %"
-    )
+    is_outside = fitted.domain.is_outside(estimate)
+    return {
+        "position_rms_mm": round(rms(position_error(estimate, contact)), 2),
+        "force_rms_percent": round(rms(force_percent), 1),
+        "force_mean_percent": round(float(np.mean(force_percent)), 1),
+        "misfit_percent": 100.0 * is_misfit.mean(),
+        "outside_percent": 100.0 * is_outside.mean(),
+        "neither_percent": 100.0 * np.mean(~is_misfit & ~is_outside),
+    }
 
 
 def main() -> None:
@@ -63,13 +64,12 @@ def main() -> None:
     )
     rng = np.random.default_rng(1)
     vented_charge = vented.charges(contact)
-    results = []
+    results = {}
     for depth_mm in DEPTHS_mm:
         charge = ForwardMap.build(with_cavity(sensor, depth_mm), PROBE, RADIUS_mm, FORCE_RANGE_N).charges(contact)
-        low, median, high = np.percentile(charge / vented_charge, [5, 50, 95])
-        ratios = f"charges times {median:.2f} ({low:.2f} to {high:.2f})"
-        results.append(f"{depth_mm:g} mm: {ratios}, {errors(fitted, contact, NOISE.add(charge, rng))}")
-    print_results("closed_back", asked, {"cavity that the model does not know": results})
+        factor = percentiles((charge / vented_charge).ravel(), (5, 50, 95), 2)
+        results[f"cavity of {depth_mm:g} mm"] = {"factor": factor, **errors(fitted, contact, NOISE.add(charge, rng))}
+    print_results("closed_back", asked, results)
 
 
 if __name__ == "__main__":

@@ -8,28 +8,15 @@ deviations without such a flag. The benchmark takes about two minutes.
 """
 
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
-from shared import arguments, markdown_table, print_results
+from shared import arguments, print_shares
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from press_faults import FaultStudy, Shares, film_map, film_variants
+from press_faults import FaultStudy, film_map, film_variants
 
 RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial"
-
-
-def cell(shares: Shares | None) -> str:
-    """Return the two shares of a cell as text, in %; empty if the model has no such fault."""
-    if shares is None:
-        return ""
-    return f"{percent(shares.flagged)}, {percent(shares.unnoticed)}"
-
-
-def percent(share: float) -> str:
-    """Return a share in percent as text, with a decimal where it is below one percent."""
-    return f"{share:.1f}" if share < 1.0 else f"{share:.0f}"
 
 
 def main() -> None:
@@ -40,11 +27,7 @@ def main() -> None:
     inside = {
         model: FaultStudy(model, nominal, variants, requested.presses, requested.seed).results() for model in models
     }
-    if requested.json:
-        results = {model: {fault: asdict(shares) for fault, shares in rows.items()} for model, rows in inside.items()}
-        print_results("flags", requested, results)
-        return
-    print_results("flags", requested, {"inside the working area": markdown_table("fault", inside, cell)})
+    print_shares("flags", requested, "fault", inside)
 
 
 if __name__ == "__main__":

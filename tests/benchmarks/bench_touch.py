@@ -182,7 +182,6 @@ def accuracy(
     delays_ms = [1e3 / RATE_Hz * int(is_contact[first:].argmax()) for first in first_frames]
     return {
         "position_mm": percentiles(error_mm, PERCENTILES, 3),
-        "position_not_saturated_mm": percentiles(error_mm[~is_saturated], PERCENTILES, 3),
         "force_percent": percentiles(force_error_percent, PERCENTILES, 3),
         "felt_share": round(len(contact_frames) / len(full_force_frames), 4),
         "saturated_share": round(float(is_saturated.mean()), 4),

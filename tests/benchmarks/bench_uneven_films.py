@@ -4,17 +4,19 @@ For each film and probe, the benchmark builds a forward map with two workers, co
 and compares some of them with direct solves. The error of a charge is relative to the directly solved charge, or to a
 tenth of the largest charge of the press if this is larger.
 
-    python tests/benchmarks/bench_uneven_films.py [--film "oval 0.01"] [--probe circle:1.0] [--presses 20]
+    python tests/benchmarks/bench_uneven_films.py [--film "oval 0.01"] [--probe circle:1.0] [--presses 20] [--json]
 """
 
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
-from shared import arguments
+from shared import arguments, print_results, report_progress
 
 from isocharge.simulate import ForwardMap, Sensor, Sweep, load_sensor, parse_probe, press, touch_charge
+from isocharge.train.data.contact_errors import rms
 
 TENSION = {"pretension": 0.75, "deviator": (0.25, 0.1)}
 MODULI = {"young": np.sqrt(3400.0 * 2400.0), "young_ratio": 3.4 / 2.4, "axis": np.deg2rad(20.0)}
@@ -46,33 +48,34 @@ def direct_errors(forward_map: ForwardMap, sensor: Sensor, count: int) -> np.nda
 
 
 def main() -> None:
-    """Print one row for each film and probe."""
-    options = arguments(__doc__, film="", probe="", presses=20)
+    options = arguments(__doc__, film="", probe="", presses=20, json=False)
     films = [options.film] if options.film else FILMS
     probes = [options.probe] if options.probe else PROBES
 
     built_in = load_sensor("four-25um-biaxial")
     sweep = Sweep(RADIUS_mm, FORCES_N, samples=SAMPLES, orientation="random")
-    print(f"{'film':40}{'probe':16}{'solves':>8}{'map, s':>8}{'charges, s':>12}{'worst error, %':>16}{'rms, %':>8}")
+    rows = {}
     with ProcessPoolExecutor(2) as executor:
-        for name in films:
+        for name, notation in product(films, probes):
             sensor = replace(built_in, film=replace(built_in.film, **FILMS[name]))
-            for notation in probes:
-                probe = parse_probe(notation)
-                start = time.perf_counter()
-                forward_map = ForwardMap.build(sensor, probe, RADIUS_mm, FORCES_N, executor=executor)
-                map_s = time.perf_counter() - start
-                presses = sweep.over([probe])
-                start = time.perf_counter()
-                forward_map.charges(presses.contact, presses.rotation)
-                charges_s = time.perf_counter() - start
-                errors = 100.0 * direct_errors(forward_map, sensor, options.presses)
-                rms = np.sqrt(np.mean(errors**2))
-                print(
-                    f"{name:40}{notation:16}{forward_map.solves:>8}{map_s:>8.0f}{charges_s:>12.0f}"
-                    f"{errors.max():>16.3f}{rms:>8.3f}",
-                    flush=True,
-                )
+            probe = parse_probe(notation)
+            start = time.perf_counter()
+            forward_map = ForwardMap.build(sensor, probe, RADIUS_mm, FORCES_N, executor=executor)
+            map_s = time.perf_counter() - start
+            presses = sweep.over([probe])
+            start = time.perf_counter()
+            forward_map.charges(presses.contact, presses.rotation)
+            charges_s = time.perf_counter() - start
+            errors = direct_errors(forward_map, sensor, options.presses)
+            rows[f"{name}, {notation}"] = {
+                "solves": forward_map.solves,
+                "map_s": round(map_s),
+                "charges_s": round(charges_s),
+                "worst_percent": round(100.0 * errors.max(), 3),
+                "rms_percent": round(100.0 * rms(errors), 3),
+            }
+            report_progress(f"{name}, {notation}", rows[f"{name}, {notation}"])
+    print_results("uneven_films", options, rows)
 
 
 if __name__ == "__main__":

@@ -10,15 +10,13 @@ elsewhere).
 """
 
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
-from bench_flags import percent
-from shared import arguments, markdown_table, print_results
+from shared import arguments, print_shares
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from press_faults import RingShares, WholeFilmStudy
+from press_faults import WholeFilmStudy
 
 RELEASED = (
     "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial,four-25um-biaxial-15mm,three-25um-biaxial-12mm,"
@@ -27,22 +25,11 @@ RELEASED = (
 RING_EDGES_mm = (8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 43.0)
 
 
-def cell(shares: RingShares | None) -> str:
-    """Return the three shares of a cell as text, in %; a dash if the working area covers the ring."""
-    if shares is None:
-        return "-"
-    return ", ".join(percent(share) for share in (shares.flagged, shares.unnoticed, shares.mirrored))
-
-
 def main() -> None:
     requested = arguments(__doc__, models=RELEASED, presses=2000, seed=1, json=False)
     models = requested.models.split(",")
     results = {model: WholeFilmStudy(model, requested.presses, requested.seed).rings(RING_EDGES_mm) for model in models}
-    if requested.json:
-        numbers = {model: {name: asdict(ring) for name, ring in rings.items()} for model, rings in results.items()}
-        print_results("whole film", requested, numbers)
-        return
-    print_results("whole film", requested, {"whole film": markdown_table("distance", results, cell)})
+    print_shares("whole film", requested, "distance", results, empty="-")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -100,21 +100,34 @@ def errors_over_limit(contact: Array, limit: Array, truth: Array) -> dict[str, f
     return ratios
 
 
-def markdown_table(corner: str, results: dict[str, dict[str, Any]], cell: Callable[[Any], str]) -> list[str]:
-    """Return the lines of a Markdown table with a column for each model.
+def print_shares(
+    name: str, asked: argparse.Namespace, corner: str, shares: dict[str, dict[str, Any]], empty: str = ""
+) -> None:
+    """Print shares as a Markdown table with a column for each model, or as one JSON object with the option `--json`.
 
     Args:
+        name: Name of the benchmark.
+        asked: Options of the benchmark.
         corner: Title of the first column.
-        results: Values by the name of the model and the name of the row. The rows have the order of the model with the
-            most rows.
-        cell: Function that returns the text of a value, or of None if a model has no value in a row.
+        shares: Dataclasses of shares in %, by the name of the model and the name of the row. The rows have the
+            order of the model with the most rows.
+        empty: Cell of a model that has no shares in a row.
     """
-    models = list(results)
-    lines = [f"| {corner} | " + " | ".join(f"`{model}`" for model in models) + " |", "|---" * (len(models) + 1) + "|"]
-    for row in max(results.values(), key=len):
-        cells = [cell(results[model].get(row)) for model in models]
-        lines.append(f"| {row} | " + " | ".join(cells) + " |")
-    return lines
+    if asked.json:
+        print_results(name, asked, {model: {row: vars(rows[row]) for row in rows} for model, rows in shares.items()})
+        return
+    titles = [f"`{model}`" for model in shares]
+    lines = [f"| {corner} | {' | '.join(titles)} |", "|---" * (len(shares) + 1) + "|"]
+    for row in max(shares.values(), key=len):
+        cells = [rows.get(row) for rows in shares.values()]
+        texts = [", ".join(map(percent, vars(cell).values())) if cell else empty for cell in cells]
+        lines.append(f"| {row} | {' | '.join(texts)} |")
+    print_results(name, asked, {name: lines})
+
+
+def percent(share: float) -> str:
+    """Return a share in percent as text, with a decimal where it is below one percent."""
+    return f"{share:.1f}" if share < 1.0 else f"{share:.0f}"
 
 
 def draw_lines(path: Path, lines: dict[str, tuple[list[float], list[float]]], **labels: str) -> None:

@@ -35,20 +35,16 @@ FADING = 0.5
 def terms(contact: Array, domain: Domain) -> Array:
     """Compute the terms of the discrepancy, each multiplied by FADING^(i + j + m).
 
-    For a contact outside the domain, the values at the nearest contact of the domain are returned.
-
     Args:
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        contact: Contacts (x, y, F) within the domain, shape (n, 3), mm and N.
         domain: Range of positions and forces to which the variables of the polynomials are scaled.
 
     Returns:
         Values of the terms, shape (n, n_term), dimensionless.
     """
-    unit_contact = domain.to_unit(contact)
-    distance = np.hypot(unit_contact[:, 0], unit_contact[:, 1])
-    unit_contact[:, :2] /= np.maximum(distance, 1.0)[:, None]  # changes only positions outside the unit disk
-    unit_contact[:, 2] = np.clip(unit_contact[:, 2], -1.0, 1.0)
-    x_values, y_values, force_values = (chebyshev.chebvander(coordinate, DEGREE) for coordinate in unit_contact.T)
+    x_values, y_values, force_values = (
+        chebyshev.chebvander(coordinate, DEGREE) for coordinate in domain.to_unit(contact).T
+    )
     degrees = _degrees()
     x_degree, y_degree, force_degree = degrees.T
     products = x_values[:, x_degree] * y_values[:, y_degree] * force_values[:, force_degree]

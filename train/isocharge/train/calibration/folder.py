@@ -338,8 +338,7 @@ def write_calibration(
     with single_threaded_blas():
         series = compact_charges(noisy_problem, result.charges, film, executor)
     settings = config or FitConfig()
-    if film.noise != problem.noise:
-        settings = FitConfig(settings.network, replace_setting(settings.training, noise=film.noise))
+    settings = FitConfig(settings.network, replace_setting(settings.training, noise=film.noise))
     fitted = fit(training_data(result.charges, film, series, executor), settings)
     if held_out is not None:
         fitted = with_guarantee(fitted, held_out)

@@ -1,7 +1,5 @@
 """Picture of a calibration, with a map of the contact error, and residuals of the presses."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -22,51 +20,33 @@ def calibration_picture(result: CalibrationResult) -> Figure:
         result: Result of the calibration.
     """
     figure = new_figure(11.0, 4.8)
+    figure.suptitle(f"calibration of {result.problem.sensor.name}", fontsize=13)
     map_axes, residual_axes = figure.subplots(1, 2)
-    _draw_error(map_axes, result)
+
+    # The position error at each contact, the electrodes and the presses
+    x, y, _ = spread_contacts(result.problem.domain).T
+    error_mm = result.sensitivity.position_errors_mm(result.film.covariance)
+    points = map_axes.scatter(x, y, c=error_mm, s=60)
+    figure.colorbar(points, ax=map_axes, label="position error by the film, mm")
+    error = result.film_error
+    sensor, _ = result.sensor_and_probe
+    title = f"{len(result.presses)} presses leave {error.position_mm:.2g} mm, {error.force_percent:.2g} % of force"
+    draw_layout(map_axes, sensor, result.problem.domain.radius, title)
     x, y, _ = result.estimation.contact.T
     is_bad = result.estimation.is_bad
     map_axes.plot(x[~is_bad], y[~is_bad], "o", color="white", mec=INK, ms=6, label="presses")
     map_axes.plot(x[is_bad], y[is_bad], "X", color=FELT, mec=INK, ms=9, label="left out")
     map_axes.legend(loc="upper right", fontsize=8)
-    _draw_residuals(residual_axes, result)
-    figure.suptitle(f"calibration of {result.problem.sensor.name}", fontsize=13)
-    return figure
 
-
-def _draw_error(axes: Any, result: CalibrationResult) -> None:
-    """Draw the electrodes, and the position error due to the uncertainty of the film at each contact.
-
-    Args:
-        axes: Axes of matplotlib.
-        result: The calibration, which defines the contacts.
-    """
-    x, y, _ = spread_contacts(result.problem.domain).T
-    error_mm = result.sensitivity.position_errors_mm(result.film.covariance)
-    points = axes.scatter(x, y, c=error_mm, s=60)
-    axes.figure.colorbar(points, ax=axes, label="position error by the film, mm")
-    error = result.film_error
-    sensor, _ = result.sensor_and_probe
-    title = f"{len(result.presses)} presses leave {error.position_mm:.2g} mm, {error.force_percent:.2g} % of force"
-    draw_layout(axes, sensor, result.problem.domain.radius, title)
-
-
-def _draw_residuals(axes: Any, result: CalibrationResult) -> None:
-    """Draw the residual of each press as a bar, relative to the expected size of the residual.
-
-    Args:
-        axes: Axes of matplotlib.
-        result: Result of the calibration.
-    """
-    # A press without redundant measurements has no residual.
+    # The residual of each press, relative to the expected size. Without redundant measurements, there is none.
     relative_residual = np.sqrt(np.nan_to_num(result.estimation.press_chi2))
-    colours = [FELT if bad else FITTED for bad in result.estimation.is_bad]
-    axes.bar(result.presses.lines, relative_residual, color=colours)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.axhline(1.0, color=INK, lw=0.8, ls="--")  # the expected size
-    axes.set(
+    residual_axes.bar(result.presses.lines, relative_residual, color=np.where(is_bad, FELT, FITTED))
+    residual_axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    residual_axes.axhline(1.0, color=INK, lw=0.8, ls="--")  # the expected size
+    residual_axes.set(
         title="residuals of the presses",
         xlabel=f"{result.presses.row_noun} of the press",
         ylabel="residual, relative to its expected size",
         yscale="symlog",
     )
+    return figure

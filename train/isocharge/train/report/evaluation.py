@@ -135,6 +135,9 @@ NOISE = noise_model("reference")
 """Noise of simulated test presses, which also weights the charges of measured presses."""
 
 
+SEED = 0
+"""Seed of all random numbers."""
+
 SINGLE_PRESSES = 64
 """Number of different presses that are predicted in turn when predictions are timed."""
 
@@ -146,13 +149,11 @@ class Settings:
     Attributes:
         presses: Smallest number of simulated test presses. Fewer presses are repeated with other noise.
         seconds: Duration for which the predictions of a method are timed, s.
-        seed: Seed of all random numbers.
         quick: Whether the report is a trial run, whose results are not meaningful.
     """
 
     presses: int = 4096
     seconds: float = 0.1
-    seed: int = 0
     quick: bool = False
 
 
@@ -285,12 +286,11 @@ class DatasetEvaluation:
     def measure(self) -> Section:
         """Fit all methods, and measure their errors and their speed."""
         domain = domain_of(self.dataset)
-        seed = self.settings.seed
         test = self.held_out_presses
         measured = is_measured(self.dataset)
         if not measured:
             test = test.repeated(self.settings.presses)
-            test = replace(test, charge=test.noisy(NOISE, seed))
+            test = replace(test, charge=test.noisy(NOISE, SEED))
 
         methods = [model_method(self.model_folder)]
         limits: dict[str, float] = {}

@@ -6,7 +6,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from isocharge.common.files import new_folder, refuse_existing, write_whole
@@ -14,7 +13,7 @@ from isocharge.common.progress import track
 from isocharge.serve.benchmark import machine
 from isocharge.simulate import Dataset
 from isocharge.simulate.plots.figure import FELT, INK, new_figure, save_picture
-from isocharge.train.report.evaluation import DatasetEvaluation, MethodRecord, Section, Settings
+from isocharge.train.report.evaluation import SEED, DatasetEvaluation, MethodRecord, Section, Settings
 from isocharge.train.training.fit import threads_and_seed
 
 RECORDED_PACKAGES = ("isocharge", "numpy", "scipy", "onnxruntime")
@@ -70,7 +69,7 @@ def report_page(sections: Sequence[Section], settings: Settings, machine: Mappin
         blocks += [f"Left out: {reason}." for reason in section.left_out]
     blocks.append(
         "All methods run in one process with one thread, and take turns. The times are medians for one press. The seed "
-        f"({settings.seed}) determines the presses and the noise."
+        f"({SEED}) determines the presses and the noise."
     )
     blocks.append(f"Machine: {', '.join(f'{name} {value}' for name, value in machine.items())}.")
     if command:
@@ -142,41 +141,32 @@ def draw_speed(sections: Sequence[Section]) -> Figure:
         sections: Results of all datasets.
 
     Returns:
-        Figure with logarithmic axes. The Cramér-Rao limit is a horizontal line.
+        Figure with a logarithmic axis of the times. The evaluated model is a star, and the Cramér-Rao limit is a
+        horizontal line. The line lies outside the panel if it is much larger than all errors, which occurs if the
+        presses reach a fold of the charges.
     """
     figure = new_figure(6.5 * len(sections), 4.5)
     panels = figure.subplots(1, len(sections), squeeze=False)
     for axes, section in zip(panels[0], sections, strict=True):
-        _draw_panel(axes, section)
+        answered = [record for record in section.methods if record.errors]
+        for record in answered:
+            is_evaluated = record is section.methods[0]
+            style: dict[str, Any] = (
+                {"color": FELT, "marker": "*", "ms": 14} if is_evaluated else {"marker": "o", "ms": 7}
+            )
+            error_mm = _position_error(record)
+            label = f"{record.name.replace('`', '')}, {error_mm:.3g} mm"
+            axes.plot(record.single_press_us, error_mm, ls="", label=label, **style)
+        if section.limits:
+            limit_mm = section.limits["position_rms_mm"]
+            axes.axhline(limit_mm, color=INK, ls=":", label=f"Cramér-Rao limit, unbiased, {limit_mm:.3g} mm")
+        axes.set(xscale="log", xlabel="time of one prediction, median, us", ylabel="position error, rms, mm")
+        axes.set_title(section.sensor)
+        axes.set_ylim(0.0, 1.2 * max(map(_position_error, answered), default=1.0))
+        axes.xaxis.set_major_formatter("{x:,g}")
+        axes.grid(alpha=0.25)
+        axes.legend(fontsize=8)
     return figure
-
-
-def _draw_panel(axes: Axes, section: Section) -> None:
-    """Draw the methods and the limit of one dataset. The evaluated model is a star.
-
-    The limit lies outside the panel if it is much larger than all errors, which occurs if the presses reach a fold of
-    the charges.
-
-    Args:
-        axes: Axes of matplotlib.
-        section: Results of the dataset.
-    """
-    answered = [record for record in section.methods if record.errors]
-    for record in answered:
-        is_evaluated = record is section.methods[0]
-        style: dict[str, Any] = {"color": FELT, "marker": "*", "ms": 14} if is_evaluated else {"marker": "o", "ms": 7}
-        error_mm = _position_error(record)
-        label = f"{record.name.replace('`', '')}, {error_mm:.3g} mm"
-        axes.plot(record.single_press_us, error_mm, ls="", label=label, **style)
-    if section.limits:
-        limit_mm = section.limits["position_rms_mm"]
-        axes.axhline(limit_mm, color=INK, ls=":", label=f"Cramér-Rao limit, unbiased, {limit_mm:.3g} mm")
-    axes.set(xscale="log", xlabel="time of one prediction, median, us", ylabel="position error, rms, mm")
-    axes.set_title(section.sensor)
-    axes.set_ylim(0.0, 1.2 * max(map(_position_error, answered), default=1.0))
-    axes.xaxis.set_major_formatter("{x:,g}")
-    axes.grid(alpha=0.25)
-    axes.legend(fontsize=8)
 
 
 def write_report(
@@ -208,7 +198,7 @@ def write_report(
     refuse_existing(folder)
     settings = settings or Settings()
     evaluations = [DatasetEvaluation.prepare(dataset, model_folder, settings) for dataset, model_folder in subjects]
-    with threads_and_seed(1, settings.seed):  # all methods are timed with one thread
+    with threads_and_seed(1, SEED):  # all methods are timed with one thread
         sections = [evaluation.measure() for evaluation in track(evaluations, "datasets")]
 
     this_machine = machine(RECORDED_PACKAGES)
@@ -216,7 +206,7 @@ def write_report(
         "format_version": FORMAT_VERSION,
         "command": command,
         "machine": this_machine,
-        "settings": asdict(settings),
+        "settings": {**asdict(settings), "seed": SEED},
         "datasets": [asdict(section) for section in sections],
     }
     page = report_page(sections, settings, this_machine, command)
