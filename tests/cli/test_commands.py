@@ -272,7 +272,7 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
         "fit": lambda *_: None,
         "release": lambda _, folder, **__: load_model(shutil.copytree(released, folder / "1")),
         "save_picture": lambda figure, _: figures.append(figure),
-        **dict.fromkeys(("press", "draw_deflection"), lambda *_: None),
+        **dict.fromkeys(("press", "draw_deflection", "draw_section", "draw_charge_map"), lambda *_: None),
     }.items():
         monkeypatch.setattr(f"isocharge.cli.demo.full_demo.{name}", stub)
     run_demo(out, 2.0, SENSOR)
@@ -287,7 +287,7 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
         assert error == pytest.approx(model.metadata.errors[name], rel=1e-3)
         if tolerance is not None:  # live, there is one press only
             assert abs(np.log(live_error[0] / error)) < tolerance
-    pressed, felt = figures[0].axes[1].lines[:2]
+    pressed, felt = figures[0].axes[2].lines[:2]
     assert (pressed.get_label(), felt.get_label(), (out / "presses").is_dir()) == ("pressed", "estimated", True)
     np.testing.assert_allclose(felt.get_xydata(), pressed.get_xydata(), atol=0.5)
 

@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+<<<<<<< HEAD
 from isocharge.simulate import Calibration, Circle, Electrode, load_sensor, press
 from isocharge.simulate.plots.film import FELT, INK, draw_deflection, draw_electrodes, draw_layout, draw_section
+=======
+from isocharge.simulate import Calibration, Circle, Domain, Electrode, FunctionMap, load_sensor, press
+from isocharge.simulate.plots.film import FELT, INK, draw_charge_map, draw_electrodes, draw_layout, draw_section
+>>>>>>> parent of 241d5102 (Draw the deflection and the live contacts in the demo; the gallery draws sections and contours)
 
 
 def test_draw_electrodes_draws_front_and_back_at_their_positions():
@@ -29,13 +34,19 @@ def test_draw_layout_shows_all_electrodes_and_highlights_one():
     """The axes show the corners of the electrodes, of which the outermost is 12.8 mm from the centre."""
     sensor = load_sensor("four-25um-biaxial")
     axes = Figure().subplots()
-    draw_layout(axes, sensor, 8.0)
-    low, high = axes.get_xlim()
-    corners = np.concatenate([electrode.corners for electrode in sensor.electrodes])
-    assert -low == high > np.linalg.norm(corners, axis=1).max()
-    axes = Figure().subplots()
-    draw_electrodes(axes, sensor, highlight="B")
+    draw_layout(axes, sensor, 8.0, highlight="B")
     assert {text.get_text(): text.get_color() for text in axes.texts} == {"A": INK, "B": FELT, "C": INK, "D": INK}
+    corners = np.concatenate([electrode.corners for electrode in sensor.electrodes])
+    low, high = axes.get_xlim()
+    assert -low == high > np.linalg.norm(corners, axis=1).max()
+
+
+def test_draw_charge_map_covers_the_whole_disk():
+    """The shaded area extends to the edge of the domain on all sides."""
+    charge_map = FunctionMap(lambda contact: contact[:, :1], ("A",), Domain(8.0, (0.1, 1.0)))
+    axes = Figure().subplots()
+    draw_charge_map(axes, charge_map, 0)
+    assert axes.dataLim.extents == pytest.approx([-8.0, -8.0, 8.0, 8.0], abs=0.02)
 
 
 def test_pictures_of_an_oval_film_end_at_its_rim():

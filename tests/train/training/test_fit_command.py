@@ -1,8 +1,11 @@
-"""The command `train fit`: what it imports, and what it prints."""
+"""The command `train fit` with a dataset: what it imports, and what it keeps if the release is refused."""
 
 import json
+import re
 import shutil
 import sys
+import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ import pytest
 from isocharge.cli.train import fit as fit_command
 from isocharge.common.errors import PressError
 from isocharge.serve import load_model
+from isocharge.train import fit
 from processes import finished
 
 SHORT_CONFIG = """
@@ -79,3 +83,26 @@ def test_each_caution_about_a_file_of_presses_is_printed_once(tmp_path, command)
     assert code == 0, err
     assert "no press has a known force" in err
     assert err.count("caution: ") == 1
+
+
+OBSTACLES = {"m": "a file", "m/config.pbtxt": "a model of another sensor", "m/1": "the same version"}
+
+
+@pytest.mark.parametrize("obstacle", OBSTACLES, ids=OBSTACLES.values())
+def test_a_training_whose_release_is_refused_costs_no_model(obstacle, dataset_folder, tmp_path, command, monkeypatch):
+    (tmp_path / "short.toml").write_text(SHORT_CONFIG)
+
+    def train_slowly(*arguments):
+        path = tmp_path / obstacle
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("written by another process")
+        return fit(*arguments)
+
+    monkeypatch.setattr(fit_command, "fit", train_slowly)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    code, _, err = command("train", "fit", dataset_folder, "--config", tmp_path / "short.toml", "-o", tmp_path / "m")
+    assert code != 0
+    kept_folder = Path(re.search(r"The trained model is kept in (\S+)", err)[1])
+    assert kept_folder.parts[-2:] == ("m", "1")
+    assert load_model(kept_folder).metadata.name == "m"
+    assert (tmp_path / obstacle).read_text() == "written by another process"

@@ -2,6 +2,7 @@
 
 from itertools import islice
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -17,7 +18,13 @@ from isocharge.serve import Port, Predictor, TouchStream
 from isocharge.simulate import Circle, Equilibrium, ForwardMap, Sweep, load_sensor, press, read_dataset
 from isocharge.simulate.dataset.sweep import solve_maps, write_sweep
 from isocharge.simulate.plots.figure import FELT, PRESSED, new_figure, save_picture
-from isocharge.simulate.plots.film import draw_deflection, draw_electrodes, draw_layout
+from isocharge.simulate.plots.film import (
+    draw_charge_map,
+    draw_deflection,
+    draw_electrodes,
+    draw_layout,
+    draw_section,
+)
 from isocharge.train import fit, release
 from isocharge.train.data.contact_errors import position_error
 
@@ -100,14 +107,25 @@ def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array
         followed: True and estimated contacts of the live part, shape (n, 2, 3), mm and N.
         path: Path of the picture, which is written.
     """
-    figure = new_figure(12.0, 5.5)
-    left, right = figure.subplots(1, 2)
+    figure = new_figure(15.0, 9.2)
+    top, bottom = cast(np.ndarray, figure.subfigures(2, 1))
+
+    # Upper row: the film under one press, a section through it, and the paths of the live part.
+    left, middle, right = top.subplots(1, 3)
     draw_deflection(left, equilibrium)
     draw_electrodes(left, forward_map.sensor, names=False)
+    draw_section(middle, equilibrium)
     true_contact, contact = followed.transpose(1, 2, 0)  # each of shape (3, n)
     right.plot(true_contact[0], true_contact[1], ".", color=PRESSED, ms=1.5, zorder=3, label="pressed")
     right.plot(contact[0], contact[1], ".", color=FELT, ms=3.0, label="estimated")
     right.legend(loc="upper right")
     draw_layout(right, forward_map.sensor, forward_map.domain.radius, "live contacts, through the port")
+
+    # Lower row: a map of the charge of each electrode.
+    all_axes = bottom.subplots(1, len(forward_map.electrodes))
+    for electrode_index, (axes, name) in enumerate(zip(all_axes, forward_map.electrodes, strict=True)):
+        draw_charge_map(axes, forward_map, electrode_index)
+        title = f"isocharge contours of {name} at 1 N, pC"
+        draw_layout(axes, forward_map.sensor, forward_map.domain.radius, title, highlight=name)
     figure.suptitle(f"isocharge demo: {forward_map.sensor.name}, {forward_map.probe.notation}", fontsize=14)
     save_picture(figure, path)

@@ -9,6 +9,7 @@ from matplotlib.patches import Polygon as Patch
 from matplotlib.patheffects import withStroke
 
 from isocharge.common.arrays import Array
+from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.plots.figure import FELT, INK
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.sensor import Sensor
@@ -93,7 +94,7 @@ def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> Non
     axes.set(xlim=limits, ylim=limits, xlabel="x, mm", ylabel="y, mm", aspect="equal", title=title)
 
 
-def draw_layout(axes: Any, sensor: Sensor, radius: float, title: str = "") -> None:
+def draw_layout(axes: Any, sensor: Sensor, radius: float, title: str = "", highlight: str = "") -> None:
     """Draw the electrodes and the working area of a sensor, and scale the axes.
 
     Args:
@@ -101,10 +102,32 @@ def draw_layout(axes: Any, sensor: Sensor, radius: float, title: str = "") -> No
         sensor: Sensor whose electrodes are drawn.
         radius: Radius of the working area, mm.
         title: Title of the axes.
+        highlight: Name of an electrode that is drawn in another colour; empty for none.
     """
-    draw_electrodes(axes, sensor)
+    draw_electrodes(axes, sensor, highlight)
     draw_working_area(axes, radius)
     frame_film(axes, sensor, radius, title)
+
+
+def draw_charge_map(axes: Any, charge_map: ChargeMap, electrode: int, force: float = 1.0, count: int = 81) -> None:
+    """Draw the charge of one electrode as a function of the position of a press.
+
+    The charge is shown by shades and by labelled contours.
+
+    Args:
+        axes: Axes of matplotlib.
+        charge_map: Map that computes the charges of contacts.
+        electrode: Index of the electrode in the order of the charges.
+        force: Force of the presses, N.
+        count: Number of points on each ring of the polar grid on which the charge is computed.
+    """
+    # The grid has half as many rings as angles.
+    x, y = _polar_grid(charge_map.domain.radius, rings=count // 2, angles=count)
+    contact = np.stack([x.ravel(), y.ravel(), np.full(x.size, force)], axis=1)
+    charge = charge_map.charges(contact)[:, electrode].reshape(x.shape)
+    axes.contourf(x, y, charge, levels=30, cmap="YlGnBu")
+    contour_lines = axes.contour(x, y, charge, levels=12, colors=INK, linewidths=0.8)
+    axes.clabel(contour_lines, fmt="%.0f", fontsize=7)
 
 
 def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:

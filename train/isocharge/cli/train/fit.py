@@ -4,6 +4,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Annotated
 
 import typer
@@ -18,7 +19,7 @@ from isocharge.cli.shared.forward_maps import (
 from isocharge.cli.shared.options import ForceStdOption, JsonOption, PositionStdOption, RadiusOption
 from isocharge.cli.shared.terminal import say, show_result, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.common.errors import InputError
+from isocharge.common.errors import InputError, ModelError, OutputError, OutputExists
 from isocharge.serve import read_presses
 from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import (
@@ -30,6 +31,7 @@ from isocharge.simulate import (
 )
 from isocharge.train import FitConfig, Fitted, TrainingConfig, TrainingData, fit, fit_presses, load_config, release
 from isocharge.train.data.presses import is_measured, measured_presses_of
+from isocharge.train.model_release.release import Release
 
 
 def fit_command(
@@ -130,9 +132,10 @@ def fit_command(
         sensor_name = output.resolve().name  # this sensor has no other name than that of the model
         train = partial(fit_presses, presses, sensor_name, probes=tuple(sorted(set(probe or ["unknown"]))))
 
-    check_target(output, version, electrodes)
+    version_folder = check_target(output, version, electrodes)
     with shown_progress():
-        released = release(train(fit_config), output, version=version, command=this_command())
+        fitted = train(fit_config)
+        released = _release(fitted, version_folder)
     show_result({"folder": str(released.folder), "errors": dict(released.metadata.errors)}, json=json)
 
 
@@ -152,6 +155,28 @@ def _refuse_options(context: typer.Context, source: str, *used_options: str) -> 
         origin = context.get_parameter_source(parameter.name or "")
         if parameter.name in unused and origin is not None and origin.name == "COMMANDLINE":
             raise InputError(f"{parameter.opts[0]}: has no effect on {source}; leave the option out")
+
+
+def _release(fitted: Fitted, version_folder: Path) -> Release:
+    """Write a trained network as a version of a model.
+
+    If the folder of the model refuses the version, for example because another process has written this version during
+    the training, the version is written to a new temporary folder.
+
+    Args:
+        fitted: The network.
+        version_folder: Folder of the version.
+
+    Raises:
+        IsochargeError: If the folder refuses the version. The message names the temporary folder.
+    """
+    model_folder = version_folder.parent
+    write = partial(release, fitted, version=int(version_folder.name), command=this_command())
+    try:
+        return write(model_folder)
+    except (OutputExists, OutputError, ModelError) as error:
+        kept = write(Path(mkdtemp(prefix="isocharge-"), model_folder.resolve().name))
+        raise type(error)(f"{error}. The trained model is kept in {kept.folder}") from error
 
 
 def _is_sensor(argument: Path) -> bool:
