@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-<<<<<<< HEAD
-from isocharge.simulate import Calibration, Circle, Electrode, load_sensor, press
-from isocharge.simulate.plots.film import FELT, INK, draw_deflection, draw_electrodes, draw_layout, draw_section
-=======
-from isocharge.simulate import Calibration, Circle, Domain, Electrode, FunctionMap, load_sensor, press
-from isocharge.simulate.plots.film import FELT, INK, draw_charge_map, draw_electrodes, draw_layout, draw_section
->>>>>>> parent of 241d5102 (Draw the deflection and the live contacts in the demo; the gallery draws sections and contours)
+from function_map import FunctionMap
+from isocharge.simulate import Calibration, Circle, Domain, Electrode, load_sensor, press
+from isocharge.simulate.plots.film import (
+    FELT,
+    INK,
+    draw_charge_map,
+    draw_deflection,
+    draw_electrodes,
+    draw_layout,
+    draw_section,
+)
 
 
 def test_draw_electrodes_draws_front_and_back_at_their_positions():

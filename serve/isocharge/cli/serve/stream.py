@@ -272,7 +272,7 @@ def stream_command(
             writers.insert(0, _require_time)
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
-            with no_frames_advice_added(port):
+            with no_frames_advice_added(port, device):
                 write_records(islice(records, count), writers)
         finally:
             if source.is_live:
@@ -283,7 +283,7 @@ def stream_command(
         raise typer.Exit(int(has_expired.is_set()))
     has_no_frames = touch.totals().frames == 0
     if has_no_frames:
-        say(f"no frames were recognised; {no_frames_hint(port)}")
+        say(f"no frames were recognised; {no_frames_hint(port, device)}")
     say_missing_records(outputs, "incomplete")
     is_recording_incomplete = recorder is not None and recorder.failed
     is_without_result = has_no_frames and has_expired.is_set()

@@ -109,8 +109,8 @@ def draw_layout(axes: Any, sensor: Sensor, radius: float, title: str = "", highl
     frame_film(axes, sensor, radius, title)
 
 
-def draw_charge_map(axes: Any, charge_map: ChargeMap, electrode: int, force: float = 1.0, count: int = 81) -> None:
-    """Draw the charge of one electrode as a function of the position of a press.
+def draw_charge_map(axes: Any, charge_map: ChargeMap, electrode: int) -> None:
+    """Draw the charge of one electrode as a function of the position of a press of 1 N.
 
     The charge is shown by shades and by labelled contours.
 
@@ -118,12 +118,9 @@ def draw_charge_map(axes: Any, charge_map: ChargeMap, electrode: int, force: flo
         axes: Axes of matplotlib.
         charge_map: Map that computes the charges of contacts.
         electrode: Index of the electrode in the order of the charges.
-        force: Force of the presses, N.
-        count: Number of points on each ring of the polar grid on which the charge is computed.
     """
-    # The grid has half as many rings as angles.
-    x, y = _polar_grid(charge_map.domain.radius, rings=count // 2, angles=count)
-    contact = np.stack([x.ravel(), y.ravel(), np.full(x.size, force)], axis=1)
+    x, y = _polar_grid(np.full(81, charge_map.domain.radius), rings=40)
+    contact = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
     charge = charge_map.charges(contact)[:, electrode].reshape(x.shape)
     axes.contourf(x, y, charge, levels=30, cmap="YlGnBu")
     contour_lines = axes.contour(x, y, charge, levels=12, colors=INK, linewidths=0.8)
@@ -137,7 +134,8 @@ def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
         axes: Axes of matplotlib.
         equilibrium: Equilibrium of the film under a press.
     """
-    x, y = _polar_grid(equilibrium.film, rings=240, angles=361)
+    rim_distance = equilibrium.film.rim_distance(np.linspace(0.0, 2.0 * np.pi, 361))
+    x, y = _polar_grid(rim_distance, rings=240)
     points = np.stack([x.ravel(), y.ravel()], axis=1)
     depth = deflection(equilibrium, points).reshape(x.shape)
     shades = axes.contourf(x, y, depth, levels=24, cmap="viridis_r")
@@ -177,18 +175,18 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
     )
 
 
-def _polar_grid(film: Film, rings: int, angles: int) -> tuple[Array, Array]:
-    """Return the points of a polar grid on a film. The areas between neighbouring rings are equal.
+def _polar_grid(rim_distance: Array, rings: int) -> tuple[Array, Array]:
+    """Return the points of a polar grid. The areas between neighbouring rings are equal.
 
     Args:
-        film: The film.
+        rim_distance: Distance of the outermost ring from the centre at evenly distributed angles from 0 to 2 pi, shape
+            (n_angle,), mm.
         rings: Number of rings, including the centre.
-        angles: Number of points on each ring.
 
     Returns:
-        Coordinates x and y, each of shape (rings, angles), mm.
+        Coordinates x and y, each of shape (rings, n_angle), mm.
     """
     share_of_rim = np.sqrt(np.linspace(0.0, 1.0, rings))
-    angle = np.linspace(0.0, 2.0 * np.pi, angles)
-    points = np.outer(share_of_rim, film.rim_distance(angle) * np.exp(1j * angle))
+    angle = np.linspace(0.0, 2.0 * np.pi, rim_distance.size)
+    points = np.outer(share_of_rim, rim_distance * np.exp(1j * angle))
     return points.real, points.imag

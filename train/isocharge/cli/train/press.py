@@ -126,7 +126,7 @@ def press_command(
         stream = ReadingStream(problem.electrodes, board, reader=f"sensor {problem.sensor.name}")
         try:
             with (
-                no_frames_advice_added(port),  # first, because it changes the errors of the next two
+                no_frames_advice_added(port, device),  # first, because it changes the errors of the next two
                 # A machine goes on while the port is lost, so its session must end.
                 open_source(port, baud=baud, reconnect=contacts is None, request=board.request) as source,
                 PressEvents(source, stream, PressWatch(problem.electrodes), keyboard) as events,
