@@ -48,10 +48,10 @@ def test_bomb_is_refused_before_it_is_unpacked():
     assert peak < 4 * MEBIBYTE
 
 
-def entry(content):
+def entry(content, name="a.npy", method=zipfile.ZIP_DEFLATED):
     file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("a.npy", content)
+    with zipfile.ZipFile(file, "w", method) as archive:
+        archive.writestr(name, content)
     return bytearray(file.getvalue())
 
 
@@ -90,3 +90,9 @@ def with_header(text):
 def test_entry_that_is_no_array_of_numbers_is_refused(content, reason):
     with pytest.raises(ValueError, match=reason):
         npz_arrays(bytes(entry(content)))
+
+
+def test_compression_method_that_numpy_does_not_write_is_refused():
+    for method in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
+        with pytest.raises(ValueError, match=f"an array has the compression method {method}"):
+            npz_arrays(bytes(entry(npy(np.zeros(1)), method=method)))

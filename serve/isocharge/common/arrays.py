@@ -1,8 +1,8 @@
 """Types of the NumPy arrays in the signatures of functions, and the reader for npz files of untrusted sources.
 
-An npz file is a zip archive with one entry in NumPy's npy format for each array. The sizes that the archive declares
-are checked before NumPy reads any array. A small file can therefore not cause the allocation of much memory. Arrays
-that contain pickled Python objects are refused.
+An npz file is a zip archive with one entry in NumPy's npy format for each array. The sizes and the compression methods
+that the archive declares are checked before NumPy reads any array. A small file can therefore not cause the allocation
+of much memory. Arrays that contain pickled Python objects are refused.
 """
 
 import io
@@ -35,6 +35,9 @@ Complexes = NDArray[np.complex128]
 LARGEST = float(np.finfo(np.float32).max)
 """Largest number that the tensors of the models can contain: the largest float32 number."""
 
+NPZ_COMPRESSION_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Compression methods that are accepted in npz files. NumPy writes no others."""
+
 
 def npz_arrays(data: bytes) -> dict[str, np.ndarray]:
     """Read the arrays of an npz file.
@@ -50,6 +53,9 @@ def npz_arrays(data: bytes) -> dict[str, np.ndarray]:
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            for entry in archive.infolist():
+                if entry.compress_type not in NPZ_COMPRESSION_METHODS:
+                    raise ValueError(f"an array has the compression method {entry.compress_type}")
             # An entry that is longer than declared is read only up to its declared length, and fails its checksum.
             unpacked_bytes = sum(entry.file_size for entry in archive.infolist())
         if unpacked_bytes > MAX_FILE_BYTES:

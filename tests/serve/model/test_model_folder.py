@@ -160,7 +160,7 @@ def test_graph_that_loads_its_numbers_from_another_file_is_refused(own_model):
     graph = onnx.load(path)
     onnx.save_model(graph, path, save_as_external_data=True, location="weights.bin", size_threshold=0)
     put_graph(own_model, path.read_bytes())
-    with pytest.raises(ModelError, match=r"cannot read .*external data"):
+    with pytest.raises(ModelError, match="external data"):
         load_model(own_model)
 
 

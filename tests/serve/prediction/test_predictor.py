@@ -1,6 +1,8 @@
 """Predictions equal those of a plain onnxruntime session, and arguments that are no charges are refused."""
 
+import copy
 import math
+import pickle
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 from decimal import Decimal
@@ -12,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from isocharge.common.errors import ChargeError
-from isocharge.serve import Contact, Contacts
+from isocharge.serve import Contact, Contacts, Predictor
 
 PRESSES = st.lists(st.floats(0.0, 5000.0, width=32), min_size=3, max_size=3).filter(lambda q: sum(q) > 1.0)
 
@@ -121,6 +123,19 @@ def test_predict_into_allocates_no_array(predictor):
     assert grown_bytes < 20_000
 
 
+def test_warning_about_an_implausible_contact_is_logged_once(models, film, caplog):
+    predictor = Predictor("linear", models=models)
+    presses = film.charge_pC([0.0, 0.0], [0.0, 0.0], [1.0, 5.9])
+    assert [predictor.flags(predictor.predict(charge_pC)) for charge_pC in presses] == [(), ("outside",)]
+    assert caplog.messages == []
+    assert predictor.flags(predictor.predict([9e9, 9e9, 9e9])) == ("outside", "beyond")
+    predictor.predict([9e9, 9e9, 9e9])
+    (message,) = caplog.messages
+    assert message.startswith("linear/1: the charges A = 9e+09, B = 9e+09, C = 9e+09 pC ")
+    assert "--check-electrodes` whether wires are swapped" in message
+    assert "1.125e+07 N cannot be a measurement" in message
+
+
 def test_order_of_the_fields_of_a_contact_is_fixed():
     """Other programs, such as exported C code, read the values by their positions."""
     names = ("x_mm", "y_mm", "force_N", "x_std_mm", "y_std_mm", "force_std_N", "misfit")
@@ -137,3 +152,15 @@ def test_predictor_answers_rightly_in_several_threads(film, predictor):
 
     with ThreadPoolExecutor(4) as threads:
         assert list(threads.map(wrong_answers, range(4))) == [0] * 4
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+def test_predictor_can_be_copied_and_pickled(film, predictor, copied, tmp_path, monkeypatch):
+    """Also after the program has changed its working directory, from which the model was loaded."""
+    charges = film.charge_pC([1.0], [2.0], [0.5])[0]
+    monkeypatch.chdir(predictor.folder.parent)
+    relative = Predictor(predictor.folder.name)
+    monkeypatch.chdir(tmp_path)
+    other = copied(relative)
+    assert other.predict(charges) == predictor.predict(charges)
+    assert other._press is not predictor._press

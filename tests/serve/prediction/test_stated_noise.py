@@ -1,6 +1,7 @@
 """Standard deviations of released models for a stated noise, against closed formulas and against simulated presses."""
 
 import json
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -76,6 +77,7 @@ def test_device_file_with_noise_widens_the_contacts_of_a_stream_and_of_predict(r
     expected = released.with_noise(1.0, 0.015).predict(PRESS_pC)
     assert frame.contact == expected
     assert expected.x_std_mm > 4.0 * released.predict(PRESS_pC).x_std_mm
+    assert pickle.loads(pickle.dumps(setup.predictor)).predict(PRESS_pC) == expected
 
     presses, board = tmp_path / "presses.csv", tmp_path / "board.toml"
     presses.write_text("A,B,C,D\n1200,800,700,900\n")

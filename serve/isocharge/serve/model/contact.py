@@ -259,6 +259,13 @@ The limit of the force is the largest force times this factor. The limit of the 
 area is the radius of the circle around the working area times this factor.
 """
 
+MAX_CENTRE_OFFSET = 0.05
+"""Largest distance between the origin and the centre of a working area that is called centred, dimensionless.
+
+The distance is relative to the radius of the area.
+"""
+
+
 N_CORNERS = 64
 """Number of corners of the polygon that represents a round working area."""
 
@@ -346,9 +353,22 @@ class Validity:
         return np.asarray((np.abs(charge_pC) > limit_pC).any(axis=1))
 
     @property
+    def is_centred(self) -> bool:
+        """Whether the centre of the working area is close to the origin."""
+        return math.hypot(*self.centre_mm) < MAX_CENTRE_OFFSET * self.radius_mm
+
+    @cached_property
     def area_text(self) -> str:
-        """Description of the working area for messages, which states its largest distance from the origin."""
-        return f"up to {self.radius_mm:.3g} mm from the origin"
+        """Description of the working area for messages.
+
+        The text states the radius of the area if its centre is close to the origin, and its bounding box otherwise.
+        """
+        if self.is_centred:
+            return f"up to {self.radius_mm:.3g} mm"
+        # The limits are the corners of the bounding box of the working area.
+        left_mm, bottom_mm = self.corners_mm.min(axis=0)
+        right_mm, top_mm = self.corners_mm.max(axis=0)
+        return f"from ({left_mm:.3g}, {bottom_mm:.3g}) to ({right_mm:.3g}, {top_mm:.3g}) mm"
 
     @cached_property
     def inscribed_radius_squared_mm2(self) -> float:

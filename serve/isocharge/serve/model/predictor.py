@@ -8,11 +8,12 @@ prediction of a single press therefore allocates no arrays and is faster than `s
 and writes the contact into an existing array, which is faster in a loop.
 """
 
-import copy
+import logging
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,10 +21,13 @@ from numpy.typing import ArrayLike
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ChargeError
 from isocharge.common.structs import convert
+from isocharge.serve.flags import BEYOND
 from isocharge.serve.model.contact import Contact, Contacts, Validity, as_batch, as_press, write_finite
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.model.model_folder import find_model, load_model
 from isocharge.serve.model.session import COLUMNS, BoundPress, run
+
+log = logging.getLogger(__name__)
 
 
 class Predictor:
@@ -31,7 +35,8 @@ class Predictor:
 
     All methods may be called from any thread. `predict` and `predict_into` use memory that the predictor allocates
     once, so that only one thread at a time executes them. Threads that must not wait for each other need their own
-    predictors. `predict_batch` does not use this memory. A predictor cannot be pickled: create one in each process.
+    predictors. `predict_batch` does not use this memory. A predictor that is copied or unpickled is loaded again from
+    its folder.
 
     Attributes:
         folder: Version folder of the model.
@@ -67,6 +72,7 @@ class Predictor:
         self._session = loaded.session
         self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
         self._press_lock = threading.Lock()  # held while a method uses the memory of `_press`
+        self._has_warned = False
         self.noise = loaded.metadata.noise
 
     def with_noise(self, white_pC: float, gain: float) -> "Predictor":
@@ -74,8 +80,8 @@ class Predictor:
 
         The contacts are the same. The covariance of a contact is increased by the covariance that the additional noise
         of the charges causes, which is computed from predictions with changed charges. If the noise is smaller than the
-        noise of the training, the standard deviations do not change. The misfit is in units of the larger noise. A
-        touch must exceed the given noise. `predict_into` ignores the noise.
+        noise of the training, the standard deviations do not change. The misfit is in units of the larger noise.
+        `predict_into` ignores the noise.
 
         Args:
             white_pC: Standard deviation of the part of the noise that does not depend on the charge, pC.
@@ -85,14 +91,25 @@ class Predictor:
             ChargeError: If a standard deviation is not a finite number from 0.
         """
         stated = {"name": "stated", "white_pC": white_pC, "gain": gain}
-        noise = convert(stated, ModelNoise, "noise", ChargeError)
-        new_predictor = copy.copy(self)
+        return self._with_stated_noise(convert(stated, ModelNoise, "noise", ChargeError))
+
+    def _with_stated_noise(self, noise: ModelNoise) -> "Predictor":
+        """Return a predictor of the same model for another noise. A touch must also exceed this noise."""
+        new_predictor = object.__new__(type(self))
+        new_predictor.__dict__.update(self.__dict__)
         new_predictor.noise = noise
         new_predictor.validity = replace(self.validity, white_pC=noise.white_pC)
         return new_predictor
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how `copy` and `pickle` create the predictor again, because the onnxruntime session has no copy."""
+        return _load_again, (type(self), self.folder, self.noise)
+
     def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
         """Compute the contact of one press. Call `flags` to find out whether the contact is valid.
+
+        If the position or the force is too large to be a measurement, a warning is logged. Only the first warning of a
+        predictor is logged.
 
         Args:
             charge_pC: Touch charges, shape (electrodes,), pC, in the order of `metadata.electrodes`.
@@ -100,9 +117,26 @@ class Predictor:
         Raises:
             ChargeError: If the number of charges is wrong, or a charge is not finite.
         """
-        if self.noise is not self.metadata.noise:
+        if self.noise is self.metadata.noise:
+            contact = self._predict_one(charge_pC)
+        else:
             contacts = self._predict_with_noise(as_press(charge_pC, self.metadata.electrodes)[np.newaxis])
-            return Contact(*np.asarray(contacts, float)[0].tolist())
+            contact = Contact(*np.asarray(contacts, float)[0].tolist())
+
+        if not self._has_warned and BEYOND in self.flags(contact):
+            self._has_warned = True
+            self._warn(charge_pC, contact)
+        return contact
+
+    def _predict_one(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
+        """Compute the contact of one press, with the standard deviations for the noise of the training.
+
+        Args:
+            charge_pC: Touch charges, shape (electrodes,), pC.
+
+        Raises:
+            ChargeError: If the number of charges is wrong, or a charge is not finite.
+        """
         values = charge_pC.tolist() if isinstance(charge_pC, np.ndarray) else charge_pC
         press = self._press
         with self._press_lock:
@@ -210,6 +244,37 @@ class Predictor:
             f"Predictor({metadata.label}: sensor {metadata.frame_id}, charges {' '.join(metadata.electrodes)} (pC), "
             f"positions {self.validity.area_text}, forces {low_N:.3g} to {high_N:.3g} N)"
         )
+
+    def _warn(self, charge_pC: object, contact: Contact) -> None:
+        """Log a warning for a contact that cannot be a measurement.
+
+        Args:
+            charge_pC: Charges of the press, as they were passed to `predict`.
+            contact: Contact that the model computed from the charges.
+        """
+        charges = np.ravel(np.asarray(charge_pC, float))
+        pairs = zip(self.metadata.electrodes, charges, strict=True)
+        log.warning(
+            "%s: the charges %s pC are far from those of any press in the training, and the contact (%.2f, %.2f) mm, "
+            "%.6g N cannot be a measurement; check the unit, the gain and the tare, and with `isocharge serve doctor "
+            "--check-electrodes` whether wires are swapped. Further contacts of this kind are not logged; "
+            "Predictor.flags reports each of them",
+            self.metadata.label,
+            ", ".join(f"{electrode} = {charge:.4g}" for electrode, charge in pairs),
+            contact.x_mm,
+            contact.y_mm,
+            contact.force_N,
+        )
+
+
+def _load_again(predictor_class: type[Predictor], folder: Path, noise: ModelNoise) -> Predictor:
+    """Load a predictor from its folder, with the noise of `with_noise`.
+
+    Raises:
+        ModelError: If the model is no longer in the folder, or is damaged.
+    """
+    predictor = predictor_class(folder)
+    return predictor if noise == predictor.noise else predictor._with_stated_noise(noise)
 
 
 def _describe(value: object) -> str:

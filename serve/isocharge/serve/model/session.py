@@ -47,6 +47,9 @@ COLUMNS = {"contact": slice(0, 3), "contact_std": slice(3, 6), "misfit": slice(6
 N_WITHOUT_CORRELATION = COLUMNS[CORRELATION].start
 """Number of values of a `Contact` before its correlations."""
 
+EXTERNAL_DATA = b"\x0a\x08location"
+"""Encoded key of the entry of an ONNX tensor that names the file with the numbers of the tensor."""
+
 
 def open_session(onnx_model: bytes, where: str) -> ort.InferenceSession:
     """Open a session of a model that uses one thread.
@@ -58,9 +61,14 @@ def open_session(onnx_model: bytes, where: str) -> ort.InferenceSession:
         where: Name or file of the model, for error messages.
 
     Raises:
-        ModelError: If the bytes are not an ONNX graph that onnxruntime can run, for example because the numbers of the
-            graph are in another file.
+        ModelError: If the bytes are not an ONNX graph that onnxruntime can run, or if the graph loads external data.
     """
+    if EXTERNAL_DATA in onnx_model:
+        raise ModelError(
+            f"{where}: expected a model with all of its numbers inside, got one that loads external data from another "
+            "file, which no checksum covers; save the model again with onnx.save(model, path, "
+            "save_as_external_data=False)"
+        )
     try:
         session = ort.InferenceSession(onnx_model, _single_thread_options(), providers=["CPUExecutionProvider"])
         # onnxruntime raises an exception when a text that is not valid UTF-8 is read.
