@@ -178,13 +178,13 @@ def test_word_that_changes_is_no_name(notation):
     assert len(feed(*lines)) == 12
 
 
-@pytest.mark.parametrize("columns", [(), ("n", "T", "A", "B", "flags")])
+@pytest.mark.parametrize("columns", [(), ("n", "T", "A", "B")])
 def test_names_of_the_counter_and_the_clock_in_a_header_have_their_meaning(columns):
     parser = TextParser(columns, {"n": "seq", "T": "t_ms"})
-    header = [] if columns else ["n,T,A,B,flags"]
-    frames = feed("", *header, *[f"{k},{5 * k},{k}.5,-1.5,{k}" for k in range(5)], parser=parser)
-    assert [(frame.seq, frame.t_us, frame.values, frame.bits) for frame in frames] == [
-        (k, 5000 * k, (k + 0.5, -1.5), k) for k in range(5)
+    header = [] if columns else ["n,T,A,B"]
+    frames = feed("", *header, *[f"{k},{5 * k},{k}.5,-1.5" for k in range(5)], parser=parser)
+    assert [(frame.seq, frame.t_us, frame.values) for frame in frames] == [
+        (k, 5000 * k, (k + 0.5, -1.5)) for k in range(5)
     ]
     assert frames[-1].names == ("A", "B")
 
