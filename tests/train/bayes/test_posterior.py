@@ -27,7 +27,7 @@ def test_the_posterior_of_linear_charges_with_white_noise_is_a_gaussian(seed):
     assert std[0, :2] == pytest.approx(np.sqrt(np.diag(covariance)), rel=0.04)
 
 
-@pytest.mark.parametrize("contact", [(5.0, 3.0, 0.06), (1.0, 2.0, 0.4)])
+@pytest.mark.parametrize("contact", [(5.0, 3.0, 0.06), (1.0, 2.0, 0.4), (0.1, 0.0, 1.9)])
 def test_posterior_means_are_weighted_means_of_the_prior(spline, contact):
     """With loud noise, the prior ends within the posterior, and the factor 1 / sigma shifts the mean."""
     noise = NoiseModel("loud", 5.0, 0.1)
