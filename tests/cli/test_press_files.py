@@ -4,6 +4,7 @@ import pyarrow
 import pytest
 from pyarrow.parquet import write_table
 
+from isocharge.cli.train import calibrate as calibrate_module
 from isocharge.common.defaults import MAX_BATCH
 from isocharge.serve import Predictor
 
@@ -54,3 +55,12 @@ def test_a_setting_without_effect_on_measured_presses_is_refused(refused, tmp_pa
     (tmp_path / "c.toml").write_text(f"[training]\n{setting}\n")
     words = "train", "fit", tmp_path / "p.csv", "--config", tmp_path / "c.toml", "-o", tmp_path / "models" / "pad"
     refused(*words, message=f"training.{setting.split()[0]} has no effect on measured presses")
+
+
+def test_too_few_held_out_presses_are_refused_before_the_film_is_solved(refused, tmp_path, monkeypatch):
+    monkeypatch.setattr(calibrate_module, "calibrate", lambda *_, **__: pytest.fail("the film is solved"))
+    (tmp_path / "p.csv").write_text("x_mm,y_mm,force_N,A,B,C,D\n1,2,1,500,500,500,500\n")
+    words = "train", "calibrate", tmp_path / "p.csv", "--sensor", "four-25um-biaxial", "-o", tmp_path / "film"
+    message = "at least 22 held-out presses within 8 mm"
+    refused(*words, "--held-out", tmp_path / "p.csv", message=message)
+    assert [path.name for path in tmp_path.iterdir()] == ["p.csv"]

@@ -148,6 +148,21 @@ def test_forward_map_of_other_films(near_electrodes, film, surface, theory):
     assert errors(forward_map, draw(forward_map, 4, seed=7)[0]).max() < 1e-3
 
 
+def test_zero_force_gives_zero_charges(three_map):
+    """Contacts with zero force may have any position. They are counted in the index of an error message."""
+    contact = np.array([[1.0, 0.0, 0.0], [50.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [2.0, 0.0, 1.0]])
+    charge = three_map.charges(contact)
+    assert not charge[:3].any()
+    np.testing.assert_allclose(charge[3:], three_map.charges(contact[3:]))
+    with pytest.raises(SceneError, match=r"press 3 at \(8\.1, 0\) mm with 1 N is outside the forward map"):
+        three_map.charges(np.concatenate([contact[:3], [[8.1, 0.0, 1.0]]]))
+
+
+def test_orientations_that_are_not_finite_are_refused(three_map):
+    with pytest.raises(SceneError, match=r"expected finite orientations in rad, got .*nan"):
+        three_map.charges(np.full((2, 3), 1.0), np.array([0.0, np.nan]))
+
+
 def test_derivatives_of_a_map_with_a_single_force_are_refused(near_electrodes):
     single = QUICK | {"force_range": (1.0, 1.0)}
     forward_map = kept(ForwardMap.build, near_electrodes, Circle(1.0), **single)

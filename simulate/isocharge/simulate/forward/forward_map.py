@@ -18,7 +18,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes
-from isocharge.common.contact_domain import Domain
+from isocharge.common.contact_domain import Domain, as_contacts
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate.execution import in_order
@@ -223,7 +223,7 @@ class ForwardMap:
         """Compute the touch charges of presses.
 
         Args:
-            contact: Presses (x, y, F), shape (n, 3), mm and N.
+            contact: Presses (x, y, F), shape (n, 3), mm and N. If F is zero, the charges are zero.
             orientation: Anticlockwise rotation of the probe in addition to its own orientation, shape (n,) or a number,
                 rad.
 
@@ -231,10 +231,18 @@ class ForwardMap:
             Charges, shape (n, n_electrode), pC.
 
         Raises:
-            SceneError: If a press lies outside the domain.
+            SceneError: If a press with a force lies outside the domain, or an orientation is not finite.
         """
-        contact = self.domain.check(contact, "forward map")
-        return self._unchecked_charges(contact, orientation)
+        contact = as_contacts(contact, "forward map")
+        orientation = np.broadcast_to(orientation, len(contact))
+        if not np.isfinite(orientation).all():
+            raise SceneError(f"forward map: expected finite orientations in rad, got {orientation}")
+
+        # A press without a force may lie anywhere. It is replaced by a valid press, whose charges become zero.
+        has_force = contact[:, 2:] != 0.0
+        valid_contact = (0.0, 0.0, self.domain.force_range[0])
+        checked_contact = self.domain.check(np.where(has_force, contact, valid_contact), "forward map")
+        return np.where(has_force, self._unchecked_charges(checked_contact, orientation), 0.0)
 
     def derivatives(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to x, y and ln F by central differences.
