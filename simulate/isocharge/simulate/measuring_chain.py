@@ -428,6 +428,4 @@ def noise_model(level: str) -> NoiseModel:
         InputError: If the level or the file does not exist, if a key is unknown or its value is out of range, or if
             the resolution of the converter is given without a limit.
     """
-    if level in NOISE_LEVELS:
-        return NOISE_LEVELS[level]
     return load_amplifier(level).noise

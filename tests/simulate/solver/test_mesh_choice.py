@@ -12,13 +12,12 @@ from isocharge.simulate import (
     Film,
     Polygon,
     SolveSettings,
-    Theory,
     load_sensor,
     press,
     touch_charge,
 )
 from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.solver.error_estimate import estimated_error, mesh_error, modelling_error
+from isocharge.simulate.solver.error_estimate import estimated_error, mesh_error
 from isocharge.simulate.solver.load_case import LoadCase, needs_second_mesh
 from isocharge.simulate.solver.press import needed_resolution
 from solved_charges import relative_error, solved_charge, with_film
@@ -138,19 +137,3 @@ def test_film_that_bends_far_from_the_rim_equals_a_finer_mesh(radius, thickness,
     expected = solved_charge(sensor, Circle(probe), at, force, finer)
     charge = solved_charge(sensor, Circle(probe), at, force)
     np.testing.assert_allclose(charge, expected, rtol=1e-4)
-
-
-@pytest.mark.parametrize("pretension", [0.0, 0.5])
-def test_error_of_omitted_bending_depends_only_on_ratios(pretension):
-    """With all lengths twice as large, four times the force causes the same strains."""
-    errors = [
-        modelling_error(
-            Film(45.0 * size, 0.025 * size, 3000.0, 0.34, pretension),
-            Circle(size),
-            0.5 * size**2,
-            Theory(bending=False),
-        )
-        for size in (1.0, 2.0)
-    ]
-    assert errors[0] > 0.0
-    assert errors[1] == pytest.approx(errors[0])

@@ -129,29 +129,23 @@ class Sweep:
 
     def contacts(self) -> Array:
         """Return the contacts (x, y, F) of a sweep with one probe, shape (n, 3), mm and N."""
-        return self._draw(self.samples, 0).contact
+        contact, _ = self._draw(self.samples, (0,), 0.0, self.radius)
+        return contact
 
     def outside_presses(self, outer_radius: float) -> SweepPresses:
         """Return presses between the disk of the sweep and a larger circle.
 
-        The positions are uniformly distributed over the ring, and the logarithms of the forces over the range of
-        forces.
-
         Args:
             outer_radius: Radius of the larger circle, mm.
         """
-        distance_fraction, angle_fraction, force_fraction, _ = self._unit_cube(self.outside, 0, 1).T
-        # The area within a distance is proportional to the square of the distance.
-        distance = np.sqrt(self.radius**2 + (outer_radius**2 - self.radius**2) * distance_fraction)
-        angle = FULL_TURN * angle_fraction
-        force = self._force(force_fraction)
-        contact = np.stack([distance * np.cos(angle), distance * np.sin(angle), force], axis=1)
+        contact, _ = self._draw(self.outside, (0, 1), self.radius, outer_radius)
         return SweepPresses(np.full(self.outside, OUTSIDE_PROBE), contact, np.zeros(self.outside))
 
     def over(self, probes: Sequence[Probe]) -> SweepPresses:
         """Return the presses of a sweep with several probes.
 
-        Successive presses cycle through the probes.
+        Successive presses cycle through the probes. The rotations are uniformly distributed over a full turn, or zero
+        if the orientation is "fixed".
 
         Args:
             probes: Probes of the sweep.
@@ -161,69 +155,49 @@ class Sweep:
         """
         if not probes:
             raise SceneError("probes: expected at least one, got none")
-        # Successive presses belong to successive probes, each of which has a sequence of points of its own.
-        n_probe = len(probes)
-        presses = SweepPresses(
-            np.empty(self.samples, dtype=np.intp), np.empty((self.samples, 3)), np.empty(self.samples)
-        )
-        for index in range(n_probe):
-            own = slice(index, None, n_probe)
-            drawn = self._draw(len(range(index, self.samples, n_probe)), index)
-            presses.probe[own] = drawn.probe
-            presses.contact[own] = drawn.contact
-            presses.rotation[own] = drawn.rotation
-        return presses
+        # Each probe has a sequence of points of its own.
+        probe = np.arange(self.samples) % len(probes)
+        contact = np.empty((self.samples, 3))
+        rotation = np.zeros(self.samples)
+        for index in range(len(probes)):
+            own = np.flatnonzero(probe == index)
+            contact[own], turn_fraction = self._draw(own.size, (index,), 0.0, self.radius)
+            if self.orientation == "random":
+                rotation[own] = FULL_TURN * turn_fraction
+        return SweepPresses(probe, contact, rotation)
 
-    def _draw(self, count: int, probe_index: int) -> SweepPresses:
-        """Draw the presses of one probe.
+    def _draw(
+        self, count: int, stream: tuple[int, ...], inner_radius: float, outer_radius: float
+    ) -> tuple[Array, Array]:
+        """Draw contacts between two circles around the centre of the film, and a rotation for each contact.
 
-        The positions are uniformly distributed over the disk. The logarithms of the forces are uniformly distributed
-        over the range of forces. The rotations are uniformly distributed over a full turn, or zero if the orientation
-        is "fixed".
-
-        Args:
-            count: Number of presses.
-            probe_index: Index of the probe in the sweep.
-        """
-        fractions = self._unit_cube(count, probe_index)
-        distance_fraction, angle_fraction, force_fraction, rotation_fraction = fractions.T
-        distance = self.radius * np.sqrt(distance_fraction)  # the area within a distance is proportional to its square
-        position = distance * np.exp(1j * FULL_TURN * angle_fraction)
-        rotation = FULL_TURN * rotation_fraction if self.orientation == "random" else np.zeros(count)
-        contact = np.stack([position.real, position.imag, self._force(force_fraction)], axis=1)
-        return SweepPresses(np.full(count, probe_index), contact, rotation)
-
-    def _unit_cube(self, count: int, *stream: int) -> Array:
-        """Draw points that are uniformly distributed over the unit cube in four dimensions.
+        The positions are uniformly distributed over the area between the circles. The logarithms of the forces are
+        uniformly distributed over the range of forces.
 
         Args:
-            count: Number of points.
+            count: Number of contacts.
             stream: Numbers that select a sequence of random numbers: the index of a probe, or 0 and 1 for the presses
                 outside the disk.
+            inner_radius: Radius of the inner circle, mm.
+            outer_radius: Radius of the outer circle, mm.
 
         Returns:
-            Points, shape (count, 4), with coordinates from 0 to 1. The coordinates are for the distance, the angle, the
-            force and the rotation of a press.
+            Contacts (x, y, F), shape (count, 3), mm and N. Rotations, shape (count,), in full turns.
         """
-        rng = np.random.default_rng([self.seed, *stream])
         # A Sobol sequence is balanced if the number of points is a power of two. Draw the next larger power of two, and
         # use the first `count` points. A probe may have no presses if there are more probes than presses.
+        rng = np.random.default_rng([self.seed, *stream])
         log2_count = int(np.ceil(np.log2(max(count, 2))))
-        points = scipy.stats.qmc.Sobol(4, rng=rng).random_base2(log2_count)
-        return np.asarray(points[:count])
+        points = scipy.stats.qmc.Sobol(4, rng=rng).random_base2(log2_count)[:count]
+        distance_fraction, angle_fraction, force_fraction, turn_fraction = points.T
 
-    def _force(self, fraction: Array) -> Array:
-        """Convert numbers from 0 to 1 into forces by linear interpolation of the logarithm of the force.
-
-        Args:
-            fraction: Fractions from 0 (smallest force) to 1 (largest force), shape (n,).
-
-        Returns:
-            Forces, shape (n,), N.
-        """
+        # The area within a distance is proportional to the square of the distance.
+        distance = np.sqrt(inner_radius**2 + (outer_radius**2 - inner_radius**2) * distance_fraction)
+        position = distance * np.exp(1j * FULL_TURN * angle_fraction)
         min_log_force, max_log_force = np.log(self.force_range)
-        force = np.exp(min_log_force + (max_log_force - min_log_force) * fraction)
-        return np.asarray(np.clip(force, *self.force_range))  # rounding must not move a force out of the range
+        force = np.exp(min_log_force + (max_log_force - min_log_force) * force_fraction)
+        force_in_range = np.clip(force, *self.force_range)  # rounding must not move a force out of the range
+        return np.column_stack([position.real, position.imag, force_in_range]), turn_fraction
 
 
 _log = logging.getLogger(__name__)
