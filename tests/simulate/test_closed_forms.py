@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import iv, ivp, kv, kvp
 
 from axisymmetric_membrane import axisymmetric_membrane
 from isocharge.simulate import (
@@ -152,6 +153,53 @@ def test_plate_under_a_disk(at, radius):
     assert relative_error(deflection(solved, points), exact) <= 1e-4
 
 
+@pytest.mark.parametrize("tension_MPa", [0.01, 10.0])
+def test_taut_plate_under_a_centred_disk(tension_MPa):
+    """The deflection is the solution of D lap lap w - N lap w = q for a pressure q on a disk.
+
+    Inside and outside the footprint, the solution consists of a parabola, a logarithm and modified Bessel functions. At
+    the edge of the footprint, the deflection and its first three derivatives are continuous.
+    """
+    film = replace(SLACK, thickness=0.3, pretension=tension_MPa)
+    tension = film.pretension * film.thickness
+    c = 0.1
+    k = film.radius * np.sqrt(tension / plate_stiffness(film))
+
+    def basis(r: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the value and three derivatives of the basis functions at a radius in film radii.
+
+        Inside the footprint they are 1 and I0, and outside 1, ln, I0 and K0, shapes (4, 2) and (4, 4). The Bessel
+        functions are divided by their values at r = c or r = 1.
+        """
+        i0, k0 = (np.array([k**n * derivative(0, k * r, n) for n in range(4)]) for derivative in (ivp, kvp))
+        one = np.array([1.0, 0, 0, 0])
+        log = np.array([np.log(r), 1 / r, -1 / r**2, 2 / r**3])
+        return (
+            np.stack([one, i0 / iv(0, k * c)], axis=1),
+            np.stack([one, log, i0 / iv(0, k), k0 / kv(0, k * c)], axis=1),
+        )
+
+    inner, outer = basis(c)
+    _, rim = basis(1.0)
+    parabola = -np.array([c**2, 2 * c, 2.0, 0.0]) / (4.0 * np.pi * c**2)  # in units of F / N: q a^2 / N = 1 / pi c^2
+    continuity = [inner, -outer]
+    clamped_rim = [np.zeros((2, 2)), rim[:2]]
+    weights = np.linalg.solve(np.block([continuity, clamped_rim]), np.concatenate([-parabola, [0.0, 0.0]]))
+    scale = TINY / tension
+    solved = press(
+        film,
+        Circle(c * film.radius),
+        (0.0, 0.0),
+        TINY,
+        SolveSettings(theory=FULL, resolution=Resolution(7, 8, 5, 2)),
+    )
+    centre = deflection(solved, np.zeros((1, 2)))[0]
+    assert centre == pytest.approx(scale * (weights[0] + weights[1] / iv(0, k * c)), rel=2e-5)
+    for r in (0.2, 0.6, 0.95):
+        expected = scale * (basis(r)[1][0] @ weights[2:])
+        np.testing.assert_allclose(deflection(solved, ring(r * film.radius)), expected, atol=2e-5 * centre)
+
+
 @pytest.mark.parametrize(
     ("share", "force", "poisson", "tension"),
     [
@@ -176,3 +224,19 @@ def test_axisymmetric_membrane(share, force, poisson, tension):
         np.testing.assert_allclose(radial, along, rtol=3e-5)
         np.testing.assert_allclose(hoop, around, rtol=1e-4)
         np.testing.assert_allclose(shear, 0.0, atol=3e-5 * along)
+
+
+def test_hencky():
+    """The stress in the centre under a uniform pressure agrees with Hencky's series.
+
+    A probe over the whole film exerts a uniform pressure q. Then N_r(0) = b0 / 4 (q^2 a^2 E h)^(1/3), with b0 = 1.7244
+    for Poisson's ratio 0.3 (Hencky 1915; digits of Fichter 1997).
+    """
+    film = replace(SLACK, poisson=0.3)
+    force = 1e-6
+    radius = 0.9999 * SLACK.radius
+    solved = press(film, Circle(radius), (0.0, 0.0), force, SolveSettings(theory=MEMBRANE, resolution=REFINED))
+    pressure = force / (np.pi * radius**2)
+    expected = 1.7244 / 4.0 * np.cbrt(pressure**2 * film.radius**2 * film.young * film.thickness)
+    centre = touch_stress(solved, np.zeros((1, 2)))[0] * film.thickness
+    np.testing.assert_allclose(centre[:2], expected, rtol=1e-4)

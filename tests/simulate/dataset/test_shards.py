@@ -1,5 +1,6 @@
 """Dataset format: round trip, manifest, and errors for incomplete or damaged datasets."""
 
+import errno
 import hashlib
 import json
 import shutil
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isocharge.common.errors import DatasetError
+from isocharge.common.errors import DatasetError, OutputError
 from isocharge.simulate import Samples, load_sensor, read_dataset, write_dataset
 from isocharge.simulate.dataset.shards import COLUMNS
 
@@ -206,3 +207,19 @@ def test_invalid_samples_are_not_written(tmp_path, changes, message):
     with pytest.raises(DatasetError, match=rf"shard-00001\.npz: {message}"):
         write_dataset(tmp_path / "presses", SENSOR, [samples(), replace(samples(), **changes)], ABOUT)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_full_disk_leaves_no_partial_dataset(tmp_path, monkeypatch):
+    """The disk is full when one of the files is written, for each file in turn."""
+    for failing in range(1, 5):
+        calls = []
+
+        def full(_handle, calls=calls, failing=failing):
+            calls.append(1)
+            if len(calls) == failing:
+                raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr("os.fsync", full)
+        with pytest.raises(OutputError, match="presses cannot be written: No space left on device"):
+            write_dataset(tmp_path / "new" / "presses", SENSOR, [samples(), samples()], ABOUT)
+        assert list(tmp_path.iterdir()) == []

@@ -177,6 +177,18 @@ def test_find_folds_finds_nothing_beside_an_electrode(film):
     assert len(find_folds(charges, Rings.spread(4.0, 13, 60), force, REFERENCE)) == 0
 
 
+def test_nearest_fold_agrees_with_signs_of_the_determinant_on_a_fine_grid(film):
+    """The determinant of J is computed by finite differences on a grid. Folds separate regions of different sign."""
+    model = ChargeSpline.of(replace(film, sensor=load_sensor("three-25um-uniaxial")), spacing=0.4)
+    steps = 0.1 * np.arange(-50, 51)
+    x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
+    contact = np.stack([x, y, np.full(x.size, 0.316)], axis=1)
+    sign = np.sign(np.linalg.det(differences(model.charges, contact, (0.01, 0.01, 1e-3))))
+    is_beyond_fold = sign != sign[x.size // 2]
+    folds = find_folds(model, Rings.spread(11.5), 0.316, REFERENCE)
+    assert np.hypot(*folds[0]) == pytest.approx(np.hypot(x, y)[is_beyond_fold].min(), abs=0.1)
+
+
 @pytest.mark.parametrize("forces", [FORCES, (0.5, 0.5)], ids=["a range", "one force"])
 def test_ambiguous_pairs_are_mirror_images_in_the_fold_line(forces):
     pairs = find_ambiguous_pairs(folded_map(forces=forces), REFERENCE, 0.5, places=400)

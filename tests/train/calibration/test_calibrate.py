@@ -126,6 +126,17 @@ def test_three_charges_need_a_known_contact_inside():
         fit(presses, three, film)
 
 
+def test_continued_calibration_needs_fewer_presses(problem, synthetic):
+    values, _, presses = rig(problem, synthetic, 20, seed=19)
+    earlier = fit(presses, problem, synthetic).film.drifted()
+    values[0] += 0.2 if values[0] < 2.0 else -0.2
+    _, _, three = rig(problem, synthetic, 3, seed=20, values=values)
+    continued = fit(three, replace(problem, earlier=earlier), synthetic)
+    fresh = fit(three, problem, synthetic)
+    assert continued.film_error.position_mm < 0.5 * fresh.film_error.position_mm
+    assert abs(continued.film.value("pretension") - values[0]) < 3.0 * continued.film.std("pretension")
+
+
 def test_proposed_presses_reduce_the_errors_as_announced(problem, synthetic):
     """The announced errors are those of a calibration with the proposed presses; random presses leave larger ones."""
     proposed = next_presses(problem, synthetic, 6)

@@ -5,8 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.benchmarks.solved_films import solve_charges
+from tests.train.calibration.conftest import rig
 
+from isocharge.train import calibrate
 from isocharge.train.calibration.calibrate import solve_even
+from isocharge.train.calibration.estimator import PLANNED
 from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.film_network import _nodes, _tension_factors
 
@@ -43,3 +46,26 @@ def test_no_node_makes_a_film_slack_in_one_direction(problem):
     values[film.layout.index("pretension")] = 0.6
     lowest = 0.6 + _nodes(replace(film, values=values)).min()
     assert 0.0 < lowest - 0.25 * 0.6 < 0.05
+
+
+@pytest.mark.slow
+def test_estimate_does_not_depend_on_the_film_that_is_solved_first(problem):
+    """Touches at unknown places show the pretension, although the first solved film is far from the real film."""
+    layout = problem.prior.layout
+    tension, difference = layout.index("pretension"), layout.index("tension_difference")
+    values = problem.prior.mean.copy()
+    values[[tension, difference]] = 1.2, -0.25
+    earlier = FilmEstimate(layout, values, 0.01 * problem.prior.covariance(PLANNED))
+    later = earlier.film_values.copy()
+    later[[tension, difference]] = 0.8, -0.25 * 1.2 / 0.8
+    film = solve_even(problem, values=later)
+    _, _, touches = rig(problem, film, 60, seed=23, values=later)
+    touches.contact[:] = np.nan
+    continued = replace(problem, earlier=earlier.drifted())
+    found = []
+    for first_MPa in (1.0, 0.6):
+        later[tension] = first_MPa
+        found.append(calibrate(touches, continued, start=solve_even(problem, values=later), accurate=False).film)
+    std = found[0].std("pretension")
+    assert abs(found[0].value("pretension") - found[1].value("pretension")) < 0.4 * std
+    assert abs(found[0].value("pretension") - 0.8) < 2.0 * std

@@ -43,6 +43,17 @@ def direct(sensor, probe, contact):
     return np.array([solved_charge(sensor, probe, (x, y), force) for x, y, force in contact.tolist()])
 
 
+def test_charges_of_a_similar_film_agree_with_direct_solves(solved):
+    """All properties differ at the same time. The change of the charges is about 5 %."""
+    prior = solved.prior
+    values = prior.mean + 0.3 * prior.std * np.random.default_rng(1).standard_normal(len(prior.names))
+    charge = solved.charges(values, CONTACT)
+    expected = direct(*prior.film(values), CONTACT)
+    change = np.abs(expected / solved.charges(prior.mean, CONTACT) - 1.0)
+    assert change.max() > 0.04
+    np.testing.assert_allclose(charge, expected, rtol=0.01)
+
+
 def test_negative_charges_agree_with_direct_solves(problem):
     """If the wires are swapped, all charges are negative. They have no logarithm, so they change linearly."""
     sensor = problem.sensor

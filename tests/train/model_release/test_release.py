@@ -20,6 +20,7 @@ from isocharge.simulate.solver.equilibrium import principal_stress
 from isocharge.train import (
     FitConfig,
     LabelledPresses,
+    evaluate,
     load_config,
     release,
 )
@@ -157,6 +158,17 @@ def test_the_folder_is_complete_and_its_card_and_metadata_agree(released, datase
     names = ["coverage_68", "coverage_95", "found_gain_20_percent", "found_dead_electrode"]
     expected_fractions = [metadata.errors[name] for name in names]
     np.testing.assert_allclose(np.array(percentages, float) / 100.0, expected_fractions, atol=6e-4)
+
+
+def test_the_errors_in_the_metadata_are_those_of_the_served_model(fitted, released):
+    errors = evaluate(fitted)
+    assert released.metadata.errors == errors
+    noisy = fitted.test.noisy(REFERENCE, seed=1)
+    contact = np.stack(Predictor(released.folder).predict_batch(noisy), axis=1)[:, :3]
+    position_error = np.hypot(*(contact - fitted.test.contact)[:, :2].T)
+    force_percent = 100.0 * np.abs(contact[:, 2] / fitted.test.contact[:, 2] - 1.0)
+    assert errors["position_rms_mm"] == pytest.approx(np.sqrt(np.mean(position_error**2)), rel=1e-3)
+    assert errors["force_p99_percent"] == pytest.approx(np.percentile(force_percent, 99), rel=1e-3)
 
 
 def test_the_stated_errors_are_those_on_other_presses_and_small_enough(truth, predictor):
