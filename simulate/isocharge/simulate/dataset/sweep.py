@@ -36,7 +36,7 @@ from isocharge.simulate.dataset.shards import (
     write_files,
 )
 from isocharge.simulate.execution import in_order
-from isocharge.simulate.forward.charge_map import check_domain
+from isocharge.simulate.forward.family import check_domain
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.footprint import Probe

@@ -142,22 +142,6 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: Array
     return np.moveaxis(derivatives, 0, 2)
 
 
-def check_domain(domain: Domain) -> None:
-    """Raise an error if the radius or the forces of a domain are not positive numbers.
-
-    Args:
-        domain: Presses that are to be simulated.
-
-    Raises:
-        SceneError: If a value is not positive or not finite, or if the smallest force exceeds the largest force.
-    """
-    min_force, max_force = domain.force_range
-    if not 0.0 < min_force <= max_force < np.inf:
-        raise SceneError(f"force range: expected 0 < MIN <= MAX in N, got {min_force:g} to {max_force:g}")
-    if not 0.0 < domain.radius < np.inf:
-        raise SceneError(f"radius: expected a positive number, got {domain.radius:g} mm")
-
-
 def check_electrode_count(n_electrode: int) -> None:
     """Raise an error if a sensor has fewer than three electrodes, because a contact has three unknowns.
 

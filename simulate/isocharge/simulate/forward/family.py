@@ -21,7 +21,6 @@ from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import SceneError
 from isocharge.common.progress import track
 from isocharge.simulate.execution import in_order
-from isocharge.simulate.forward.charge_map import check_domain
 from isocharge.simulate.forward.readout import touch_charge
 from isocharge.simulate.mechanics.theory import rotate_stress
 from isocharge.simulate.mesh.blocks import Resolution
@@ -307,6 +306,22 @@ def spread_check_presses(domain: Domain, count: int) -> tuple[Array, Array]:
     # angle, so that the rotation and the direction are independent.
     position = distance * np.exp(2.4j * number)
     return np.column_stack([position.real, position.imag, force]), 0.7 * number
+
+
+def check_domain(domain: Domain) -> None:
+    """Raise an error if the radius or the forces of a domain are not positive numbers.
+
+    Args:
+        domain: Presses that are to be simulated.
+
+    Raises:
+        SceneError: If a value is not positive or not finite, or if the smallest force exceeds the largest force.
+    """
+    min_force, max_force = domain.force_range
+    if not 0.0 < min_force <= max_force < np.inf:
+        raise SceneError(f"force range: expected 0 < MIN <= MAX in N, got {min_force:g} to {max_force:g}")
+    if not 0.0 < domain.radius < np.inf:
+        raise SceneError(f"radius: expected a positive number, got {domain.radius:g} mm")
 
 
 def check_family(film: Film, probe: Probe, domain: Domain) -> None:
