@@ -13,7 +13,8 @@ record as text also contains the contact that was estimated from the single fram
 
 The messages are encoded in CDR, the binary format of ROS 2. The messages of the wrench and of the pose consist of a
 header and numbers of double precision. This module has its own encoder. The encoder of `mcap-ros2-support` is available
-only as a part of a writer that is much slower and cannot write JSON. The tests decode the messages with rosbags.
+only as a part of a writer that is much slower and cannot write JSON. The tests decode the messages with
+`mcap-ros2-support` and with rosbags.
 """
 
 import math
