@@ -74,6 +74,7 @@ def test_forward_map_agrees_with_direct_solves_between_the_nodes(three_map, near
     near_error = errors(near_map, np.concatenate([contact, ends]))
     assert max(near_error.max(), errors(three_map, draw(three_map, 6, seed=0)[0]).max()) < 1e-3
     assert near_error.max() / 3.0 < near_map.error <= INTERPOLATION_ERROR
+    assert near_map.solves == len(near_map.table)  # a round probe needs no further rotations
 
 
 def test_forward_map_agrees_with_direct_solves_for_random_orientations(oriented_map):

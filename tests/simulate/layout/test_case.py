@@ -17,6 +17,7 @@ def test_clearances_are_distances_from_rim_kept_electrodes_and_other_squares(sen
     places = np.array([[14.0, 1.0], [-7.0, 43.0], [-7.0, 40.0]])
     from_rim = 44.0 - np.hypot([15.0, 8.0, 8.0], [2.0, 44.0, 41.0])
     from_kept = [4.0 - 2.5 - 0.5, 40.0, 37.0]
+    assert case.new_count == len(places)
     assert case.clearance(places) == pytest.approx(np.minimum(from_rim, from_kept))
     assert case.pair_clearance(places[1:2], places)[0] == pytest.approx([42.0 - 2.5, -2.5, 3.0 - 2.5])
     traced = sensor.electrodes[0].with_trace(((10.0, 0.0), (30.0, 0.0)), 0.5)
