@@ -68,8 +68,9 @@ def test_plot_draws_a_recording(command, recorded, tmp_path, figures):
     for name, values in expected.items():
         np.testing.assert_array_equal(lines[name], np.array(values, dtype=float))
     position_lines = next(axes for axes in figures[0].axes if axes.get_ylabel().startswith("position")).lines
-    upper_limit = [np.nan if r["x_mm"] is None else r["x_mm"] + 2.0 * r["x_std_mm"] for r in records]
-    np.testing.assert_allclose(position_lines[2].get_ydata(), upper_limit)
+    for line, factor in ((position_lines[1], -2.0), (position_lines[2], 2.0)):
+        limit = [np.nan if r["x_mm"] is None else r["x_mm"] + factor * r["x_std_mm"] for r in records]
+        np.testing.assert_allclose(line.get_ydata(), limit)
 
     flag_axes = next(axes for axes in figures[0].axes if axes.get_xlabel().startswith("time since"))
     words = [label.get_text() for label in flag_axes.get_yticklabels()]

@@ -16,6 +16,7 @@ from isocharge.train.training.network import (
     FIRST_LAYER_SLOPES,
     Posterior,
     TrainablePerceptron,
+    compress_length,
     logarithmic_features,
 )
 from isocharge.train.training.training_data import Split
@@ -68,6 +69,13 @@ def test_charges_below_1_pC_are_distinguished_down_to_the_noise_or_the_smallest_
     assert features.low_pC == lowest_pC
     expected_typical_pC = np.sqrt(np.maximum(charge[0], lowest_pC) * np.maximum(charge[1], lowest_pC))
     np.testing.assert_array_less(np.abs(np.log2(features.typical_pC / expected_typical_pC)), 0.5001)
+
+
+def test_lengths_of_residuals_are_compressed_beyond_the_limit_of_the_misfit():
+    """The flag `misfit` is set above 5. The direction of a residual remains."""
+    residual = torch.tensor([[3.0, 0.0, 4.0], [0.0, -50.0, 0.0]], dtype=torch.float64)
+    expected = [[0.6 * np.arcsinh(1.0), 0.0, 0.8 * np.arcsinh(1.0)], [0.0, -np.arcsinh(10.0), 0.0]]
+    np.testing.assert_allclose(compress_length(residual).numpy(), expected, atol=1e-12)
 
 
 def settings(hidden=(16, 16), misfit_hidden=(8, 8), weights="float32", **training):
