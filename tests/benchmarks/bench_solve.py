@@ -13,10 +13,12 @@ but not the effects that a theory neglects.
 
 import time
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from shared import arguments, draw_lines, print_results
+from matplotlib.figure import Figure
+from shared import arguments, print_results
 
 from isocharge.simulate import (
     Circle,
@@ -181,22 +183,30 @@ def measure_all(positions: int, seed: int) -> dict[str, Any]:
     }
 
 
+def plot(result: dict[str, Any], path: Path) -> None:
+    """Draw the largest error against the CPU time, with the order of the elements beside each point."""
+    figure = Figure(figsize=(7.2, 4.4), layout="constrained")
+    axes = figure.subplots()
+    for theory in MESHES:
+        rows = [row for row in result["meshes"] if row["theory"] == theory.name]
+        for group, marker in (("away", "o"), ("on", "s")):
+            times_s = [1e-3 * row["cold_ms"][0] for row in rows]
+            errors = [row[f"error_{group}"][1] for row in rows]
+            axes.loglog(times_s, errors, marker, ms=5, label=f"{theory.name}, probe {group} electrodes")
+            for row, time_s, error in zip(rows, times_s, errors, strict=True):
+                order = row["mesh"][0]
+                axes.annotate(order, (time_s, error), xytext=(4, 4), textcoords="offset points", fontsize=7)
+    axes.set(xlabel="CPU time of one press, s", ylabel="worst error of a charge", title="Numbers: order of elements")
+    axes.grid(True, color="0.9")
+    axes.legend(fontsize=7)
+    figure.savefig(path, dpi=130)
+
+
 def main() -> None:
     asked = arguments(__doc__, positions=20, seed=1, plot=None, json=False)
     result = measure_all(asked.positions, asked.seed)
     if asked.plot:
-        lines = {}
-        for theory in MESHES:
-            rows = [row for row in result["meshes"] if row["theory"] == theory.name]
-            times_s = [1e-3 * row["cold_ms"][0] for row in rows]
-            for group in ("away", "on"):
-                lines[f"{theory.name}, probe {group} electrodes"] = (
-                    times_s,
-                    [row[f"error_{group}"][1] for row in rows],
-                )
-        labels = {"xlabel": "CPU time of one press, s", "ylabel": "worst error of a charge"}
-        title = "one point for each mesh, coarse to fine"
-        draw_lines(asked.plot, lines, xscale="log", yscale="log", title=title, **labels)
+        plot(result, asked.plot)
     print_results("solve", asked, result)
 
 
