@@ -61,8 +61,8 @@ def second_thread(shown_title: str | None = None) -> Iterator[Executor]:
     not started are cancelled. The running call ends with a `CancelledError` when it next reports its progress.
 
     Args:
-        shown_title: Title of all reports of the thread, because a title identifies a progress bar, and two computations
-            that run at the same time need different titles; None for the titles that the calls state.
+        shown_title: Title that replaces the titles of all reports of the thread; None for their own titles. A title
+            identifies a progress bar, so two computations that run at the same time need different titles.
 
     Yields:
         The executor.

@@ -295,6 +295,7 @@ def test_noise_of_each_electrode_and_of_older_models_is_read(film, extra):
     np.testing.assert_allclose(variance, [[1.0 + 0.04, 4.0, 9.0 + 0.01]])
 
 
-def test_metadata_that_are_not_json_are_refused(film):
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        film.metadata(errors={"median_mm": float("nan")}).to_props()
+@pytest.mark.parametrize("value", [{"median_mm": float("nan")}, {"median_mm": object()}], ids=["NaN", "object"])
+def test_metadata_that_are_not_json_are_refused(film, value):
+    with pytest.raises(ModelError, match="'errors': expected a JSON value"):
+        film.metadata(errors=value).to_props()

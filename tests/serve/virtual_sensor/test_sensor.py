@@ -131,6 +131,10 @@ def test_frames_are_withheld_without_a_reader(film):
             assert counts.crc_errors + counts.malformed <= 1
             assert (counts.repeated, counts.restarts) == (0, 0)
         assert sensor.sent >= 400
+    with sensor:
+        assert sensor.withheld == 0
+        frames, _ = read(sensor.url, 3)
+        assert frames[0].seq < 1000
     with pytest.raises(PortError, match="does not play"):
         sensor.url  # noqa: B018
 

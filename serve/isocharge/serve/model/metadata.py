@@ -225,14 +225,20 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         Fields that are None are left out.
 
         Raises:
-            TypeError, ValueError: If a value, such as NaN, cannot be expressed in JSON.
+            ModelError: If a value, such as NaN, cannot be expressed in JSON.
         """
         values = {name: getattr(self, name) for name in self.__struct_fields__}
-        return {
-            name: json.dumps(value, allow_nan=False, default=to_builtins)
-            for name, value in values.items()
-            if value is not None
-        }
+        props = {}
+        for name, value in values.items():
+            if value is None:
+                continue
+            try:
+                props[name] = json.dumps(value, allow_nan=False, default=to_builtins)
+            except (TypeError, ValueError) as error:
+                raise ModelError(
+                    f"model metadata {name!r}: expected a JSON value, got {shown(value)} ({error})"
+                ) from error
+        return props
 
     @classmethod
     def from_props(cls, props: Mapping[str, str], where: str) -> "ModelMetadata":

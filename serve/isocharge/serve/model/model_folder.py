@@ -151,8 +151,17 @@ def version_folders(folder: Path) -> dict[int, Path]:
 
 
 def _subfolders(folder: Path) -> list[Path]:
-    """Return the subfolders of a folder. The list is empty if the path is not a folder."""
-    return [entry for entry in folder.glob("*") if entry.is_dir()]
+    """Return the subfolders of a folder. The list is empty if the path is not a folder.
+
+    Raises:
+        ModelError: If the folder cannot be listed.
+    """
+    try:
+        if not folder.is_dir():
+            return []
+        return [entry for entry in folder.iterdir() if entry.is_dir()]
+    except OSError as error:
+        raise ModelError(f"{folder}: cannot be listed ({error.strerror}); try again, or correct its rights") from error
 
 
 def _first_model(candidates: list[Path], model: str | Path, roots: list[Path], is_path: bool) -> Path:

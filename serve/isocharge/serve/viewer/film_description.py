@@ -19,14 +19,15 @@ def describe_film(name: str, metadata: ModelMetadata) -> dict[str, Any]:
         metadata: Metadata of the model.
     """
     film = metadata.sensor.get("film")
-    polygons_mm = _electrode_polygons(metadata.sensor, metadata.electrodes)  # the first one is the pad
+    polygons_mm = _electrode_polygons(metadata.sensor, metadata.electrodes)  # for each electrode, the pad is the first
+    leads_mm = {electrode: leads for electrode, (_, *leads) in polygons_mm.items()}
     return {
         "name": name,
         "model": metadata.label,
         "sensor": metadata.frame_id,
         "electrodes": list(metadata.electrodes),
-        "outlines_mm": {name: pad for name, (pad, *_) in polygons_mm.items()},
-        "more_mm": {name: leads for name, (_, *leads) in polygons_mm.items() if leads},  # most electrodes have none
+        "outlines_mm": {electrode: pad for electrode, (pad, *_) in polygons_mm.items()},
+        "more_mm": {electrode: leads for electrode, leads in leads_mm.items() if leads},
         "film": film,
         "radius_mm": film.get("radius_mm") if isinstance(film, dict) else None,
         "working_area_mm": [[float(x), float(y)] for x, y in metadata.working_area_mm],

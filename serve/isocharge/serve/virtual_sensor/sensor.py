@@ -115,7 +115,7 @@ MAX_RANDOM_OFFSET_pC = 20.0
 class VirtualSensor:
     """Context manager that plays a script repeatedly while the context is active.
 
-    Readers may open and close the port at any time. The context can be entered only once.
+    Readers may open and close the port at any time. Entering the context resets the counters.
 
     Attributes:
         script: The presses that are played.
@@ -259,11 +259,17 @@ class VirtualSensor:
         return damaged_data
 
     def __enter__(self) -> Self:
-        """Open the port, and start the thread that writes the frames.
+        """Reset the counters, open the port, and start the thread that writes the frames.
 
         Raises:
             InputError: If the link cannot be created.
         """
+        self.lost = 0
+        self.corrupted = 0
+        self.withheld = 0
+        self.paused_s = 0.0
+        self._frame_count = 0
+        self._stop.clear()
         port = PseudoPort()
         self._port_stack.callback(port.close)
         if self._link:

@@ -236,7 +236,8 @@ class ForwardMap:
         contact = as_contacts(contact, "forward map")
         orientation = np.broadcast_to(orientation, len(contact))
         if not np.isfinite(orientation).all():
-            raise SceneError(f"forward map: expected finite orientations in rad, got {orientation}")
+            wrong_orientation = orientation[~np.isfinite(orientation)][0]
+            raise SceneError(f"forward map: expected finite orientations in rad, got {wrong_orientation}")
 
         # A press without a force may lie anywhere. It is replaced by a valid press, whose charges become zero.
         has_force = contact[:, 2:] != 0.0

@@ -148,19 +148,19 @@ FILM_IS_ODD = np.array([field.odd for field in FILM_FIELDS])
 
 
 def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
-    """Compute the changes of the scaled stress that a changed film causes at the nodes.
+    """Compute how the scaled stress at the nodes changes if a property of the film changes.
 
-    The film is rotated such that the press lies on the positive x axis. The changes refer to fixed points of the
-    rotated film. The unit of a tension is the sum of E A^2 and the mean pretension, where E is Young's modulus and A is
-    the amplitude of the press.
+    The properties are those of `FILM_FIELDS`. The film is rotated such that the press lies on the positive x axis. The
+    stress is compared at fixed points of the rotated film. A change of the tension is in units of E A^2 + T, where E is
+    Young's modulus, A is the amplitude of the press, and T is the mean pretension.
 
     Args:
         solved: Press with a circular probe.
         surface: Surface of the film at which the stress is computed; see `touch_stress`.
 
     Returns:
-        Changes per unit, shape (n_element, n_local, n_field, 3), in the order of the table of a `ForwardMap` with
-        several fields. The last two axes are the field of `FILM_FIELDS` and the stress component (S11, S22, S12).
+        Change of the stress per unit of each property, shape (n_element, n_local, n_field, 3), in the order of the
+        table of a `ForwardMap` with several fields. The last axis is the stress component (S11, S22, S12).
     """
     if solved.rest is not None:  # the touch stress is the difference from the stress before the contact
         before_contact = stress_changes(solved.rest, surface)

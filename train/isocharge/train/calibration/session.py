@@ -125,8 +125,14 @@ class PressSession:
         self._save = save
         self._until = until
         self._stds = {"position_std_mm": position_std_mm, "force_std": force_std}
-        no_charges = np.empty((0, len(problem.electrodes)))
-        no_presses = MeasuredPresses(np.empty((0, 3)), no_charges, np.empty(0), np.empty(0), problem.electrodes, ())
+        no_presses = MeasuredPresses(
+            contact=np.empty((0, 3)),
+            charge_pC=np.empty((0, len(problem.electrodes))),
+            position_std_mm=np.empty(0),
+            force_std=np.empty(0),
+            electrodes=problem.electrodes,
+            lines=(),
+        )
         self._fit(presses or no_presses)
 
     def __len__(self) -> int:

@@ -140,8 +140,8 @@ N_EXTREME = 10_000
 EXTREME_CHARGES_pC = (-LARGEST, LOWEST_CHARGE, LARGEST)
 """Charges for which every output must be finite, pC.
 
-`LARGEST` is the largest float32 number. A negative charge is set to the lower limit of the network, which is
-`LOWEST_CHARGE` at most, before its logarithm is computed. Therefore, it gives the smallest logarithm.
+`LARGEST` is the largest float32 number. A network sets smaller charges to its lower limit, which is at most
+`LOWEST_CHARGE`, before it computes their logarithm. A negative charge therefore gives the smallest logarithm.
 """
 
 

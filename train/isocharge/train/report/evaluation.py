@@ -238,8 +238,8 @@ class DatasetEvaluation:
         """Select the presses that the model covers, and hold out a part of them for the test.
 
         Of simulated presses, a tenth of the positions is held out, which a training on the same dataset also holds out.
-        Of measured presses, which are fewer, a fifth is held out. Held-out presses from which the model was calibrated
-        are left out.
+        Of measured presses, which are fewer, a fifth is held out. A held-out press is
+        left out if a calibration of the model has used it.
 
         Args:
             dataset: The dataset.
