@@ -100,21 +100,11 @@ class ElasticFilm:
         return residual
 
     @property
-    def load_scale(self) -> float:
-        """Norm of the nodal forces of the probe, or of the static pressure if there is no probe."""
+    def load_forces(self) -> Array:
+        """Nodal forces of the probe, or of the static pressure if there is no probe, shape (n_node,)."""
         if self.back is None or self.groups.load != 0.0:
-            return self.groups.load * float(np.linalg.norm(self.geometry.load))
-        return abs(self.groups.static_pressure) * float(np.linalg.norm(self.back.weights))
-
-    def work(self, field: Array) -> float:
-        """Compute the magnitude of the work that the probe does, or that the static pressure does if there is no probe.
-
-        Args:
-            field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
-        """
-        if self.back is None or self.groups.load != 0.0:
-            return self.groups.load * abs(float(self.geometry.load @ field[:, 2]))
-        return abs(self.groups.static_pressure * float(self.back.weights @ field[:, 2]))
+            return self.groups.load * self.geometry.load
+        return self.groups.static_pressure * self.back.weights
 
     def in_plane_scale(self, field: Array) -> float:
         """Compute the norm of the in-plane forces of the elements, which scales the in-plane residual.

@@ -230,8 +230,7 @@ class PlacedMesh:
 
         The shape is (n_element, n_local, 2, n_local).
         """
-        _, derivatives = tensor_basis(self.resolution.order, self.template.xi, self.template.eta)
-        gradient, _ = _film_gradient(derivatives[:, None], self.points)
+        gradient, _ = _film_gradient(_quadrature(self.resolution.order).node_derivatives[:, None], self.points)
         return gradient
 
 

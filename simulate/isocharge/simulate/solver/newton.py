@@ -16,9 +16,10 @@ from typing import Self
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans, Complexes
+from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.theory import DimensionlessGroups
+from isocharge.simulate.mesh.placed_mesh import PlacedMesh, from_oval
 from isocharge.simulate.solver.assembly import Assembly, SolveTangent, factor_tangent
 
 STABILISING_TENSION = 0.4
@@ -66,49 +67,31 @@ class NewtonResult:
     message: str
 
 
-def schwerin_start(template_points: Complexes, template_radius: float, groups: DimensionlessGroups) -> Array:
-    """Compute the first iterate of Newton's method from Schwerin's deflection of a membrane.
+def first_iterate(mesh: PlacedMesh, groups: DimensionlessGroups) -> Array:
+    """Compute the first iterate of Newton's method: an approximate deflection under the probe and the static pressure.
 
-    Schwerin's deflection is W = (3 / pi)^(1/3) (1 - r^(2/3)), where r is the distance from the origin of the template
-    plane. This deflection is exact for a membrane without pretension under a point load if Poisson's ratio is 1/3
-    (Schwerin 1929). In the first iterate, the estimated height of the film under the probe replaces the factor
-    (3 / pi)^(1/3). The in-plane displacements are zero.
+    Schwerin's deflection of a membrane is W = (3 / pi)^(1/3) (1 - r^(2/3)), where r is the distance from the origin of
+    the template plane. This deflection is exact for a membrane without pretension under a point load if Poisson's ratio
+    is 1/3 (Schwerin 1929). In the first iterate, the estimated height of the film under the probe replaces the factor
+    (3 / pi)^(1/3). The deflection under the static pressure is a paraboloid, which is added. Without a probe or without
+    a static pressure, the height of its deflection is zero. The in-plane displacements are zero.
 
     Args:
-        template_points: Nodes x + iy in the template plane, shape (n_node,).
-        template_radius: Radius of the innermost circle in the template plane.
+        mesh: Mesh of the press.
         groups: Dimensionless groups of the press.
 
     Returns:
         Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
     """
+    circular_points = from_oval(mesh.node_points, mesh.oval)
+    template_distance = np.abs(mesh.placement.to_template(circular_points))
     # The term r0^2, with the radius r0 of the innermost circle, rounds the tip of the deflection under the probe.
-    distance = np.abs(template_points)
-    deflection_shape = np.cbrt(1.0 + template_radius**2) - np.cbrt(distance**2 + template_radius**2)
-    field = np.zeros((template_points.size, 3))
-    field[:, 2] = groups.height * deflection_shape
-    is_on_rim = distance > 1.0 - 1e-9
-    field[is_on_rim] = 0.0  # removes rounding errors
-    return field
-
-
-def parabolic_start(circular_points: Complexes, groups: DimensionlessGroups) -> Array:
-    """Compute the first iterate of Newton's method for a film under static pressure without a probe.
-
-    The deflection is a paraboloid whose height approximates the deflection under the static pressure.
-
-    Args:
-        circular_points: Nodes x + iy on the circular film, shape (n_node,), in film radii.
-        groups: Dimensionless groups of the film.
-
-    Returns:
-        Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
-    """
-    radius = np.abs(circular_points)
-    field = np.zeros((radius.size, 3))
-    field[:, 2] = groups.static_height * np.maximum(1.0 - radius**2, 0.0)
-    is_on_rim = radius > 1.0 - 1e-9
-    field[is_on_rim] = 0.0  # removes rounding errors
+    tip = float(mesh.placement.template_radius) ** 2
+    probe_shape = np.cbrt(1.0 + tip) - np.cbrt(template_distance**2 + tip)
+    pressure_shape = 1.0 - np.abs(circular_points) ** 2
+    field = np.zeros((circular_points.size, 3))
+    field[:, 2] = groups.height * probe_shape + groups.static_height * pressure_shape
+    field[mesh.template.on_rim] = 0.0  # removes rounding errors
     return field
 
 
@@ -198,7 +181,7 @@ class _Iterate:
         in-plane forces of the elements.
         """
         free_residual = self.residual * self.free  # without the reactions at fixed nodes
-        load = self.elastic.load_scale
+        load = np.linalg.norm(self.elastic.load_forces)
         in_plane_force = max(self.elastic.in_plane_scale(self.field), 1e-300)  # the limit avoids a division by zero
         transverse_ratio = np.linalg.norm(free_residual[:, 2]) / load
         in_plane_ratio = np.linalg.norm(free_residual[:, :2]) / in_plane_force
@@ -236,7 +219,7 @@ def _step_size(elastic: ElasticFilm, field: Array, step: Array, residual: Array)
         residual: Out-of-balance forces before the step, same shape as `step`.
     """
     step_energy = abs(float(np.sum(step * residual)))
-    work = max(elastic.work(field), 1e-300)  # the limit avoids a division by zero
+    work = max(abs(float(elastic.load_forces @ field[:, 2])), 1e-300)  # the limit avoids a division by zero
     return float(np.sqrt(step_energy / work))
 
 

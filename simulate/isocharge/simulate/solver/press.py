@@ -14,7 +14,7 @@ from isocharge.common.errors import SolveError
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.theory import DimensionlessGroups
 from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.mesh.placed_mesh import Geometry, PlacedMesh, from_oval
+from isocharge.simulate.mesh.placed_mesh import Geometry, PlacedMesh
 from isocharge.simulate.mesh.template import Template
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.sensor.film import Film
@@ -32,8 +32,7 @@ from isocharge.simulate.solver.load_case import (
 from isocharge.simulate.solver.newton import (
     UNSTABILISED_BELOW,
     NewtonResult,
-    parabolic_start,
-    schwerin_start,
+    first_iterate,
     solve_newton,
 )
 
@@ -189,10 +188,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
 
     # The first iterate is an approximate deflection under the probe and the static pressure, or the field of the
     # starting equilibrium. If Newton's method fails, the load is applied in steps.
-    circular_points = from_oval(mesh.node_points, mesh.oval)
-    template_points = mesh.placement.to_template(circular_points)
-    default_field = schwerin_start(template_points, float(mesh.placement.template_radius), elastic.groups)
-    default_field += parabolic_start(circular_points, elastic.groups)
+    default_field = first_iterate(mesh, elastic.groups)
     first_field = _first_field(start, mesh.template, default_field)
     result = solve_newton(elastic, solver, first_field, case.settings.tolerance)
     if not result.converged:
@@ -238,8 +234,7 @@ def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
     mesh = equilibrium.mesh
     elastic = ElasticFilm(mesh.geometry, equilibrium.groups.without_probe)
     solver = assembly(mesh.template, elastic.unknowns_per_node)
-    first_field = parabolic_start(from_oval(mesh.node_points, mesh.oval), elastic.groups)
-    result = solve_newton(elastic, solver, first_field, tolerance)
+    result = solve_newton(elastic, solver, first_iterate(mesh, elastic.groups), tolerance)
 
     # The number of iterations is the sum of both solves.
     rest = replace(equilibrium, groups=elastic.groups, field=result.field, force=0.0, side_force=(0.0, 0.0))

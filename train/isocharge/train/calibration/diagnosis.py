@@ -256,7 +256,7 @@ def _log_ratio(measured: Array, expected: Array) -> Array:
     """
     tiny = np.finfo(float).tiny
     ratio = measured * expected / np.maximum(expected**2, tiny)
-    return np.asarray(np.log(np.maximum(ratio, tiny)))
+    return np.log(np.maximum(ratio, tiny))
 
 
 def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[tuple[str, Array, Array]]:

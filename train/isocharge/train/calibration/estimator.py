@@ -175,7 +175,7 @@ class Prior:
 
     def covariance(self, hypothesis: Hypothesis) -> Array:
         """Return the covariance of the unknowns, shape (n_unknown, n_unknown)."""
-        return np.asarray(np.tensordot(hypothesis.variances, self.parts, 1))
+        return np.tensordot(hypothesis.variances, self.parts, 1)
 
 
 @dataclass(frozen=True)

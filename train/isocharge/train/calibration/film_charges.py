@@ -212,7 +212,7 @@ class FilmCharges:
         step = STEP * one.std
         sensors = [changed_film(sensor, self.film.probe, {one.name: change})[0] for change in (step, -step)]
         forward, backward = (_read(self.film, changed).charges(contact) for changed in sensors)
-        return np.asarray((forward - backward) / (2.0 * step))
+        return (forward - backward) / (2.0 * step)
 
 
 def solve_even_map(prior: FilmPrior, values: Array, domain: Domain, executor: Executor | None) -> ForwardMap:

@@ -66,7 +66,7 @@ def discrepancy_jacobian(charge: Array, contact: Array, domain: Domain) -> Array
     """
     own_charge = charge[:, :, None] * np.eye(charge.shape[1])
     jacobian = own_charge[:, :, None, :] * terms(contact, domain)[:, None, :, None]
-    return np.asarray(jacobian.reshape(*charge.shape, -1))
+    return jacobian.reshape(*charge.shape, -1)
 
 
 @cache

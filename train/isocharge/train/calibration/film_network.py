@@ -97,7 +97,7 @@ def _film_charges(charges: FilmCharges, film: FilmEstimate, contact: Array) -> A
     """Compute the most probable charges of contacts, with the discrepancy, without offset, shape (n, n_electrode)."""
     charge = charges.charges(film.film_values, contact)
     discrepancy = discrepancy_jacobian(charge, contact, charges.domain) @ film.values[film.layout.coefficients]
-    return np.asarray(charge + discrepancy)
+    return charge + discrepancy
 
 
 def _nodes(film: FilmEstimate) -> Array:

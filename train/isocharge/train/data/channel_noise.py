@@ -121,23 +121,23 @@ class ChannelNoise:
 
     def sigma(self, charge: Array) -> Array:
         """Return the standard deviation of the noise, pC, of each charge, pC. Both have the shape (n, n_electrode)."""
-        return np.asarray(np.hypot(self.white, self.gain * charge))
+        return np.hypot(self.white, self.gain * charge)
 
     def add(self, charge: Array, rng: np.random.Generator) -> Array:
         """Add random noise to charges, pC. Charges and result have the shape (n, n_electrode)."""
-        return np.asarray(charge + self.sigma(charge) * rng.standard_normal(charge.shape))
+        return charge + self.sigma(charge) * rng.standard_normal(charge.shape)
 
     def level(self, charge: Array) -> Array:
         """Convert charges Q, shape (n, n_electrode), pC, into the levels asinh(gain Q / white) / gain.
 
         The noise of every level has a standard deviation of about 1.
         """
-        return np.asarray(np.arcsinh(charge * self.gain / self.white) / self.gain)
+        return np.arcsinh(charge * self.gain / self.white) / self.gain
 
     def charge(self, level: Array) -> Array:
         """Convert levels into charges, pC. This method is the inverse of `level`."""
         exponent = np.clip(level * self.gain, -LARGEST_LOGARITHM, LARGEST_LOGARITHM)
-        return np.asarray(np.sinh(exponent) * self.white / self.gain)
+        return np.sinh(exponent) * self.white / self.gain
 
     def transition_charge(self, charge: Array) -> Array:
         """Return the transition charge of each channel, shape (n_electrode,), pC.
@@ -155,7 +155,7 @@ class ChannelNoise:
         smallest_transition = np.where(has_both_signs, MIN_TRANSITION_RATIO * usual_size(charge), 0.0)
         # Below this charge, the noise is mostly white, and above it mostly proportional to the charge.
         noise_corner = self.white / self.gain
-        return np.asarray(np.maximum(noise_corner, smallest_transition))
+        return np.maximum(noise_corner, smallest_transition)
 
     def scaled(self, factor: float) -> "ChannelNoise":
         """Multiply all standard deviations by a factor, and return the new noise model."""

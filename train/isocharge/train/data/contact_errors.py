@@ -28,7 +28,7 @@ def position_error(contact: Array, truth: Array) -> Array:
     Returns:
         Distances, shape (n,), mm.
     """
-    return np.asarray(np.hypot(contact[:, 0] - truth[:, 0], contact[:, 1] - truth[:, 1]))
+    return np.hypot(contact[:, 0] - truth[:, 0], contact[:, 1] - truth[:, 1])
 
 
 def force_error_percent(contact: Array, truth: Array) -> Array:
@@ -41,7 +41,7 @@ def force_error_percent(contact: Array, truth: Array) -> Array:
     Returns:
         Relative errors, shape (n,), %, positive if the estimated force is larger than the true force.
     """
-    return np.asarray(100.0 * (contact[:, 2] / truth[:, 2] - 1.0))
+    return 100.0 * (contact[:, 2] / truth[:, 2] - 1.0)
 
 
 def contact_error_statistics(contact: Array, truth: Array) -> dict[str, float]:

@@ -70,7 +70,7 @@ class LabelledPresses:
     @property
     def distance(self) -> Array:
         """Distance of each press from the centre, shape (n,), mm."""
-        return np.asarray(np.hypot(self.contact[:, 0], self.contact[:, 1]))
+        return np.hypot(self.contact[:, 0], self.contact[:, 1])
 
     def within(self, radius: float) -> "LabelledPresses":
         """Return the presses whose distance from the centre is at most `radius`, mm."""

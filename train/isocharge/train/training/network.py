@@ -328,4 +328,4 @@ def fold_network(network: InverseNetwork) -> FoldedNetwork:
 
 def _to_numpy(tensor: Tensor) -> Array:
     """Return a copy of a tensor as a NumPy array in double precision."""
-    return np.asarray(tensor.detach().double().numpy())
+    return tensor.detach().double().numpy()
