@@ -39,6 +39,7 @@ from isocharge.simulate.execution import in_order
 from isocharge.simulate.forward.family import check_domain
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
+from isocharge.simulate.numerics.disk import log_spaced_forces
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Sensor
@@ -194,10 +195,8 @@ class Sweep:
         # The area within a distance is proportional to the square of the distance.
         distance = np.sqrt(inner_radius**2 + (outer_radius**2 - inner_radius**2) * distance_fraction)
         position = distance * np.exp(1j * FULL_TURN * angle_fraction)
-        min_log_force, max_log_force = np.log(self.force_range)
-        force = np.exp(min_log_force + (max_log_force - min_log_force) * force_fraction)
-        force_in_range = np.clip(force, *self.force_range)  # rounding must not move a force out of the range
-        return np.column_stack([position.real, position.imag, force_in_range]), turn_fraction
+        force = log_spaced_forces(force_fraction, self.force_range)
+        return np.column_stack([position.real, position.imag, force]), turn_fraction
 
 
 _log = logging.getLogger(__name__)

@@ -26,7 +26,7 @@ from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.readout import contact_charges
 from isocharge.simulate.mechanics.theory import amplitude_squared
-from isocharge.simulate.numerics.disk import contacts_at, sunflower
+from isocharge.simulate.numerics.disk import contacts_at, log_spaced_forces, sunflower
 from isocharge.simulate.numerics.interpolation import chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Film
 
@@ -365,9 +365,7 @@ def _largest_error(spline: ChargeSpline, forward_map: ForwardMap, count: int = 4
     """
     position = spline.domain.radius * sunflower(count)
     # Multiples of the golden ratio, modulo 1, distribute the logarithms of the forces evenly.
-    log_force_fraction = np.arange(count) * 0.618 % 1.0
-    min_force, max_force = spline.domain.force_range
-    force = np.clip(min_force * (max_force / min_force) ** log_force_fraction, min_force, max_force)
+    force = log_spaced_forces(np.arange(float(count)) * 0.618 % 1.0, spline.domain.force_range)
     contact = np.column_stack([position, force])
     true_charge = forward_map.charges(contact)
     error = np.abs(spline.charges(contact) - true_charge).max(axis=1)

@@ -29,16 +29,7 @@ from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.mechanics.theory import amplitude_squared
 from isocharge.simulate.mesh.conformal_map import distance_coordinate
 from isocharge.simulate.sensor.film import Film
-from isocharge.simulate.solver.sensitivity import FILM_IS_ODD, stress_changes
-
-TENSION_NAMES = ("pretension", "tension_difference", "tension_shear")
-"""Names of the mean pretension, of half of T11 - T22, and of T12, whose unit is MPa."""
-
-STIFFNESS_NAMES = ("stiffness_x", "stiffness_xy")
-"""Names of the components of ln(E1 / E2), which are dimensionless."""
-
-OVAL_NAMES = ("oval_x", "oval_xy")
-"""Names of the components of the parameter e of an oval clamp, which are dimensionless."""
+from isocharge.simulate.solver.sensitivity import FILM_FIELDS, FILM_IS_ODD, TENSION_FIELDS, stress_changes
 
 
 def few_nodes(film: Film, domain: Domain) -> NodeCount:
@@ -96,7 +87,8 @@ class FilmSlopes:
     def jacobian(self, contact: Array) -> dict[str, Array]:
         """Compute the derivatives of the charges with respect to the properties of the film.
 
-        The names of the properties are `TENSION_NAMES`, `STIFFNESS_NAMES` and `OVAL_NAMES`.
+        The names of the properties are those of `sensitivity.FILM_FIELDS`. The unit of a tension is MPa, and the other
+        properties are dimensionless.
 
         Args:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
@@ -112,34 +104,16 @@ class FilmSlopes:
         field_charge = self.film.sensor.calibration.read(
             self.fields.field_charges(contact, FILM_IS_ODD).swapaxes(1, 2)  # shape (n, n_field, n_electrode)
         )
-        mean_tension, even_tension, odd_tension, *other_fields = np.moveaxis(field_charge, 1, 0)
-        tension_unit = (film.young * amplitude_squared(film, contact[:, 2]) + film.pretension)[:, None]
+        tension_unit = film.young * amplitude_squared(film, contact[:, 2]) + film.pretension
+        field_charge[:, :TENSION_FIELDS] /= tension_unit[:, None, None]
 
-        derivatives = {TENSION_NAMES[0]: mean_tension / tension_unit}
-        even_and_odd = {
-            TENSION_NAMES[1:]: (even_tension / tension_unit, odd_tension / tension_unit),
-            STIFFNESS_NAMES: tuple(other_fields[:2]),
-            OVAL_NAMES: tuple(other_fields[2:]),
-        }
         # The axes of an even field are along and across the direction of the press, at the angle t from the x axis.
         # The axes of an odd field are rotated by 45 degrees from them. Rotate both to the axes x and y.
-        twice_angle = 2.0 * np.arctan2(contact[:, 1], contact[:, 0])[:, None]
-        for names, (even, odd) in even_and_odd.items():
-            derivatives.update(zip(names, _to_axes(even, odd, twice_angle), strict=True))
-        return derivatives
-
-
-def _to_axes(even: Array, odd: Array, angle: Array) -> tuple[Array, Array]:
-    """Rotate derivatives from the frame of each press to the axes x and y.
-
-    Args:
-        even: Derivatives that belong to the even field, shape (n, n_electrode).
-        odd: Derivatives that belong to the odd field, shape (n, n_electrode).
-        angle: Angle of the rotation, shape (n, 1), rad.
-
-    Returns:
-        Both components, each of shape (n, n_electrode).
-    """
-    cosine = np.cos(angle)
-    sine = np.sin(angle)
-    return cosine * even - sine * odd, sine * even + cosine * odd
+        even, odd = field_charge[:, 1::2], field_charge[:, 2::2]
+        twice_angle = 2.0 * np.arctan2(contact[:, 1], contact[:, 0])[:, None, None]
+        cosine = np.cos(twice_angle)
+        sine = np.sin(twice_angle)
+        components = np.stack([cosine * even - sine * odd, sine * even + cosine * odd], axis=2)
+        field_charge[:, 1:] = components.reshape(field_charge[:, 1:].shape)
+        names = [field.name for field in FILM_FIELDS]
+        return dict(zip(names, np.moveaxis(field_charge, 1, 0), strict=True))

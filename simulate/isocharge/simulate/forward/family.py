@@ -26,6 +26,7 @@ from isocharge.simulate.mechanics.theory import rotate_stress
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import distance_coordinate
 from isocharge.simulate.mesh.template import Template
+from isocharge.simulate.numerics.disk import log_spaced_forces
 from isocharge.simulate.numerics.interpolation import Turns, chebyshev_nodes, lagrange_values
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.footprint import Probe
@@ -296,11 +297,8 @@ def spread_check_presses(domain: Domain, count: int) -> tuple[Array, Array]:
     number = np.arange(float(count))
     distance = domain.radius * np.append(np.sqrt(chebyshev_nodes(count - 1, 0.0, 1.0)), 1.0)
 
-    # Multiples of the golden ratio (0.618), modulo 1, distribute the logarithms of the forces evenly. Rounding must
-    # not move a force out of the range.
-    min_log_force, max_log_force = np.log(domain.force_range)
-    log_force = min_log_force + (max_log_force - min_log_force) * ((0.5 + 0.618 * number) % 1.0)
-    force = np.clip(np.exp(log_force), *domain.force_range)
+    # Multiples of the golden ratio (0.618), modulo 1, distribute the logarithms of the forces evenly.
+    force = log_spaced_forces((0.5 + 0.618 * number) % 1.0, domain.force_range)
 
     # The golden angle (2.4 rad) distributes the directions evenly. The rotation of the probe changes by a different
     # angle, so that the rotation and the direction are independent.

@@ -21,7 +21,7 @@ from isocharge.simulate.noise import NoiseModel
 from isocharge.simulate.numerics.disk import Rings
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.probe import Circle
-from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.sensor.sensor import Sensor, outermost_corner
 
 MAX_SEARCH_RADIUS = 0.9
 """Largest search radius in units of `Film.inner_radius`, dimensionless.
@@ -270,9 +270,8 @@ def search_radius(sensor: Sensor, probe: Probe) -> float:
             f"{probe.notation}: expected a probe that can move on this film, which reaches less than "
             f"{largest_distance:.4g} mm from its centroid, got {probe.reach:.4g} mm; use a smaller probe"
         )
-    corners = [sensor.calibration.place(np.array(electrode.corners)) for electrode in sensor.electrodes]
-    outermost_corner = float(np.hypot(*np.concatenate(corners).T).max())
-    return min(outermost_corner, largest_distance - probe.reach)
+    pads = [electrode.corners for electrode in sensor.electrodes]
+    return min(outermost_corner(sensor, pads), largest_distance - probe.reach)
 
 
 def map_to_search(

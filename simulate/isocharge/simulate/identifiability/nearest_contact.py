@@ -227,7 +227,6 @@ def search(
     *,
     starts: int = 2,
     candidates: int = CANDIDATES,
-    min_change: float = MIN_CHANGE,
 ) -> tuple[Array, Array]:
     """Find the contacts whose charges are nearest to given charges, without given starting points.
 
@@ -240,7 +239,6 @@ def search(
         sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
         starts: Number of descents for each row of charges.
         candidates: Number of candidates for the starting points.
-        min_change: A descent ends if the squared distance changes by less than `min_change` times 1 + its value.
 
     Returns:
         Contacts (x, y, F), shape (n, 3), mm and N, and residuals, shape (n, n_electrode), of the best descent for each
@@ -252,7 +250,6 @@ def search(
         np.repeat(charge, starts, axis=0),
         np.repeat(sigma, starts, axis=0),
         start.reshape(-1, 3),
-        min_change=min_change,
     )
 
     # Choose the descent with the smallest residual for each row of charges. The axes are (row, start, component).

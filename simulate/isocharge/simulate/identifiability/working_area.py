@@ -252,9 +252,10 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
     x_difference, y_difference, _ = (second_contact - first_contact).T
     is_distant = np.hypot(x_difference, y_difference) > min_distance[first_index]
     is_ambiguous = is_distant & (charge_difference < INDISTINGUISHABLE_SIGMAS)
-    pairs = AmbiguousPairs(first_contact[is_ambiguous], second_contact[is_ambiguous], charge_difference[is_ambiguous])
+    pairs = AmbiguousPairs(first_contact, second_contact, charge_difference)
     order = np.argsort(pairs.outer_radius, kind="stable")
-    return AmbiguousPairs(pairs.first[order], pairs.second[order], pairs.distance[order])
+    ordered = order[is_ambiguous[order]]
+    return AmbiguousPairs(first_contact[ordered], second_contact[ordered], charge_difference[ordered])
 
 
 DEFAULT_ERROR = 1.0

@@ -19,8 +19,8 @@ scaled strain E'. The scaled strain is of order one for every force.
 The stress follows from Saint-Venant-Kirchhoff elasticity in plane stress as S = E_young A^2 (C : E' + tau I). Here, C
 is the elasticity matrix divided by Young's modulus, tau is the scaled pretension, and I is the unit tensor. Energies
 are in units of E_young h a^2 A^4, where h is the thickness of the film. For an anisotropic film, a matrix is added to
-C, and a deviator is added to tau I (`theory.Anisotropy`). The bending stiffness is always computed for an isotropic
-film.
+C, and a deviator is added to tau I (`theory.DimensionlessGroups`). The bending stiffness is always computed for an
+isotropic film.
 """
 
 from itertools import combinations_with_replacement
@@ -100,19 +100,14 @@ class ElasticFilm:
         return residual
 
     @property
-    def load_forces(self) -> Array:
-        """Nodal forces of the probe, or of the static pressure if there is no probe, shape (n_node,)."""
-        if self.back is None or self.groups.load != 0.0:
-            return self.groups.load * self.geometry.load
-        return self.groups.static_pressure * self.back.weights
+    def load(self) -> tuple[float, Array]:
+        """Magnitude of the load, and its share at each node, shape (n_node,).
 
-    def in_plane_scale(self, field: Array) -> float:
-        """Compute the norm of the in-plane forces of the elements, which scales the in-plane residual.
-
-        Args:
-            field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
+        The load is the force of the probe, or the static pressure if there is no probe.
         """
-        return float(np.linalg.norm(self.membrane.forces(field)[..., :2]))
+        if self.back is None or self.groups.load != 0.0:
+            return self.groups.load, self.geometry.load
+        return abs(self.groups.static_pressure), self.back.weights
 
     def tangent(self, field: Array, added_tension: float = 0.0) -> Array:
         """Compute the tangent matrix of each element, without the stiffness of trapped air.
@@ -165,7 +160,7 @@ class Membrane:
         # Weights of the squared slopes of U1, U2 and W in the strain, shape (3,)
         self._slope_weights = np.array([groups.squared_amplitude, groups.squared_amplitude, 1.0])
         # Pretension in units of E_young A^2, as stress (T11, T22, T12) and as a symmetric matrix
-        self._pretension = groups.tension * EQUAL_TENSION + groups.anisotropy.tension
+        self._pretension = groups.tension * EQUAL_TENSION + groups.uneven_tension
         self._pretension_matrix = _symmetric_matrix(self._pretension)
 
     def _slopes(self, field: Array) -> Array:

@@ -23,7 +23,8 @@ bending (`error_estimate.modelling_error`), and the amplitude determines whether
 Saint-Venant-Kirchhoff elasticity (`load_case.check_strains`).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -188,24 +189,6 @@ WITH_BENDING = Theory(bending=True)
 """Theory with all terms, which is the default."""
 
 
-@dataclass(frozen=True, eq=False)
-class Anisotropy:
-    """Direction-dependent properties of a film in the axes of the press.
-
-    Attributes:
-        moduli: Elasticity matrix of the film minus the elasticity matrix of an isotropic film, divided by Young's
-            modulus E, shape (3, 3); see `mechanics.stress.stress`.
-        tension: Pretension (T11, T22, T12) minus its mean, divided by E A^2, shape (3,).
-    """
-
-    moduli: Array
-    tension: Array
-
-
-ISOTROPIC = Anisotropy(moduli=np.zeros((3, 3)), tension=np.zeros(3))
-"""Properties of an isotropic film with an isotropic pretension."""
-
-
 @dataclass(frozen=True)
 class DimensionlessGroups:
     """Dimensionless groups that define the scaled problem of a press.
@@ -218,7 +201,10 @@ class DimensionlessGroups:
         tension: Mean pretension divided by E A^2.
         bending: Bending stiffness divided by E h a^2 A^2. Zero if the theory omits bending.
         poisson: Poisson's ratio.
-        anisotropy: Direction-dependent properties.
+        moduli: Elasticity matrix of the film minus the elasticity matrix of an isotropic film, divided by Young's
+            modulus E, in the axes of the press, shape (3, 3); see `stress`.
+        uneven_tension: Pretension (T11, T22, T12) minus its mean, divided by E A^2, in the axes of the press, shape
+            (3,).
         side_load: Side force (Fx, Fy) divided by E h a A^2, in the axes of the press.
         static_pressure: Static pressure divided by E h A^3 / a, positive in the direction of the push.
         ambient_pressure: Pressure of the atmosphere divided by E h A^3 / a.
@@ -231,7 +217,8 @@ class DimensionlessGroups:
     tension: float
     bending: float
     poisson: float
-    anisotropy: Anisotropy = ISOTROPIC
+    moduli: Array = field(default_factory=partial(np.zeros, (3, 3)))
+    uneven_tension: Array = field(default_factory=partial(np.zeros, 3))
     side_load: tuple[float, float] = (0.0, 0.0)
     static_pressure: float = 0.0
     ambient_pressure: float = 0.0
@@ -267,6 +254,12 @@ class DimensionlessGroups:
         rotation = complex(np.cos(angle), -np.sin(angle))
         side_load = complex(*side_force) * rotation / side_force_unit(film, squared_amplitude)
 
+        # The pretension (T11, T22, T12) minus its mean, MPa, refers to the axes x and y. The angle from the direction
+        # of the press to the x axis is `-angle`.
+        half_difference, shear_tension = film.deviator
+        deviator = np.array([half_difference, -half_difference, shear_tension])
+        tension_unit = film.young * squared_amplitude
+
         # The unit of the displaced volume is a^3 A. The compression is this unit divided by the volume of the air.
         compression = 0.0
         if film.back_volume is not None:
@@ -274,10 +267,11 @@ class DimensionlessGroups:
         return cls(
             squared_amplitude=squared_amplitude,
             load=force / force_unit,
-            tension=film.pretension / (film.young * squared_amplitude),
+            tension=film.pretension / tension_unit,
             bending=slenderness(film) / squared_amplitude if bending else 0.0,
             poisson=film.poisson,
-            anisotropy=press_frame_anisotropy(film, squared_amplitude, angle),
+            moduli=press_frame_moduli(film, angle),
+            uneven_tension=rotate_stress(deviator, -angle) / tension_unit,
             side_load=(side_load.real, side_load.imag),
             static_pressure=film.static_pressure / pressure_unit,
             ambient_pressure=AMBIENT_PRESSURE / pressure_unit,
@@ -331,34 +325,26 @@ def scaled_stress(scaled_strain: Array, groups: DimensionlessGroups) -> Array:
     Returns:
         Scaled stress (S11, S22, S12) without the pretension, shape (..., 3), in units of E_young A^2.
     """
-    return stress(scaled_strain, groups.poisson, groups.anisotropy.moduli)
+    return stress(scaled_strain, groups.poisson, groups.moduli)
 
 
-def press_frame_anisotropy(film: Film, squared_amplitude: float, angle: float) -> Anisotropy:
-    """Compute the direction-dependent properties of a film in the axes of a press.
+def press_frame_moduli(film: Film, angle: float) -> Array:
+    """Compute the difference of the elasticity matrix of a film from that of an isotropic film, in the axes of a press.
 
     The first axis of the press points from the centre of the film to the press.
 
     Args:
         film: The film.
-        squared_amplitude: Square A^2 of the amplitude of the press.
         angle: Direction of the press from the centre of the film, rad.
 
     Returns:
-        Differences of the film from the isotropic elasticity matrix and from the mean pretension.
+        Difference, divided by Young's modulus, shape (3, 3); see `orthotropic_moduli`.
     """
     # The moduli refer to the axes of the material. The angle from the direction of the press to axis 1 of the material
     # is `material_angle`.
     material_angle = film.axis - angle
     rotation = rotate_stress(np.eye(3), material_angle).T  # matrix for the stress components (s11, s22, s12)
-    moduli = rotation @ orthotropic_moduli(film) @ rotation.T
-
-    # The pretension refers to the axes x and y. The angle from the direction of the press to the x axis is `-angle`.
-    half_difference, shear_tension = film.deviator
-    deviator = np.array([half_difference, -half_difference, shear_tension])  # (T11, T22, T12) minus the mean, MPa
-    rotated_deviator = rotate_stress(deviator, -angle)
-    tension_unit = film.young * squared_amplitude
-    return Anisotropy(moduli, rotated_deviator / tension_unit)
+    return rotation @ orthotropic_moduli(film) @ rotation.T
 
 
 def side_force_unit(film: Film, squared_amplitude: Array | float) -> Any:

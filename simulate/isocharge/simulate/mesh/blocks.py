@@ -20,12 +20,11 @@ of the elements, and the class `Template` numbers their nodes.
 
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
-from isocharge.simulate.numerics.interpolation import lobatto_nodes
+from isocharge.simulate.numerics.interpolation import divide_intervals, lobatto_nodes
 from isocharge.simulate.sensor.footprint import FootprintTopology
 
 
@@ -148,17 +147,11 @@ class Blocks:
         corners = np.eye(self.n_corner + 1)[:-1]
         middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
 
-        # List the middles and the corners of the meshed part alternately in anticlockwise order.
-        middles_and_corners = [middles[-1]]
-        for corner, middle in zip(corners[: self.n_meshed], middles[: self.n_meshed], strict=True):
-            middles_and_corners += [corner, middle]
-
-        # Divide each half edge, which connects a middle and a corner, into `n_half_edge` equal parts.
-        fraction = np.arange(self.n_half_edge)[:, None] / self.n_half_edge
-        points = [start + fraction * (end - start) for start, end in pairwise(middles_and_corners)]
-        last_middle = middles_and_corners[-1]
-        points.append(last_middle[None])
-        return np.concatenate(points)
+        # List the middles and the corners of the meshed part alternately in anticlockwise order, and divide each half
+        # edge, which connects a middle and a corner, into `n_half_edge` equal parts.
+        corners_and_middles = np.stack([corners, middles], axis=1)[: self.n_meshed].reshape(-1, self.n_corner + 1)
+        ends_of_half_edges = np.concatenate([middles[-1:], corners_and_middles])
+        return divide_intervals(ends_of_half_edges.T, self.n_half_edge).T
 
     @cached_property
     def inner_corner_weights(self) -> Array:
@@ -172,43 +165,39 @@ class Blocks:
         The elements are those of the core polygon, followed by one or two layers of elements that surround the core
         polygon up to the innermost circle.
         """
-        core_elements = [element for corner in range(self.n_meshed) for element in self._core_elements(corner)]
-        zero = np.zeros(self.n_corner + 1)
+        weights = np.zeros((self.n_inner, 4, self.n_corner + 1))
+        weights[: self.n_quad] = self._core_elements()
 
         # The first layer has a straight inner side on the core polygon, and an outer side that may be curved. Both
         # sides of the second layer are curved.
-        first_layer = [[first, last, zero, zero] for first, last in pairwise(self.core_outline)]
-        n_second_layer = self.n_sector * (self.n_layer - 1)  # 0 if there is only one layer
-        second_layer = [[zero, zero, zero, zero] for _ in range(n_second_layer)]
-        return np.array([*core_elements, *first_layer, *second_layer])
+        first_layer = weights[self.n_quad : self.n_quad + self.n_sector]
+        first_layer[:, 0] = self.core_outline[:-1]
+        first_layer[:, 1] = self.core_outline[1:]
+        return weights
 
-    def _core_elements(self, corner: int) -> Array:
-        """Return the corners of the elements in the quadrilateral that belongs to a corner of the core polygon.
+    def _core_elements(self) -> Array:
+        """Return the corners of the elements in the core polygon.
 
-        The quadrilateral lies between the corner, the centroid of the core polygon, and the middles of both adjacent
-        edges. It consists of n_half_edge * n_half_edge elements.
-
-        Args:
-            corner: Index of the corner of the core polygon.
+        The elements that belong to a corner of the core polygon fill a quadrilateral between the corner, the centroid
+        of the core polygon, and the middles of both adjacent edges. It consists of n_half_edge * n_half_edge elements.
 
         Returns:
             First and last corner of the inner side, and first and last corner of the outer side of each element, as
-            weights, shape (n_half_edge^2, 4, n_corner + 1).
+            weights, shape (n_quad, 4, n_corner + 1). The elements are ordered corner by corner.
         """
-        # Corners of the quadrilateral. There are `n_half_edge` steps along the outline between a middle and a corner.
+        # Corners of the quadrilaterals. There are `n_half_edge` steps along the outline between a middle and a corner.
         centroid = np.eye(self.n_corner + 1)[-1]
-        start = 2 * self.n_half_edge * corner
-        middle_before = self.core_outline[start]
-        corner_point = self.core_outline[start + self.n_half_edge]
-        middle_after = self.core_outline[start + 2 * self.n_half_edge]
+        middles = self.core_outline[:: 2 * self.n_half_edge]
+        corners = self.core_outline[self.n_half_edge :: 2 * self.n_half_edge]
 
-        # Interpolate bilinearly on the grid of the corners of all elements, from the inner to the outer side.
-        fraction = np.linspace(0.0, 1.0, self.n_half_edge + 1)[:, None]
-        inner_side = centroid + fraction * (middle_after - centroid)
-        outer_side = middle_before + fraction * (corner_point - middle_before)
-        grid = inner_side + fraction[:, None] * (outer_side - inner_side)  # shape (radial, angular, n_corner + 1)
-        element_corners = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]], axis=2)
-        return element_corners.reshape(-1, 4, self.n_corner + 1)
+        # Interpolate bilinearly on the grid of the corners of all elements, from the inner to the outer side. The axes
+        # are the radial and the angular direction, the quadrilateral and the weight.
+        n_grid = self.n_half_edge + 1
+        inner_side = np.linspace(centroid, middles[1:], n_grid)
+        outer_side = np.linspace(middles[:-1], corners, n_grid)
+        grid = np.linspace(inner_side, outer_side, n_grid)
+        element_corners = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]], axis=3)
+        return np.moveaxis(element_corners, 2, 0).reshape(-1, 4, self.n_corner + 1)
 
     def rotated(self, steps: int, steps_per_turn: int) -> Integers:
         """Return how the elements are renumbered by a rotation of the probe that maps the mesh onto itself.

@@ -20,6 +20,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.simulate.mesh.blocks import Blocks, Resolution
+from isocharge.simulate.numerics.interpolation import divide_intervals
 
 CLEARANCE = 0.4
 """Gap between the farthest point of a footprint and the enclosing circle, dimensionless.
@@ -91,7 +92,7 @@ def enclosing_circle(outline: Complexes, centroid: Array, bisection_steps: int =
     """
     rim_gap = 1.0 - np.abs(outline).max(axis=-1)  # between the footprint and the rim
     max_extent = 1.0 - OUTER_GAP_SHARE * rim_gap  # largest allowed x coordinate of a circle
-    radius_at_centroid = _enclosing_radius(outline, centroid)
+    radius_at_centroid = _enclosing_radius(outline, centroid, rim_gap)
     centroid_fits = centroid + radius_at_centroid <= max_extent
     if np.all(centroid_fits):
         return centroid, radius_at_centroid
@@ -101,24 +102,24 @@ def enclosing_circle(outline: Complexes, centroid: Array, bisection_steps: int =
     upper_bound = centroid.copy()
     for _ in range(bisection_steps):
         middle = 0.5 * (lower_bound + upper_bound)
-        middle_fits = middle + _enclosing_radius(outline, middle) <= max_extent
+        middle_fits = middle + _enclosing_radius(outline, middle, rim_gap) <= max_extent
         lower_bound = np.where(middle_fits, middle, lower_bound)
         upper_bound = np.where(middle_fits, upper_bound, middle)
     centre = np.where(centroid_fits, centroid, lower_bound)
-    return centre, _enclosing_radius(outline, centre)
+    return centre, _enclosing_radius(outline, centre, rim_gap)
 
 
-def _enclosing_radius(outline: Complexes, centre: Array) -> Array:
+def _enclosing_radius(outline: Complexes, centre: Array, rim_gap: Array) -> Array:
     """Compute the radius of a circle that encloses a footprint with a gap. The centre of the circle is given.
 
     Args:
         outline: Points x + iy along the boundary of each footprint, shape (..., n), in film radii.
         centre: Position of the centre of each circle on the x axis, shape (...), in film radii.
+        rim_gap: Gap between each footprint and the rim, shape (...), in film radii.
 
     Returns:
         Radius, shape (...), in film radii.
     """
-    rim_gap = 1.0 - np.abs(outline).max(axis=-1)  # between the footprint and the rim
     reach = np.abs(outline - centre[..., None]).max(axis=-1)
     gap = np.minimum(CLEARANCE * reach, INNER_GAP_SHARE * rim_gap)
     return np.asarray(reach + gap)
@@ -220,12 +221,8 @@ def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array, ma
     rotation = max_turn * np.tanh(evenness * (even_angle - inner_angle) / max_turn)
     mixed_angle = inner_angle + rotation
 
-    # Add the rays between the rays of the inner points. Divide each interval into `blocks.n_half_edge` equal parts.
-    fraction = np.arange(blocks.n_half_edge) / blocks.n_half_edge
-    interval = np.diff(mixed_angle, axis=-1)[..., None]
-    angles_in_intervals = mixed_angle[..., :-1, None] + fraction * interval  # shape (..., n_point - 1, n_half_edge)
-    angles = angles_in_intervals.reshape(*mixed_angle.shape[:-1], -1)
-    return np.concatenate([angles, mixed_angle[..., -1:]], axis=-1)
+    # Add the rays between the rays of the inner points.
+    return divide_intervals(mixed_angle, blocks.n_half_edge)
 
 
 def rim_angles(angle: Array, map_parameter: Array, template_radius: Array, grading: float = 0.65) -> Array:

@@ -99,14 +99,15 @@ class Placement:
         if probe.topology.fills_circle:
             centre = centroid
             radius = np.full(centroid.shape, probe.reach / film_radius)
-            inner_extent = np.abs(corners - centre[..., None]).max(axis=-1)
+            inner_boundary = corners
         else:
-            outline = centroid[..., None] + probe.outline / film_radius * rotation_factor[..., None]
-            centre, radius = enclosing_circle(outline, centroid)
-            inner_extent = np.abs(outline - centre[..., None]).max(axis=-1)
+            inner_boundary = centroid[..., None] + probe.outline / film_radius * rotation_factor[..., None]
+            centre, radius = enclosing_circle(inner_boundary, centroid)
             if isinstance(probe, CurvedProbe) and probe.topology.is_curved:
                 boundary = probe.boundary(blocks.boundary_parameter[:: blocks.n_half_edge])
                 inner_points = np.asarray(centroid[..., None] + boundary / film_radius * rotation_factor[..., None])
+
+        inner_extent = np.abs(inner_boundary - centre[..., None]).max(axis=-1)
 
         # Compute the conformal map of the innermost circle, and the angles and depths of the elements around it.
         map_parameter, template_radius = automorphism_onto(centre, radius)

@@ -32,6 +32,25 @@ SAMPLE_LAYER = 0.05
 """Width of the thin rings at the rim under the sample press, in film radii."""
 
 
+@dataclass(frozen=True)
+class SampleProbe(RoundProbe):
+    """Probe of the sample press, whose circular footprint replaces another footprint with the same topology.
+
+    Attributes:
+        radius: Radius of the circle, mm.
+        other_topology: Topology of the other footprint.
+    """
+
+    other_topology: FootprintTopology
+    name = "sample"
+    period = 2.0 * np.pi
+
+    @property
+    def topology(self) -> FootprintTopology:
+        """Topology of the other footprint."""
+        return self.other_topology
+
+
 class Template(Blocks):
     """Elements with numbered nodes. Adjacent elements share the nodes on their common side.
 
@@ -54,7 +73,11 @@ class Template(Blocks):
             whole: Whether to mesh the whole film although the footprint is symmetric.
         """
         super().__init__(resolution, topology, whole)
-        element_points = sample_points(self)  # x + iy in film radii, shape (n_element, n_local)
+        # No element is folded under the sample press. Therefore two nodes have the same position only if they are the
+        # same node.
+        probe = SampleProbe(SAMPLE_REACH, topology)
+        placement = Placement.of(self, probe, np.array(SAMPLE_DISTANCE), 1.0, SAMPLE_LAYER)
+        element_points = placement.element_points(self)  # x + iy in film radii, shape (n_element, n_local)
         all_points = element_points.ravel()
         rounded_points = np.round(all_points, 9)  # positions of the same node may differ by rounding errors
         _, self.first_occurrence, node_number = np.unique(rounded_points, return_index=True, return_inverse=True)
@@ -65,43 +88,6 @@ class Template(Blocks):
         node_points = all_points[self.first_occurrence]
         self.on_rim = np.abs(node_points) > 1.0 - 1e-9
         self.on_axis = (np.abs(node_points.imag) < 1e-9) & self.half
-
-
-@dataclass(frozen=True)
-class SampleProbe(RoundProbe):
-    """Probe of the sample press, whose circular footprint replaces another footprint with the same topology.
-
-    Attributes:
-        radius: Radius of the circle, mm.
-        other_topology: Topology of the other footprint.
-    """
-
-    other_topology: FootprintTopology
-    name = "sample"
-    period = 2.0 * np.pi
-
-    @property
-    def topology(self) -> FootprintTopology:
-        """Topology of the other footprint."""
-        return self.other_topology
-
-
-def sample_points(blocks: Blocks) -> Complexes:
-    """Return the film points of the nodes of all elements under a sample press.
-
-    No element is folded under the sample press. Therefore two nodes have the same position only if they are the same
-    node.
-
-    Args:
-        blocks: The elements.
-
-    Returns:
-        Film points x + iy, shape (n_element, (order + 1)^2), in film radii.
-    """
-    placement = Placement.of(
-        blocks, SampleProbe(SAMPLE_REACH, blocks.topology), np.array(SAMPLE_DISTANCE), 1.0, SAMPLE_LAYER
-    )
-    return placement.element_points(blocks)
 
 
 template_for = lru_cache(maxsize=16)(Template)

@@ -87,6 +87,21 @@ def contacts_at(position: Array, force: float) -> Array:
     return np.column_stack([position, np.full(len(position), force)])
 
 
+def log_spaced_forces(fraction: Array, force_range: tuple[float, float]) -> Array:
+    """Return the forces at given fractions of a range of forces on a logarithmic scale.
+
+    Args:
+        fraction: Fractions from 0 (smallest force) to 1 (largest force), any shape.
+        force_range: Smallest and largest force, N.
+
+    Returns:
+        Forces, same shape, N.
+    """
+    min_log_force, max_log_force = np.log(force_range)
+    force = np.exp(min_log_force + (max_log_force - min_log_force) * fraction)
+    return np.asarray(np.clip(force, *force_range))  # rounding must not move a force out of the range
+
+
 def sunflower(count: int) -> Array:
     """Return points that are distributed evenly over the unit disk.
 

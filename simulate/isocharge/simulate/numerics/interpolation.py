@@ -74,6 +74,20 @@ def chebyshev_nodes(count: int, low: float, high: float) -> Array:
     return np.asarray(middle + half_width * np.cos(angles))
 
 
+def divide_intervals(ends: Array, count: int) -> Array:
+    """Divide each of several adjacent intervals into equal parts.
+
+    Args:
+        ends: Ends of the intervals, shape (..., n).
+        count: Number of parts of each interval.
+
+    Returns:
+        Ends of all parts, shape (..., (n - 1) * count + 1).
+    """
+    starts_of_parts = np.linspace(ends[..., :-1], ends[..., 1:], count, endpoint=False, axis=-1)
+    return np.append(starts_of_parts.reshape(*ends.shape[:-1], -1), ends[..., -1:], axis=-1)
+
+
 def lagrange_values(nodes: Array, points: Array) -> Array:
     """Evaluate the Lagrange polynomials of given nodes.
 

@@ -12,7 +12,7 @@ from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.plots.figure import FELT, INK
 from isocharge.simulate.sensor.film import Film
-from isocharge.simulate.sensor.sensor import Sensor
+from isocharge.simulate.sensor.sensor import Sensor, outermost_corner
 from isocharge.simulate.solver.equilibrium import Equilibrium, deflection
 
 
@@ -84,12 +84,9 @@ def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> Non
         radius: Radius of the circle, mm.
         title: Title of the axes.
     """
-    # Find the distance of the outermost corner of an electrode from the centre of the film.
     polygons = [polygon for electrode in sensor.electrodes for polygon in electrode.front]
-    calibrated_corners = sensor.calibration.place(np.concatenate(polygons))
-    outermost = float(np.linalg.norm(calibrated_corners, axis=1).max())
     margin_mm = 0.7
-    half_width = max(radius, outermost) + margin_mm
+    half_width = max(radius, outermost_corner(sensor, polygons)) + margin_mm
     limits = (-half_width, half_width)
     axes.set(xlim=limits, ylim=limits, xlabel="x, mm", ylabel="y, mm", aspect="equal", title=title)
 

@@ -24,7 +24,7 @@ from isocharge.common.errors import SceneError, SensorError
 from isocharge.simulate.sensor.film import Film, increased
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.probe import Circle
-from isocharge.simulate.sensor.sensor import Calibration, Sensor
+from isocharge.simulate.sensor.sensor import Calibration, Sensor, outermost_corner
 
 MAX_DEVIATION = 4.0
 """Largest allowed deviation of a property from its mean, in standard deviations."""
@@ -212,9 +212,8 @@ class FilmPrior:
     @cached_property
     def _rim_gap(self) -> float:
         """Smallest distance between an electrode and the rim of the described film, mm."""
-        calibration = self.sensor.calibration
-        corners = [calibration.place(np.concatenate(electrode.parts)) for electrode in self.sensor.electrodes]
-        return self.sensor.film.inner_radius - float(np.linalg.norm(np.concatenate(corners), axis=1).max())
+        parts = [part for electrode in self.sensor.electrodes for part in electrode.parts]
+        return self.sensor.film.inner_radius - outermost_corner(self.sensor, parts)
 
     @cached_property
     def properties(self) -> tuple[FilmProperty, ...]:

@@ -5,6 +5,7 @@ axis is the transverse direction (2). The film is seen from the side of the prob
 the direction of the push. The units are mm, N, MPa and pC.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import combinations
@@ -12,6 +13,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import shapely
+from numpy.typing import ArrayLike
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SensorError, cut, is_printable, shown
@@ -205,7 +207,7 @@ class Electrode:
     def metal(self) -> tuple[Array, ...]:
         """Convex parts of all metal on the front, including metal that collects no charge; see `parts`."""
         # Without polygons on the back, the whole back is metal, and all metal on the front collects charge.
-        return replace(self, back=()).parts if self.back else self.parts
+        return replace(self, back=()).parts
 
     @cached_property
     def region(self) -> shapely.Geometry:
@@ -247,8 +249,6 @@ class Calibration:
         Returns:
             Charges with crosstalk, of the same shape, pC.
         """
-        if self.crosstalk == 0.0:
-            return charge
         charge_of_others = charge.sum(axis=-1, keepdims=True) - charge
         return np.asarray(charge + self.crosstalk * charge_of_others)
 
@@ -352,6 +352,17 @@ def electrode_index(sensor: Sensor, name: str) -> int:
     if name not in sensor.electrode_names:
         raise SensorError(f"no electrode {name!r} on {sensor.name}: it has {', '.join(sensor.electrode_names)}")
     return sensor.electrode_names.index(name)
+
+
+def outermost_corner(sensor: Sensor, polygons: Sequence[ArrayLike]) -> float:
+    """Return the largest distance of a corner of polygons on the real film from the centre of the film, mm.
+
+    Args:
+        sensor: Sensor with the calibrated positions.
+        polygons: Corners (x, y) of each polygon at their nominal positions, each of shape (n, 2), mm.
+    """
+    corners = sensor.calibration.place(np.concatenate(polygons))
+    return float(np.linalg.norm(corners, axis=1).max())
 
 
 def _as_tuples(value: Any) -> Any:

@@ -24,17 +24,23 @@ The dense matrices are small. `single_threaded_blas` limits the threads of all c
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from scipy.sparse import csc_matrix, eye_array
 from scipy.sparse.linalg import SuperLU, splu
 from threadpoolctl import ThreadpoolController
 
-from isocharge.common.arrays import Array, Integers
+from isocharge.common.arrays import Array
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mesh.template import Template
+
+SolveTangent = Callable[[Array], Array]
+"""Function that solves a linear system with a factorised tangent for the displacements at the nodes.
+
+The argument is the right-hand side for (U1, U2, W) at the nodes, and the result is the solution, both of the shape
+(n_node, 3). Fixed unknowns are zero.
+"""
 
 
 class Assembly:
@@ -79,28 +85,33 @@ class Assembly:
         self.interior_unknowns = unknown[:, self._interior_indices]
         self.side_unknowns = unknown[:, self._side_indices]
 
-        # Number the skeleton unknowns, which are the free unknowns on sides. All other unknowns have the number -1.
+        # The skeleton unknowns are the free unknowns on sides.
         is_in_skeleton = np.zeros(self.free.size, dtype=bool)
         is_in_skeleton[self.side_unknowns.ravel()] = True
         self.skeleton = np.flatnonzero(is_in_skeleton & self.free.ravel())
-        skeleton_number = np.full(self.free.size, -1, dtype=np.intp)
-        skeleton_number[self.skeleton] = np.arange(self.skeleton.size)
-        self._set_pattern(skeleton_number[self.side_unknowns])
-        self._reorder()
+        self._set_pattern()
 
-    def _set_pattern(self, skeleton_numbers: Integers) -> None:
+        # Renumber the skeleton unknowns by the minimum-degree method, so that the factors have few nonzero entries.
+        # SuperLU returns its column order only after a factorisation. The factorised matrix has the pattern of the
+        # skeleton matrix and a dominant diagonal, because such a matrix needs no pivoting.
+        pattern = self._skeleton_matrix(np.ones(self._indices.size))
+        dominant_matrix = csc_matrix(pattern + pattern.sum() * eye_array(pattern.shape[0]))
+        self.skeleton = self.skeleton[np.argsort(_factorise(dominant_matrix, "MMD_AT_PLUS_A").perm_c)]
+        self._set_pattern()
+
+    def _set_pattern(self) -> None:
         """Determine which entries of the skeleton matrix may be nonzero, and where the element matrices are added.
 
         The skeleton matrix is the matrix of the unknowns on the sides of the elements, and is the sum of the matrices
         of all elements. Only its nonzero entries are stored, in an array that is ordered column by column (compressed
         sparse column format). The method stores the position of each entry of each element matrix in this array.
         Entries that belong to a fixed unknown get the position after the last nonzero entry.
-
-        Args:
-            skeleton_numbers: Row of the skeleton matrix for each unknown on the sides of each element, shape
-                (n_element, n_side). Fixed unknowns have the number -1.
         """
-        # Row and column of each entry of the element matrices in the skeleton matrix
+        # Row and column of each entry of the element matrices in the skeleton matrix. Fixed unknowns have the number
+        # -1.
+        skeleton_number = np.full(self.free.size, -1, dtype=np.intp)
+        skeleton_number[self.skeleton] = np.arange(self.skeleton.size)
+        skeleton_numbers = skeleton_number[self.side_unknowns]
         n_element, n_side = skeleton_numbers.shape
         shape = (n_element, n_side, n_side)
         size = self.skeleton.size
@@ -123,33 +134,7 @@ class Assembly:
         entries_per_column = np.bincount(codes // size, minlength=size)
         self._indptr = np.concatenate([[0], np.cumsum(entries_per_column)]).astype(np.int32)
 
-    def _reorder(self) -> None:
-        """Renumber the skeleton unknowns by the minimum-degree method, so that the factors have few nonzero entries.
-
-        The skeleton unknowns are the unknowns on the sides of the elements.
-        """
-        # SuperLU returns its column order only after a factorisation. The factorised matrix has the pattern of the
-        # skeleton matrix and a dominant diagonal, because such a matrix needs no pivoting.
-        pattern = self._skeleton_matrix(np.ones(self._indices.size))
-        dominant_matrix = csc_matrix(pattern + pattern.sum() * eye_array(pattern.shape[0]))
-        order = np.argsort(_factorise(dominant_matrix, "MMD_AT_PLUS_A").perm_c)
-
-        # The renumbering moves each stored entry of the matrix to a new position. To find the new positions, set each
-        # entry to its old position, permute the matrix, and invert the resulting list of old positions.
-        pattern.data = np.arange(pattern.nnz)
-        permuted_pattern = pattern[:, order][order]
-        permuted_pattern.sort_indices()
-        old_position = permuted_pattern.data
-
-        # Entries of fixed unknowns keep their position after the last stored entry.
-        position_of_fixed = permuted_pattern.nnz
-        new_position = np.append(np.argsort(old_position), position_of_fixed)
-        self._entry_positions = new_position[self._entry_positions]
-        self._indices = permuted_pattern.indices
-        self._indptr = permuted_pattern.indptr
-        self.skeleton = self.skeleton[order]
-
-    def factor(self, matrix: Array) -> "Factor":
+    def factor(self, matrix: Array) -> SolveTangent:
         """Factorise the matrix of the mesh.
 
         Args:
@@ -157,7 +142,7 @@ class Assembly:
                 unknowns_per_node).
 
         Returns:
-            Factorisation that solves the linear system for arbitrary right-hand sides.
+            Function that solves the linear system for a right-hand side.
         """
         interior = self._interior_indices
         sides = self._side_indices
@@ -180,7 +165,49 @@ class Assembly:
         entry_count = self._indices.size + 1
         skeleton_entries = np.bincount(self._entry_positions, schur_complement.ravel(), entry_count)[:-1]
         skeleton_factor = _factorise(self._skeleton_matrix(skeleton_entries), "NATURAL")
-        return Factor(self, interior_inverse, coupling, reduced_coupling, skeleton_factor)
+        return partial(self._solve, interior_inverse, coupling, reduced_coupling, skeleton_factor)
+
+    def _solve(
+        self,
+        interior_inverse: Array,
+        coupling: Array,
+        reduced_coupling: Array,
+        skeleton_factor: SuperLU,
+        right: Array,
+    ) -> Array:
+        """Solve the linear system of a factorised matrix for the free unknowns.
+
+        Args:
+            interior_inverse: Inverse of the block of the interior unknowns of each element, shape
+                (n_element, n_interior, n_interior).
+            coupling: Block between interior unknowns and unknowns on sides, shape (n_element, n_interior, n_side).
+            reduced_coupling: Product of `interior_inverse` and `coupling`, same shape as `coupling`.
+            skeleton_factor: Factorisation of the matrix of the skeleton unknowns.
+            right: Right-hand side for (U1, U2, W) at the nodes, shape (n_node, 3). The values of fixed unknowns are
+                ignored.
+
+        Returns:
+            Solution (U1, U2, W) at the nodes, shape (n_node, 3). Fixed unknowns are zero.
+        """
+        padded_right = np.zeros(self.free.shape)
+        padded_right[:, :3] = right  # the right-hand side of the auxiliary unknown of bending is zero
+        flat_right = padded_right.ravel()
+
+        # Eliminate the interior unknowns of each element from the right-hand side.
+        interior_right = flat_right[self.interior_unknowns][..., None]  # shape (n_element, n_interior, 1)
+        interior_solution = interior_inverse @ interior_right
+        coupled_right = coupling.transpose(0, 2, 1) @ interior_solution  # shape (n_element, n_side, 1)
+        reduced_right = flat_right - np.bincount(self.side_unknowns.ravel(), coupled_right.ravel(), flat_right.size)
+
+        # Solve for the unknowns of the skeleton.
+        solution = np.zeros(flat_right.size)
+        solution[self.skeleton] = skeleton_factor.solve(reduced_right[self.skeleton])
+
+        # Compute the interior unknowns of each element from the unknowns on its sides.
+        side_solution = solution[self.side_unknowns][..., None]  # shape (n_element, n_side, 1)
+        correction = reduced_coupling @ side_solution
+        solution[self.interior_unknowns] = (interior_solution - correction)[..., 0]
+        return solution.reshape(self.free.shape)[:, :3]
 
     def _skeleton_matrix(self, entries: np.ndarray) -> csc_matrix:
         """Create the matrix of the skeleton unknowns.
@@ -189,57 +216,6 @@ class Assembly:
             entries: Entries of the sparsity pattern, in the order of the compressed sparse column format.
         """
         return csc_matrix((entries, self._indices, self._indptr), shape=(self.skeleton.size, self.skeleton.size))
-
-
-@dataclass(frozen=True)
-class Factor:
-    """Factorisation of the matrix of a mesh.
-
-    Attributes:
-        assembly: Linear solver with the indices of the unknowns.
-        interior_inverse: Inverse of the block of the interior unknowns of each element, shape
-            (n_element, n_interior, n_interior).
-        coupling: Block between interior unknowns and unknowns on sides, shape (n_element, n_interior, n_side).
-        reduced_coupling: Product of `interior_inverse` and `coupling`, same shape as `coupling`.
-        skeleton_factor: Factorisation of the matrix of the skeleton unknowns.
-    """
-
-    assembly: Assembly
-    interior_inverse: Array
-    coupling: Array
-    reduced_coupling: Array
-    skeleton_factor: SuperLU
-
-    def solve(self, right: Array) -> Array:
-        """Solve the linear system for the free unknowns.
-
-        Args:
-            right: Right-hand side for (U1, U2, W) at the nodes, shape (n_node, 3). The values of fixed unknowns are
-                ignored.
-
-        Returns:
-            Solution (U1, U2, W) at the nodes, shape (n_node, 3). Fixed unknowns are zero.
-        """
-        assembly = self.assembly
-        padded_right = np.zeros(assembly.free.shape)
-        padded_right[:, :3] = right  # the right-hand side of the auxiliary unknown of bending is zero
-        flat_right = padded_right.ravel()
-
-        # Eliminate the interior unknowns of each element from the right-hand side.
-        interior_right = flat_right[assembly.interior_unknowns][..., None]  # shape (n_element, n_interior, 1)
-        interior_solution = self.interior_inverse @ interior_right
-        coupled_right = self.coupling.transpose(0, 2, 1) @ interior_solution  # shape (n_element, n_side, 1)
-        reduced_right = flat_right - np.bincount(assembly.side_unknowns.ravel(), coupled_right.ravel(), flat_right.size)
-
-        # Solve for the unknowns of the skeleton.
-        solution = np.zeros(flat_right.size)
-        solution[assembly.skeleton] = self.skeleton_factor.solve(reduced_right[assembly.skeleton])
-
-        # Compute the interior unknowns of each element from the unknowns on its sides.
-        side_solution = solution[assembly.side_unknowns][..., None]  # shape (n_element, n_side, 1)
-        correction = self.reduced_coupling @ side_solution
-        solution[assembly.interior_unknowns] = (interior_solution - correction)[..., 0]
-        return solution.reshape(assembly.free.shape)[:, :3]
 
 
 def _factorise(matrix: csc_matrix, column_order: str) -> SuperLU:
@@ -280,13 +256,6 @@ def _free_unknowns(mesh: Template, unknowns_per_node: int, odd: bool) -> np.ndar
 assembly = lru_cache(maxsize=16)(Assembly)
 """Function that returns the linear solver for the mesh of a template. Linear solvers are cached."""
 
-SolveTangent = Callable[[Array], Array]
-"""Function that solves a linear system with a factorised tangent for the displacements at the nodes.
-
-The argument is the right-hand side for (U1, U2, W) at the nodes, and the result is the solution, both of the shape
-(n_node, 3). Fixed unknowns are zero.
-"""
-
 
 def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, added_tension: float = 0.0) -> SolveTangent:
     """Factorise the tangent of the film for given displacements, including the stiffness of trapped air.
@@ -303,7 +272,7 @@ def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, added
     Returns:
         Function that solves linear systems with the tangent.
     """
-    solve_film = assembly.factor(elastic.tangent(field, added_tension)).solve
+    solve_film = assembly.factor(elastic.tangent(field, added_tension))
     back = elastic.back
     if back is None or elastic.groups.compression == 0.0 or assembly.odd:  # odd fields do not compress the air
         return solve_film

@@ -213,13 +213,11 @@ def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
     # Compute the scaled principal stresses without the mean pretension. The deviator of the pretension is added before,
     # because it changes the directions of the principal stresses.
     groups = equilibrium.groups
-    deviator = groups.anisotropy.tension
     pressed = replace(equilibrium, rest=None)  # with the stress before the contact
-    smallest, largest = principal_stresses(nodal_stress(pressed) + deviator)
-    if equilibrium.theory.bending:
-        for surface in ("top", "bottom"):
-            _, largest_at_surface = principal_stresses(nodal_stress(pressed, surface) + deviator)
-            largest = max(largest, largest_at_surface)
+    surfaces: tuple[Surface, ...] = ("middle", "top", "bottom") if equilibrium.theory.bending else ("middle",)
+    extremes = [principal_stresses(nodal_stress(pressed, surface) + groups.uneven_tension) for surface in surfaces]
+    smallest, _ = extremes[0]
+    largest = max(largest_at_surface for _, largest_at_surface in extremes)
 
     # Convert the stresses to MPa, and add the mean pretension, which is the same in all directions.
     stress_unit = equilibrium.film.young * groups.squared_amplitude

@@ -181,10 +181,11 @@ class _Iterate:
         in-plane forces of the elements.
         """
         free_residual = self.residual * self.free  # without the reactions at fixed nodes
-        load = np.linalg.norm(self.elastic.load_forces)
-        in_plane_force = max(self.elastic.in_plane_scale(self.field), 1e-300)  # the limit avoids a division by zero
+        magnitude, shares = self.elastic.load
+        load = magnitude * np.linalg.norm(shares)
+        in_plane_force = float(np.linalg.norm(self.elastic.membrane.forces(self.field)[..., :2]))
         transverse_ratio = np.linalg.norm(free_residual[:, 2]) / load
-        in_plane_ratio = np.linalg.norm(free_residual[:, :2]) / in_plane_force
+        in_plane_ratio = np.linalg.norm(free_residual[:, :2]) / max(in_plane_force, 1e-300)  # avoids a division by zero
         return float(max(transverse_ratio, in_plane_ratio))
 
     def result(self, iterations: int, *, converged: bool, message: str) -> NewtonResult:
@@ -219,7 +220,8 @@ def _step_size(elastic: ElasticFilm, field: Array, step: Array, residual: Array)
         residual: Out-of-balance forces before the step, same shape as `step`.
     """
     step_energy = abs(float(np.sum(step * residual)))
-    work = max(abs(float(elastic.load_forces @ field[:, 2])), 1e-300)  # the limit avoids a division by zero
+    magnitude, shares = elastic.load
+    work = max(magnitude * abs(float(shares @ field[:, 2])), 1e-300)  # the limit avoids a division by zero
     return float(np.sqrt(step_energy / work))
 
 

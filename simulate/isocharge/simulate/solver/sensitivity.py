@@ -44,7 +44,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.energy import ElasticFilm
-from isocharge.simulate.mechanics.theory import Anisotropy, press_frame_anisotropy, side_force_unit
+from isocharge.simulate.mechanics.theory import press_frame_moduli, side_force_unit
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, from_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Surface, increased
@@ -66,10 +66,12 @@ class StressField:
     """Field of the stress changes that an imperfection causes.
 
     Attributes:
+        name: Name of the property of the film that the imperfection changes.
         add: Function that adds the imperfection to the film of an equilibrium.
         odd: Whether the field is odd about the direction of the press.
     """
 
+    name: str
     add: AddImperfection
     odd: bool
 
@@ -86,8 +88,8 @@ def _add_tension(solved: Equilibrium, value: float, direction: tuple[float, floa
         direction: Components (T11, T22, T12) of one unit.
     """
     unit = 1.0 + solved.groups.tension  # divided by E A^2, like all tensions in `groups`
-    tension = solved.groups.anisotropy.tension + value * unit * np.array(direction)
-    return _with_anisotropy(solved, replace(solved.groups.anisotropy, tension=tension))
+    tension = solved.groups.uneven_tension + value * unit * np.array(direction)
+    return replace(solved, groups=replace(solved.groups, uneven_tension=tension))
 
 
 def _add_stiffness(solved: Equilibrium, log_ratio: float, angle: float) -> Equilibrium:
@@ -102,13 +104,8 @@ def _add_stiffness(solved: Equilibrium, log_ratio: float, angle: float) -> Equil
     addition = cmath.rect(log_ratio, 2.0 * (solved.direction + angle))
     new_log_ratio, axis = increased(math.log(film.young_ratio), film.axis, addition)
     changed_film = replace(film, young_ratio=math.exp(new_log_ratio), axis=axis)
-    moduli = press_frame_anisotropy(changed_film, solved.groups.squared_amplitude, solved.direction).moduli
-    return _with_anisotropy(solved, replace(solved.groups.anisotropy, moduli=moduli))
-
-
-def _with_anisotropy(solved: Equilibrium, anisotropy: Anisotropy) -> Equilibrium:
-    """Return a press with other direction-dependent properties of the film."""
-    return replace(solved, groups=replace(solved.groups, anisotropy=anisotropy))
+    moduli = press_frame_moduli(changed_film, solved.direction)
+    return replace(solved, groups=replace(solved.groups, moduli=moduli))
 
 
 def _add_oval(solved: Equilibrium, value: float, direction: complex) -> Equilibrium:
@@ -130,18 +127,23 @@ def _add_oval(solved: Equilibrium, value: float, direction: complex) -> Equilibr
 
 
 FILM_FIELDS = (
-    StressField(partial(_add_tension, direction=(1.0, 1.0, 0.0)), odd=False),
-    StressField(partial(_add_tension, direction=(1.0, -1.0, 0.0)), odd=False),
-    StressField(partial(_add_tension, direction=(0.0, 0.0, 1.0)), odd=True),
-    StressField(partial(_add_stiffness, angle=0.0), odd=False),
-    StressField(partial(_add_stiffness, angle=0.25 * np.pi), odd=True),
-    StressField(partial(_add_oval, direction=1.0), odd=False),
-    StressField(partial(_add_oval, direction=1j), odd=True),
+    StressField("pretension", partial(_add_tension, direction=(1.0, 1.0, 0.0)), odd=False),
+    StressField("tension_difference", partial(_add_tension, direction=(1.0, -1.0, 0.0)), odd=False),
+    StressField("tension_shear", partial(_add_tension, direction=(0.0, 0.0, 1.0)), odd=True),
+    StressField("stiffness_x", partial(_add_stiffness, angle=0.0), odd=False),
+    StressField("stiffness_xy", partial(_add_stiffness, angle=0.25 * np.pi), odd=True),
+    StressField("oval_x", partial(_add_oval, direction=1.0), odd=False),
+    StressField("oval_xy", partial(_add_oval, direction=1j), odd=True),
 )
 """Stress fields of a changed film: mean tension, uneven tension, uneven stiffness, and oval clamp.
 
-The mean tension has one field. Each other imperfection has an even field and an odd field, in this order.
+The mean tension has one field. Each other imperfection has an even field and an odd field, in this order. They belong
+to two properties of the film: the size of the imperfection times the cosine and the sine of twice the angle from the x
+axis to its axis 1.
 """
+
+TENSION_FIELDS = 3
+"""Number of stress fields of a changed tension, which are the first of `FILM_FIELDS`."""
 
 FILM_IS_ODD = np.array([field.odd for field in FILM_FIELDS])
 """Whether each of `FILM_FIELDS` is odd about the direction of the press, shape (n_field,)."""

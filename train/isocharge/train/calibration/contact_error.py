@@ -22,13 +22,15 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.presses.measured_presses import FORCE_STD, POSITION_STD_MM
 from isocharge.simulate import Domain, Sweep
-from isocharge.simulate.numerics.disk import sunflower
+from isocharge.simulate.identifiability.cramer_rao import CramerRao
+from isocharge.simulate.numerics.disk import log_spaced_forces, sunflower
 from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.calibration.estimator import PLANNED
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.press_data import PressData, linearise
 from isocharge.train.calibration.problem import CalibrationProblem
+from isocharge.train.data.contact_errors import rms
 
 N_CONTACTS = 200
 """Number of contacts over which the errors are averaged, and of positions that are compared for the next press."""
@@ -58,9 +60,8 @@ class ContactError:
     @classmethod
     def of(cls, covariance: Array) -> "ContactError":
         """Compute the errors from the covariances of estimated contacts (x, y, ln F), shape (n, 3, 3)."""
-        variance = np.diagonal(covariance, axis1=1, axis2=2)
-        position = float(np.sqrt(variance[:, :2].sum(axis=1).mean()))
-        return cls(position, 100.0 * float(np.sqrt(variance[:, 2].mean())))
+        errors = CramerRao(covariance)
+        return cls(rms(errors.position), 100.0 * rms(errors.force))
 
 
 @dataclass(frozen=True)
@@ -107,8 +108,7 @@ class ContactSensitivity:
 
         The contacts are those of `spread_contacts`.
         """
-        variance = np.diagonal(self._contact_covariance(covariance), axis1=1, axis2=2)
-        return np.asarray(np.sqrt(variance[:, :2].sum(axis=1)))
+        return CramerRao(self._contact_covariance(covariance)).position
 
     def _contact_covariance(self, covariance: Array) -> Array:
         """Return the covariances of contacts (x, y, ln F) that a covariance of the unknowns causes, shape (n, 3, 3)."""
@@ -198,7 +198,7 @@ def _candidates(problem: CalibrationProblem) -> Array:
     low, high = domain.force_range
     strongest = force_within_stress(problem.sensor.film, problem.probe, problem.stress_limit, domain.force_range)
     high = min(high, strongest)
-    forces = np.exp(np.log(low) + np.array(CANDIDATE_FORCES) * (np.log(high) - np.log(low)))
+    forces = log_spaced_forces(np.array(CANDIDATE_FORCES), (low, high))
     forces = np.clip(np.round(forces / GRID_N) * GRID_N, max(low, GRID_N), high)
     return np.array([(x, y, force) for x, y in position for force in forces])
 

@@ -42,13 +42,12 @@ def terms(contact: Array, domain: Domain) -> Array:
     Returns:
         Values of the terms, shape (n, n_term), dimensionless.
     """
-    x_values, y_values, force_values = (
-        chebyshev.chebvander(coordinate, DEGREE) for coordinate in domain.to_unit(contact).T
-    )
     degrees = _degrees()
-    x_degree, y_degree, force_degree = degrees.T
-    products = x_values[:, x_degree] * y_values[:, y_degree] * force_values[:, force_degree]
-    return np.asarray(FADING ** degrees.sum(axis=1) * products)
+    largest_degrees = (DEGREE, DEGREE, FORCE_DEGREE)
+    x, y, log_force = domain.to_unit(contact).T
+    products = chebyshev.chebvander3d(x, y, log_force, largest_degrees)
+    columns = np.ravel_multi_index(degrees.T, np.add(largest_degrees, 1))
+    return np.asarray(FADING ** degrees.sum(axis=1) * products[:, columns])
 
 
 def discrepancy_jacobian(charge: Array, contact: Array, domain: Domain) -> Array:

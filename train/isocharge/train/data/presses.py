@@ -17,6 +17,7 @@ from isocharge.common.files import sha256_of
 from isocharge.common.structs import Positive, convert
 from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
 from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor
+from isocharge.simulate.numerics.disk import log_spaced_forces
 from isocharge.train.data.channel_noise import Noise
 
 LOWEST_CHARGE = 1.0
@@ -116,8 +117,7 @@ def draw_contacts(rng: np.random.Generator, domain: Domain, count: int) -> Array
     """
     distance = domain.radius * np.sqrt(rng.random(count))
     place = distance * np.exp(2j * np.pi * rng.random(count))  # x + i y
-    min_log_force, max_log_force = np.log(domain.force_range)
-    force = np.exp(rng.uniform(min_log_force, max_log_force, count))
+    force = log_spaced_forces(rng.random(count), domain.force_range)
     return np.column_stack([place.real, place.imag, force])
 
 

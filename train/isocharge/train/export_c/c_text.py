@@ -1,7 +1,6 @@
 """Numbers, arrays and texts in the syntax of C99."""
 
 import re
-from collections.abc import Iterable
 from importlib import resources
 from string import Template
 from textwrap import wrap
@@ -32,11 +31,6 @@ def _with_point(digits: str) -> str:
     """Append a decimal point to the digits of an integer, so that C reads a floating-point number."""
     has_point = "." in digits or "e" in digits
     return digits if has_point else f"{digits}.0"
-
-
-def c_doubles(values: Iterable[float]) -> str:
-    """Return the initialiser of an array of doubles in one line, for example `{1.0, 2.0}`."""
-    return "{" + ", ".join(map(c_double, values)) + "}"
 
 
 def c_array(name: str, values: NDArray[Any]) -> str:

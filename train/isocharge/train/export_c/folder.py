@@ -15,7 +15,7 @@ from isocharge.common.files import new_folder, refuse_existing, write_whole
 from isocharge.serve.live.device import ANY_BOARD, STAGES
 from isocharge.serve.model.model_folder import load_model
 from isocharge.serve.signal_chain.stage import NOT_IN_C, Device, Setup
-from isocharge.train.export_c.c_text import c_comment, c_double, c_doubles, source_text
+from isocharge.train.export_c.c_text import c_comment, c_double, source_text
 from isocharge.train.export_c.model_source import model_header, model_source, self_test
 from isocharge.train.model_release.onnx_graph import read_graph
 
@@ -69,13 +69,15 @@ def settings_origin(device: Device) -> str:
 
 
 def _c_literal(value: Any) -> str:
-    """Return a number, a truth value or an array as a C literal. A truth value becomes 0 or 1.
+    """Return a number or a truth value as a C literal, and an array as an initialiser, for example `{1.0, 2.0}`.
+
+    A truth value becomes 0 or 1.
 
     Args:
         value: The number, truth value or array.
     """
     if isinstance(value, np.ndarray):
-        return c_doubles(value)
+        return "{" + ", ".join(map(c_double, value)) + "}"
     if isinstance(value, int):  # truth values are integers as well
         return str(int(value))
     return c_double(value)

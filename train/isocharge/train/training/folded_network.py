@@ -351,14 +351,15 @@ def _add_features(builder: GraphBuilder, features: ChargeFeatures) -> str:
     Returns:
         Name of the tensor with the features.
     """
-    inverse_typical = 1.0 / features.typical_pC
-    if features.mean is None:
-        clipped = builder.add("Clip", INPUT, builder.constant(features.low_pC), builder.constant(features.high_pC))
-        ratio = builder.add("Mul", clipped, builder.constant(inverse_typical))
+    is_signed = features.mean is not None
+    low, high = builder.constant(features.low_pC), builder.constant(features.high_pC)
+    if is_signed:
+        clipped = builder.add("Min", builder.add("Max", INPUT, low), high)
+    else:
+        clipped = builder.add("Clip", INPUT, low, high)
+    ratio = builder.add("Mul", clipped, builder.constant(1.0 / features.typical_pC))
+    if not is_signed:
         return builder.add("Log", ratio)
-    clipped_below = builder.add("Max", INPUT, builder.constant(features.low_pC))
-    clipped = builder.add("Min", clipped_below, builder.constant(features.high_pC))
-    ratio = builder.add("Mul", clipped, builder.constant(inverse_typical))
     return builder.add("Sub", builder.add("Asinh", ratio), builder.constant(features.mean))
 
 
