@@ -16,9 +16,47 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError
 
 
+class GaussianNoise:
+    """Base class of Gaussian noise that is independent for each reading.
+
+    The attributes are numbers, or arrays that are broadcast with the charges.
+
+    Attributes:
+        white: Standard deviation of the part of the noise that does not depend on the charge, pC.
+        gain: Standard deviation of the part of the noise that is proportional to the charge, divided by the charge,
+            dimensionless.
+    """
+
+    white: float | Array
+    gain: float | Array
+
+    def sigma(self, charge: Array) -> Array:
+        """Compute the standard deviation of the noise for given charges.
+
+        Args:
+            charge: Charges of any shape, pC.
+
+        Returns:
+            Standard deviations of the same shape, pC.
+        """
+        return np.hypot(self.white, self.gain * np.asarray(charge))
+
+    def add(self, charge: Array, rng: np.random.Generator) -> Array:
+        """Add random noise to charges.
+
+        Args:
+            charge: Charges without noise, any shape, pC.
+            rng: Generator of the noise.
+
+        Returns:
+            Charges with noise, same shape, pC.
+        """
+        return charge + self.sigma(charge) * rng.standard_normal(np.shape(charge))
+
+
 @dataclass(frozen=True)
-class NoiseModel:
-    """Gaussian noise that is independent for each reading.
+class NoiseModel(GaussianNoise):
+    """Gaussian noise with the same parameters for all channels.
 
     Attributes:
         name: Name of the noise level.
@@ -36,17 +74,6 @@ class NoiseModel:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise InputError(f"noise {self.name!r}: {name}: expected a finite number from 0, got {value}")
-
-    def sigma(self, charge: Array) -> Array:
-        """Compute the standard deviation of the noise for given charges.
-
-        Args:
-            charge: Charges of any shape, pC.
-
-        Returns:
-            Standard deviations of the same shape, pC.
-        """
-        return np.hypot(self.white, self.gain * np.asarray(charge))
 
     def variance(self, charge: Array) -> Array:
         """Compute the variance of the noise for given charges.
@@ -76,18 +103,6 @@ class NoiseModel:
         """
         variance = self.variance(charge)
         return (1.0 + 2.0 * (self.gain**2 * np.asarray(charge)) ** 2 / variance) / variance
-
-    def add(self, charge: Array, rng: np.random.Generator) -> Array:
-        """Add random noise to charges.
-
-        Args:
-            charge: Charges without noise, any shape, pC.
-            rng: Generator of the noise.
-
-        Returns:
-            Charges with noise, same shape, pC.
-        """
-        return charge + self.sigma(charge) * rng.standard_normal(np.shape(charge))
 
     def to_dict(self) -> dict[str, float | str]:
         """Return the name and the parameters of the noise as a dictionary for the metadata of a model."""

@@ -190,13 +190,14 @@ class Identification:
     def _listed_pairs(self) -> list[dict[str, Any]]:
         """Return the first `MAX_LISTED_PAIRS` ambiguous pairs as dictionaries for JSON."""
         pairs = self.area.pairs
+        columns = (values[:MAX_LISTED_PAIRS].tolist() for values in (pairs.first, pairs.second, pairs.distance))
         return [
             {
-                "first": dict(zip(CONTACT_KEYS, pairs.first[number].tolist(), strict=True)),
-                "second": dict(zip(CONTACT_KEYS, pairs.second[number].tolist(), strict=True)),
-                "sigmas_apart": float(pairs.distance[number]),
+                "first": dict(zip(CONTACT_KEYS, first, strict=True)),
+                "second": dict(zip(CONTACT_KEYS, second, strict=True)),
+                "sigmas_apart": distance,
             }
-            for number in range(min(len(pairs), MAX_LISTED_PAIRS))
+            for first, second, distance in zip(*columns, strict=True)
         ]
 
 

@@ -8,7 +8,7 @@ nearly the same influence on the points of the circle.
 """
 
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from isocharge.simulate.forward.charge_map import ChargeMap, within
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.identifiability.nearest_contact import search
 from isocharge.simulate.noise import NoiseModel
+from isocharge.simulate.numerics.disk import Rings
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Sensor
@@ -81,12 +82,12 @@ class MirrorRegion:
         """
         min_force, max_force = whole_film.domain.force_range
         forces = np.geomspace(max(min_force, max_force / FORCE_RATIO), max_force, N_FORCES)
-        empty = cls(radius, whole_film.domain.radius, forces, np.zeros((N_RINGS, N_SECTORS)))
-        angles = 2.0 * np.pi * (np.arange(N_SECTORS) + 0.5) / N_SECTORS
-        distance, angle, force = np.meshgrid(empty.distance, angles, forces, indexing="ij")
-        presses = np.stack([distance * np.cos(angle), distance * np.sin(angle), force], axis=-1).reshape(-1, 3)
+        outer = whole_film.domain.radius
+        middles = Rings.between(radius, outer, N_RINGS, N_SECTORS)
+        presses = np.concatenate([middles.contacts(force) for force in forces.tolist()])
         is_mirrored = has_mirror(within(charges, radius), whole_film.charges(presses), noise)
-        return replace(empty, share=is_mirrored.reshape(distance.shape).mean(axis=2))
+        share = is_mirrored.reshape(N_FORCES, N_RINGS, N_SECTORS).mean(axis=0)
+        return cls(radius, outer, forces, share)
 
     @property
     def edges(self) -> Array:

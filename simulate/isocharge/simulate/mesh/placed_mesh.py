@@ -19,6 +19,7 @@ from isocharge.simulate.numerics.interpolation import (
     lobatto_nodes,
     lobatto_quadrature,
     tensor_basis,
+    tensor_rule,
 )
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.footprint import Probe
@@ -406,11 +407,8 @@ def _quadrature(order: int) -> _Quadrature:
     values, derivatives = tensor_basis(order, xi, eta)
 
     # Gauss-Lobatto rule
-    line_nodes = lobatto_nodes(order)
-    node_xi, node_eta = np.meshgrid(line_nodes, line_nodes)
-    _, node_derivatives = tensor_basis(order, node_xi.ravel(), node_eta.ravel())
-    line_weights = lobatto_quadrature(order)
-    node_weights = np.outer(line_weights, line_weights).ravel()
+    node_xi, node_eta, node_weights = tensor_rule(lobatto_nodes(order), lobatto_quadrature(order))
+    _, node_derivatives = tensor_basis(order, node_xi, node_eta)
     return _Quadrature(values, derivatives, weights, node_derivatives, node_weights)
 
 

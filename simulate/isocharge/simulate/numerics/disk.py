@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Complexes
 
 ROUNDING = 1e-9
 """Relative tolerance for points on the edge of a disk, dimensionless."""
@@ -41,7 +41,29 @@ class Rings:
             angles: Number of positions on each ring.
         """
         distance = radius * np.arange(1, rings + 1) / rings
-        z = np.outer(distance, np.exp(2j * np.pi * np.arange(angles) / angles))
+        return cls._at(distance, np.exp(2j * np.pi * np.arange(angles) / angles))
+
+    @classmethod
+    def between(cls, inner: float, outer: float, rings: int, sectors: int) -> "Rings":
+        """Divide the area between two circles into rings of equal width, and each ring into sectors.
+
+        The positions are the middles of the sectors. The first sector begins at the x axis, and the others follow
+        anticlockwise.
+
+        Args:
+            inner: Radius of the inner circle.
+            outer: Radius of the outer circle.
+            rings: Number of rings.
+            sectors: Number of sectors of each ring.
+        """
+        edges = np.linspace(inner, outer, rings + 1)
+        distance = 0.5 * (edges[1:] + edges[:-1])
+        return cls._at(distance, np.exp(2j * np.pi * (np.arange(sectors) + 0.5) / sectors))
+
+    @classmethod
+    def _at(cls, distance: Array, direction: Complexes) -> "Rings":
+        """Return the positions at given distances, shape (n_ring,), and unit vectors x + iy, shape (n_angle,)."""
+        z = np.outer(distance, direction)
         return cls(distance, np.stack([z.real, z.imag], axis=-1))
 
     def contacts(self, force: float) -> Array:

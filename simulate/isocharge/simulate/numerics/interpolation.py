@@ -198,10 +198,22 @@ def gauss_reference_square(count: int) -> tuple[Array, Array, Array]:
         Coordinates xi and eta of the points, and the weights of the points, each of shape (count^2,). The coordinate xi
         varies fastest. The weights add up to 4.
     """
-    line_points, line_weights = leggauss(count)
-    xi, eta = np.meshgrid(line_points, line_points)
-    weights = np.outer(line_weights, line_weights)
-    return _read_only(xi.ravel()), _read_only(eta.ravel()), _read_only(weights.ravel())
+    return tensor_rule(*leggauss(count))
+
+
+def tensor_rule(points: Array, weights: Array) -> tuple[Array, Array, Array]:
+    """Return the rule for the square [-1, 1]^2 that is the product of two equal rules for the interval [-1, 1].
+
+    Args:
+        points: Points of the rule for the interval, shape (n,).
+        weights: Weights of these points, shape (n,).
+
+    Returns:
+        Coordinates xi and eta of the points, and the weights of the points, each of shape (n^2,). The coordinate xi
+        varies fastest.
+    """
+    xi, eta = np.meshgrid(points, points)
+    return _read_only(xi.ravel()), _read_only(eta.ravel()), _read_only(np.outer(weights, weights).ravel())
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,15 @@ is the same for all electrodes, because all charges are smaller where a film is 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cache, cached_property, partial
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
 from isocharge.common.arrays import Array, Integers
-from isocharge.simulate import Domain, FilmPrior, NoiseModel, noise_model
+from isocharge.simulate import Domain, FilmPrior, NoiseModel
+from isocharge.simulate.noise import NOISE_LEVELS
 from isocharge.simulate.sensor.film_properties import PRETENSION, UNEVEN_TENSIONS
 
 DEGREE = 4
@@ -183,7 +184,7 @@ class FilmEstimate:
     layout: Layout
     values: Array
     covariance: Array
-    noise: NoiseModel = field(default_factory=partial(noise_model, "reference"))
+    noise: NoiseModel = NOISE_LEVELS["reference"]
 
     @property
     def film_values(self) -> Array:

@@ -1,11 +1,12 @@
 """Problem of a calibration: the films that a sensor may have, and the contacts for which a model is needed."""
 
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from dataclasses import dataclass
+from functools import cached_property
 
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import SensorError
-from isocharge.simulate import Domain, FilmPrior, NoiseModel, Probe, Sensor, noise_model
+from isocharge.simulate import Domain, FilmPrior, NoiseModel, Probe, Sensor
+from isocharge.simulate.noise import NOISE_LEVELS
 from isocharge.simulate.sensor.film_properties import PRETENSION
 from isocharge.train.calibration.estimator import Prior
 from isocharge.train.calibration.film_charges import round_probe
@@ -46,7 +47,7 @@ class CalibrationProblem:
     force_range: tuple[float, float] = DEFAULT_FORCE_RANGE
     earlier: FilmEstimate | None = None
     stress_limit: float = DEFAULT_STRESS_LIMIT
-    noise: NoiseModel = field(default_factory=partial(noise_model, "reference"))
+    noise: NoiseModel = NOISE_LEVELS["reference"]
 
     def __post_init__(self) -> None:
         """Check that a calibration can find the film that the sensor file describes.

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.simulate import NoiseModel, noise_model
+from isocharge.simulate.noise import GaussianNoise
 from isocharge.train.data.contact_errors import rounded
 
 NEIGHBOURS = 16
@@ -62,7 +63,7 @@ CANDIDATES = 8
 
 
 @dataclass(frozen=True)
-class ChannelNoise:
+class ChannelNoise(GaussianNoise):
     """A noise model with separate parameters for each channel.
 
     Attributes:
@@ -118,14 +119,6 @@ class ChannelNoise:
     def alike(cls, noise: NoiseModel) -> "ChannelNoise":
         """Create a noise model with the same noise on every electrode, whose parameters have the shape ()."""
         return cls(np.array(noise.white), np.array(max(noise.gain, LEAST_GAIN)), noise.name)
-
-    def sigma(self, charge: Array) -> Array:
-        """Return the standard deviation of the noise, pC, of each charge, pC. Both have the shape (n, n_electrode)."""
-        return np.hypot(self.white, self.gain * charge)
-
-    def add(self, charge: Array, rng: np.random.Generator) -> Array:
-        """Add random noise to charges, pC. Charges and result have the shape (n, n_electrode)."""
-        return charge + self.sigma(charge) * rng.standard_normal(charge.shape)
 
     def level(self, charge: Array) -> Array:
         """Convert charges Q, shape (n, n_electrode), pC, into the levels asinh(gain Q / white) / gain.

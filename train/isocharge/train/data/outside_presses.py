@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from isocharge.common.arrays import Booleans
 from isocharge.serve.model.metadata import UnnoticedPresses
 from isocharge.simulate import Domain
+from isocharge.simulate.numerics.disk import Rings
 from isocharge.train.data.contact_errors import rounded
 from isocharge.train.data.presses import LabelledPresses
 
@@ -77,12 +78,8 @@ class OutsidePresses:
         Args:
             is_unnoticed: Whether the answer to each press of `test` is wrong and carries no flag, shape (n,).
         """
-        ring_edges = np.linspace(self.domain.radius, self.outer, N_SECTORS + 1)
-        distance = 0.5 * (ring_edges[1:] + ring_edges[:-1])
-        angle = 2.0 * np.pi * (np.arange(N_SECTORS) + 0.5) / N_SECTORS
-        direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        middle = distance[:, None, None] * direction  # (x, y), shape (N_SECTORS, N_SECTORS, 2)
-        _, nearest = cKDTree(self.test.contact[:, :2]).query(middle, N_NEIGHBOURS)
+        middles = Rings.between(self.domain.radius, self.outer, N_SECTORS, N_SECTORS)
+        _, nearest = cKDTree(self.test.contact[:, :2]).query(middles.position, N_NEIGHBOURS)
         shares = is_unnoticed[nearest].mean(axis=-1).round(2)
 
         min_force, max_force = self.domain.force_range

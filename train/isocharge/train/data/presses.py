@@ -139,14 +139,15 @@ def domain_of(dataset: Dataset) -> Domain:
     Raises:
         DatasetError: If the ranges in the manifest are not numbers or do not contain the samples.
     """
-    samples = dataset.samples
+    presses = LabelledPresses.of(dataset.samples)
+    force = presses.contact[:, 2]
     ranges = convert(dataset.manifest.get("ranges", {}), _Ranges, "manifest ranges", DatasetError)
-    sample_radius = float(np.hypot(samples.x_mm, samples.y_mm).max())
-    sample_forces = (float(samples.force_N.min()), float(samples.force_N.max()))
+    sample_radius = float(presses.distance.max())
+    sample_forces = (float(force.min()), float(force.max()))
     radius = ranges.radius_mm or sample_radius
     min_force, max_force = ranges.force_N or sample_forces
     domain = Domain(radius, (min_force, max_force))
-    if not domain.contains(LabelledPresses.of(samples).contact).all():
+    if not domain.contains(presses.contact).all():
         raise DatasetError(
             f"manifest ranges: radius_mm {radius:g} and force_N [{min_force:g}, {max_force:g}] do not hold the "
             f"samples, which reach {sample_radius:g} mm and {sample_forces[0]:g} to {sample_forces[1]:g} N"

@@ -197,8 +197,8 @@ class LinearTargets:
         noise_response[~is_linear] = 0.0
         noise_factor = np.maximum(LARGEST_LINEAR_STD / largest_std, 1.0)
         return cls(
-            noise_response=as_tensor(np.asarray(noise_response, dtype=float)),
-            noise_factor=as_tensor(np.asarray(noise_factor[:, None], dtype=float)),
+            noise_response=as_tensor(noise_response),
+            noise_factor=as_tensor(noise_factor[:, None]),
         )
 
     def enlarge(self, noise: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Reals
 from isocharge.common.contact_domain import Domain
 from isocharge.serve.model.contact import MISFIT_LIMIT
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
@@ -300,7 +300,7 @@ def compress_length(residual: Tensor) -> Tensor:
     return nn.functional.normalize(residual, dim=-1) * torch.asinh(length / MISFIT_LIMIT)
 
 
-def as_tensor(values: Array) -> Tensor:
+def as_tensor(values: Reals) -> Tensor:
     """Return a copy of an array as a tensor in single precision."""
     return torch.tensor(values).float()
 
