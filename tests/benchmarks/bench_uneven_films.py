@@ -2,7 +2,8 @@
 
 For each film and probe, the benchmark builds a forward map with two workers, computes the charges of 100,000 presses,
 and compares some of them with direct solves. The error of a charge is relative to the directly solved charge, or to a
-tenth of the largest charge of the press if this is larger.
+tenth of the largest charge of the press if this is larger. A probe that is not round either keeps its orientation or has
+random orientations.
 
     python tests/benchmarks/bench_uneven_films.py [--film "oval 0.01"] [--probe circle:1.0] [--presses 20] [--json]
 """
@@ -11,31 +12,35 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from itertools import product
+from typing import get_args
 
 import numpy as np
 from shared import arguments, print_results, report_progress
 
 from isocharge.simulate import ForwardMap, Sensor, Sweep, load_sensor, parse_probe, press, touch_charge
+from isocharge.simulate.forward.family import Orientation
 from isocharge.train.data.contact_errors import rms
 
 TENSION = {"pretension": 0.75, "deviator": (0.25, 0.1)}
 MODULI = {"young": np.sqrt(3400.0 * 2400.0), "young_ratio": 3.4 / 2.4, "axis": np.deg2rad(20.0)}
 OVAL = {"oval": 0.01}
+SMALL_AND_TAUT = {"radius": 30.0, "thickness": 0.04, "pretension": 2.0, "deviator": (0.4, 0.2)} | OVAL
 FILMS = {
     "pretension [1.0, 0.5, 0.1] MPa": TENSION,
     "moduli 3.4 and 2.4 GPa at 20 degrees": MODULI,
     "oval 0.01": OVAL,
     "all three": TENSION | MODULI | OVAL,
+    "small and taut": SMALL_AND_TAUT,
 }
-PROBES = ("circle:1.0", "finger:6.0", "triangle:4.0")
+PROBES = ("circle:1.0", "finger:6.0", "rectangle:4.0x2.0", "triangle:4.0")
 RADIUS_mm = 8.0
 FORCES_N = (0.05, 2.0)
 SAMPLES = 100_000
 
 
-def direct_errors(forward_map: ForwardMap, sensor: Sensor, count: int) -> np.ndarray:
+def direct_errors(forward_map: ForwardMap, sensor: Sensor, orientation: Orientation, count: int) -> np.ndarray:
     """Compare the charges of random presses with direct solves, and return the largest error of each press."""
-    sweep = Sweep(RADIUS_mm, FORCES_N, samples=count, seed=7, orientation="random")
+    sweep = Sweep(RADIUS_mm, FORCES_N, samples=count, seed=7, orientation=orientation)
     presses = sweep.over([forward_map.probe])
     interpolated = forward_map.charges(presses.contact, presses.rotation)
     errors = []
@@ -53,28 +58,32 @@ def main() -> None:
     probes = [options.probe] if options.probe else PROBES
 
     built_in = load_sensor("four-25um-biaxial")
-    sweep = Sweep(RADIUS_mm, FORCES_N, samples=SAMPLES, orientation="random")
     rows = {}
     with ProcessPoolExecutor(2) as executor:
-        for name, notation in product(films, probes):
+        for name, notation, orientation in product(films, probes, get_args(Orientation)):
             sensor = replace(built_in, film=replace(built_in.film, **FILMS[name]))
             probe = parse_probe(notation)
+            if probe.is_axisymmetric and orientation == "random":
+                continue
             start = time.perf_counter()
-            forward_map = ForwardMap.build(sensor, probe, RADIUS_mm, FORCES_N, executor=executor)
+            forward_map = ForwardMap.build(
+                sensor, probe, RADIUS_mm, FORCES_N, orientation=orientation, executor=executor
+            )
             map_s = time.perf_counter() - start
-            presses = sweep.over([probe])
+            presses = Sweep(RADIUS_mm, FORCES_N, samples=SAMPLES, orientation=orientation).over([probe])
             start = time.perf_counter()
             forward_map.charges(presses.contact, presses.rotation)
             charges_s = time.perf_counter() - start
-            errors = direct_errors(forward_map, sensor, options.presses)
-            rows[f"{name}, {notation}"] = {
+            errors = direct_errors(forward_map, sensor, orientation, options.presses)
+            row_name = f"{name}, {notation}, {orientation}"
+            rows[row_name] = {
                 "solves": forward_map.solves,
                 "map_s": round(map_s),
                 "charges_s": round(charges_s),
                 "worst_percent": round(100.0 * errors.max(), 3),
                 "rms_percent": round(100.0 * rms(errors), 3),
             }
-            report_progress(f"{name}, {notation}", rows[f"{name}, {notation}"])
+            report_progress(row_name, rows[row_name])
     print_results("uneven_films", options, rows)
 
 

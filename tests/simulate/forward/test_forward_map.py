@@ -12,6 +12,7 @@ from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate import (
     ChargeSpline,
     Circle,
+    Domain,
     Electrode,
     Ellipse,
     Finger,
@@ -24,7 +25,7 @@ from isocharge.simulate import (
     load_sensor,
 )
 from isocharge.simulate.forward import forward_map as forward_map_module
-from isocharge.simulate.forward.family import NODE_COUNTS, NodeCount
+from isocharge.simulate.forward.family import NODE_COUNTS, Family, NodeCount
 from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR
 from kept import kept
 from solved_charges import solved_charge, with_film
@@ -238,19 +239,22 @@ UNEVEN_FILMS = {
 
 
 @pytest.mark.parametrize(
-    ("changes", "probe"),
+    ("changes", "probe", "orientation"),
     [
-        (UNEVEN_FILMS["tension"] | UNEVEN_FILMS["moduli"] | UNEVEN_FILMS["oval"], Circle(1.0)),
-        pytest.param(UNEVEN_FILMS["moduli"], Polygon.triangle(2.5), marks=pytest.mark.slow),
-        *(pytest.param(changes, Circle(1.0), marks=pytest.mark.slow) for changes in UNEVEN_FILMS.values()),
+        (UNEVEN_FILMS["tension"] | UNEVEN_FILMS["moduli"] | UNEVEN_FILMS["oval"], Circle(1.0), "fixed"),
+        (UNEVEN_FILMS["moduli"], Ellipse(2.0, 1.4).rotated(0.5), "fixed"),
+        pytest.param(UNEVEN_FILMS["moduli"], Polygon.triangle(2.5), "fixed", marks=pytest.mark.slow),
+        pytest.param(UNEVEN_FILMS["moduli"], Polygon.triangle(2.5), "random", marks=pytest.mark.slow),
+        *(pytest.param(changes, Circle(1.0), "fixed", marks=pytest.mark.slow) for changes in UNEVEN_FILMS.values()),
     ],
 )
-def test_maps_of_films_that_are_not_axisymmetric_agree_with_direct_solves(near_electrodes, changes, probe):
-    """The presses lie in all directions from the centre, and a probe that is not round has random orientations."""
+def test_maps_of_films_that_are_not_axisymmetric_agree_with_direct_solves(near_electrodes, changes, probe, orientation):
+    """The presses lie in all directions from the centre. The film of a map for the wrong directions differs."""
     sensor = with_film(near_electrodes, **changes)
-    forward_map = kept(ForwardMap.build, sensor, probe, **QUICK | {"force_range": (1.0, 1.0)})
+    settings = QUICK | {"force_range": (1.0, 1.0), "orientation": orientation}
+    forward_map = kept(ForwardMap.build, sensor, probe, **settings)
     contact, rotation = draw(forward_map, 10, seed=12)
-    assert errors(forward_map, contact, 0.0 if probe.is_axisymmetric else rotation).max() < 1e-3
+    assert errors(forward_map, contact, rotation if orientation == "random" else 0.0).max() < 1e-3
     film = sensor.film
     deviator = complex(*film.deviator) * np.exp(2j)  # its components are those of twice the angle
     turned = replace(
@@ -258,6 +262,26 @@ def test_maps_of_films_that_are_not_axisymmetric_agree_with_direct_solves(near_e
     )
     other = replace(forward_map, sensor=replace(sensor, film=turned))
     assert errors(other, contact).max() > 2e-3, "the direction of the film does not matter"
+
+
+@pytest.mark.parametrize(("probe", "solves"), [(Circle(1.0), 7), (Ellipse(2.0, 1.4), 5), (Polygon.triangle(2.5), 9)])
+def test_a_probe_that_keeps_its_orientation_needs_few_turns(near_electrodes, probe, solves):
+    """Nine harmonics of the rotation: an ellipse and the film are the same after half a turn, a triangle is not."""
+    film = with_film(near_electrodes, **UNEVEN_FILMS["tension"]).film
+    family = Family.spread(Domain(4.0, (1.0, 1.0)), film, probe, NodeCount(1, 1))
+    assert len(family.turns.solved) == solves
+
+
+def test_rotation_of_a_probe_whose_map_has_its_own_orientation_is_refused(near_electrodes):
+    sensor = with_film(near_electrodes, **UNEVEN_FILMS["tension"])
+    domain = Domain(1.0, (1.0, 1.0))
+    contact = np.array([(0.5, 0.0, 1.0)])
+    counts = NodeCount(1, 1, (1,))
+    oriented = ForwardMap.build_unchecked(sensor, Ellipse(2.0, 1.4), domain, counts, COARSE)
+    with pytest.raises(SceneError, match=r"ellipse:2.0x1.4 in its own orientation, got a rotation by 0.1 rad"):
+        oriented.charges(contact, 0.1)
+    free = ForwardMap.build_unchecked(sensor, Ellipse(2.0, 1.4), domain, counts, COARSE, orientation="random")
+    assert np.isfinite(free.charges(contact, 0.1)).all()
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ IRREGULAR = Polygon.of(np.array([(0.0, 0.0), (3.0, 0.0), (1.0, 2.0)]))
 @pytest.mark.parametrize("largest", [DEFAULT_HARMONICS, (7, 5, 3, 2, 1)])
 def test_fourier_series_is_interpolated_exactly(film: Film, probe, largest):
     """The expected values are those of the series itself, with the terms of which the docstring speaks."""
-    turns = Turns.spread(largest, probe.period, is_axisymmetric=film.is_axisymmetric)
+    turns = Turns.spread(largest, probe.period, has_directions=not film.is_axisymmetric)
     rng = np.random.default_rng(3)
     terms = [
         (m, k, rng.normal(), rng.uniform(0.0, 2.0 * np.pi))
@@ -43,13 +43,13 @@ def test_fourier_series_is_interpolated_exactly(film: Film, probe, largest):
 )
 def test_fewer_turns_are_solved_than_all_pairs_of_angles(probe, solves, all_pairs):
     """All pairs are seven directions times the rotations, of which the symmetry of the probe saves some."""
-    assert len(Turns.spread(DEFAULT_HARMONICS, probe.period, is_axisymmetric=False).solved) == solves <= all_pairs
+    assert len(Turns.spread(DEFAULT_HARMONICS, probe.period, has_directions=True).solved) == solves <= all_pairs
 
 
 @pytest.mark.parametrize("probe", [Ellipse(4.0, 2.0), Polygon.triangle(4.0), Polygon.rectangle(3.0, 3.0)])
 def test_rotation_by_a_period_of_the_probe_is_the_same_press(probe):
     """Both angles increase by the period. Directions that differ by half a turn are equal."""
-    turns = Turns.spread(DEFAULT_HARMONICS, probe.period, is_axisymmetric=False)
+    turns = Turns.spread(DEFAULT_HARMONICS, probe.period, has_directions=True)
     n_solved = len(turns.solved)
     np.testing.assert_allclose(turns.rotation[n_solved:] - turns.rotation[:-n_solved], probe.period)
     change = turns.direction[n_solved:] - turns.direction[:-n_solved] - probe.period

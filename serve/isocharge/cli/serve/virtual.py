@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import numpy as np
 import typer
 
-from isocharge.cli.shared.forward_maps import ROUNDING_MARGIN, ProbeOption
+from isocharge.cli.shared.forward_maps import ROUNDING_MARGIN, ProbeOption, solving_executor
 from isocharge.cli.shared.options import MapRadiusOption, SecondsOption, SensorArgument
 from isocharge.cli.shared.terminal import announce, say, shown_progress, until_stopped
 from isocharge.cli.shared.virtual_sensor import film_charges, measure_function, random_script
@@ -110,12 +110,13 @@ def virtual_command(
         start_s = time.monotonic()
         announce(player.port_path)
         say("solving the film, which is not touched until then")
-        with shown_progress():
+        with shown_progress(), solving_executor(played_sensor.film) as executor:
             forward_map = ForwardMap.build(
                 played_sensor,
                 footprint,
                 radius=radius,
                 force_range=(DEFAULT_PLAYED_FORCE_RANGE[0], force_max),
+                executor=executor,
             )
         threading.Event().wait(start_s + rest - time.monotonic())  # sleeps, unless the time is negative
         presses = scripted_presses or random_script(forward_map, seed, rate, force_max)

@@ -46,6 +46,15 @@ def executor_for(workers: int | None = None, cluster: str | None = None) -> Abst
     return dask_workers(cluster) if cluster else local_workers(workers or min(cores(), 64))
 
 
+def solving_executor(film: Film) -> AbstractContextManager[Executor | None]:
+    """Return a context manager that yields the executor of a command which has no option for the number of workers.
+
+    An axisymmetric film is solved within seconds, for which no processes are started. The other films are solved by one
+    process for each core.
+    """
+    return executor_for(1 if film.is_axisymmetric else None)
+
+
 def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tuple[float, float]) -> float:
     """Return the radius of a sweep, mm.
 
@@ -68,11 +77,12 @@ def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tupl
     from isocharge.simulate.identifiability.identification import map_to_search
 
     radii = []
-    for probe in probes:
-        forward_map = map_to_search(sensor, probe, force)  # charges over the largest possible working area
-        area = working_area(forward_map, noise_model("reference"))
-        say(f"{probe.notation}: {area.summary}")
-        radii.append(area.radius)
+    with solving_executor(sensor.film) as executor:
+        for probe in probes:
+            forward_map = map_to_search(sensor, probe, force, executor)  # covers the largest possible working area
+            area = working_area(forward_map, noise_model("reference"))
+            say(f"{probe.notation}: {area.summary}")
+            radii.append(area.radius)
     smallest_radius = min(radii)
     if smallest_radius == 0.0:
         raise InputError(
@@ -111,8 +121,6 @@ trained on fewer presses have larger errors near the rim of this area."""
 def simulated_presses(sensor: Sensor, probes: Sequence[Probe], radius: float, force: tuple[float, float]) -> Dataset:
     """Simulate presses with the default settings of a sweep.
 
-    The simulation uses a single process, because it takes only a few seconds.
-
     Args:
         sensor: The sensor.
         probes: The probes.
@@ -123,6 +131,6 @@ def simulated_presses(sensor: Sensor, probes: Sequence[Probe], radius: float, fo
 
     has_few_electrodes = len(sensor.electrodes) <= FEW_ELECTRODES
     n_press = N_SIMULATED_PRESSES if has_few_electrodes else MANY_SIMULATED_PRESSES
-    with TemporaryDirectory() as folder:
-        sweep = Sweep(radius, force, samples=n_press)
-        return read_dataset(run_sweep(Path(folder) / "presses", sensor, probes, sweep))
+    sweep = Sweep(radius, force, samples=n_press)
+    with TemporaryDirectory() as folder, solving_executor(sensor.film) as executor:
+        return read_dataset(run_sweep(Path(folder) / "presses", sensor, probes, sweep, executor=executor))

@@ -19,7 +19,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 import scipy  # loads each of its subpackages on first use
@@ -36,7 +36,7 @@ from isocharge.simulate.dataset.shards import (
     write_files,
 )
 from isocharge.simulate.execution import in_order
-from isocharge.simulate.forward.family import check_domain
+from isocharge.simulate.forward.family import Orientation, check_domain
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.numerics.disk import log_spaced_forces
@@ -58,9 +58,6 @@ SAMPLING = "scrambled Sobol, uniform over the disk, log-uniform in force"
 
 OUTSIDE_PROBE = -1
 """Index of the round probe of the presses outside the disk, which is the last of all probes."""
-
-Orientation = Literal["fixed", "random"]
-"""Whether all presses have the given orientation of the probe, or each press has a random orientation."""
 
 
 @dataclass(frozen=True)
@@ -280,7 +277,15 @@ def solve_maps(
         executor: Executor that runs the solves; None for this process.
     """
     return tuple(
-        ForwardMap.build(sensor, probe, sweep.radius, sweep.force_range, settings, executor=executor)
+        ForwardMap.build(
+            sensor,
+            probe,
+            sweep.radius,
+            sweep.force_range,
+            settings,
+            orientation=sweep.orientation,
+            executor=executor,
+        )
         for probe in probes
     )
 

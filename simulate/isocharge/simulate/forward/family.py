@@ -12,7 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -73,15 +73,19 @@ power of the force to another, and pass through zero.
 ASYMMETRIC_NODE_COUNTS = (
     NodeCount(5, 3),
     NodeCount(5, 7),
-    NodeCount(8, 7, (7, 5, 3, 2, 1)),
+    NodeCount(5, 12, (6, 4, 2, 1)),
+    NodeCount(8, 12, (7, 5, 3, 2, 1)),
     NodeCount(13, 12, (10, 8, 6, 4, 2, 1)),
 )
 """Numbers of nodes that are tried for a film that is not axisymmetric.
 
-Every solve is repeated in several directions. If the first number of forces is not sufficient, only this number is
-increased at first. A film with a pretension starts with the second entry.
+Every solve is repeated in several directions, so that more distances cost much. Therefore, the number of forces is
+increased first. A film with a pretension starts with the second entry.
 """
 
+
+Orientation = Literal["fixed", "random"]
+"""Whether all presses have the given orientation of the probe, or each press has a random orientation."""
 
 Reading = Callable[[Equilibrium, Surface], Array]
 """Type of a function that computes values from a solved press, such as the stresses at a surface of the film.
@@ -115,6 +119,7 @@ class Family:
             `distance_coordinate` has Chebyshev nodes.
         force: Forces of the solved presses, shape (n_force,), N. Their logarithms are Chebyshev nodes.
         turns: Directions of the presses on the film, and rotations of the probe.
+        is_oriented: Whether the probe keeps its own orientation in all presses. Otherwise, it may have any orientation.
     """
 
     domain: Domain
@@ -122,9 +127,12 @@ class Family:
     distance: Array
     force: Array
     turns: Turns
+    is_oriented: bool
 
     @classmethod
-    def spread(cls, domain: Domain, film: Film, probe: Probe, count: NodeCount) -> "Family":
+    def spread(
+        cls, domain: Domain, film: Film, probe: Probe, count: NodeCount, orientation: Orientation = "fixed"
+    ) -> "Family":
         """Distribute the solved presses over a domain.
 
         Args:
@@ -132,6 +140,8 @@ class Family:
             film: Film on which the probe presses.
             probe: Probe that presses the film.
             count: Numbers of distances and forces, and harmonics of the angles.
+            orientation: Whether the probe keeps its own orientation ("fixed") or may be rotated ("random"). On an
+                axisymmetric film, and under an axisymmetric probe, a rotation needs no further solves.
 
         Returns:
             The family. It has only one force if the smallest and the largest force of the domain are equal.
@@ -147,8 +157,14 @@ class Family:
         else:
             force = np.array([domain.force_range[0]])
 
-        turns = Turns.spread(count.largest_harmonics, probe.period, is_axisymmetric=film.is_axisymmetric)
-        return cls(domain, film.radius, distance, force, turns)
+        period = probe.period
+        is_oriented = orientation == "fixed" and not film.is_axisymmetric and not probe.is_axisymmetric
+        if is_oriented:  # the film maps onto itself only after half a turn
+            symmetry_order = round(2.0 * np.pi / period)
+            period = 2.0 * np.pi / math.gcd(symmetry_order, 2)
+        has_directions = not film.is_axisymmetric and not is_oriented
+        turns = Turns.spread(count.largest_harmonics, period, has_directions=has_directions)
+        return cls(domain, film.radius, distance, force, turns, is_oriented)
 
     def weights(self, position: Complexes, force: Array, rotation: Array) -> Array:
         """Compute the weights that interpolate the stress between the solved presses (nodes).

@@ -26,6 +26,7 @@ from isocharge.simulate.forward.charge_map import STEPS, differences
 from isocharge.simulate.forward.family import (
     Family,
     NodeCount,
+    Orientation,
     Reading,
     check_family,
     direct_charges,
@@ -112,6 +113,7 @@ class ForwardMap:
         force_range: tuple[float, float] = DEFAULT_FORCE_RANGE,
         settings: SolveSettings = SolveSettings(),
         *,
+        orientation: Orientation = "fixed",
         executor: Executor | None = None,
     ) -> "ForwardMap":
         """Build a forward map: solve a family of presses, and compare the interpolated charges with direct solves.
@@ -124,6 +126,9 @@ class ForwardMap:
             settings: Accuracy, theory and mesh. A setting that is "auto" is chosen once for all presses. The mesh is as
                 fine as the outermost press requires. The width of the thin rings is that of the geometric mean of the
                 smallest and the largest force.
+            orientation: Whether the probe keeps its own orientation ("fixed") or may be rotated ("random"). It only
+                matters if neither the film nor the probe is axisymmetric. The map for a fixed orientation then needs
+                three to eight times fewer solves.
             executor: Executor that runs the solves; None for this process. The result does not depend on it.
 
         Raises:
@@ -138,15 +143,19 @@ class ForwardMap:
         # the check presses, which are solved directly in the first pass of the loop. If the error is very large, the
         # next number of nodes would not suffice either and is skipped.
         contact, rotation = spread_check_presses(domain, CHECK_COUNT)
-        checks = np.column_stack([contact, rotation]).tolist()
         check_charges: list[Array] = []
         error = np.inf
         remaining_counts = list(node_counts(film))
         while remaining_counts:
             count = remaining_counts.pop(0)
-            forward_map = cls.build_unchecked(sensor, probe, domain, count, settings, executor=executor)
+            forward_map = cls.build_unchecked(
+                sensor, probe, domain, count, settings, orientation=orientation, executor=executor
+            )
             settings = replace(forward_map.settings, layer=forward_map.layer)  # the next map has the same mesh
             if not check_charges:
+                if forward_map.family.is_oriented:
+                    rotation = np.zeros(CHECK_COUNT)
+                checks = np.column_stack([contact, rotation]).tolist()
                 solve_directly = partial(direct_charges, sensor, probe, forward_map.settings)
                 check_charges = list(in_order(executor, solve_directly, checks))
             error = relative_error(forward_map.charges(contact, rotation), np.array(check_charges))
@@ -168,6 +177,7 @@ class ForwardMap:
         count: NodeCount,
         settings: SolveSettings = SolveSettings(),
         *,
+        orientation: Orientation = "fixed",
         read: Reading = probe_frame_stress,
         executor: Executor | None = None,
     ) -> "ForwardMap":
@@ -179,6 +189,7 @@ class ForwardMap:
             domain: Presses for which the map will be used.
             count: Numbers of distances and forces, and harmonics of the angles, for which presses are solved.
             settings: Accuracy, theory and mesh; see `build`.
+            orientation: Whether the probe keeps its own orientation; see `build`.
             read: Function that computes the stress fields of the table from each solved press, shape (n_element,
                 n_local, ..., 3), in the frame of the probe.
             executor: Executor that runs the solves; None for this process.
@@ -190,7 +201,7 @@ class ForwardMap:
         check_family(sensor.film, probe, domain)
         resolution, layer = family_mesh(sensor.film, probe, domain, settings)
         same_mesh = SolveSettings(theory=settings.theory, resolution=resolution, layer=layer)
-        family = Family.spread(domain, sensor.film, probe, count)
+        family = Family.spread(domain, sensor.film, probe, count, orientation)
         template = template_for(resolution, probe.topology, not sensor.film.is_axisymmetric)
         table = family.unfold(family.solve(sensor, probe, same_mesh, executor, read), template)
         return cls(sensor, probe, family, settings.theory, resolution, layer, table, np.inf)
@@ -231,13 +242,19 @@ class ForwardMap:
             Charges, shape (n, n_electrode), pC.
 
         Raises:
-            SceneError: If a press with a force lies outside the domain, or an orientation is not finite.
+            SceneError: If a press with a force lies outside the domain, an orientation is not finite, or the map is
+                only valid for the probe's own orientation.
         """
         contact = as_contacts(contact, "forward map")
         orientation = np.broadcast_to(orientation, len(contact))
         if not np.isfinite(orientation).all():
             wrong_orientation = orientation[~np.isfinite(orientation)][0]
             raise SceneError(f"forward map: expected finite orientations in rad, got {wrong_orientation}")
+        if self.family.is_oriented and orientation.any():
+            raise SceneError(
+                f"forward map: expected {self.probe.notation} in its own orientation, got a rotation by "
+                f"{orientation[orientation != 0.0][0]:.4g} rad; build the map with orientation='random'"
+            )
 
         # A press without a force may lie anywhere. It is replaced by a valid press, whose charges become zero.
         has_force = contact[:, 2:] != 0.0

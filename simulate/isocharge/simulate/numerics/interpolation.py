@@ -239,7 +239,7 @@ class Turns:
 
     Attributes:
         direction: Directions from the centre of the film to the presses, plus the rotation of a probe that is not
-            axisymmetric, shape (n_turn,), rad. They are zero if the film is axisymmetric.
+            axisymmetric, shape (n_turn,), rad. They are zero if they do not vary.
         rotation: Rotations of the probe relative to the direction of the press, evenly spaced over a full turn, shape
             (n_turn,), rad. They are zero if the probe is axisymmetric.
         harmonics: Pairs (2 m, k) of the terms of the Fourier series, shape (n_term, 2).
@@ -254,16 +254,17 @@ class Turns:
     symmetry_order: int
 
     @classmethod
-    def spread(cls, largest_harmonics: tuple[int, ...], period: float, *, is_axisymmetric: bool) -> "Turns":
+    def spread(cls, largest_harmonics: tuple[int, ...], period: float, *, has_directions: bool) -> "Turns":
         """Choose the turns at which presses are solved, as few as determine the coefficients of a Fourier series.
 
         Args:
             largest_harmonics: Largest |k| of the terms of the series for |m| = 0, 1, 2, and so on; see the docstring of
-                the class. For an axisymmetric film, only m = 0 is used. For an axisymmetric probe, only k = 0 is used.
+                the class. Without directions, only m = 0 is used. For an axisymmetric probe, only k = 0 is used.
             period: Smallest rotation that maps the probe onto itself, rad; 0 if the probe is axisymmetric.
-            is_axisymmetric: Whether the film is axisymmetric.
+            has_directions: Whether the angle d varies. It does not matter if the film is axisymmetric, and it is zero
+                if the probe keeps its orientation on the film.
         """
-        largest_m = 0 if is_axisymmetric else len(largest_harmonics) - 1
+        largest_m = len(largest_harmonics) - 1 if has_directions else 0
         pairs: list[tuple[int, int]] = []  # (m, k) of each term
         for m in _symmetric_range(largest_m):
             largest_k = largest_harmonics[abs(m)] if period else 0
@@ -273,7 +274,7 @@ class Turns:
         n_turn, step = _lattice(harmonics, symmetry_order)
         turn = np.arange(n_turn)
         return cls(
-            direction=np.zeros(n_turn) if is_axisymmetric else np.pi * step * turn / n_turn,
+            direction=np.pi * step * turn / n_turn if has_directions else np.zeros(n_turn),
             rotation=2.0 * np.pi * turn / n_turn if period else np.zeros(n_turn),
             harmonics=harmonics * np.array([2, 1]),
             symmetry_order=symmetry_order,
