@@ -2,8 +2,8 @@
 
 For each film and probe, the benchmark builds a forward map with two workers, computes the charges of 100,000 presses,
 and compares some of them with direct solves. The error of a charge is relative to the directly solved charge, or to a
-tenth of the largest charge of the press if this is larger. A probe that is not round either keeps its orientation or has
-random orientations.
+tenth of the largest charge of the press if this is larger. A probe that is not round either keeps its orientation or
+has random orientations.
 
     python tests/benchmarks/bench_uneven_films.py [--film "oval 0.01"] [--probe circle:1.0] [--presses 20] [--json]
 """
