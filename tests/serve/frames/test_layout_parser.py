@@ -14,6 +14,7 @@ from crcmod.predefined import mkPredefinedCrcFun
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from frame_formats import FORMATS
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Frame, device_from_table
 from isocharge.serve.frames.frame_layout import SyncParser
@@ -68,41 +69,27 @@ def test_frames_of_sensors_as_their_makers_describe_them(name, data, seq, t_us, 
     assert frame.names == LAYOUTS[name].columns.names
 
 
-COUNTS = st.lists(st.integers(-32768, 32767), min_size=7, max_size=7)
-
-
-def encoded(name, counts):
-    """Return the bytes of a frame whose channels have these values before the scaling."""
-    layout = LAYOUTS[name]
-    values = [count * scale for count, (_, scale) in zip(counts, layout.columns.channels, strict=False)]
-    return encode_layout(layout, Frame(abs(counts[0]), abs(counts[1]), tuple(values)))
-
-
 @settings(derandomize=True)
-@given(st.lists(st.one_of(COUNTS, st.binary(max_size=20), st.just(b"\xaa\x07\x08")), max_size=12), st.integers(1, 50))
-def test_every_byte_is_a_part_of_a_frame_or_counted_as_dropped(parts, step):
+@given(st.data(), st.integers(1, 50))
+def test_every_byte_is_a_part_of_a_frame_or_counted_as_dropped(data, step):
     """After a reset, no byte is stored, and no byte has been counted twice."""
-    layout = LAYOUTS["optoforce_omd"]
-    stream = b"".join(part if isinstance(part, bytes) else encoded("optoforce_omd", part) for part in parts)
-    parser = SyncParser(layout)
-    frames = []
+    form = FORMATS["described"]
+    stream = b"".join(data.draw(st.lists(form.frames.map(form.encode) | form.junk, max_size=12)))
+    parser = form.parser()
     for start in range(0, len(stream), step):
-        frames += parser.feed(stream[start : start + step])
+        parser.feed(stream[start : start + step])
     parser.reset()
-    assert parser.counts.bytes_dropped == len(stream) - layout.length * len(frames)
-    assert parser.counts.frames == len(frames)
+    assert parser.counts.bytes_dropped == len(stream) - len(form.tail) * parser.counts.frames
 
 
 @pytest.mark.parametrize("name", ["seq", "t_s"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_counter_or_clock_that_is_nan_drops_only_its_frame(name, value):
     """Without a checksum, only this value shows that the frame is damaged."""
-    fields = f'fields = [{{name = "{name}", type = "f32"}}, {{name = "A", type = "f32"}}]'
-    described = layout(f'sync = "20 4E"\nlength = 10\n{fields}')
-    good = b"\x20\x4e" + struct.pack("<ff", 2.0, 1.0)
-    bad = b"\x20\x4e" + struct.pack("<ff", value, 1.0)
-    parser = SyncParser(described)
-    assert [frame.values for frame in parser.feed(good + bad + good)] == [(1.0,), (1.0,)]
+    fields = [{"name": name, "type": "f32"}, {"name": "A", "type": "f32"}]
+    parser = SyncParser(layout({"sync": "20 4E", "length": 10, "fields": fields}))
+    data = b"".join(b"\x20\x4e" + struct.pack("<ff", number, 1.0) for number in (2.0, value, 2.0))
+    assert [frame.values for frame in parser.feed(data)] == [(1.0,), (1.0,)]
     assert (parser.counts.frames, parser.counts.malformed, parser.counts.bytes_dropped) == (2, 1, 10)
 
 
@@ -142,24 +129,27 @@ def datagram_parser(**others):
 
 def test_damaged_frame_in_a_datagram_makes_no_other_frame():
     parser = datagram_parser(checksum="sum-8")
-    rng = np.random.default_rng(0)
-    for _ in range(200):
-        frames = [struct.pack("<Bf", seq, rng.normal()) for seq in range(4)]
-        frames = [bytearray(frame + bytes([sum(frame) % 256])) for frame in frames]
-        frames[2][3] ^= 0x55
-        assert [frame.seq for frame in parser.feed(b"".join(frames))] == [0, 1, 3]
+    for value in np.random.default_rng(0).normal(size=200):
+        datagram = bytearray()
+        for seq in range(4):
+            frame = struct.pack("<Bf", seq, value)
+            datagram += frame + bytes([sum(frame) % 256])
+        datagram[15] ^= 0x55
+        assert [frame.seq for frame in parser.feed(bytes(datagram))] == [0, 1, 3]
     assert (parser.counts.crc_errors, parser.counts.bytes_dropped) == (200, 1200)
 
 
 def test_datagrams_contain_whole_frames():
     parser = datagram_parser(sync="A5")
-    first = struct.pack("<BBf", 0xA5, 1, 0.5)
-    second = struct.pack("<BBf", 0xA5, 2, 1.0)
-    first_with_another_sync = b"\x5a" + first[1:]
-    assert [frame.values for frame in parser.feed(first + second)] == [(0.5,), (1.0,)]
-    assert [frame.values for frame in parser.feed(first + b"\n")] == [(0.5,)]  # as a UDP socket adds it to text
-    assert parser.feed(first[:3]) == []
-    assert [frame.values for frame in parser.feed(first_with_another_sync + second)] == [(1.0,)]
+    first, second = (struct.pack("<BBf", 0xA5, seq, seq) for seq in (1, 2))
+    read = [
+        (first + second, [1, 2]),
+        (first + b"\n", [1]),  # as a UDP socket adds it to text
+        (first[:3], []),
+        (b"\x5a" + first[1:] + second, [2]),  # another sync
+    ]
+    for datagram, numbers in read:
+        assert [frame.values[0] for frame in parser.feed(datagram)] == numbers
     assert (parser.counts.malformed, parser.counts.bytes_dropped) == (2, 9)
 
 

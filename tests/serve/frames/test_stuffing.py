@@ -76,12 +76,9 @@ def piece(body):
 
 
 def test_binary_frame_has_the_documented_layout():
-    version = bytes([1])
-    seq_and_time = struct.pack("<H", 0x1234) + struct.pack("<I", 0x89ABCDEF)
-    count_and_flags = bytes([3, 1])
-    charges = struct.pack("<fff", 1.0, -2.5, 848.25)
+    """The version, the number, the time, the number of charges, the flags and the charges, without gaps."""
     frame = Frame(seq=0x1234, t_us=0x89ABCDEF, values=(1.0, -2.5, 848.25), bits=1)
-    assert encode_frame(frame) == piece(version + seq_and_time + count_and_flags + charges)
+    assert encode_frame(frame) == piece(struct.pack("<BHIBB3f", 1, frame.seq, frame.t_us, 3, frame.bits, *frame.values))
 
 
 @pytest.mark.parametrize(
@@ -97,20 +94,21 @@ def test_binary_frame_has_the_documented_layout():
 def test_piece_that_is_no_frame_is_counted(data, counter):
     parser = BinaryParser()
     assert parser.feed(data) == []
-    assert getattr(parser.counts, counter) == 1
-    assert parser.counts.bytes_dropped == len(data)
+    assert (getattr(parser.counts, counter), parser.counts.bytes_dropped) == (1, len(data))
 
 
 @pytest.mark.parametrize("size", [2 * MAX_STUFFED_LENGTH, 1_000_000])
 @pytest.mark.parametrize("step", [1, 700, 5000])
 def test_overlong_piece_is_counted_once_and_the_next_frame_is_found(size, step):
-    data = b"\x01" * size + b"\0"  # valid stuffing of zeros, so that only the length is wrong
-    parser = BinaryParser()
+    piece_of_zeros = b"\x01" * size + b"\0"  # valid stuffing, so that only the length is wrong
     frame = Frame(7, 8, (9.0,))
+    data = piece_of_zeros + encode_frame(frame)
+    parser = BinaryParser()
     parser.sequence_flags(5)
+    frames = []
     for start in range(0, len(data), step):
-        assert parser.feed(data[start : start + step]) == []
+        frames += parser.feed(data[start : start + step])
+    assert frames == [frame]
     counts = parser.counts
-    assert (counts.malformed, counts.crc_errors, counts.bytes_dropped) == (1, 0, len(data))
-    assert parser.feed(encode_frame(frame)) == [frame]
+    assert (counts.malformed, counts.crc_errors, counts.bytes_dropped) == (1, 0, len(piece_of_zeros))
     assert parser.sequence_flags(7) == ("gap",)  # the piece was frame 6
