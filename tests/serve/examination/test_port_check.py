@@ -16,6 +16,7 @@ from isocharge.serve.examination.port_check import examine_received
 
 RATE_HZ = 200.0
 FOUR = ("A", "B", "C", "D")
+LINES = partial(encode_text, notation="csv")
 AT_REST = device_from_table({"leak": {"tau_s": 10.0}}, "test")
 
 
@@ -30,14 +31,16 @@ def examined(encode, **settings):
     return examine_received(received(encode), **settings)
 
 
-def charges(*, offset=(5.0, -6.0, 7.0), noise=0.3, hum=0.0, drift=0.0, encode=encode_frame):
+def charges(*, offset=(5.0, -6.0, 7.0), noise=0.3, hum=0.0, drift=0.0, press=None, encode=encode_frame):
     """Return a function that returns the frames of a board with three electrodes, which sends charges in pC."""
     rng = np.random.default_rng(0)
 
     def frame(number):
         time_s = number / RATE_HZ
         change = hum * np.sin(2 * np.pi * 50 * time_s + 0.5) + drift * time_s
-        values = np.array(offset) + change + rng.normal(0.0, noise, 3)
+        values = rng.normal(offset, noise) + change
+        if press is not None and number > 150:
+            values += press
         return encode(Frame(number, 5000 * number, tuple(values.tolist())))
 
     return frame
@@ -56,18 +59,13 @@ def missing(report):
 
 def test_of_a_touched_film_only_the_touch_is_reported():
     """The offset, the noise and the drift of a pressed film would lead to wrong advice."""
-
-    def pressed_frame(number):
-        press = 400.0 if number > 150 else 0.0
-        return encode_frame(Frame(number, 5000 * number, (5.0 + press, 2.0 * press - 6.0, 7.0)))
-
-    report = examined(pressed_frame, device=AT_REST, electrodes=FOUR[:3])
+    report = examined(charges(press=(400.0, 800.0, 0.0)), device=AT_REST, electrodes=FOUR[:3])
     assert "as under a touch; take the finger away" in report.touch
     assert report.missing == (report.touch,)
 
 
 def test_check_of_a_healthy_board():
-    report = examined(charges(), device=AT_REST, electrodes=("A", "B", "C"))
+    report = examined(charges(), device=AT_REST, electrodes=FOUR[:3])
     assert (report.baud, report.format, report.missing) == (115200, "binary frames of isocharge", ())
     assert report.missing_for_held_presses == ()
     assert (report.good, report.bad, report.lost, report.repeated, report.device_clock) == (400, 0, 0, 0, True)
@@ -75,21 +73,17 @@ def test_check_of_a_healthy_board():
     assert [round(channel.offset_pC) for channel in report.channels] == [5, -6, 7]
 
 
-def test_check_of_a_channel_without_a_number():
+@pytest.mark.parametrize("others", [("1.5", "2.5"), ("nan", "nan")])
+def test_check_of_a_channel_without_a_number(others):
     """A board sends `nan` for a missing amplifier. The other channels are reported as usual, also as valid JSON."""
-    report = examined(lambda _: b"A:nan,B:1.5,C:2.5\n")
-    assert [(c.name, c.offset_pC) for c in report.channels] == [("A", None), ("B", 1.5), ("C", 2.5)]
-    assert report.channels[0].unusable == report.good == 400
+    report = examined(lambda _: "A:nan,B:{},C:{}\n".format(*others).encode())
     assert "channel A is nan in 400 frames" in missing(report)
-    assert "counts" not in missing(report)
-    assert "channel B is dead: every value is 1.5" in missing(report)
+    assert "counts" not in missing(report)  # the board is not taken for one that sends counts
+    if others[0] == "1.5":
+        assert [(c.name, c.offset_pC) for c in report.channels] == [("A", None), ("B", 1.5), ("C", 2.5)]
+        assert report.channels[0].unusable == report.good == 400
+        assert "channel B is dead: every value is 1.5" in missing(report)
     json.dumps(asdict(report), allow_nan=False)
-
-
-def test_a_board_that_only_sends_nan_is_not_taken_for_counts():
-    report = examined(lambda _: b"A:nan,B:nan,C:nan\n")
-    assert "channel A is nan in 400 frames" in missing(report)
-    assert "counts" not in missing(report)
 
 
 @pytest.mark.parametrize(
@@ -118,21 +112,18 @@ def test_check_reports_missing_settings(board, message):
     assert message in missing(examined(board, electrodes=FOUR))
 
 
-def test_missing_clock_is_reported_only_with_leak():
-    lines = received(charges(encode=partial(encode_text, notation="csv")))
-    reports = (
-        examine_received(lines, device=AT_REST),
-        examine_received(lines),
-        examined(charges(), device=AT_REST),
-    )
-    assert ["a device clock" in " / ".join(report.missing_for_held_presses) for report in reports] == [
-        True,
-        False,
-        False,
-    ]
+@pytest.mark.parametrize(
+    ("encode", "settings", "is_missing"),
+    [(LINES, {"device": AT_REST}, True), (LINES, {}, False), (encode_frame, {"device": AT_REST}, False)],
+    ids=["lines and a leak", "lines", "frames with a clock and a leak"],
+)
+def test_missing_clock_is_reported_only_with_leak(encode, settings, is_missing):
+    report = examined(charges(encode=encode), **settings)
+    assert ("a device clock" in " / ".join(report.missing_for_held_presses)) == is_missing
 
 
-def test_unused_inputs_are_ignored():
+def test_proposed_device_file_ignores_unused_inputs_and_reads_the_same_charges():
+    """A check with the proposed file gives the same result as the check that has proposed the file."""
     report = examined(row, electrodes=FOUR)
     assert report.device["channels"] == {"A": "1", "B": "3", "C": "4", "D": "6"}
     assert (report.unused, report.unit) == (("2", "5"), "counts")
@@ -142,33 +133,33 @@ def test_unused_inputs_are_ignored():
     assert {"offset_counts", "drift_counts_per_s"} <= set(first)
     assert not any("pC" in name for name in first)
 
-
-def test_proposed_device_file_reads_the_same_charges():
-    """A check with the proposed file gives the same result as the check that has proposed the file."""
-    gain = {"pC_per_unit": {"A": 0.5, "B": -0.5, "C": 0.5, "D": 0.5}}
-    first = examined(row, electrodes=FOUR, gain=gain)
-    assert first.device["gain"]["offset"] == pytest.approx(dict.fromkeys("ABCD", 305), abs=10)
-    again = examined(row, device=device_from_table(first.device, "test"))
-    assert [channel.name for channel in again.channels] == [channel.name for channel in first.channels]
+    gain = {"A": 0.5, "B": -0.5, "C": 0.5, "D": 0.5}
+    proposed = examined(row, electrodes=FOUR, gain={"pC_per_unit": gain}).device
+    assert proposed["gain"]["offset"] == pytest.approx(dict.fromkeys("ABCD", 305), abs=10)
+    again = examined(row, device=device_from_table(proposed, "test"))
+    assert [channel.name for channel in again.channels] == [channel.name for channel in report.channels]
     assert all(abs(channel.offset_pC) < 5 for channel in again.channels)
     assert (again.unit, again.unused) == ("pC", ("2", "5"))
+
+
+def test_gain_of_some_electrodes_is_refused():
     with pytest.raises(DeviceError, match=r"gain\.pC_per_unit: expected a number, or one for each"):
         examined(row, electrodes=FOUR, gain={"pC_per_unit": {"A": 0.5}})
 
 
 @pytest.mark.parametrize(
-    ("gain", "rests", "offset"),
+    ("gain", "levels", "has_offset"),
     [
-        ({}, (32768 + 400, 32768 - 90), {"A": 33168, "B": 32678}),
-        ({"pC_per_unit": 0.01}, (32768 + 400, 32768 - 90), {"A": 33168, "B": 32678}),
-        ({"pC_per_unit": 1.0}, (10, -10), {"A": 10, "B": -10}),
-        ({}, (0, 0), None),
+        ({}, (33168, 32678), True),
+        ({"pC_per_unit": 0.01}, (33168, 32678), True),
+        ({"pC_per_unit": 1.0}, (10, -10), True),
+        ({}, (0, 0), False),
     ],
 )
-def test_level_at_rest_is_proposed_as_offset(gain, rests, offset):
-    board = lambda k: b"%d,%d\n" % tuple(rest + (k * 7) % 5 - 2 for rest in rests)  # noqa: E731
-    proposed = examined(board, electrodes=("A", "B"), gain=gain).device["gain"]
-    assert proposed == gain | ({} if offset is None else {"offset": offset})
+def test_level_at_rest_is_proposed_as_offset(gain, levels, has_offset):
+    board = lambda k: b"%d,%d\n" % tuple(level + (k * 7) % 5 - 2 for level in levels)  # noqa: E731
+    offset = {"offset": dict(zip("AB", levels, strict=True))} if has_offset else {}
+    assert examined(board, electrodes=("A", "B"), gain=gain).device["gain"] == gain | offset
 
 
 def test_line_that_is_not_read_is_shown():
@@ -179,14 +170,10 @@ def test_line_that_is_not_read_is_shown():
 @pytest.mark.parametrize(
     ("names", "channels", "message"),
     [
-        (
-            "A_nC B_nC C_nC",
-            {"A": "A_nC", "B": "B_nC", "C": "C_nC"},
-            "the channels seem to be in nC",
-        ),
-        ("c b a", {"A": "a", "B": "b", "C": "c"}, ""),
+        ("A_nC B_nC C_nC", "A_nC B_nC C_nC", "the channels seem to be in nC"),
+        ("c b a", "a b c", ""),
         ("A B z", None, "('A', 'B', 'z')"),
-        ("x y z", {"A": "x", "B": "y", "C": "z"}, ""),
+        ("x y z", "x y z", ""),
         ("ch3 ch2 ch1", None, "('ch3', 'ch2', 'ch1')"),
         ("1,B A C", None, "a frame has 4"),  # it is not clear whether the name stands before or behind its value
     ],
@@ -198,30 +185,29 @@ def test_channels_are_proposed_by_their_names(names, channels, message):
     def board(_):
         return ",".join(f"{name}{mark}{rng.normal():.3f}" for name in names.split()).encode() + b"\n"
 
-    report = examined(board, electrodes=("A", "B", "C"))
-    assert (report.device.get("channels"), not report.missing) == (channels, not message)
+    report = examined(board, electrodes=FOUR[:3])
+    expected = channels and dict(zip("ABC", channels.split(), strict=True))
+    assert (report.device.get("channels"), not report.missing) == (expected, not message)
     assert message in missing(report)
 
 
 @pytest.mark.parametrize("noise", [0.3, 1.0])
 def test_doubled_bytes_of_a_serial_server_lead_to_the_advice_about_telnet(noise):
-    board = charges(noise=noise)
-    data = received(lambda k: board(k).replace(b"\xff", b"\xff\xff"))
+    data = received(charges(noise=noise, encode=lambda frame: encode_frame(frame).replace(b"\xff", b"\xff\xff")))
     report = examine_received(replace(data, url="tcp://127.0.0.1:4001"), device=AT_REST)
     assert "if a serial server uses the telnet protocol" in missing(report)
     assert "baud" not in missing(report)
 
 
-def test_offset_drift_hum_and_noise_of_a_channel():
-    t, rng = np.arange(0.0, 4.0, 0.002), np.random.default_rng(0)
-    charge = 12.0 + 3.0 * t + 2.0 * np.sin(2 * np.pi * 50 * t + 1) + 0.5 * np.sin(2 * np.pi * 60 * t)
-    health = measure_channel_health("A", charge + rng.normal(0, 0.3, t.size), t, 500.0)
+@pytest.mark.parametrize(("rate_Hz", "hum_pC"), [(500.0, (2.0, 0.5)), (100.0, (None, None))])
+def test_offset_drift_hum_and_noise_of_a_channel(rate_Hz, hum_pC):
+    """A hum above half of the rate is not estimated."""
+    t = np.arange(0.0, 4.0, 1.0 / rate_Hz)
+    charge = np.random.default_rng(0).normal(12.0 + 3.0 * t, 0.3)
+    for frequency_Hz, amplitude_pC in zip((50, 60), hum_pC, strict=True):
+        charge += (amplitude_pC or 0.0) * np.sin(2 * np.pi * frequency_Hz * t + 1)
+    health = measure_channel_health("A", charge, t, rate_Hz)
     assert health.offset_pC == pytest.approx(12.0 + 6.0, abs=0.1)
     assert health.drift_pC_per_s == pytest.approx(3.0, abs=0.05)
-    assert health.hum_pC == pytest.approx((2.0, 0.5), abs=0.05)
+    assert health.hum_pC == (pytest.approx(hum_pC, abs=0.05) if hum_pC[0] else hum_pC)
     assert health.noise_pC == pytest.approx(0.3, rel=0.05)
-
-
-def test_hum_above_half_the_rate_is_not_estimated():
-    t = np.arange(0.0, 4.0, 0.01)
-    assert measure_channel_health("A", np.sin(t), t, 100.0).hum_pC == (None, None)

@@ -27,6 +27,10 @@ def table(text):
     return lambda path: path.write_text(text)
 
 
+def parquet(path):
+    write_table(pa.table({"A": [1.0]}), path)
+
+
 FOREIGN = {
     "touch.rec": (recording, r"got a recording; play it with: isocharge serve replay \S*touch.rec$"),
     "touch.jsonl": (
@@ -35,7 +39,7 @@ FOREIGN = {
     ),
     "touch.mcap": (mcap, "got an MCAP file; .*isocharge serve replay touch.rec"),
     "presses.parquet": (
-        lambda path: write_table(pa.table({"A": [1.0]}), path),
+        parquet,
         "got a Parquet file; .*isocharge serve predict MODEL",
     ),
     "measured.txt": (
@@ -73,26 +77,22 @@ def test_lines_of_a_board_with_a_name_of_a_table_are_read_from_stdin(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "text"),
+    "text",
     [
-        ("lines.csv", "seq,t_us,A,B,C\n1,2,3,4,5\n"),
-        ("lines.csv", "801.2,799.5,803.3\n"),
-        ("lines.txt", "A,B,C\n1,2,3\n"),
-        ("lines.txt", '{"seq": 1, "A": 801.2}\n'),
-        ("lines.txt", '{"timestamp": 1.5, "charge_pC": [1, 2, 3]}\n'),
-        ("frames.bin", "\x01\x02\x03\x00"),
+        "seq,t_us,A,B,C\n1,2,3,4,5\n",
+        "801.2,799.5,803.3\n",
+        "A,B,C\n1,2,3\n",
+        '{"seq": 1, "A": 801.2}\n',
+        '{"timestamp": 1.5, "charge_pC": [1, 2, 3]}\n',
+        "\x01\x02\x03\x00",
     ],
 )
-def test_bytes_of_a_board_in_a_file_are_read(tmp_path, name, text):
-    path = tmp_path / name
-    path.write_text(text)
-    with open_source(str(path)) as source:
-        assert b"".join(chunk.data for chunk in source) == text.encode()
-
-
-def test_file_of_bytes_is_refused_as_a_port(tmp_path):
-    path = tmp_path / "frames.bin"
-    path.write_bytes(b"\x01\x02")
+def test_bytes_of_a_board_in_a_file_are_read_by_a_stream_only(tmp_path, text):
+    for name in ("lines.csv", "lines.txt"):
+        path = tmp_path / name
+        path.write_text(text)
+        with open_source(str(path)) as source:
+            assert b"".join(chunk.data for chunk in source) == text.encode()
     with pytest.raises(InputError, match="expected a port, got a file; only `isocharge serve stream`"), Port(str(path)):
         pass
 
