@@ -88,14 +88,16 @@ def test_device_without_a_file_has_tare_and_touch(device):
     assert isinstance(ANY_BOARD.parser(), AutoParser)
 
 
-def test_offset_is_subtracted_before_the_gain(device):
+@pytest.mark.parametrize(
+    ("offset", "zero"), [("8388608", [8388608] * 3), ("{A = 1, B = 2, C = 3}", [1, 2, 3])], ids=["half range", "each"]
+)
+def test_offset_is_subtracted_before_the_gain(device, offset, zero):
     """The offset is one number, such as half of the range of a converter, or one number for each electrode."""
-    for offset, zero in (("8388608", [8388608] * 3), ("{A = 1, B = 2, C = 3}", [1, 2, 3])):
-        board = device(f"[gain]\noffset = {offset}\npC_per_unit = {{A = 0.5, B = -0.5, C = 1}}\n")
-        frame = Frame(None, None, ())
-        frame.sent = np.array(zero) + 10.0
-        Gain(Setup(ELECTRODES, board)).step(frame)
-        np.testing.assert_array_equal(frame.charge_pC, [5.0, -5.0, 10.0])
+    board = device(f"[gain]\noffset = {offset}\npC_per_unit = {{A = 0.5, B = -0.5, C = 1}}\n")
+    frame = Frame(None, None, ())
+    frame.sent = np.array(zero) + 10.0
+    Gain(Setup(ELECTRODES, board)).step(frame)
+    assert frame.charge_pC.tolist() == [5.0, -5.0, 10.0]
 
 
 def test_device_file_with_a_request(device):
@@ -148,61 +150,73 @@ def test_device_file_that_is_refused(device, text, message):
         device(text)
 
 
+CHANNELS = {
+    "": "123",
+    "C,A,B": "231",
+    "C_pC,A_pC,B_pC": "231",
+    "x,y,z": "123",
+    "C [pC],a_pC,charge.b": "231",
+    "ch0,ch1,ch2": "123",
+    "Q_C,Q_A,Q_B": "231",
+    "electrode B,electrode C,electrode A": "312",
+    "chC,chA,chB": "231",
+    "qc_pC,qa_pC,qb_pC": "231",
+    "A0,A1,A2": "123",
+    "bat_V,A,B,C": "234",  # the unit of a channel that is no electrode does not matter
+    "C,B,A,t_mV": "321",
+}
+"""Numbers of the channels of the electrodes A, B and C, by the names of the channels in a header."""
+
+
+def charges_sent(names, channels):
+    """Return the charges of the electrodes A, B and C if the channels with these names send 1, 2, 3 and so on, pC."""
+    header = tuple(names.split(",")) if names else ()
+    frame = Frame(0, 0, tuple(range(1, 1 + (len(header) or 3))), names=header)
+    Channels(Setup(ELECTRODES, Device(channels=channels, where="board.toml"))).step(frame)
+    return frame.sent.tolist()
+
+
 @pytest.mark.parametrize(
     ("names", "channels", "picked"),
     [
-        ("", {}, "123"),
-        ("C,A,B", {}, "231"),
-        ("C_pC,A_pC,B_pC", {}, "231"),
-        ("x,y,z", {}, "123"),
-        ("C [pC],a_pC,charge.b", {}, "231"),
-        ("ch0,ch1,ch2", {}, "123"),
-        ("Q_C,Q_A,Q_B", {}, "231"),
-        ("electrode B,electrode C,electrode A", {}, "312"),
-        ("chC,chA,chB", {}, "231"),
-        ("qc_pC,qa_pC,qb_pC", {}, "231"),
-        ("A0,A1,A2", {}, "123"),
+        *((names, {}, picked) for names, picked in CHANNELS.items()),
         ("x,y,z", {"A": "z", "B": "y", "C": "x"}, "321"),
         ("", {"A": "3", "B": "ch2", "C": "ch1"}, "321"),
         ("ch3,2,z", {"A": "2", "B": "ch3", "C": "3"}, "213"),
-        ("bat_V,A,B,C", {}, "234"),  # the unit of a channel that is no electrode does not matter
-        ("C,B,A,t_mV", {}, "321"),
     ],
 )
 def test_channel_of_each_electrode(names, channels, picked):
-    values = (1.0, 2.0, 3.0, 4.0) if names.count(",") == 3 else (1.0, 2.0, 3.0)
-    frame = Frame(0, 0, values, names=header(names))
-    Channels(Setup(ELECTRODES, Device(channels=channels))).step(frame)
-    assert frame.sent.tolist() == [float(number) for number in picked]
-
-
-def header(names):
-    """Return the names of the channels in a header; none for an empty header."""
-    return tuple(names.split(",")) if names else ()
+    assert charges_sent(names, channels) == [*map(int, picked)]
 
 
 @pytest.mark.parametrize(
     ("names", "channels", "message"),
     [
-        ("x,y", {}, r"\[channels\] A = "),
-        ("A_nC,B_nC,C_nC", {}, "A_nC' is in nC: convert it to pC"),
-        ("AnC,BnC,CnC", {}, "AnC' is in nC: convert it to pC"),
-        ("A_coulomb,B_coulomb,C_coulomb", {}, "A_coulomb' is in coulomb: convert it to pC"),
-        ("A_mean,A_std,B_mean,B_std,C_mean,C_std", {}, r"\[channels\] A = "),
-        ("A,B,z", {}, r"\[channels\] A = "),
+        *(
+            (names, {}, r"\[channels\] A = ")
+            for names in (
+                "x,y",
+                "A_mean,A_std,B_mean,B_std,C_mean,C_std",
+                "A,B,z",
+                "ch3_v1,ch2_v1,ch1_v1",
+                "adc1 in2,adc1 in10,adc1 in1",
+            )
+        ),
         ("ch3,ch2,ch1", {}, r"ch3'.*\[channels\] A = "),
-        ("ch3_v1,ch2_v1,ch1_v1", {}, r"\[channels\] A = "),
-        ("adc1 in2,adc1 in10,adc1 in1", {}, r"\[channels\] A = "),
+        *(
+            (",".join(name + unit for name in "ABC"), {}, f"A{unit}' is in {unit.strip('_')}: convert it to pC")
+            for unit in ("_nC", "nC", "_coulomb")
+        ),
         ("x,y,z", {"A": "zz"}, r'^board\.toml: \[channels\] A = "zz": no channel .* have x, y, z, or 1 to'),
-        *(("", {"A": name}, "no channel is called that") for name in ("0", "4", "ch0", "ch4", "ch", "", "-1")),
-        *(("", {"A": name}, "no channel is called that") for name in ("1.0", "99999", "²")),
+        *(
+            ("", {"A": name}, "no channel is called that")
+            for name in ("0", "4", "ch0", "ch4", "ch", "", "-1", "1.0", "99999", "²")
+        ),
     ],
 )
 def test_unknown_channels_are_refused(names, channels, message):
-    assigned = {"A": "1", "B": "2", "C": "3"} | channels if channels else {}
-    stage = Channels(Setup(ELECTRODES, Device(channels=assigned, where="board.toml")))
     with pytest.raises(ChargeError, match=message):
-        stage.step(Frame(0, 0, (1.0,) * (len(header(names)) or 3), names=header(names)))
+        charges_sent(names, channels and {"A": "1", "B": "2", "C": "3"} | channels)
 
 
 def test_advice_for_the_channels_is_a_valid_device_file():
@@ -223,11 +237,8 @@ def test_tare_error_states_the_offset_for_the_device_file():
 def test_saturation_is_flagged_until_the_press_is_over(device):
     chain = StageRunner(device=device("[saturation]\nlimit_pC = 1500.0\n[tare]\nframes = 5\n"))
     charges_pC = [0.0] * 6 + [800.0, 1500.0, 800.0, 800.0, 0.0, 0.0, 800.0]
-    is_saturated = []
-    for number, charge_pC in enumerate(charges_pC):
-        reading = chain.advance(np.full(3, charge_pC), 0.005 * number, 0.005)
-        is_saturated.append("saturated" in reading.flags)
-    assert is_saturated == [False] * 7 + [True] * 3 + [False] * 3
+    readings = chain.run(np.tile(np.array(charges_pC)[:, None], 3), 200.0)
+    assert ["saturated" in reading.flags for reading in readings] == [False] * 7 + [True] * 3 + [False] * 3
 
 
 def test_warming_needs_four_electrodes(device):

@@ -35,11 +35,10 @@ def chunks_of_presses(film):
     """
     data = b"".join(encoded_frames(islice(taps(film, rest=21, press=19), 80)))
     chunks = []
-    for number, begin in enumerate(range(0, len(data), CHUNK_BYTES)):
-        outage_s = 1.5 if number == 40 else 0.0
-        timestamp = 1e9 + CHUNK_INTERVAL_S * number
-        clock_ns = round(1e9 * CHUNK_INTERVAL_S * number)
-        chunks.append(Chunk(data[begin : begin + CHUNK_BYTES], timestamp, clock_ns, outage_s))
+    for begin in range(0, len(data), CHUNK_BYTES):
+        time_s = CHUNK_INTERVAL_S * len(chunks)
+        outage_s = 1.5 if len(chunks) == 40 else 0.0
+        chunks.append(Chunk(data[begin : begin + CHUNK_BYTES], 1e9 + time_s, round(1e9 * time_s), outage_s))
     return chunks
 
 

@@ -25,29 +25,36 @@ def noise_std(charge_pC):
     return np.hypot(1.0, 0.002 * charge_pC)
 
 
-def readings(charge_pC, *, flags=None):
+def readings(charge_pC, flags):
     """Yield noisy readings. Something touches if the first charge is above 20 pC.
 
     Args:
         charge_pC: Charges without noise, shape (n, 4), pC.
         flags: Flags of some frames by their numbers.
     """
-    rng = np.random.default_rng(1)
-    for number, clean_pC in enumerate(charge_pC):
-        noisy_pC = clean_pC + noise_std(clean_pC) * rng.standard_normal(4)
-        frame_flags = (flags or {}).get(number, ())
-        has_tare = TARE not in frame_flags
-        frame = Frame(number, round(1e6 * number / RATE_HZ), (), clock_s=number / RATE_HZ, flags=list(frame_flags))
-        frame.charge_pC = noisy_pC if has_tare else None
+    noisy_pC = np.random.default_rng(1).normal(charge_pC, noise_std(charge_pC))
+    for number, reading_pC in enumerate(noisy_pC):
+        frame = Frame(number, round(1e6 * number / RATE_HZ), (), clock_s=number / RATE_HZ)
+        frame.flags = list(flags.get(number, ()))
+        if TARE not in frame.flags:
+            frame.charge_pC = reading_pC
+            frame.is_contact = charge_pC[number, 0] > 20.0
         frame.noise_pC = np.ones(4)
-        frame.is_contact = has_tare and clean_pC[0] > 20.0
         yield frame
 
 
-def watch_presses(*parts, **options):
-    """Return the results of a press watch for the readings of successive parts; see `rest` and `held`."""
+def watch_presses(*parts, flags=None, armed_frame=None):
+    """Return the results of a press watch for the readings of successive parts; see `rest` and `held`.
+
+    The watch is armed before the frame with the number `armed_frame`.
+    """
     watch = PressWatch(NAMES)
-    return [watch.feed(reading) for reading in readings(np.concatenate(parts), **options)]
+    results = []
+    for reading in readings(np.concatenate(parts), flags or {}):
+        if reading.seq == armed_frame:
+            watch.arm()
+        results.append(watch.feed(reading))
+    return results
 
 
 def rest(seconds, level=0.0):
@@ -169,10 +176,5 @@ def test_press_is_refused_and_the_other_press_is_not(parts, flags, phases, reaso
 
 
 def test_an_armed_watch_takes_no_press_that_has_begun():
-    watch = PressWatch(NAMES)
-    results = []
-    for number, reading in enumerate(readings(np.concatenate([rest(1), held(2), rest(1), held(2)]))):
-        if number == 240:  # in the first press
-            watch.arm()
-        results.append(watch.feed(reading))
+    results = watch_presses(rest(1), held(2), rest(1), held(2), armed_frame=240)  # in the first press
     assert phases_of(results) == ["waiting", "settling", "lift", "waiting", "settling", "taken", "lift"]

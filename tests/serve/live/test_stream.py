@@ -29,62 +29,58 @@ def chunk(*frames):
     return Chunk(b"".join(map(encode_frame, frames)), time.time(), time.perf_counter_ns())
 
 
-def rest_frames(n=10):
-    """Return n frames of a film at rest."""
-    return [Frame(number, 5000 * number, tuple(OFFSET.tolist())) for number in range(n)]
+def frames_of(charges_pC, n, first=0):
+    """Return n frames with the touch charges of three electrodes, pC, and the charges at rest."""
+    values = tuple((OFFSET + charges_pC).tolist())
+    return [Frame(number, 5000 * number, values) for number in range(first, first + n)]
 
 
 @pytest.fixture
-def records_after_rest(predictor):
-    """Return a function that processes frames after ten frames at rest, and returns the records of these frames."""
+def record_after_rest(predictor):
+    """Return a function that processes a frame after ten frames at rest, and returns its record."""
 
-    def process(*frames):
-        chunks = [chunk(*rest_frames()), *(chunk(frame) for frame in frames)]
-        records = list(stream(chunks, predictor, BOARD))
-        return records[10:]
+    def process(frame):
+        *_, record = stream([chunk(*frames_of(0.0, 10)), chunk(frame)], predictor, BOARD)
+        return record
 
     return process
 
 
-def press_charges(film):
-    """Return the touch charges of a press of 0.5 N at (2, -3) mm, shape (3,), pC."""
+@pytest.fixture
+def press_pC(film):
+    """Touch charges of a press of 0.5 N at (2, -3) mm, shape (3,), pC."""
     return film.charge_pC([2.0], [-3.0], [0.5])[0]
-
-
-def raw_press(film):
-    """Return the charges of this press as the board sends them, with the charges at rest."""
-    return tuple((press_charges(film) + OFFSET).tolist())
 
 
 def test_timestamps_of_a_file_follow_the_clock_of_the_board(predictor, tmp_path):
     path = tmp_path / "frames"
-    path.write_bytes(chunk(*rest_frames(600)).data)
+    path.write_bytes(chunk(*frames_of(0.0, 600)).data)
     with open_source(str(path)) as source:
         times = [record.timestamp for record in stream(source, predictor)]
     np.testing.assert_allclose(np.diff(times), 0.005, atol=1e-6)
 
 
-def test_record_of_a_press(film, records_after_rest):
-    (record,) = records_after_rest(Frame(10, 50_000, raw_press(film)))
+def test_record_of_a_press(press_pC, record_after_rest):
+    record = record_after_rest(*frames_of(press_pC, 1, first=10))
     assert (record.x_mm, record.y_mm, record.force_N) == pytest.approx((2.0, -3.0, 0.5), rel=1e-5)
     assert (record.contact, record.flags, record.seq, record.t_device_us) == (True, (), 10, 50_000)
-    assert record.charge_pC == pytest.approx(dict(zip("ABC", press_charges(film), strict=True)), rel=1e-5)
-    assert record.charge_raw_pC == pytest.approx(dict(zip("ABC", raw_press(film), strict=True)), rel=1e-6)
+    assert [*record.charge_pC.values()] == pytest.approx(press_pC.tolist(), rel=1e-5)
+    assert [*record.charge_raw_pC.values()] == pytest.approx((press_pC + OFFSET).tolist(), rel=1e-6)
     assert record.tare_pC == {"A": 12.0, "B": -7.0, "C": 3.0}
     assert (record.model, record.frame_id) == ("linear/1", "linear-film")
     assert abs(record.timestamp - time.time()) < 5.0
     assert 0.0 < record.latency_us < 5e6
 
 
-def test_record_out_of_contact(records_after_rest):
-    (record,) = records_after_rest(Frame(10, 50_000, tuple((OFFSET + 1.0).tolist())))
+def test_record_out_of_contact(record_after_rest):
+    record = record_after_rest(*frames_of(1.0, 1, first=10))
     assert (record.contact, record.force_N, record.flags) == (False, 0.0, ())
     assert {record.x_mm, record.y_mm, record.x_std_mm, record.y_std_mm, record.force_std_N, record.misfit} == {None}
     assert record.charge_pC == {"A": 1.0, "B": 1.0, "C": 1.0}
 
 
 def test_record_before_the_tare(predictor):
-    for record in stream([chunk(*rest_frames())], predictor, BOARD):
+    for record in stream([chunk(*frames_of(0.0, 10))], predictor, BOARD):
         assert record.flags == ("tare",)
         assert (record.contact, record.force_N, record.charge_pC, record.tare_pC) == (False, 0.0, None, None)
         assert record.charge_raw_pC == {"A": 12.0, "B": -7.0, "C": 3.0}
@@ -97,9 +93,9 @@ def test_file_without_a_frame_raises_an_error(predictor, data):
         list(stream([Chunk(data, 1e9, 0)] if data else [], predictor))
 
 
-def test_wrong_number_of_charges_raises_an_error(records_after_rest):
+def test_wrong_number_of_charges_raises_an_error(record_after_rest):
     with pytest.raises(ChargeError, match=r"model linear/1 expects 3 charges \('A', 'B', 'C'\), frame 10 has 4"):
-        records_after_rest(Frame(10, 0, (1.0, 2.0, 3.0, 4.0)))
+        record_after_rest(Frame(10, 0, (1.0, 2.0, 3.0, 4.0)))
 
 
 SENSORS_OF_ANY_SIGN = [
@@ -111,16 +107,15 @@ SENSORS_OF_ANY_SIGN = [
 
 @pytest.mark.parametrize("sensor", SENSORS_OF_ANY_SIGN, ids=lambda sensor: sensor["name"])
 @pytest.mark.parametrize("is_replaced", [False, True])
-def test_touch_with_negative_charges(film, predictor, sensor, is_replaced, tmp_path):
+def test_touch_with_negative_charges(film, predictor, press_pC, sensor, is_replaced, tmp_path):
     """The model is the first one of the stream, or it replaces the model of a film with positive charges."""
     film.write(tmp_path, name="other", sensor=sensor)
     other = Predictor("other", models=tmp_path)
     touch = TouchStream(predictor if is_replaced else other, BOARD)
-    records = list(touch.feed(chunk(*rest_frames())))
+    records = list(touch.feed(chunk(*frames_of(0.0, 10))))
     if is_replaced:
         touch.use(other)
-    values = tuple((OFFSET - press_charges(film)).tolist())
-    records += touch.feed(chunk(*[Frame(number, 5000 * number, values) for number in range(10, 15)]))
+    records += touch.feed(chunk(*frames_of(-press_pC, 5, first=10)))
     assert [record.contact for record in records] == [False] * 10 + [True] * 5
     with pytest.raises(ChargeError, match="model other/1 expects 3 charges"):
         list(touch.feed(chunk(Frame(15, 75_000, (1.0, 2.0)))))

@@ -11,12 +11,12 @@ from isocharge.serve.signal_chain.stage import Setup
 def without_hum(raw_pC, rate_Hz):
     """Return charges, shape (n, electrodes), pC, from which the hum is removed."""
     hum = Hum(Setup(tuple("ABC")))
-    rows = []
-    for number, row_pC in enumerate(raw_pC):
-        frame = Frame(None, None, (), dt_s=1 / rate_Hz, clock_s=number / rate_Hz, charge_pC=row_pC)
+    frames = [
+        Frame(None, None, (), dt_s=1 / rate_Hz, clock_s=k / rate_Hz, charge_pC=row) for k, row in enumerate(raw_pC)
+    ]
+    for frame in frames:
         hum.step(frame)
-        rows.append(frame.charge_pC)
-    return np.array(rows)
+    return np.array([frame.charge_pC for frame in frames])
 
 
 def mains_hum(n, rate_Hz, amplitude_pC, frequency_Hz=50.0):
