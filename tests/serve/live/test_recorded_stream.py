@@ -42,25 +42,20 @@ def chunks_of_presses(film):
     return chunks
 
 
-def record_chunks(path, chunks, predictor, table):
-    """Record a stream, and yield its records as JSON. A new tare is requested before chunk 30."""
-    stream = TouchStream(predictor, device_from_table(table, "test"))
-    with Recorder(path, predictor.metadata.label, table) as recorder:
-        live = RecordedStream(stream, recorder)
-
-        def chunks_with_request():
-            for number, chunk in enumerate(chunks):
-                if number == 30:
-                    live.request_tare()
-                yield chunk
-
-        for record in live.follow(chunks_with_request()):
-            yield record.to_json()
+def with_requests(chunks, requests):
+    """Yield chunks. Before the chunks with some numbers, call the functions that make requests."""
+    for number, chunk in enumerate(chunks):
+        if number in requests:
+            requests[number]()
+        yield chunk
 
 
 def record_presses(path, film, predictor):
-    """Record the stream of `chunks_of_presses`, and return its records as JSON."""
-    return list(record_chunks(path, chunks_of_presses(film), predictor, DEVICE))
+    """Record the stream of `chunks_of_presses`, and yield its records as JSON. A new tare is requested at chunk 30."""
+    with Recorder(path, predictor.metadata.label, DEVICE) as recorder:
+        live = RecordedStream(TouchStream(predictor, device_from_table(DEVICE, "test")), recorder)
+        for record in live.follow(with_requests(chunks_of_presses(film), {30: live.request_tare})):
+            yield record.to_json()
 
 
 def replayed_lines(path, predictor):
@@ -72,15 +67,13 @@ def replayed_lines(path, predictor):
 
 def test_replay_repeats_the_records_bit_for_bit(tmp_path, film, predictor):
     path = tmp_path / "touch.rec"
-    lines = record_presses(path, film, predictor)
+    lines = [*record_presses(path, film, predictor)]
     assert len(lines) > 60
     records = [json.loads(line) for line in lines]
-    all_flags = {flag for record in records for flag in record["flags"]}
-    assert all_flags >= {"tare", "reconnected"}
+    assert {flag for record in records for flag in record["flags"]} >= {"tare", "reconnected"}
     assert any(record["contact"] for record in records)
     assert all(record["latency_us"] > 0 for record in records)
-    tare_requests = [event for event in Recording(path).events() if event.tare]
-    assert len(tare_requests) == 1
+    assert [event.tare for event in Recording(path).events()].count(True) == 1
     assert replayed_lines(path, predictor) == lines
 
 
@@ -103,7 +96,7 @@ def test_replay_of_an_interrupted_recording_ends_with_the_last_record(tmp_path, 
     monkeypatch.setattr(os, function, interrupted_function)
     lines = []
     with pytest.raises(KeyboardInterrupt):
-        lines.extend(record_chunks(path, chunks_of_presses(film), predictor, DEVICE))
+        lines.extend(record_presses(path, film, predictor))
     monkeypatch.undo()
     assert 10 < len(lines) < 60
     assert replayed_lines(path, predictor) == lines
@@ -113,7 +106,7 @@ def test_recording_on_a_full_disk_remains_readable(tmp_path, film, predictor, fi
     """The disk becomes full in the middle of a line. The recording stops, but the stream continues."""
     path = tmp_path / "touch.rec"
     fill_disk(9000)
-    lines = record_presses(path, film, predictor)
+    lines = [*record_presses(path, film, predictor)]
     assert len(lines) > 60
     assert path.stat().st_size < 9000
     assert path.read_bytes().endswith(b"}\n")
@@ -147,27 +140,23 @@ def test_recording_that_begins_later_restarts_the_stream(film, predictor, tmp_pa
     device = device_from_table(DEVICE, "test")
     stream = TouchStream(predictor, device)
     live = RecordedStream(stream)
-
-    def chunks_with_requests():
-        for number, chunk in enumerate(chunks_of_presses(film)):
-            if number == 20:
-                live.request_recording(Recorder(path, label, DEVICE))
-            if number == 30:
-                live.request_marker(Marker(1e9, "now"))
-            if number == 60:
-                live.request_recording(None)
-            yield chunk
-
-    lines = [record.to_json() for record in live.follow(chunks_with_requests()) if live.recorder is not None]
+    requests = {
+        20: lambda: live.request_recording(Recorder(path, label, DEVICE)),
+        30: lambda: live.request_marker(Marker(1e9, "now")),
+        60: lambda: live.request_recording(None),
+    }
+    records = live.follow(with_requests(chunks_of_presses(film), requests))
+    lines = [record.to_json() for record in records if live.recorder is not None]
     assert len(lines) > 20
     # The totals continue in spite of the restart. The restart and the outage each cut one of the 80 frames in two.
     assert stream.totals().frames == 80 - 2
     assert stream.totals().reconnects == 1
 
     markers = []
-    new_stream = TouchStream(predictor, device)
-    records = replay(Recording(path), new_stream, on_marker=markers.append, load=lambda _: predictor)
-    assert [record.to_json() for record in records] == lines
+    replayed = replay(
+        Recording(path), TouchStream(predictor, device), on_marker=markers.append, load=lambda _: predictor
+    )
+    assert [record.to_json() for record in replayed] == lines
     assert markers == [Marker(1e9, "now")]
     assert [event.use for event in Recording(path).events() if event.use] == model_changes
     assert list(tmp_path.iterdir()) == [path]

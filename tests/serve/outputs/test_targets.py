@@ -40,35 +40,41 @@ def test_form_of_a_target_chooses_the_output(target, form):
 
 
 @pytest.mark.parametrize(
-    "target", ["touch.txt", "", "tcp://127.0.0.1:9", "JSON", "touch", "mqtt://h/x.csv", "s3://h/x.ros2.mcap"]
+    ("targets", "message"),
+    [
+        *(
+            ([target], r"expected one of the forms json, csv, FILE\.jsonl")
+            for target in (
+                "touch.txt",
+                "",
+                "tcp://127.0.0.1:9",
+                "JSON",
+                "touch",
+                "mqtt://h/x.csv",
+                "s3://h/x.ros2.mcap",
+            )
+        ),
+        (["json", "csv"], "at most one on standard output"),
+        (["a.csv", "a.csv"], "expected targets that differ"),
+    ],
 )
-def test_target_of_no_form_is_refused_with_the_known_forms(target):
-    with pytest.raises(InputError, match=r"expected one of the forms json, csv, FILE\.jsonl"):
-        Outputs([target], context())
-
-
-def test_two_outputs_on_standard_output_are_refused():
-    with pytest.raises(InputError, match="at most one on standard output"):
-        Outputs(["json", "csv"], context())
-
-
-def test_repeated_target_is_refused():
-    with pytest.raises(InputError, match="expected targets that differ"):
-        Outputs(["a.csv", "a.csv"], context())
+def test_wrong_targets_are_refused(targets, message):
+    with pytest.raises(InputError, match=message):
+        Outputs(targets, context())
 
 
 @live_and_replayed
 def test_same_records_go_to_every_output(record, tmp_path, is_live):
     records = [record(seq=number, charge_pC={"A": 1.0, "B": 2.0}) for number in range(50)]
     printed = []
-    targets = ["json", str(tmp_path / "touch.jsonl"), str(tmp_path / "touch.csv")]
+    json_path, csv_path = tmp_path / "touch.jsonl", tmp_path / "touch.csv"
+    targets = ["json", str(json_path), str(csv_path)]
     with Outputs(targets, context(is_live=is_live, write_stdout=printed.append)) as outputs:
         for one in records:
             outputs.write(one)
-    lines = [one.to_json() for one in records]
-    assert "".join(printed).splitlines() == lines
-    assert (tmp_path / "touch.jsonl").read_text("utf-8").splitlines() == lines
-    with (tmp_path / "touch.csv").open(newline="") as file:
+    text = "".join(one.to_json() + "\n" for one in records)
+    assert ("".join(printed), json_path.read_text("utf-8")) == (text, text)
+    with csv_path.open(newline="") as file:
         assert [int(row["seq"]) for row in csv.DictReader(file)] == list(range(50))
     assert outputs.not_written == {}
 
