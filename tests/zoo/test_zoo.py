@@ -147,51 +147,37 @@ class Board:
         self.rest_pC = self.rng.uniform(-8.0, 8.0, len(self.press_pC))
         self.frames = 0
 
-    def frame(self, *, pressed=False):
-        charge_pC = self.rest_pC + self.rng.normal(0.0, 0.3, len(self.rest_pC)) + self.press_pC * pressed
-        self.frames += 1
-        return self.encode(self.frames - 1, charge_pC)
-
     def chunks(self, count, *, pressed=False):
         for _ in range(count // 3):
-            yield Chunk(b"".join(self.frame(pressed=pressed) for _ in range(3)), 1.7e9 + self.frames / RATE_HZ, 0)
-
-
-def examined(board, kind, gain):
-    """What doctor finds in a second of a board."""
-    received = ReceivedData(kind.url, 115200, kind.request, list(board.chunks(330)), 0.825)
-    return examine_received(received, electrodes=predictor(kind.model).metadata.electrodes, gain=gain)
-
-
-@pytest.fixture
-def written(tmp_path):
-    """Write the device file that doctor proposes: its path."""
-
-    def write(examination):
-        path = tmp_path / "board.toml"
-        path.write_text(device_text(examination), "utf-8")
-        return path
-
-    return write
+            data = b""
+            for charge_pC in self.rng.normal(self.rest_pC + self.press_pC * pressed, 0.3, (3, len(self.press_pC))):
+                data += self.encode(self.frames, charge_pC)
+                self.frames += 1
+            yield Chunk(data, 1.7e9 + self.frames / RATE_HZ, 0)
 
 
 def check_touch(records, model):
     """The end of a press is where the model sees it in the true charges."""
-    pressed = [record for record in records if record["contact"]][20:]
+    pressed = [record for record in records if record.contact][20:]
     assert len(pressed) > 50
     expected = predictor(model).predict(PRESSES[model])
-    x_mm, y_mm, force_N = np.mean([[record[key] for key in ("x_mm", "y_mm", "force_N")] for record in pressed], axis=0)
+    x_mm, y_mm, force_N = np.mean([(record.x_mm, record.y_mm, record.force_N) for record in pressed], axis=0)
     assert np.hypot(x_mm - expected.x_mm, y_mm - expected.y_mm) < 0.03
-    assert abs(force_N / expected.force_N - 1.0) < 0.005
-    assert all("restart" not in record["flags"] and "gap" not in record["flags"] for record in records)
-    clock = [record["t_device_us"] for record in records if record["t_device_us"] is not None]
+    assert force_N == pytest.approx(expected.force_N, rel=0.005)
+    assert not any({"restart", "gap"} & {*record.flags} for record in records)
+    clock = [record.t_device_us for record in records if record.t_device_us is not None]
     assert (np.diff(clock) > 0).all()
 
 
 @pytest.mark.parametrize("name", ZOO)
-def test_a_board_gets_to_a_right_touch(name, written):
+def test_a_board_gets_to_a_right_touch(name, tmp_path):
     kind = ZOO[name]
+    model = predictor(kind.model)
     board = Board(kind)
-    stream = TouchStream(predictor(kind.model), load_device(written(examined(board, kind, kind.gain))))
+    received = ReceivedData(kind.url, 115200, kind.request, list(board.chunks(330)), 0.825)
+    findings = examine_received(received, electrodes=model.metadata.electrodes, gain=kind.gain)
+    path = tmp_path / "board.toml"
+    path.write_text(device_text(findings), "utf-8")
+    stream = TouchStream(model, load_device(path))
     chunks = [*board.chunks(480), *board.chunks(171, pressed=True)]
-    check_touch([json.loads(record.to_json()) for chunk in chunks for record in stream.feed(chunk)], kind.model)
+    check_touch([record for chunk in chunks for record in stream.feed(chunk)], kind.model)
