@@ -33,7 +33,6 @@ from kept import kept
 
 RATE_HZ = 200.0
 REST_S = 0.9
-PRESS_S = 0.5
 FRAMES_AT_ONCE = 4
 END_S = 60.0
 """Time without a press at the end of a script, s."""
@@ -60,11 +59,13 @@ class SimulatedPort:
 def press_script(directions, rest_s=REST_S, first_rest_s=REST_S, end_s=END_S):
     """Return a script of presses of 0.3 N, 8 mm from the centre in some directions, with a rest before each press."""
     rows = [(0.0, 0.0, 0.0, 0.0)]
-    for number, (x, y) in enumerate(directions):
-        begin_s = rows[-1][0] + (rest_s if number else first_rest_s)
-        for since_begin_s, force_N in ((0.0, 0.0), (0.1, 0.3), (PRESS_S, 0.3), (PRESS_S + 0.1, 0.0)):
-            rows.append((begin_s + since_begin_s, 8.0 * x, 8.0 * y, force_N))
-    rows.append((rows[-1][0] + end_s, 0.0, 0.0, 0.0))
+    begin_s = first_rest_s
+    for x_mm, y_mm in 8.0 * np.asarray(directions):
+        for since_begin_s, force_N in ((0.0, 0.0), (0.1, 0.3), (0.5, 0.3), (0.6, 0.0)):
+            rows.append((begin_s + since_begin_s, x_mm, y_mm, force_N))
+        end_of_press_s = begin_s + 0.6
+        begin_s = end_of_press_s + rest_s
+    rows.append((end_of_press_s + end_s, 0.0, 0.0, 0.0))
     return VirtualScript(presses=tuple(rows)).script(RATE_HZ)
 
 

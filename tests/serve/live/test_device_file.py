@@ -19,10 +19,11 @@ from isocharge.serve import (
 from isocharge.serve.frames.formats import Frames
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.live.device import ANY_BOARD
+from isocharge.serve.port.serial_line import Request
 from isocharge.serve.signal_chain.channels import Channels
-from isocharge.serve.signal_chain.gain import Gain, SaturationRule
+from isocharge.serve.signal_chain.gain import Gain, GainRule, SaturationRule
 from isocharge.serve.signal_chain.hum import HumRule
-from isocharge.serve.signal_chain.leak import Leak, LeakRule
+from isocharge.serve.signal_chain.leak import LeakRule
 from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.signal_chain.tare import TareRule
 from isocharge.serve.signal_chain.thermal import ThermalRule
@@ -71,14 +72,16 @@ def device(tmp_path):
 
 def test_device_file_with_all_sections(device):
     board = device(FULL)
-    setup = Setup(ELECTRODES, board)
     assert (board.name, board.channels["A"]) == ("bench board 3", "adc1")
-    np.testing.assert_array_equal(Gain(setup).gain_pC, [0.5, -0.25, 0.5])
-    np.testing.assert_array_equal(Leak.c_settings(setup)["tau_s"], [10.0, 10.2, 9.9])
-    hum = board.rule(HumRule)
-    assert (board.rule(SaturationRule).limit_pC, hum.frequency_Hz, hum.settle_s) == (1500, 60.0, 1.0)
-    assert (board.rule(TareRule).frames, board.rule(LeakRule).settle_s) == (50, 5.0)
-    assert board.rule(TouchRule).floor_pC == 20.0
+    rules = [
+        GainRule(pC_per_unit={"A": 0.5, "B": -0.25, "C": 0.5}),
+        SaturationRule(limit_pC=1500),
+        HumRule(frequency_Hz=60.0, settle_s=1.0),
+        TareRule(frames=50),
+        LeakRule(tau_s={"A": 10.0, "B": 10.2, "C": 9.9}, settle_s=5.0),
+        TouchRule(floor_pC=20.0),
+    ]
+    assert board.rules == {type(rule): rule for rule in rules}
     assert isinstance(board.parser(), TextParser)
 
 
@@ -102,8 +105,7 @@ def test_offset_is_subtracted_before_the_gain(device, offset, zero):
 
 def test_device_file_with_a_request(device):
     assert device("[frames]\n").request is None
-    request = device('[frames]\nrequest = "3F 0A"\nrequest_Hz = 50\n').request
-    assert (request.data, request.rate_Hz) == (b"?\n", 50.0)
+    assert device('[frames]\nrequest = "3F 0A"\nrequest_Hz = 50\n').request == Request(b"?\n", 50.0)
     described = 'sync = "55"\nlength = 5\nfields = [{name = "A", type = "f32"}]'
     assert device(f'[frames]\nformat = "described"\nrequest = "01"\n{described}').request.data == b"\x01"
 

@@ -43,12 +43,14 @@ def test_record_that_is_not_a_number_has_no_json(record):
         record(misfit=float("nan")).to_json()
 
 
-def test_schema_accepts_null_only_where_a_value_may_be_unknown(record):
+def test_schema_refuses_missing_and_wrong_values_and_accepts_null_only_where_a_value_may_be_unknown(record, contract):
     validator = jsonschema_rs.Draft7Validator(record_schema(("A", "B")))
     values = json.loads(record().to_json())
     for field in RECORD_FIELDS:
-        if field.name in values:
+        if field.name in contract:
             assert validator.is_valid(values | {field.name: None}) == field.may_be_null, field.name
+            assert not validator.is_valid(values | {field.name: [1.0]}), field.name
+            assert not validator.is_valid({name: values[name] for name in contract if name != field.name}), field.name
 
 
 def test_table_of_the_documentation_has_every_field_with_its_unit_and_meaning(pytestconfig):

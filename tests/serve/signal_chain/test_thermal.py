@@ -123,20 +123,16 @@ def test_reading_is_corrected_in_the_frame_of_the_estimate(leak):
     assert next_reading.charge_pC == pytest.approx(reading.charge_pC, abs=0.01)
 
 
-def test_large_warming_is_flagged():
+def test_large_warming_is_flagged_and_a_clipped_charge_changes_no_warming():
+    chain = chain_in_contact()
+    reading = advance(chain, 15.0, limited=True)
+    assert (reading.flags, warming_of(chain)) == (("saturated",), 0.0)
+    np.testing.assert_allclose(reading.tare_pC, TARE_PC, atol=1.0)
+
     chain = chain_in_contact()
     for _ in range(5):
         reading = advance(chain, 30.0)
     assert reading.flags == ("thermal",)
-
-
-def test_clipped_charge_changes_no_warming():
-    chain = chain_in_contact()
-    previous_pC = warming_of(chain)
-    reading = advance(chain, 15.0, limited=True)
-    assert warming_of(chain) == previous_pC
-    assert reading.flags == ("saturated",)
-    np.testing.assert_allclose(reading.tare_pC, TARE_PC, atol=1.0)
 
 
 def test_touch_begins_without_warming_and_the_correction_stays():
