@@ -1,9 +1,8 @@
-"""The live page's price: what viewers cost the reader, and how old a picture is.
+"""The age of the newest sample when a viewer of the live page has it.
 
-A board of 1 kHz plays on a pseudo-terminal; `isocharge serve stream --live --record` follows it. Rounds without viewers
-and rounds with three (one of which stalls) take turns in one run; each stream is a process of its own, as is the board
-and the viewers. Reported: the reader's latency (last byte to record), the frames that the recording misses, the age of
-the newest sample when a viewer has it.
+A board of 1 kHz plays on a pseudo-terminal, and `isocharge serve stream --live` follows it in a process of its own, as
+is the board. Three viewers read the samples, of which one stalls. The reported age is that of the newest sample in each
+answer.
 
     python tests/benchmarks/bench_live.py --rounds 4 --seconds 10 [--rate-hz 1000]
 """
@@ -18,7 +17,6 @@ import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from itertools import product
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -26,9 +24,8 @@ import bench_stream
 import numpy as np
 from shared import arguments, percentiles, print_results
 
-from isocharge.serve import Recording, Script, wander
+from isocharge.serve import Script, wander
 
-SHARES = (50, 95, 99)
 MODEL = "three-25um-biaxial"
 
 
@@ -39,11 +36,11 @@ def presses(rate_Hz):
     return Script(*columns, rate_Hz)
 
 
-def watch(url, viewers, seconds, results):
-    """Viewers in threads of a process of its own: ages of the newest sample, s. The first one reads no answers."""
+def watch(url, viewers, seconds):
+    """Ages of the newest sample at viewers in threads, s. The first viewer reads no answers."""
     with ThreadPoolExecutor(viewers) as threads:
         ages = threads.map(lambda number: _watch(urlsplit(url).netloc, number == 0, seconds), range(viewers))
-        results.send([age for viewer in ages for age in viewer])
+        return np.array([age for viewer in ages for age in viewer])
 
 
 def _watch(place, stalls, seconds):
@@ -62,38 +59,21 @@ def _watch(place, stalls, seconds):
 
 
 @contextmanager
-def following(port, folder, name, *words):
-    """A stream that follows the port and has its tare; the URL of its page."""
-    said = folder / f"{name}.txt"
+def following(port, folder):
+    """A stream with a live page that follows the port and has its tare; the URL of its page."""
+    said = folder / "said.txt"
     command = [sys.executable, "-m", "isocharge.cli", "serve", "stream", MODEL, "--port", port, "--output", "none"]
     with said.open("w") as output:
-        process = subprocess.Popen([*command, *words], stderr=output)
+        process = subprocess.Popen([*command, "--live", "127.0.0.1:0"], stderr=output)
     try:
         while "tared" not in said.read_text():
             assert process.poll() is None, said.read_text()
             time.sleep(0.05)
-        match = re.search(r"page: (\S+)", said.read_text())
-        yield match[1] if match else ""
+        yield re.search(r"page: (\S+)", said.read_text())[1]
         assert process.poll() is None, said.read_text()
     finally:
         process.terminate()
         process.wait(30)
-
-
-def one_round(port, viewers, seconds, folder, name):
-    """Follow the port for a while: latencies (us), lost frames and ages (s)."""
-    path, (ours, theirs) = folder / f"{name}.rec", multiprocessing.Pipe(duplex=False)
-    words = ["--live", "127.0.0.1:0"] if viewers else []
-    with following(port, folder, name, "--record", path, *words) as url:
-        watching = multiprocessing.Process(target=watch, args=(url, viewers, seconds, theirs))
-        if viewers:
-            watching.start()
-        time.sleep(seconds)
-        ages = ours.recv() if viewers else []
-    latencies = np.array([us for event in Recording(path).events() for us in event.latencies_us])
-    lines = (json.loads(line) for line in path.open() if line.startswith('{"timestamp"'))
-    seq = np.array([line["seq"] for line in lines])
-    return latencies, int(((np.diff(seq) - 1) % 65536).sum()), ages
 
 
 def main():
@@ -103,19 +83,12 @@ def main():
         target=bench_stream.board, args=(far, 3, presses(options.rate_Hz), 0), daemon=True
     )
     board.start()
-    port, p99 = pipe.recv(), {0: [], 3: []}
+    port = pipe.recv()
     with tempfile.TemporaryDirectory() as folder:
-        for number, viewers in product(range(options.rounds), (0, 3)):
-            name = f"round {number}, {viewers} viewers"
-            latencies, lost, ages = one_round(port, viewers, options.seconds, Path(folder), name)
-            p99[viewers].append(float(np.percentile(latencies, 99)))
-            results[name] = {
-                "latency_us": percentiles(latencies, SHARES),
-                "records, lost": (len(latencies), lost),
-                "age_ms": percentiles(1e3 * np.array(ages), SHARES),
-            }
-    ratios = np.array(p99[3]) / p99[0]
-    results["p99 with three viewers over without, by round"] = ratios.round(2).tolist()
+        for number in range(options.rounds):
+            with following(port, Path(folder)) as url:
+                ages_s = watch(url, 3, options.seconds)
+            results[f"round {number}, age in ms"] = percentiles(1e3 * ages_s, (50, 95, 99))
     pipe.send("enough")
     results["board"] = pipe.recv()
     board.join()

@@ -24,7 +24,6 @@ BOARD = {
     "hum": {"frequency_Hz": 50.0},
     "leak": {"tau_s": 1e6},
 }
-SHARES = (50, 99, 99.9)
 
 
 def reference_noise(charge_pC: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -65,24 +64,17 @@ def play(predictor: Predictor, seconds: float, rate_Hz: float, seed: int) -> dic
         for chunk in port:
             for record in path.feed(chunk):
                 record.to_json()
-                latencies.append((record.latency_us, record.contact))
+                latencies.append(record.latency_us)
             if time.perf_counter() - began >= seconds:
                 break
         wall, used = time.perf_counter() - began, time.process_time() - used
     pipe.send("enough")
     played = pipe.recv()
     process.join()
-    return summary(np.array(latencies, dtype=float), path, played) | {"core_share": round(used / wall, 3)}
-
-
-def summary(latencies: np.ndarray, path: TouchStream, played: dict[str, int]) -> dict[str, Any]:
-    """Counters and percentiles; latencies has the columns last byte to record (us), contact."""
-    touched = latencies[latencies[:, 1] == 1.0]
     return asdict(path.totals()) | {
         "board": played,
-        "in_contact": len(touched),
-        "last_byte_to_record_us": percentiles(latencies[:, 0], SHARES),
-        "in_contact_us": percentiles(touched[:, 0], SHARES),
+        "last_byte_to_record_us": percentiles(latencies, (50, 99, 99.9)),
+        "core_share": round(used / wall, 3),
     }
 
 

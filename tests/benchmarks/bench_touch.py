@@ -183,7 +183,6 @@ def accuracy(
     return {
         "position_mm": percentiles(error_mm, PERCENTILES, 3),
         "force_percent": percentiles(force_error_percent, PERCENTILES, 3),
-        "felt_share": round(len(contact_frames) / len(full_force_frames), 4),
         "saturated_share": round(float(is_saturated.mean()), 4),
         "first_reading_ms": percentiles(delays_ms, PERCENTILES, 3),
     }

@@ -1,10 +1,9 @@
-"""Presses on simulated films as a rig measures them, and the errors of the contacts of a calibrated film."""
+"""Presses on simulated films as a rig measures them."""
 
 import numpy as np
 
 from isocharge.serve import MeasuredPresses
 from isocharge.train import CalibrationProblem
-from isocharge.train.data.contact_errors import position_error, rms
 
 POSITION_STD_mm = 0.1
 """Standard deviation of x and y of a press, mm."""
@@ -44,20 +43,3 @@ def measured_presses(problem: CalibrationProblem, contact: np.ndarray, charge: n
         electrodes=problem.electrodes,
         lines=tuple(range(2, count + 2)),
     )
-
-
-def contact_errors(contact: np.ndarray, std: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """Return the root-mean-square errors of contacts, and the shares within two standard deviations.
-
-    Args:
-        contact: Estimated contacts (x, y, F), shape (n, 3), mm and N.
-        std: Reported standard deviations of x, y and F, shape (n, 3), mm and N.
-        truth: True contacts, shape (n, 3), mm and N.
-    """
-    is_within = np.abs(contact - truth) < 2.0 * std
-    return {
-        "position_mm": rms(position_error(contact, truth)),
-        "force_percent": 100.0 * rms(contact[:, 2] / truth[:, 2] - 1.0),
-        "position_coverage": float(is_within[:, :2].mean()),
-        "force_coverage": float(is_within[:, 2].mean()),
-    }
