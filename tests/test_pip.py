@@ -35,14 +35,14 @@ COMMANDS_OF_EXTRAS = {
 """A command that imports the packages of each extra. It runs in an install with this extra only."""
 
 
-def predicted(bin_folder, folder):
-    """The contact that the installed command computes."""
+def check_prediction(bin_folder, folder):
+    """Check the contact that the installed command computes."""
     table = "A,B,C\n942.9,910.4,690.8\n"
     words = [bin_folder / "isocharge", "serve", "predict", "three-25um-biaxial", "-", "--json"]
     done = subprocess.run(words, input=table, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     record = json.loads(done.stdout)
-    return [record["x_mm"], record["y_mm"], record["force_N"]]
+    assert [record["x_mm"], record["y_mm"], record["force_N"]] == pytest.approx([3.0, -2.0, 1.0], abs=0.06)
 
 
 @pytest.fixture(scope="module")
@@ -121,6 +121,13 @@ def run(base, program, *words, timeout=60, **options):
     return finished([base / program, *words], timeout=timeout, **options)
 
 
+def check_example(bin_folder, folder, page, number):
+    """Check that a Python example of a page prints what its comments say."""
+    example = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)[number]
+    done = run(bin_folder, "python", "-c", example, cwd=folder)
+    assert done.stdout.splitlines() == re.findall(r"^print\(.*\)  # (.+)$", example, re.MULTILINE), done.stderr
+
+
 def test_twine_accepts_both_distributions(distributions):
     names = [path.name for path in distributions]
     assert names == [f"isocharge-{VERSION}-py3-none-any.whl", f"isocharge-{VERSION}.tar.gz"]
@@ -159,15 +166,13 @@ def test_the_size_of_the_base_install_is_as_stated(base):
 
 
 def test_predict_works_from_any_folder(base, tmp_path):
-    assert predicted(base, tmp_path) == pytest.approx([3.0, -2.0, 1.0], abs=0.06)
+    check_prediction(base, tmp_path)
 
 
 @pytest.mark.parametrize(("page", "number"), [("README.md", 0), ("serve/docs/tutorial.md", 1)])
 def test_examples_of_the_base_install_work_from_any_folder(base, tmp_path, page, number):
     """The examples print what their comments say in an installation without extras."""
-    example = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)[number]
-    done = run(base, "python", "-c", example, cwd=tmp_path)
-    assert done.stdout.splitlines() == re.findall(r"^print\(.*\)  # (.+)$", example, re.MULTILINE), done.stderr
+    check_example(base, tmp_path, page, number)
 
 
 @pytest.mark.parametrize("stage", ["simulate", "train"])
@@ -190,7 +195,7 @@ def check_help_and_missing_argument(bin_folder, folder):
 @pytest.mark.slow
 def test_the_base_install_works_with_the_lower_bounds_of_its_packages(wheel, tmp_path):
     bin_folder = install([wheel], tmp_path, timeout=280, constraints=lower_bounds())
-    assert predicted(bin_folder, tmp_path) == pytest.approx([3.0, -2.0, 1.0], abs=0.06)
+    check_prediction(bin_folder, tmp_path)
     check_help_and_missing_argument(bin_folder, tmp_path)
 
 
@@ -214,9 +219,7 @@ def test_the_base_tests_pass_with_the_lower_bounds_of_all_packages(tmp_path):
 @pytest.mark.parametrize("extra", sorted(COMMANDS_OF_EXTRAS))
 def test_the_wheel_with_an_extra_runs_the_readme_and_a_command_of_the_extra(wheel, tmp_path, extra, constraints):
     bin_folder = install([f"{wheel}[{extra}]"], tmp_path, 3000, constraints)
-    example = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)[1]
-    done = run(bin_folder, "python", "-c", example, cwd=tmp_path)
-    assert done.stdout.splitlines() == re.findall(r"^print\(.*\)  # (.+)$", example, re.MULTILINE), done.stderr
+    check_example(bin_folder, tmp_path, "README.md", 0)
     (tmp_path / "frames.txt").write_text("942.9,910.4,690.8\n" * 200)
     write_table(table({"A": [942.9], "B": [910.4], "C": [690.8]}), tmp_path / "charges.parquet")
     done = run(bin_folder, "isocharge", *COMMANDS_OF_EXTRAS[extra].split(), cwd=tmp_path, timeout=600)

@@ -30,6 +30,7 @@ from isocharge.simulate.forward.readout import (
 )
 from isocharge.simulate.numerics.polygon import to_corners
 
+UNIAXIAL = load_sensor("four-25um-uniaxial")
 AREA = 9.0
 D31 = 20.0
 D32 = 2.0
@@ -54,7 +55,7 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
 
 @pytest.fixture(params=["area", "edge"])
 def sensor(request) -> Sensor:
-    return replace(load_sensor("four-25um-uniaxial"), readout=request.param)
+    return replace(UNIAXIAL, readout=request.param)
 
 
 @pytest.mark.parametrize("per_side", [1, 3, 12])
@@ -69,7 +70,7 @@ def test_linear_stress_is_read_at_the_centre(sensor, per_side):
 def test_edge_readout_equals_equation_3_of_the_paper():
     """Quadratic stresses distinguish the edges: s11 on the left and right, s22 on the lower and upper edges (eq. 3)."""
     square = Electrode.of_square("A", (5.0, -2.0), 3.0)
-    sensor = replace(load_sensor("four-25um-uniaxial"), electrodes=(square,), readout="edge")
+    sensor = replace(UNIAXIAL, electrodes=(square,), readout="edge")
     h2 = 1.5**2
 
     def over_x(x, _):
@@ -86,7 +87,7 @@ def test_edge_readout_equals_equation_3_of_the_paper():
 
 def test_edges_of_a_turned_pattern_are_those_of_the_same_squares(solved):
     """The pattern of four squares has the same squares after a quarter turn, with other names."""
-    sensor = replace(load_sensor("four-25um-uniaxial"), readout="edge")
+    sensor = replace(UNIAXIAL, readout="edge")
     turned = replace(sensor, calibration=Calibration(rotation=0.5 * np.pi))
     np.testing.assert_allclose(sorted(touch_charge(turned, solved)), sorted(touch_charge(sensor, solved)), rtol=1e-9)
 
@@ -116,7 +117,7 @@ def test_a_trace_collects_the_stress_under_it(film, at):
     for low, high in (((8.5, -1.5), (11.5, 1.5)), ((11.5, -0.25), (18.25, 0.25)), ((17.75, 0.25), (18.25, 20.0))):
         points, cell = midpoints(low, high)
         expected += cell * float((touch_stress(solved, points)[:, :2] @ [D31, D32]).sum())
-    charge = touch_charge(replace(load_sensor("four-25um-uniaxial"), electrodes=(traced,)), solved)
+    charge = touch_charge(replace(UNIAXIAL, electrodes=(traced,)), solved)
     assert charge[0] == pytest.approx(expected, rel=1e-4)
 
 
@@ -151,7 +152,7 @@ def test_pressure_and_thermal_charge_only_where_front_and_back_overlap():
 def test_each_rule_is_accurate_from_its_smallest_distance_on(film, readout):
     """The electrode lies at the smallest distance at which the forward map uses the rule."""
     electrode = Electrode.of_square("A", (10.0, 0.0), 3.0)
-    sensor = replace(load_sensor("four-25um-uniaxial"), electrodes=(electrode,), readout=readout)
+    sensor = replace(UNIAXIAL, electrodes=(electrode,), readout=readout)
     reach = 1.0
     unit = 1.5 * np.sqrt(2.0) + reach
     for smallest_distance, tolerance in ((0.0, 2e-4), (NEAR_DISTANCE, 1e-4)):
@@ -168,7 +169,7 @@ def test_small_probe_on_a_large_electrode(film, probe):
     cells = [Electrode.of_square("A", (x, y), 0.5) for x in centres for y in centres]
     pressed = press(film, probe, (2.3, -1.1), 0.5)
     points = ElectrodePieces.covering(cells)
-    large = replace(load_sensor("four-25um-uniaxial"), electrodes=(Electrode.of_square("A", (0.0, 0.0), 24.0),))
+    large = replace(UNIAXIAL, electrodes=(Electrode.of_square("A", (0.0, 0.0), 24.0),))
     expected = 0.0
     for rule in points.rules(Circle(100.0), np.zeros(1), (12, 12)):
         stress = touch_stress(pressed, to_corners(rule.points.ravel())).reshape(*rule.points.shape, 3)
@@ -187,8 +188,7 @@ def test_touch_charge_with_another_film_raises_error(solved):
 
 
 def with_d33(d33: float = -30.0, **changes) -> Sensor:
-    sensor = load_sensor("four-25um-uniaxial")
-    return replace(sensor, piezo=replace(sensor.piezo, d33=d33), **changes)
+    return replace(UNIAXIAL, piezo=replace(UNIAXIAL.piezo, d33=d33), **changes)
 
 
 @pytest.mark.parametrize(
@@ -251,7 +251,7 @@ def test_thermal_charge():
 
 def test_thermal_charge_of_a_clamped_film_contains_the_charge_of_its_changed_tension():
     """A film that cannot expand has the plane stress -E alpha / (1 - nu) per kelvin in all directions."""
-    sensor = load_sensor("four-25um-uniaxial")
+    sensor = UNIAXIAL
     film = replace(sensor.film, expansion=(1e-4, 1e-4))
     sensor = replace(sensor, film=film, piezo=Piezo(20.0, 2.0, pyro=-30.0))
     stress = -film.young * 1e-4 / (1.0 - film.poisson)  # MPa/K

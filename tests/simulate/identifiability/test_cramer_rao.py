@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from function_map import FunctionMap
+from function_map import round_map
 from isocharge.simulate import ChargeSpline, Domain, Electrode, NoiseModel, limits_at, noise_model
 from isocharge.simulate.identifiability.cramer_rao import cramer_rao
 
@@ -15,13 +15,7 @@ REFERENCE = noise_model("reference")
 AT = np.array([[8.0, 0.0], [0.0, 8.0], [-8.0, 0.0], [0.0, -8.0]])
 
 
-def far_field(contact):
-    """Return charges that decrease with the distance from four electrodes and are proportional to F^(2/3), pC."""
-    distance = np.linalg.norm(contact[:, None, :2] - AT, axis=2)
-    return 1e3 * contact[:, 2:] ** (2.0 / 3.0) / (1.0 + (distance / 10.0) ** 2)
-
-
-MAP = FunctionMap(far_field, ("A", "B", "C", "D"), Domain(6.0, (0.05, 2.0)))
+MAP = round_map(AT, Domain(6.0, (0.05, 2.0)))
 CONTACT = np.array([[1.0, -2.0, 0.3], [4.0, 3.0, 1.5]])
 
 
@@ -70,7 +64,7 @@ def test_nuisances_are_equivalent_to_correlated_noise():
 
 def test_limit_of_an_unobservable_parameter_is_large():
     """The charges do not depend on y."""
-    blind = replace(MAP, function=lambda contact: far_field(contact * [1.0, 0.0, 1.0]))
+    blind = replace(MAP, function=lambda contact: MAP.charges(contact * [1.0, 0.0, 1.0]))
     limits = limits_at(blind, CONTACT, REFERENCE)
     assert np.isfinite(limits.position).all()
     assert (limits.position > 1000.0).all()

@@ -6,7 +6,7 @@ from scipy.optimize import least_squares
 from tests.simulate.conftest import COARSE
 
 from drawn_contacts import draw_contacts
-from function_map import FunctionMap
+from function_map import round_map
 from isocharge.common.errors import ChargeError, SceneError
 from isocharge.simulate import (
     ChargeSpline,
@@ -20,20 +20,10 @@ from isocharge.simulate import (
 )
 from kept import kept
 
-RADIUS = 8.0
 FORCES = (0.2, 2.0)
+DOMAIN = Domain(8.0, FORCES)
 LAYOUTS = {name: load_sensor(f"{name}-25um-biaxial") for name in ("three", "four")}
 CENTRES = {name: np.array([electrode.centre for electrode in sensor.electrodes]) for name, sensor in LAYOUTS.items()}
-
-
-def round_map(centres: np.ndarray, forces: tuple[float, float] = FORCES) -> FunctionMap:
-    """Return a map whose charges depend on the distance from each electrode only, so its contours are circles."""
-
-    def charges(contact):
-        distance = np.linalg.norm(contact[:, None, :2] - centres, axis=2)
-        return 1e3 * contact[:, 2:] ** (2.0 / 3.0) / (1.0 + (distance / 12.0) ** 2)
-
-    return FunctionMap(charges, tuple("ABCD"[: len(centres)]), Domain(RADIUS, forces))
 
 
 def errors(fix, contact: np.ndarray) -> np.ndarray:
@@ -43,7 +33,7 @@ def errors(fix, contact: np.ndarray) -> np.ndarray:
 
 def test_triangulation_agrees_with_least_squares_of_scipy():
     """The four charges are not those of any press. The result is then the minimum that a general solver finds."""
-    charge_map = round_map(CENTRES["four"])
+    charge_map = round_map(CENTRES["four"], DOMAIN)
     charge = charge_map.charges(np.array([[2.0, -1.0, 0.8]])) * (1.0 + 0.01 * np.array([1, 1, -1, -1.5]))
     fix = Triangulation(charge_map).locate(charge)
 
@@ -93,7 +83,7 @@ def test_contours_that_do_not_meet_have_no_contact(triangle_map, on_film):
 
 def test_contours_that_meet_twice_have_no_contact():
     """If all electrodes lie on a line, the circles also meet at the mirror image of the position."""
-    charge_map = round_map(np.array([[-9.0, 0.0], [0.0, 0.0], [9.0, 0.0]]))
+    charge_map = round_map(np.array([[-9.0, 0.0], [0.0, 0.0], [9.0, 0.0]]), DOMAIN)
     fix = Triangulation(charge_map).locate(charge_map.charges(np.array([[1.0, 3.0, 1.0]])))
     assert np.isnan(fix.contact).all()
     assert fix.spread[0] < 1e-3
@@ -115,10 +105,10 @@ def test_charge_map_with_folds_has_two_positions():
 )
 def test_impossible_triangulation_raises_an_error(count, tolerance, message):
     with pytest.raises(SceneError, match=message):
-        Triangulation(round_map(CENTRES["three"][:count]), tolerance=tolerance)
+        Triangulation(round_map(CENTRES["three"][:count], DOMAIN), tolerance=tolerance)
 
 
 @pytest.mark.parametrize("charge", [np.ones(3), np.ones((2, 4)), [[1.0, np.nan, 1.0]]])
 def test_wrong_charges_raise_a_charge_error(charge):
     with pytest.raises(ChargeError, match=r"expected finite charges of shape \(n, 3\) for .*, got shape"):
-        Triangulation(round_map(CENTRES["three"])).locate(charge)
+        Triangulation(round_map(CENTRES["three"], DOMAIN)).locate(charge)

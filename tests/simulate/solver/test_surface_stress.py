@@ -48,6 +48,11 @@ def outer(film, force: float, c: float, r: float) -> tuple[float, float]:
     return scale * (second + nu * slope / r), scale * (slope / r + nu * second)
 
 
+def pressed_in_the_centre(film, radius):
+    """Solve a plate under a small force on a disk, whose radius is given in mm."""
+    return press(film, Circle(radius), (0.0, 0.0), FORCE, SolveSettings(theory=PLATE, resolution=FINE))
+
+
 def surface_stress(solved, surface: str, points: np.ndarray) -> np.ndarray:
     return touch_stress(solved, points, surface) - touch_stress(solved, points)
 
@@ -56,7 +61,7 @@ def surface_stress(solved, surface: str, points: np.ndarray) -> np.ndarray:
 def test_bending_stress_outside_the_footprint(thick, share):
     """Radial and hoop stress of a clamped plate at the top surface, up to the rim."""
     c = share * thick.radius
-    solved = press(thick, Circle(c), (0.0, 0.0), FORCE, SolveSettings(theory=PLATE, resolution=FINE))
+    solved = pressed_in_the_centre(thick, c)
     for r in (1.5 * c, 0.6 * thick.radius, 0.99 * thick.radius):
         points = r * np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), np.sqrt([0.5, 0.5])])
         radial, hoop = outer(thick, FORCE, c, r)
@@ -74,7 +79,7 @@ def test_bending_stress_under_the_centre_of_the_probe(thick, share):
     The moment is M = F (1 + nu) / (4 pi) (ln(a / c) + c^2 / (4 a^2)).
     """
     c = share * thick.radius
-    solved = press(thick, Circle(c), (0.0, 0.0), FORCE, SolveSettings(theory=PLATE, resolution=FINE))
+    solved = pressed_in_the_centre(thick, c)
     moment = FORCE * (1.0 + thick.poisson) / (4.0 * np.pi) * (np.log(1.0 / share) + 0.25 * share**2)
     found = surface_stress(solved, "top", np.array([(1e-6, 0.0)]))[0]
     np.testing.assert_allclose(found[:2], -6.0 * moment / thick.thickness**2, rtol=1e-3)
@@ -82,10 +87,9 @@ def test_bending_stress_under_the_centre_of_the_probe(thick, share):
 
 def test_charge_of_a_surface_is_the_integral_of_its_stress(thick):
     """The charge of a small electrode is A (d31 s11 + d32 s22) with the stress at its surface."""
-    probe = Circle(2.0)
     electrode = Electrode.of_square("A", (12.05, 0.05), 0.1)
     sensor = replace(load_sensor("four-25um-uniaxial"), film=thick, electrodes=(electrode,))
-    solved = press(thick, probe, (0.0, 0.0), FORCE, SolveSettings(theory=PLATE, resolution=FINE))
+    solved = pressed_in_the_centre(thick, 2.0)
     for surface, sign in (("top", 1.0), ("bottom", -1.0)):
         charge = touch_charge(replace(sensor, surface=surface), solved) - touch_charge(sensor, solved)
         radial, hoop = outer(thick, FORCE, 2.0, 12.05)

@@ -6,6 +6,7 @@ from tests.benchmarks.measured_films import measured_presses, with_rig_errors
 from tests.train.calibration.synthetic_film import SyntheticFilm
 
 from isocharge.train.calibration import calibrate as calibrate_module
+from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.data.presses import draw_contacts
 
 
@@ -33,3 +34,12 @@ def rig(problem, charges, count, seed, values=None):
     contact = draw_contacts(rng, problem.domain, count)
     charge = problem.noise.add(charges.charges(values, contact), rng)
     return values, contact, measured_presses(problem, with_rig_errors(contact, rng), charge)
+
+
+def uneven_film(problem):
+    """Return the estimate of a film whose tension is uneven, without uncertainty."""
+    layout = problem.prior.layout
+    values = problem.prior.mean.copy()
+    values[layout.index("pretension")] = 1.2
+    values[layout.index("tension_difference")] = -0.25
+    return FilmEstimate(layout, values, np.zeros((len(values), len(values))))

@@ -5,22 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.benchmarks.solved_films import solve_charges
-from tests.train.calibration.conftest import rig
+from tests.train.calibration.conftest import rig, uneven_film
 
 from isocharge.train import calibrate
 from isocharge.train.calibration.calibrate import solve_even
 from isocharge.train.calibration.estimator import PLANNED
-from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.film_network import _nodes, _tension_factors
-
-
-def uneven_film(problem):
-    """Return the estimate of a film whose tension is uneven, without uncertainty."""
-    layout = problem.prior.layout
-    values = problem.prior.mean.copy()
-    values[layout.index("pretension")] = 1.2
-    values[layout.index("tension_difference")] = -0.25
-    return FilmEstimate(layout, values, np.zeros((len(values), len(values))))
 
 
 @pytest.mark.slow
@@ -53,9 +43,7 @@ def test_estimate_does_not_depend_on_the_film_that_is_solved_first(problem):
     """Touches at unknown places show the pretension, although the first solved film is far from the real film."""
     layout = problem.prior.layout
     tension, difference = layout.index("pretension"), layout.index("tension_difference")
-    values = problem.prior.mean.copy()
-    values[[tension, difference]] = 1.2, -0.25
-    earlier = FilmEstimate(layout, values, 0.01 * problem.prior.covariance(PLANNED))
+    earlier = replace(uneven_film(problem), covariance=0.01 * problem.prior.covariance(PLANNED))
     later = earlier.film_values.copy()
     later[[tension, difference]] = 0.8, -0.25 * 1.2 / 0.8
     film = solve_even(problem, values=later)

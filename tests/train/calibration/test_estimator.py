@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 from tests.benchmarks.measured_films import measured_presses, with_rig_errors
-from tests.train.calibration.conftest import rig
+from tests.train.calibration.conftest import rig, uneven_film
 
 from isocharge.serve.model.robust_estimate import robust_estimate
 from isocharge.simulate import NoiseModel, noise_model
@@ -16,7 +16,7 @@ from isocharge.simulate.mechanics.warming import warmed
 from isocharge.train.calibration import estimator
 from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.estimator import Hypothesis, Prior, estimate, hypotheses
-from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, terms
+from isocharge.train.calibration.film_estimate import SESSION, terms
 from isocharge.train.calibration.press_data import Linearised, PressData, PressErrors
 from isocharge.train.data.presses import draw_contacts
 
@@ -119,11 +119,15 @@ def test_estimate_minimises_the_sum_of_squares_of_all_unknowns_and_contacts(prob
 
 def test_ellipses_of_contacts_contain_95_percent_on_films_of_all_hypotheses(problem, synthetic, monkeypatch):
     """The films are drawn from the hypotheses with their probabilities. To save time, there are only 32 hypotheses."""
-    monkeypatch.setattr(estimator, "IMPERFECTION_SCALES", ((0.1, 0.5), (1.5, 0.5)))
-    monkeypatch.setattr(estimator, "DISCREPANCY_SIZES", ((0.001, 0.5), (0.01, 0.5)))
-    monkeypatch.setattr(estimator, "FORCE_SCATTERS", ((0.0, 1.0),))
-    monkeypatch.setattr(estimator, "POSITION_RATIOS", ((1.0, 1.0),))
-    monkeypatch.setattr(estimator, "NOISE_RATIOS", ((1.0, 0.5), (8.0, 0.5)))
+    few_values = {
+        "IMPERFECTION_SCALES": ((0.1, 0.5), (1.5, 0.5)),
+        "DISCREPANCY_SIZES": ((0.001, 0.5), (0.01, 0.5)),
+        "FORCE_SCATTERS": ((0.0, 1.0),),
+        "POSITION_RATIOS": ((1.0, 1.0),),
+        "NOISE_RATIOS": ((1.0, 0.5), (8.0, 0.5)),
+    }
+    for name, values_and_probabilities in few_values.items():
+        monkeypatch.setattr(estimator, name, values_and_probabilities)
     within = []
     for seed in range(16):
         rng = np.random.default_rng([seed, 3])
@@ -201,11 +205,10 @@ def test_touches_at_unknown_places_find_a_change_of_the_pretension(problem, synt
 def test_warming_changes_the_shares_of_the_uneven_tension(problem):
     """Temperature adds the same tension in all directions, so the difference of the tensions in MPa remains."""
     layout = problem.prior.layout
-    values = problem.prior.mean.copy()
     tension, difference = layout.index("pretension"), layout.index("tension_difference")
-    values[[tension, difference]] = 1.2, -0.25
-    drift = FilmEstimate(layout, values, np.zeros((len(values), len(values)))).drifted().covariance
-    sensor, _ = layout.prior.film(values[layout.film])
+    estimate_of_film = uneven_film(problem)
+    drift = estimate_of_film.drifted().covariance
+    sensor, _ = layout.prior.film(estimate_of_film.film_values)
     film = replace(sensor.film, expansion=(100e-6, 100e-6), ring_expansion=23e-6)
     warm = warmed(replace(sensor, film=film), 0.01).film
     expected_slope = (warm.deviator[0] / warm.pretension + 0.25) / (warm.pretension - 1.2)

@@ -41,7 +41,7 @@ def test_presses_with_few_forces_determine_no_higher_powers_of_the_force(film, f
 
 
 def test_too_few_presses_are_refused():
-    few = LabelledPresses(draw_contacts(np.random.default_rng(0), DOMAIN, 50), np.ones((50, 3)))
+    few = draw_presses(np.ones_like, 50)
     with pytest.raises(TrainingError, match="expected at least 448 presses"):
         fit_charge_series(DOMAIN, ("A", "B", "C"), few, few)
 
@@ -49,18 +49,25 @@ def test_too_few_presses_are_refused():
 REFERENCE = noise_model("reference")
 
 
-def fit_field(charges):
-    """Fit a charge series to 3,000 presses.
+def draw_presses(charges, count=3000):
+    """Draw presses without noise.
 
     Args:
-        charges: Function from x, y and F, shape (n,) each, to charges, shape (n, n_electrode).
+        charges: Function from contacts, shape (n, 3), mm and N, to charges, shape (n, n_electrode), pC.
+        count: Number of presses.
+    """
+    contact = draw_contacts(np.random.default_rng(0), DOMAIN, count)
+    return LabelledPresses(contact, charges(contact))
+
+
+def fit_field(charges, count=3000):
+    """Fit a charge series to the presses of `draw_presses`, of which a sixth are for the validation.
 
     Returns:
         The series and the presses.
     """
-    contact = draw_contacts(np.random.default_rng(0), DOMAIN, 3000)
-    presses = LabelledPresses(contact, charges(*contact.T))
-    is_validation = np.arange(3000) % 6 == 0
+    presses = draw_presses(charges, count)
+    is_validation = np.arange(count) % 6 == 0
     return fit_charge_series(DOMAIN, ("A", "B", "C"), presses[~is_validation], presses[is_validation]), presses
 
 
@@ -70,7 +77,8 @@ def charges_folded_at(fold_x):
     The logarithm of the second charge is 0.1 (x - x^2 / (2 fold_x)), whose slope changes its sign there.
     """
 
-    def charges(x, y, force):
+    def charges(contact):
+        x, y, force = contact.T
         log_ratios = np.stack([0.0 * x, 0.1 * (x - x**2 / (2.0 * fold_x)), 0.1 * y], axis=1)
         return force[:, None] ** 0.7 * np.exp(log_ratios)
 
@@ -80,7 +88,8 @@ def charges_folded_at(fold_x):
 def test_field_of_a_taut_film_follows_the_change_of_the_exponent_of_the_force():
     """The charges grow with F below 0.3 N and with F^(2/3) above it; two powers of ln F leave an error of 1 %."""
 
-    def charges(x, y, force):
+    def charges(contact):
+        x, y, force = contact.T
         growth = force / np.cbrt(1.0 + force / 0.3)
         return 500.0 * growth[:, None] * np.exp(0.05 * np.stack([x + y, x - y, -x], axis=1))
 
@@ -110,8 +119,9 @@ def test_probable_fold_of_presses_with_two_probes_is_stated():
     charges = charges_folded_at(3.0)
     has_second_probe = np.random.default_rng(1).random(3000) < 0.5
 
-    def of_two_probes(x, y, force):
-        return charges(x, y, force) * (1.0 - 0.02 * has_second_probe * np.hypot(x, y) / 8.0)[:, None]
+    def of_two_probes(contact):
+        x, y, _ = contact.T
+        return charges(contact) * (1.0 - 0.02 * has_second_probe * np.hypot(x, y) / 8.0)[:, None]
 
     field, presses = fit_field(of_two_probes)
     domain, (caution,) = invertible_domain(field, presses, REFERENCE)
@@ -121,9 +131,7 @@ def test_probable_fold_of_presses_with_two_probes_is_stated():
 
 
 def test_spurious_folds_of_a_poor_fit_are_not_stated(film):
-    contact = draw_contacts(np.random.default_rng(0), DOMAIN, 600)
-    presses = LabelledPresses(contact, film.charges(contact))
-    field = fit_charge_series(DOMAIN, film.electrodes, presses[60:], presses[:60])
+    field, presses = fit_field(film.charges, 600)
     assert field.charge_std > 1e-3
     assert invertible_domain(field, presses, REFERENCE) == (DOMAIN, ())
 
@@ -137,12 +145,12 @@ def test_fold_near_the_centre_is_refused():
 def test_charge_series_of_the_whole_domain_and_a_caution_are_released_if_the_domain_is_reduced(
     sensor, split, tmp_path, caplog
 ):
-    contact = draw_contacts(np.random.default_rng(0), DOMAIN, 3000)
-    presses = LabelledPresses(contact, 1000.0 * charges_folded_at(5.0)(*contact.T))
+    charges = charges_folded_at(5.0)
+    presses = draw_presses(lambda contact: 1000.0 * charges(contact))
     data = TrainingData(sensor=sensor, probes=("circle:1.0",), domain=DOMAIN, presses=presses, sha256="0" * 64)
     fitted = fit(data, short_training(8, 8, 5, 5, 1_000))
     series = charge_map_from_bytes(fitted.files["charges.npz"], ("A", "B", "C"))
-    assert np.allclose(series.charges(contact), presses.charge, rtol=2e-3)
+    assert np.allclose(series.charges(presses.contact), presses.charge, rtol=2e-3)
     assert fitted.domain.radius < 5.2 < series.domain.radius
     assert split.folded_charges is None
 

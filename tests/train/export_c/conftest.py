@@ -103,11 +103,13 @@ class Exported:
             frames.append((seq, t_us, flags, tuple(frame_values[:n_value].tolist())))
         return frames, tuple(counts)
 
-    def encode(self, seq, t_us, flags, values):
+    def encode(self, frame):
         """Return the bytes of a frame."""
-        charges = np.array(values, dtype=np.float32)
+        charges = np.array(frame.values, dtype=np.float32)
         data = ctypes.create_string_buffer(2000)
-        size = self.library.bridge_encode(seq, ctypes.c_uint32(t_us), len(values), flags, _pointer(charges), data)
+        size = self.library.bridge_encode(
+            frame.seq, ctypes.c_uint32(frame.t_us), len(charges), frame.bits, _pointer(charges), data
+        )
         return data.raw[:size]
 
     def clock(self, t_us):

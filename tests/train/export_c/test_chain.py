@@ -279,14 +279,14 @@ def test_c_and_python_parse_any_bytes_into_the_same_frames_and_counters(exported
 @given(frame=FRAMES)
 @settings(max_examples=100, deadline=None)
 def test_c_and_python_write_the_same_frames(exported, frame):
-    assert exported.encode(frame.seq, frame.t_us, frame.bits, frame.values) == encode_frame(frame)
+    assert exported.encode(frame) == encode_frame(frame)
 
 
 @pytest.mark.parametrize("n_value", [0, 1, 60, 61, 62, 63, 124, 125, 126, 255])
 def test_frames_without_a_zero_byte_are_divided_after_254_bytes(exported, n_value):
     values = np.frombuffer(b"\1\1\1\1" * n_value, np.float32).tolist()
     frame = Frame(0x0101, 0x01010101, values, 1)
-    assert exported.encode(frame.seq, frame.t_us, frame.bits, frame.values) == encode_frame(frame)
+    assert exported.encode(frame) == encode_frame(frame)
     frames, _ = exported.frames(encode_frame(frame))
     assert frames == [(frame.seq, frame.t_us, 1, tuple(frame.values))]
 

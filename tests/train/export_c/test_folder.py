@@ -158,6 +158,9 @@ def test_host_example_says_what_is_wrong(host, tmp_path):
     assert played(program, tmp_path / "noisy", 1, 2)[0] == 2
 
 
+needs_compiler_of_sketches = pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not installed")
+
+
 def run_sketch(export, folder, pins, *options, start_us=0):
     """What the sketch sends, compiled with a host's Arduino, while its pins read these counts from `start_us` on."""
     objects = []
@@ -171,7 +174,7 @@ def run_sketch(export, folder, pins, *options, start_us=0):
     return subprocess.run([folder / "sketch"], input=lines.encode(), capture_output=True, check=True).stdout
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not installed")
+@needs_compiler_of_sketches
 def test_sketch_prints_our_contacts_and_sends_frames_that_we_read(exports, tmp_path):
     """Rest, a press of some hundred counts, rest."""
     export = exports[0] / "arduino" / "isocharge_sketch"
@@ -189,7 +192,7 @@ def test_sketch_prints_our_contacts_and_sends_frames_that_we_read(exports, tmp_p
     assert [frame.t_us for frame in frames[:2]] == [5000, 10000]
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not installed")
+@needs_compiler_of_sketches
 def test_clock_of_a_board_that_begins_again_leaves_the_hum_removed(tmp_path):
     """After 71.6 minutes, `micros` is 0 again. A hum with another phase would look like touches."""
     device = device_from_table({"hum": {"frequency_Hz": 50.0}}, "x")

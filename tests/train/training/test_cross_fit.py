@@ -197,30 +197,23 @@ def test_charges_between_places_that_were_pressed_many_times_fit_the_presses():
     assert 0.1 < np.median(np.abs(residual)) < 0.4
 
 
+def with_column(name, column, new_values):
+    """Return the presses on the L with other values in one column of their contacts or of their charges.
+
+    Args:
+        name: "contact" for the contacts (x, y, F), or "charge_pC".
+        column: Number of the column.
+        new_values: Function from all columns, shape (n, n_column), to the values of this column, shape (n,).
+    """
+    presses = presses_on_l()
+    rows = getattr(presses, name).copy()
+    rows[:, column] = new_values(rows)
+    return replace(presses, **{name: rows})
+
+
 def with_channel(channel, new_charge):
-    """Return the presses on the L with other charges of one channel.
-
-    Args:
-        channel: Number of the channel.
-        new_charge: Function from the charges of all channels, shape (n, 4), to those of the channel, shape (n,).
-    """
-    presses = presses_on_l()
-    charge = presses.charge_pC.copy()
-    charge[:, channel] = new_charge(charge)
-    return measured_presses(presses.contact, charge, CHANNELS)
-
-
-def with_contact(column, new_values):
-    """Return the presses on the L with another column of the contact.
-
-    Args:
-        column: Number of the column: 0 for x, 1 for y, 2 for the force.
-        new_values: Function from the contacts, shape (n, 3), to the values of the column, shape (n,).
-    """
-    presses = presses_on_l()
-    contact = presses.contact.copy()
-    contact[:, column] = new_values(contact)
-    return measured_presses(contact, presses.charge_pC, CHANNELS)
+    """Return the presses on the L with other charges of one channel; see `with_column`."""
+    return with_column("charge_pC", channel, new_charge)
 
 
 def in_eighth_press(value, column):
@@ -247,7 +240,10 @@ FAULTY_PRESSES = {
         with_channel(2, in_eighth_press(1e37, 2)),
         r"^line 9, column 'Q3': expected a value of the size of the others, whose median is .* got 1e\+37; correct it",
     ),
-    "a force of 1e20": (with_contact(2, in_eighth_press(1e20, 2)), r"^line 9, column 'force_N': .* got 1e\+20"),
+    "a force of 1e20": (
+        with_column("contact", 2, in_eighth_press(1e20, 2)),
+        r"^line 9, column 'force_N': .* got 1e\+20",
+    ),
     "a channel that is constant but for rounding": (
         with_channel(2, lambda charge: 5.0 + 1e-12 * charge[:, 2]),
         "channel 'Q3': expected charges that vary, got 5 in 1200 of 1200",
@@ -257,10 +253,10 @@ FAULTY_PRESSES = {
         "channel 'Q3': expected charges that vary, got 0 in 1199 of 1200 presses",
     ),
     "positions with one y but for rounding": (
-        with_contact(1, lambda _: 3.0 + 1e-9 * JITTER),
+        with_column("contact", 1, lambda _: 3.0 + 1e-9 * JITTER),
         "got 1200 places on one line; press beside it, too",
     ),
-    "one position": (with_contact(slice(2), lambda _: np.ones((1_200, 2))), "got 1200 at 1; measure more"),
+    "one position": (with_column("contact", slice(2), lambda _: np.ones((1_200, 2))), "got 1200 at 1; measure more"),
 }
 """Presses of which each has one fault, and the message that names the fault."""
 
