@@ -222,8 +222,7 @@ def start_http(stopping):
     started = []
 
     def start(app, *, tls=None, uds=None):
-        settings = (app.limits, app.traffic) if isinstance(app, Handler) else ()
-        server = HttpServer(app, Address(uds=uds), *settings, tls=tls)
+        server = HttpServer(app, Address(uds=uds), tls)
         thread = Thread(target=server.run)
         thread.start()
         started.append((server, thread))

@@ -25,7 +25,7 @@ def test_invalid_tokens_are_refused(token):
 def test_tls_files_that_cannot_be_used(handler, tls_files, certificate, key):
     tls = Tls(tls_files / certificate, key and tls_files / key)
     with pytest.raises(InputError, match=r"pem.*|tls.*: not a certificate and its unencrypted private key"):
-        HttpServer(handler, Address(), tls=tls)
+        HttpServer(handler, Address(), tls)
 
 
 def test_server_on_a_unix_socket_takes_over_a_socket_left_by_a_killed_server(handler, start_http, tmp_path):

@@ -82,7 +82,7 @@ def http_command(
         for reason in store.refusals():
             log.warning("refused: %s", reason)
         handler = Handler(store, traffic=traffic, access=access)
-        server = HttpServer(handler, address, handler.limits, traffic, tls=tls)
+        server = HttpServer(handler, address, tls)
         load_all = unless_hung_up(lambda: threading.Thread(target=_load_all, args=[store], name="load").start())
         with (
             closing(server),

@@ -27,6 +27,7 @@ from isocharge.serve.flags import MEANINGS
 from isocharge.serve.network.address import Address, ServerLimits, Tls
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.http import HttpServer
+from isocharge.serve.network.metrics import Traffic
 from isocharge.serve.network.protocol.handler import Application
 from isocharge.serve.network.protocol.response import Response, json_response, response_of
 from isocharge.serve.record.record import PredictionRecord
@@ -140,6 +141,7 @@ class LivePage(Application):
         dtype = sample_type(self._electrodes)
         self.tape: Tape = RecordedTape(dtype) if is_recording else Tape(dtype)
         self.act: Callable[[Action], None] | None = None
+        self.traffic = Traffic()
         self._access = access or AccessCheck()
         self._markers: deque[tuple[float, str]] = deque(maxlen=MAX_MARKERS)
         self._state: dict[str, Any] = {}
@@ -231,7 +233,7 @@ def serve_page(page: LivePage, address: Address, tls: Tls | None = None) -> Iter
         InputError: If the TLS files cannot be used.
         ListenError: If the address is in use or cannot be used.
     """
-    with closing(page.tape), closing(HttpServer(page, address, page.limits, tls=tls)) as server:
+    with closing(page.tape), closing(HttpServer(page, address, tls)) as server:
         thread = Thread(target=server.run, name="live page", daemon=True)
         thread.start()
         try:

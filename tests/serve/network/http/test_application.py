@@ -11,6 +11,8 @@ from starlette.routing import Mount, Route
 
 from infer_requests import BODY, INFER
 from isocharge.serve import asgi_app
+from isocharge.serve.network.address import ServerLimits
+from isocharge.serve.network.metrics import Traffic
 from one_request import send
 
 
@@ -23,6 +25,8 @@ def ask(models, start_http):
             Mount("/touch", asgi_app(models, token="sesame")),
         ]
     )
+    program.limits = ServerLimits()
+    program.traffic = Traffic()
     return partial(send, start_http(program).url)
 
 

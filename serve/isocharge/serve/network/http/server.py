@@ -23,6 +23,7 @@ from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 
 from isocharge.serve.network.address import Address, ServerLimits, Tls
 from isocharge.serve.network.metrics import Exchange, Traffic
+from isocharge.serve.network.protocol.handler import Application
 from isocharge.serve.network.protocol.response import json_response
 
 
@@ -174,30 +175,21 @@ class HttpServer:
         url: URL that clients use.
     """
 
-    def __init__(
-        self,
-        application: Any,
-        address: Address,
-        limits: ServerLimits | None = None,
-        traffic: Traffic | None = None,
-        *,
-        tls: Tls | None = None,
-    ) -> None:
+    def __init__(self, application: Application, address: Address, tls: Tls | None = None) -> None:
         """Open the socket on which the server listens.
 
         Args:
-            application: ASGI application that answers the requests.
+            application: ASGI application that answers the requests. Its limits are also those of the connections. Its
+                counters also count refused requests and open connections.
             address: Address on which to listen.
-            limits: Limits of the connections. By default, the limits of `ServerLimits`.
-            traffic: Counters of refused requests and of open connections. By default, nothing is counted.
             tls: Certificate and private key for TLS, or None for a server without TLS.
 
         Raises:
             InputError: If a TLS file cannot be used.
             ListenError: If the address is in use or cannot be used.
         """
-        limits = limits or ServerLimits()
-        traffic = traffic or Traffic()
+        limits = application.limits
+        traffic = application.traffic
         tls_context = tls.context() if tls else None
         self._address = address
         self._socket = address.listen(limits.connections)

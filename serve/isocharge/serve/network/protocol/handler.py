@@ -46,11 +46,13 @@ class Application(ABC):
 
     Attributes:
         limits: Limits of the requests.
+        traffic: Counters of the requests.
         blocking_paths: Beginnings of the paths for which computing a response may take a long time. Such a response is
             computed in another thread, so that other requests are not delayed.
     """
 
     limits: ServerLimits
+    traffic: Traffic
     blocking_paths: tuple[str, ...] = ()
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
