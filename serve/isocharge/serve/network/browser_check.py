@@ -148,7 +148,7 @@ class AccessCheck:
         """
         if not host:  # HTTP/1.0 does not require the header, but browsers always send it
             return True
-        name = _name_in(f"//{host.decode('latin-1')}")
+        name = _name_in(host.decode("latin-1"))
         return ip_address(name) is not None or name in self._host_names
 
     def _is_own_page(self, origin: bytes, host: bytes) -> bool:
@@ -173,8 +173,8 @@ class AccessCheck:
             return True
         # The following names contain no ports. If the names are equal and both have a port, the page belongs to another
         # server on the same machine.
-        page_name = _name_in(f"//{page_host}")
-        requested_name = _name_in(f"//{requested_host}")
+        page_name = _name_in(page_host)
+        requested_name = _name_in(requested_host)
         is_port_removed = page_host.startswith(f"{requested_host}:")
         return page_name in self._allowed_names and (page_name != requested_name or is_port_removed)
 
@@ -220,10 +220,14 @@ def host_name(text: str) -> str:
 
 
 @lru_cache
-def _name_in(url: str) -> str:
-    """Return the host name in a URL in lower case, or "?" if the URL contains no host name."""
+def _name_in(host: str) -> str:
+    """Return the host name in lower case, without the port, or "?" if the text contains no host name.
+
+    Args:
+        host: Value of the header `Host`, or the part of the header `Origin` after the scheme.
+    """
     try:
-        name = urlsplit(url).hostname or "?"
+        name = urlsplit(f"//{host}").hostname or "?"
     except ValueError:
         return "?"
     return name.removesuffix(".")
