@@ -210,18 +210,17 @@ class ModelStore:
             name: Name of the model.
             folder: Folder of the model.
         """
-        earlier = {row.number: row.loaded for row in self._find(name) if row.loaded}
+        earlier = {row.number: row._replace(reason="") for row in self._find(name) if row.loaded}
         rows: dict[int, Version] = {}
         for number, version_folder in version_folders(folder).items():
-            loaded = earlier.get(number)
-            reason = ""
+            row = earlier.get(number, Version(name, number, None, ""))
             try:
-                loaded = self._load_version(name, number, version_folder)
+                row = row._replace(loaded=self._load_version(name, number, version_folder))
             except Exception as error:  # any error in one folder must not affect the other models
-                reason = _refusal_reason(version_folder, error)
-            rows[number] = Version(name, number, loaded, reason)
+                row = row._replace(reason=_refusal_reason(version_folder, error))
+            rows[number] = row
         if not rows or any(row.reason for row in rows.values()):
-            rows = {number: Version(name, number, loaded, "") for number, loaded in earlier.items()} | rows
+            rows = earlier | rows
         self._replace(name, list(rows.values()))
 
     def _load_version(self, name: str, number: int, folder: Path) -> LoadedVersion:
