@@ -119,16 +119,14 @@ class Statistics:
     def to_json(self) -> dict[str, Any]:
         """Return the counters as a JSON object with the names that Triton uses in its statistics."""
         answered = int(_value(self.latency, "_count"))
-        answered_ns = round(1e9 * _value(self.latency, "_sum"))
         refused = int(_value(self.refused, "_total"))
-        refused_ns = round(1e9 * _value(self.refused_time, "_total"))
         return {
             "last_inference": round(1e3 * _value(self.latest, "")),
             "inference_count": int(_value(self.presses, "_total")),
             "execution_count": answered,
             "inference_stats": {
-                "success": {"count": answered, "ns": answered_ns},
-                "fail": {"count": refused, "ns": refused_ns},
+                "success": {"count": answered, "ns": round(1e9 * _value(self.latency, "_sum"))},
+                "fail": {"count": refused, "ns": round(1e9 * _value(self.refused_time, "_total"))},
             },
             "batch_stats": [],
         }
