@@ -72,13 +72,13 @@ def test_server_may_open_as_many_files_as_the_system_permits():
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "example.org"])
 def test_address_of_other_machines_needs_a_token(host):
     with pytest.raises(InputError, match=f"{host} lets other machines in: give --token TOKEN"):
-        check_exposure(Address(host), has_token=False)
-    check_exposure(Address(host), has_token=True)
+        check_exposure(Address(host), None)
+    check_exposure(Address(host), "sesame")
 
 
 @pytest.mark.parametrize("address", [Address(), Address("127.0.0.2"), Address("::1"), Address("localhost")])
 def test_loopback_address_needs_no_token(address):
-    check_exposure(address, has_token=False)
+    check_exposure(address, None)
 
 
 def test_unix_socket_of_another_server_is_not_replaced(handler, tmp_path):

@@ -147,7 +147,7 @@ def live_page(
         yield None
         return
     address = page_address(live)
-    check_exposure(address, has_token=token is not None)
+    check_exposure(address, token)
     with require("http"):
         from isocharge.serve.viewer.live_page import LivePage, serve_page
 

@@ -33,12 +33,6 @@ class Address:
     port: int = 0
     uds: Path | None = None
 
-    @property
-    def is_private(self) -> bool:
-        """Whether only programs on this machine can connect to the address."""
-        address = ip_address(self.host)
-        return self.uds is not None or self.host == "localhost" or (address is not None and address.is_loopback)
-
     def listen(self, backlog: int) -> socket.socket:
         """Open a Unix socket or a TCP socket that listens on this address, and return the socket.
 
@@ -179,17 +173,20 @@ def ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | Non
         return None
 
 
-def check_exposure(address: Address, *, has_token: bool) -> None:
+def check_exposure(address: Address, token: str | None) -> None:
     """Check that a server without a token is not reachable from other machines.
 
     Args:
         address: Address on which the server listens.
-        has_token: Whether the server has a token that clients must send.
+        token: Token that clients must send; None if the server has no token.
 
     Raises:
         InputError: If other machines can connect, but the server has no token.
     """
-    if not (address.is_private or has_token):
+    if token is not None or address.uds is not None or address.host == "localhost":
+        return
+    ip = ip_address(address.host)
+    if ip is None or not ip.is_loopback:
         raise InputError(f"{address.host} lets other machines in: give --token TOKEN, which they then must send")
 
 
