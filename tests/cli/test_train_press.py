@@ -162,11 +162,6 @@ def test_list_that_repeats_its_presses_is_continued_at_the_next_row(taken, next_
         Dialogue(session, Script(TARED, refused(PORT_LOST))).follow_machine(contacts)
 
 
-def test_a_port_that_goes_away_under_a_machine_ends_the_session():
-    with pytest.raises(PortLost, match="continue with row 2 of its list"):
-        dialogue(TARED, STEADY, refused(PORT_LOST), contacts=LIST)
-
-
 @pytest.fixture(scope="module")
 def problem():
     return CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))

@@ -1,5 +1,7 @@
 """The clients of Triton for HTTP and gRPC with their default settings, connected to the servers of isocharge."""
 
+from contextlib import ExitStack
+
 import numpy as np
 import pytest
 import tritonclient.grpc
@@ -10,22 +12,17 @@ from tritonclient.utils import InferenceServerException
 from isocharge.serve import Predictor
 
 
-@pytest.fixture(params=("http", "grpc"))
-def client(request, handler, start_http, start_grpc):
-    if request.param == "grpc":
-        with (
-            start_grpc(handler) as url,
-            tritonclient.grpc.InferenceServerClient(url.removeprefix("grpc://")) as stock,
-        ):
-            yield stock
-    else:
-        with tritonclient.http.InferenceServerClient(start_http(handler).url.removeprefix("http://")) as stock:
-            yield stock
+@pytest.fixture(params=(tritonclient.http, tritonclient.grpc), ids=("http", "grpc"))
+def module(request):
+    return request.param
 
 
 @pytest.fixture
-def module(client):
-    return tritonclient.grpc if isinstance(client, tritonclient.grpc.InferenceServerClient) else tritonclient.http
+def client(module, handler, start_http, start_grpc):
+    with ExitStack() as stack:
+        is_grpc = module is tritonclient.grpc
+        url = stack.enter_context(start_grpc(handler)) if is_grpc else start_http(handler).url
+        yield stack.enter_context(module.InferenceServerClient(url.partition("://")[2]))
 
 
 def plain(answer):

@@ -29,7 +29,7 @@ LOG_FORCE_STD = 0.003
 
 RNG = np.random.default_rng(0)
 
-X, Y, FORCE, X_STD, Y_STD = range(5)
+X, Y, _, X_STD, Y_STD = range(5)
 """Columns of an array of tracked contacts."""
 
 
@@ -53,24 +53,15 @@ def noisy_contacts(path, std=STD, correlation=0.6):
         )
 
 
-def track_path(path, rate_Hz=1000.0, **options):
-    """Track noisy contacts along a path; see `track_contacts`."""
-    return track_contacts(noisy_contacts(path, **options), rate_Hz)
+def track_contacts(contacts):
+    """Track contacts at 1 kHz, and return the tracked contacts, shape (n, 9)."""
+    results = update_all(new_tracker(lasting=0.0), contacts, begin_s=0.0)
+    return np.array([structs.astuple(tracked) for tracked, _ in results])
 
 
-def track_contacts(contacts, rate_Hz=1000.0):
-    """Track contacts.
-
-    Returns:
-        The tracked contacts, shape (n, 9), and the events with the numbers of their frames.
-    """
-    results = update_all(new_tracker(lasting=0.0), contacts, 0.0, rate_Hz=rate_Hz)
-    return np.array([structs.astuple(tracked) for tracked, _ in results]), events_of(results)
-
-
-def update_all(tracker, contacts, begin_s, flags=(), rate_Hz=1000.0):
-    """Track contacts from a time on, s; return the results of all updates."""
-    return [track(tracker, contact, begin_s + number / rate_Hz, flags) for number, contact in enumerate(contacts)]
+def update_all(tracker, contacts, begin_s, flags=()):
+    """Track contacts at 1 kHz from a time on, s; return the results of all updates."""
+    return [track(tracker, contact, begin_s + number / 1000.0, flags) for number, contact in enumerate(contacts)]
 
 
 def events_of(results):
@@ -127,8 +118,7 @@ def test_reported_std_adapts_to_a_board_whose_noise_differs_from_the_training(no
     reported_variances = []
     for _ in range(10):
         contacts = noisy_contacts(path, std=noise_ratio * STD)
-        tracked, _ = track_contacts(contact._replace(x_std_mm=STD, y_std_mm=STD) for contact in contacts)
-        settled = tracked[100:]
+        settled = track_contacts(contact._replace(x_std_mm=STD, y_std_mm=STD) for contact in contacts)[100:]
         squared_errors.append(np.abs(position_errors(settled, path[100:])) ** 2)
         reported_variances.append(settled[:, X_STD] ** 2 + settled[:, Y_STD] ** 2)
     assert 0.33 < np.mean(squared_errors) / np.mean(reported_variances) < 2.0
@@ -157,7 +147,7 @@ def test_slide_is_tracked_without_lag_and_better_than_by_any_moving_average(spee
     errors = []
     measured = []
     for _ in range(10):
-        errors.append(position_errors(track_path(path)[0], path))
+        errors.append(position_errors(track_contacts(noisy_contacts(path)), path))
         measured.append([complex(contact.x_mm, contact.y_mm) for contact in noisy_contacts(path)])
     errors = np.array(errors)
     lag_ms = -1e3 * np.mean((errors[:, is_moving] / np.exp(0.7j)).real) / speed
@@ -172,12 +162,12 @@ def test_slide_is_tracked_without_lag_and_better_than_by_any_moving_average(spee
 
 def test_contact_that_is_lifted_and_pressed_elsewhere_is_tracked_within_three_frames():
     second = 4.0 - 3.0j
-    tracked, _ = track_path(np.where(np.arange(200) < 100, 0.0, second))
+    tracked = track_contacts(noisy_contacts(np.where(np.arange(200) < 100, 0.0, second)))
     assert np.abs(position_errors(tracked[102:], second)).max() < 4.0 * STD
 
 
 def test_single_outlier_is_ignored():
-    tracked, _ = track_path(np.where(np.arange(200) == 100, 3.0, 0.0))
+    tracked = track_contacts(noisy_contacts(np.where(np.arange(200) == 100, 3.0, 0.0)))
     assert np.abs(tracked[50:, [X, Y]]).max() < 2.0 * STD
 
 

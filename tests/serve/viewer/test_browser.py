@@ -38,12 +38,9 @@ def sensor(film):
 @pytest.fixture
 def presses():
     """Presses that stand still, with pauses that are long enough for a tare, played again and again."""
-    pause, press = np.zeros(round(PAUSE_S * RATE_HZ)), np.ones(round(PRESS_S * RATE_HZ))
-    force_N = np.concatenate([np.concatenate([pause, force * press]) for _, _, force in PRESSES])
-    places = [
-        np.concatenate([np.concatenate([pause * np.nan, place[axis] * press]) for place in PRESSES]) for axis in (0, 1)
-    ]
-    return Script(*places, force_N, RATE_HZ)
+    rows = [row for press in PRESSES for row in ((np.nan, np.nan, 0.0), press)]
+    counts = [round(PAUSE_S * RATE_HZ), round(PRESS_S * RATE_HZ)] * len(PRESSES)
+    return Script(*np.repeat(rows, counts, axis=0).T, RATE_HZ)
 
 
 @pytest.fixture

@@ -56,7 +56,7 @@ def open_page(chromium, file):
     Scripts of a test do not run under the security policy of the page, so it is bypassed unless it is tested.
     """
 
-    def open_window(width, height, bypass_csp=True, **options):
+    def open_window(width=1280, height=800, bypass_csp=True, **options):
         viewport = {"width": width, "height": height}
         context = chromium.new_context(viewport=viewport, offline=True, bypass_csp=bypass_csp, **options)
         page = context.new_page()
@@ -71,11 +71,11 @@ def open_page(chromium, file):
 
 @pytest.fixture(scope="module")
 def page(open_page):
-    return open_page(1280, 800)
+    return open_page()
 
 
 def test_the_file_is_small_and_loads_nothing_from_elsewhere(open_page, file):
-    page = open_page(1280, 800, bypass_csp=False)
+    page = open_page(bypass_csp=False)
     assert file.stat().st_size <= MAX_SIZE_BYTES
     assert [url for url in page.requests if not url.startswith("data:")] == [file.as_uri()]
     assert page.errors == []
@@ -83,17 +83,13 @@ def test_the_file_is_small_and_loads_nothing_from_elsewhere(open_page, file):
 
 @pytest.mark.parametrize("name", MODELS)
 def test_answers_are_the_golden_vectors(page, name):
-    model = load_model(find_model(name))
-    golden = model.golden
+    golden = load_model(find_model(name)).golden
     answers = page.evaluate(ANSWERS, [MODELS.index(name), golden.charge_pC.tolist()])
-    computed = np.array([[answer[key] for key in ("x", "y", "force")] for answer in answers])
-    std = np.array([[answer[key] for key in ("xStd", "yStd", "forceStd")] for answer in answers])
-    np.testing.assert_allclose(computed, golden.outputs["contact"], rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(std, golden.outputs["contact_std"], rtol=1e-4, atol=1e-4)
-    misfit = [answer["misfit"] for answer in answers]
-    np.testing.assert_allclose(misfit, np.ravel(golden.outputs["misfit"]), rtol=1e-4, atol=1e-4)
-    correlation = [answer["correlation"] for answer in answers]
-    np.testing.assert_allclose(correlation, np.array(golden.outputs["contact_correlation"])[:, 0], rtol=1e-4, atol=1e-4)
+    keys = ("x", "y", "force", "xStd", "yStd", "forceStd", "misfit", "correlation")
+    values = [[answer[key] for key in keys] for answer in answers]
+    outputs = [golden.outputs[key] for key in ("contact", "contact_std", "misfit", "contact_correlation")]
+    expected = np.hstack(outputs)[:, : len(keys)]  # of the correlations, the page computes that of x and y
+    np.testing.assert_allclose(values, expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("index", range(len(MODELS)))
@@ -132,7 +128,7 @@ def test_the_isocharge_curves_cross_at_the_press(page, press):
 
 
 def test_presses_in_the_mirror_region_are_answered_elsewhere_without_a_flag(open_page):
-    page = open_page(1280, 800)
+    page = open_page()
     centres = np.array(page.evaluate(MIRROR))  # drawn at once, as on the live page
     places = centres[np.hypot(*centres.T) < 24.0][::10]
     force = np.geomspace(0.2, 2.0, len(places))[:, None]
@@ -148,7 +144,7 @@ def test_presses_in_the_mirror_region_are_answered_elsewhere_without_a_flag(open
 
 
 def test_a_press_with_the_mouse_gives_its_place_and_force(open_page):
-    page = open_page(1280, 800)
+    page = open_page()
     box = page.locator("#stage").bounding_box()
     page.evaluate("isocharge.playground.setFaults({ noise: 0 })")
     page.mouse.move(box["x"] + 0.45 * box["width"], box["y"] + 0.4 * box["height"])
@@ -163,7 +159,7 @@ def test_a_press_with_the_mouse_gives_its_place_and_force(open_page):
 
 
 def test_a_dead_electrode_and_a_wrong_gain_are_flagged_with_four_electrodes(open_page):
-    page = open_page(1280, 800)
+    page = open_page()
     page.click("#models button:nth-of-type(2)")
     page.select_option("#dead", "0")
     page.wait_for_function("document.querySelector('#flags').innerText.includes('misfit')")

@@ -1,7 +1,6 @@
 """Samples of the live page: their numbers, their storage in a tape, and coalescing."""
 
 from contextlib import closing
-from itertools import repeat
 
 import numpy as np
 import pytest
@@ -86,8 +85,8 @@ def test_coalescing_shows_the_latest_contact_of_a_run():
     assert shown["timestamp"][0] == 63.0
 
 
-def append(tape, times_s, force_N=None):
-    for time_s, force in zip(times_s, repeat(0.0) if force_N is None else force_N, strict=force_N is not None):
+def append(tape, times_s, force_N=0.0):
+    for time_s, force in zip(times_s, np.broadcast_to(force_N, len(times_s)), strict=True):
         tape.append((time_s, *(force if name == "force_N" else 0.0 for name in TYPE.names[1:])))
 
 
