@@ -25,10 +25,6 @@ def test_version(command):
     assert serve.__version__ == simulate.__version__ == train.__version__ == VERSION
 
 
-def test_the_module_is_the_command():
-    assert run(sys.executable, "-m", "isocharge.cli", "--version") == run(ISOCHARGE, "--version")
-
-
 @pytest.mark.parametrize(
     ("typed", "proposed"),
     [

@@ -135,7 +135,10 @@ def analyze(*words):
     return done.returncode, done.stdout + done.stderr
 
 
-@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze")
+needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze")
+
+
+@needs_systemd
 @pytest.mark.parametrize("names", UNITS)
 def test_systemd_analyze_accepts_the_units(tmp_path, names):
     unit = installed_unit(tmp_path, names)
@@ -145,7 +148,7 @@ def test_systemd_analyze_accepts_the_units(tmp_path, names):
     assert "/nowhere/isocharge" in analyze("verify", unit)[1]  # so verify has read this file
 
 
-@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze")
+@needs_systemd
 def test_the_page_states_the_exposure_of_the_units(tmp_path):
     page = (ROOT / "serve/docs/systemd.md").read_text("utf-8")
     for number, names in enumerate(UNITS):

@@ -54,8 +54,8 @@ LEVELS = {"OK": 0, "WARN": 1, "ERROR": 2}
 
 
 @pytest.fixture
-def published(monkeypatch):
-    """What the node publishes: topic and serialised message."""
+def run_node(monkeypatch):
+    """Function that runs the node with records in place of a port, and returns the topics and serialised messages."""
     published = []
 
     class Node:
@@ -80,18 +80,6 @@ def published(monkeypatch):
         modules[package] = Mock()
     for name, module in {"rclpy": Mock(), "rclpy.qos": Mock(), **modules}.items():
         monkeypatch.setitem(sys.modules, name, module)
-    return published
-
-
-def numbers(message):
-    """The doubles at the end of a CDR message, and what is before them; -0 is 0."""
-    count = 6 if len(message) < 200 else 43
-    return np.array(struct.unpack(f"<{count}d", message[-8 * count :])) + 0.0, message[: -8 * count]
-
-
-@pytest.fixture
-def run_node(published):
-    """Function that runs the node with records in place of a port, and returns what it has published."""
 
     def run(records):
         module = runpy.run_path(str(NODE))
@@ -101,6 +89,12 @@ def run_node(published):
         return published
 
     return run
+
+
+def numbers(message):
+    """The doubles at the end of a CDR message, and what is before them; -0 is 0."""
+    count = 6 if len(message) < 200 else 43
+    return np.array(struct.unpack(f"<{count}d", message[-8 * count :])) + 0.0, message[: -8 * count]
 
 
 def test_the_node_publishes_flags_and_diagnostics_once_a_second(run_node, record):

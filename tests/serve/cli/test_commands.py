@@ -6,6 +6,7 @@ Commands whose stdin, stdout or stderr is closed, full, or read by somebody slow
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -40,14 +41,6 @@ def test_predict_from_stdin_and_from_a_file_of_measured_presses(presses, models,
     presses.write_text("\n".join(["x_mm,y_mm,force_N," + header, *(f"1,,2,{row}" for row in rows)]))
     result = run("predict", "linear", presses, "--models", models)
     assert (result.stdout, "ignored columns" in result.stderr) == (expected, True)
-
-
-def test_leak_of_a_file_without_times_is_not_ignored(models, refused, tmp_path):
-    device, frames = tmp_path / "leak.toml", tmp_path / "frames.csv"
-    device.write_text("[leak]\ntau_s = 5.0\n")
-    frames.write_text("A,B,C\n" + "1,2,3\n" * 200)
-    words = ("serve", "stream", "linear", "--models", models, "--port", frames, "--device", device)
-    refused(*words, message="expected a column t_ms, t_us or t_s")
 
 
 @pytest.fixture
@@ -93,14 +86,26 @@ def test_check_of_many_presses_shows_the_worst(measured, models, command):
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "message"),
+    ("line", "message"),
     [
-        ("--force-std", "0", "force_std: expected a positive share"),
-        ("--position-std", "nan", "position_std_mm: expected"),
+        ("check linear measured.csv --force-std 0", "force_std: expected a positive share"),
+        ("check linear measured.csv --position-std nan", "position_std_mm: expected"),
+        ("stream linear --port frames.csv --device leak.toml", "expected a column t_ms, t_us or t_s"),
+        ("stream linear --port p --name ''", "--name: expected printable characters"),
+        ("stream linear --port p --name 'a\nb'", "--name: expected printable characters"),
+        ("doctor --port p --device gain.toml --pc-per-unit 1000", "--pc-per-unit: expected none beside --device"),
+        ("doctor --port p --device gain.toml --request ?", "--request: expected none beside --device"),
     ],
 )
-def test_check_refuses_with_the_reason(measured, models, refused, option, value, message):
-    refused("serve", "check", "linear", measured(), "--models", models, option, value, message=message)
+def test_wrong_options_are_refused_with_the_reason(measured, models, refused, monkeypatch, line, message):
+    """A file without times has no leak, and the device file already states the charge of a unit."""
+    path = measured()
+    path.with_name("leak.toml").write_text("[leak]\ntau_s = 5.0\n")
+    path.with_name("frames.csv").write_text("A,B,C\n" + "1,2,3\n" * 200)
+    path.with_name("gain.toml").write_text("[gain]\npC_per_unit = 2.0\n")
+    monkeypatch.chdir(path.parent)
+    monkeypatch.setenv("ISOCHARGE_MODELS", str(models))
+    refused("serve", *shlex.split(line), message=message)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -158,12 +163,6 @@ def test_stream_that_ends_without_a_tare_says_why(tmp_path, stream):
     assert {tuple(record["flags"]) for record in records_of(streamed.stdout)} == {("tare",)}
     assert "caution: no tare" in streamed.stderr
     assert "A 300.00 pC, B 1.00 pC, C 2.00 pC" in streamed.stderr
-
-
-@pytest.mark.parametrize("name", ["", "a\nb"])
-def test_option_name_refuses_empty_and_unprintable_names(stream, name):
-    with pytest.raises(InputError, match="--name: expected printable characters"):
-        stream("p", "--name", name)
 
 
 def test_a_recording_that_was_killed_is_readable(board, models, start_stream, tmp_path, run):
@@ -241,14 +240,6 @@ def test_doctor_lists_the_ports_and_what_they_send(resting, run, monkeypatch):
 def test_doctor_refuses_with_the_reason(resting, run, words, message):
     with resting() as sensor, pytest.raises((InputError, OutputError), match=re.escape(message)):
         run("doctor", "--port", sensor.url, "--seconds", 0.5, *words)
-
-
-@pytest.mark.parametrize(("option", "value"), [("--pc-per-unit", 1000), ("--request", "?")])
-def test_doctor_refuses_what_a_device_file_states(refused, tmp_path, option, value):
-    board = tmp_path / "board.toml"
-    board.write_text("[gain]\npC_per_unit = 2.0\n")
-    words = ("serve", "doctor", "--port", "/dev/ttyNone", "--device", board, option, value)
-    refused(*words, message=f"{option}: expected none beside --device")
 
 
 def test_doctor_writes_no_file_of_which_the_unit_is_missing(resting, command, tmp_path):

@@ -63,14 +63,14 @@ def test_plot_draws_a_recording(command, recorded, tmp_path, figures):
 
     records = [json.loads(line) for line in path.read_text().splitlines() if line.startswith('{"timestamp"')]
     lines = {line.get_label(): line.get_ydata() for axes in figures[0].axes for line in axes.lines}
-    expected = {name: [record[key] for record in records] for name, key in (("x", "x_mm"), ("force", "force_N"))}
-    expected["C"] = [(record["charge_pC"] or {"C": None})["C"] for record in records]
-    for name, values in expected.items():
-        np.testing.assert_array_equal(lines[name], np.array(values, dtype=float))
+    keys = ("x_mm", "x_std_mm", "force_N")
+    x_mm, x_std_mm, force_N = np.array([[record[key] for key in keys] for record in records], dtype=float).T
+    charge_C_pC = np.array([(record["charge_pC"] or {"C": None})["C"] for record in records], dtype=float)
+    for name, values in {"x": x_mm, "force": force_N, "C": charge_C_pC}.items():
+        np.testing.assert_array_equal(lines[name], values)
     position_lines = next(axes for axes in figures[0].axes if axes.get_ylabel().startswith("position")).lines
-    for line, factor in ((position_lines[1], -2.0), (position_lines[2], 2.0)):
-        limit = [np.nan if r["x_mm"] is None else r["x_mm"] + factor * r["x_std_mm"] for r in records]
-        np.testing.assert_allclose(line.get_ydata(), limit)
+    for line, limit_mm in zip(position_lines[1:3], (x_mm - 2.0 * x_std_mm, x_mm + 2.0 * x_std_mm), strict=True):
+        np.testing.assert_allclose(line.get_ydata(), limit_mm)
 
     flag_axes = next(axes for axes in figures[0].axes if axes.get_xlabel().startswith("time since"))
     words = [label.get_text() for label in flag_axes.get_yticklabels()]

@@ -4,7 +4,6 @@ import json
 import logging
 import os
 import shutil
-import socket
 import threading
 from datetime import UTC, datetime
 
@@ -25,6 +24,7 @@ from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
 from isocharge.serve.network.protocol.routes import ROUTES
 from model_files import put_graph
+from serve.network.http.test_server import exchange
 
 
 @pytest.fixture
@@ -217,12 +217,9 @@ def test_log_has_a_line_for_each_grpc_call(app, lines, start_grpc):
 
 def test_log_has_a_line_for_an_unreadable_request(app, lines, start_http):
     """The first request is not HTTP, and the headers of the second request are too long."""
-    place = start_http(app).url.removeprefix("http://").split(":")
+    server = start_http(app)
     for sent in (b"rubbish\r\n\r\n", b"GET / HTTP/1.1\r\nx: " + b"a" * 20_000 + b"\r\n\r\n"):
-        with socket.create_connection((place[0], int(place[1])), timeout=20) as connection:
-            connection.sendall(sent)
-            while connection.recv(1 << 16):
-                pass
+        exchange(server, sent)
     logged = [(line["route"], line["status"], line["client"][:10]) for line in map(json.loads, lines)]
     assert logged == [("none", 400, "127.0.0.1:"), ("none", 431, "127.0.0.1:")]
     assert not any("rubbish" in line for line in lines)

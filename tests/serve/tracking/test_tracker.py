@@ -262,8 +262,7 @@ def test_saturated_frames_have_a_small_weight():
 def test_records_with_track_only_add_fields(film, predictor):
     rest = np.zeros((10, 3))
     noise = np.random.default_rng(0).standard_normal((30, 3))
-    pressed = film.charge_pC(np.full(30, 2.0), np.full(30, -3.0), np.full(30, 0.5)) + noise
-    rows = np.concatenate([rest, pressed, rest])
+    rows = np.concatenate([rest, film.charges(np.array([[2.0, -3.0, 0.5]])) + noise, rest])
 
     plain_lines = recorded_lines(predictor, rows, {})
     records = [json.loads(line) for line in recorded_lines(predictor, rows, {"track": {}})]

@@ -53,7 +53,7 @@ def call(channel, name, /, metadata=None, **fields):
         request_serializer=request.SerializeToString,
         response_deserializer=response.FromString,
     )
-    return method(request(**fields), metadata=metadata, timeout=20)
+    return method(request(**fields), metadata=metadata, timeout=60)
 
 
 def tensor(charges, datatype="FP32", **fields):
@@ -166,10 +166,7 @@ def silent_call():
 
 def is_served(channel):
     """Return whether the server answers a call."""
-    method = channel.unary_unary(
-        f"/{SERVICE}/ServerMetadata", response_deserializer=METHODS["ServerMetadata"][1].FromString
-    )
-    return method(b"", timeout=60).name == "isocharge"
+    return call(channel, "ServerMetadata").name == "isocharge"
 
 
 def refusal(call):
