@@ -17,6 +17,7 @@ import crcmod.predefined
 import numpy as np
 import pytest
 
+from frame_formats import STUFFINGS
 from isocharge.cli.serve.doctor import device_text
 from isocharge.serve import Chunk, Predictor, TouchStream, load_device
 from isocharge.serve.examination.listening import ReceivedData
@@ -92,9 +93,9 @@ def bare_struct(k, q):
 
 
 def stuffed_by_slip(k, q):
+    delimiter, stuff = STUFFINGS["slip"]
     body = struct.pack(">H3f", k % 65536, *q)
-    data = body + struct.pack(">H", binascii.crc_hqx(body, 0))
-    return data.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + b"\xc0"
+    return stuff(body + struct.pack(">H", binascii.crc_hqx(body, 0))) + delimiter
 
 
 def ticks(k, q):

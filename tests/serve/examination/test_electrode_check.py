@@ -141,28 +141,28 @@ def test_press_that_does_not_end_raises_an_error(film, check):
         check(VirtualSensor(film.charges, script, noise=noise), "ABC", timeout_s=1.4)
 
 
-@pytest.mark.parametrize("delay_s", [0.1, 0.48, 0.5, 0.58])
-def test_press_right_after_the_request_is_accepted(film, check, delay_s):
-    """The pause is shorter than the time in which the rest level is measured. A block may contain half of a release."""
-    result = check(sensor_with_wiring(film.charges, film.directions, (1, 0, 2), rest_s=delay_s), "ABC")
-    assert result.found == {"A": "2", "B": "1", "C": "3"}
+def encode_damaged(frame):
+    """Return the bytes of a frame. Two frames before the first press are damaged."""
+    if frame.seq in (500, 501):
+        frame.values = (frame.values[0], frame.values[1] + 300.0, frame.values[2])
+    return encode_frame(frame)
 
 
-def test_finger_that_is_on_the_film_at_first_is_waited_for(film, check):
-    sensor = sensor_with_wiring(film.charges, film.directions[[2, 0, 1, 2]], (0, 1, 2), first_rest_s=0.1)
-    result = check(sensor, "ABC")
-    assert result.found == {"A": "1", "B": "2", "C": "3"}
-    assert [*result.sentences][-1] == "every channel belongs to its electrode"
-
-
-def test_damaged_frames_before_a_press_are_no_press(film, check):
-    def encode(frame):
-        if frame.seq in (500, 501):
-            frame.values = (frame.values[0], frame.values[1] + 300.0, frame.values[2])
-        return encode_frame(frame)
-
-    sensor = sensor_with_wiring(film.charges, film.directions, (0, 1, 2), encode=encode, first_rest_s=3.0)
-    assert check(sensor, "ABC").found == {"A": "1", "B": "2", "C": "3"}
+@pytest.mark.parametrize(
+    ("presses", "wiring", "options"),
+    [
+        # The pause is shorter than the time in which the rest level is measured. A block may contain half of a release.
+        *(((0, 1, 2), (1, 0, 2), {"rest_s": delay_s}) for delay_s in (0.1, 0.48, 0.5, 0.58)),
+        ((2, 0, 1, 2), (0, 1, 2), {"first_rest_s": 0.1}),
+        ((0, 1, 2), (0, 1, 2), {"first_rest_s": 3.0, "encode": encode_damaged}),
+    ],
+    ids=[*["a press right after the request"] * 4, "a finger is on the film at first", "damaged frames before a press"],
+)
+def test_presses_near_the_electrodes_find_the_channels(film, check, presses, wiring, options):
+    result = check(sensor_with_wiring(film.charges, film.directions[[*presses]], wiring, **options), "ABC")
+    assert result.found == {"ABC"[electrode]: str(channel + 1) for channel, electrode in enumerate(wiring)}
+    is_right = wiring == (0, 1, 2)
+    assert ([*result.sentences][-1] == "every channel belongs to its electrode") == is_right
 
 
 def test_settings_of_single_electrodes_move_with_their_channels():

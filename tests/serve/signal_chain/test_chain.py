@@ -7,7 +7,6 @@ from scipy.stats import chi2
 from isocharge.common.errors import TareError
 from isocharge.serve import Frame
 from isocharge.serve.signal_chain.stage import Device, Setup
-from isocharge.serve.signal_chain.tare import TareRule, measure_tare
 from isocharge.serve.signal_chain.touch import Touch, TouchRule
 from stage_runner import StageRunner
 
@@ -36,9 +35,17 @@ def run(frames_pC, **sections):
     return StageRunner(**sections).run(frames_pC, RATE_HZ)
 
 
-def test_tare_under_a_resting_weight_is_refused():
-    with pytest.raises(TareError, match=r"rests at 81\d.* pC, expected at most 100 pC; take off"):
-        measure_tare(TareRule(), rest(100) + 800.0)
+@pytest.mark.parametrize(
+    ("charges_pC", "message"),
+    [
+        (rest(300) + 800.0, r"rests at 81\d.* pC, expected at most 100 pC; take off"),
+        (rest(300, std_pC=50.0), "varies by"),
+    ],
+    ids=["a resting weight", "a moving finger"],
+)
+def test_tare_gives_up_with_the_reason(charges_pC, message):
+    with pytest.raises(TareError, match=message):
+        run(charges_pC, tare={"patience": 250})
 
 
 def test_tare_takes_the_first_hundred_frames():
@@ -46,11 +53,6 @@ def test_tare_takes_the_first_hundred_frames():
     assert all(reading.tare_pC is None and reading.flags == ("tare",) for reading in readings[:100])
     np.testing.assert_allclose(readings[100].tare_pC, rest(150)[:100].mean(axis=0), atol=0.01)
     np.testing.assert_allclose(np.mean([reading.charge_pC for reading in readings[100:]], axis=0), 0.0, atol=0.5)
-
-
-def test_tare_gives_up_with_the_reason():
-    with pytest.raises(TareError, match="varies by"):
-        run(rest(300, std_pC=50.0), tare={"patience": 250})
 
 
 def test_second_tare_never_gives_up():
