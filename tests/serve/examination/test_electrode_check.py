@@ -38,24 +38,6 @@ END_S = 60.0
 """Time without a press at the end of a script, s."""
 
 
-class SimulatedPort:
-    """Port on which the frames of a virtual sensor arrive in simulated time.
-
-    Attributes:
-        now_s: The simulated time, s.
-    """
-
-    def __init__(self, sensor):
-        self._frames = sensor.frames()
-        self.now_s = 0.0
-
-    def __iter__(self):
-        """Yield the frames that arrive next. The simulated time passes until they have arrived."""
-        while True:
-            self.now_s += FRAMES_AT_ONCE / RATE_HZ
-            yield Chunk(b"".join(islice(self._frames, FRAMES_AT_ONCE)), 1e9 + self.now_s, round(1e9 * self.now_s))
-
-
 def press_script(directions, rest_s=REST_S, first_rest_s=REST_S, end_s=END_S):
     """Return a script of presses of 0.3 N, 8 mm from the centre in some directions, with a rest before each press."""
     rows = [(0.0, 0.0, 0.0, 0.0)]
@@ -86,16 +68,22 @@ def check(monkeypatch):
     """Return a function that checks the electrodes of a virtual sensor in simulated time."""
 
     def check_in_simulated_time(sensor, electrodes, unit="pC", rest_span=8.0, timeout_s=20.0):
-        port = SimulatedPort(sensor)
-        monkeypatch.setattr(electrode_check, "time", SimpleNamespace(monotonic=lambda: port.now_s))
+        clock = SimpleNamespace(now_s=0.0)
+
+        def arriving_chunks():
+            frames = sensor.frames()
+            while True:
+                clock.now_s += FRAMES_AT_ONCE / RATE_HZ
+                yield Chunk(b"".join(islice(frames, FRAMES_AT_ONCE)), 1e9 + clock.now_s, round(1e9 * clock.now_s))
+
+        monkeypatch.setattr(electrode_check, "time", SimpleNamespace(monotonic=lambda: clock.now_s))
         channels = {electrode: str(number + 1) for number, electrode in enumerate(electrodes)}
+        device = device_from_table({}, "test")
         requests = []
-        result = check_electrodes(
-            port, device_from_table({}, "test"), channels, requests.append, unit, rest_span, timeout_s
-        )
+        result = check_electrodes(arriving_chunks(), device, channels, requests.append, unit, rest_span, timeout_s)
         assert requests[0].startswith("wait")
-        presses = [sentence for sentence in requests if sentence.startswith("press near")]
-        assert list(dict.fromkeys(sentence.split()[3].rstrip(",") for sentence in presses)) == list(electrodes)
+        presses = [sentence.split()[3].rstrip(",") for sentence in requests if sentence.startswith("press near")]
+        assert [*dict.fromkeys(presses)] == [*electrodes]
         return result
 
     return check_in_simulated_time

@@ -66,8 +66,8 @@ def test_of_a_touched_film_only_the_touch_is_reported():
 
 def test_check_of_a_healthy_board():
     report = examined(charges(), device=AT_REST, electrodes=FOUR[:3])
-    assert (report.baud, report.format, report.missing) == (115200, "binary frames of isocharge", ())
-    assert report.missing_for_held_presses == ()
+    assert (report.baud, report.format) == (115200, "binary frames of isocharge")
+    assert (report.missing, report.missing_for_held_presses) == ((), ())
     assert (report.good, report.bad, report.lost, report.repeated, report.device_clock) == (400, 0, 0, 0, True)
     assert report.rate_Hz == pytest.approx(200.0)
     assert [round(channel.offset_pC) for channel in report.channels] == [5, -6, 7]

@@ -99,27 +99,13 @@ def test_file_that_exists_is_not_overwritten_and_nothing_else_is_left(tmp_path):
     assert not (tmp_path / "a.jsonl").exists()
 
 
-class Added:
-    """An output of another package, which drops its records, and calls a function when it is closed."""
-
-    def __init__(self, at_close=None):
-        self.close = at_close
-
-    def write(self, record):
-        pass
-
-
-class Failing(Added):
-    """An output that fails at once."""
-
-    def write(self, _=None):
-        raise RuntimeError("no such table")
-
-    close = write
-
-
 def raise_error(*_):
     raise RuntimeError("not open")
+
+
+def added(write=lambda _: None, close=lambda: None):
+    """Return an output of another package."""
+    return SimpleNamespace(write=write, close=close)
 
 
 @pytest.fixture
@@ -136,7 +122,8 @@ def add_kind(monkeypatch):
 
 @pytest.fixture
 def failing(add_kind):
-    add_kind("broken".__eq__, Failing())
+    """An output that fails at once."""
+    add_kind("broken".__eq__, added(raise_error, raise_error))
 
 
 @live_and_replayed
@@ -149,7 +136,7 @@ def test_added_output_that_cannot_be_closed_spoils_no_other_output(
     record, tmp_path, add_kind, caplog, monkeypatch, is_live, at_close, reason
 ):
     monkeypatch.setattr("isocharge.serve.outputs.output.END_TIMEOUT_s", 0.5)
-    add_kind("mine".__eq__, Added(at_close))
+    add_kind("mine".__eq__, added(close=at_close))
     path = tmp_path / "touch.jsonl"
     outputs = Outputs([str(path), "mine"], context(is_live=is_live)).__enter__()
     outputs.write(record())
@@ -161,7 +148,7 @@ def test_added_output_that_cannot_be_closed_spoils_no_other_output(
 
 
 def test_ctrl_c_while_an_output_closes_spoils_no_other_output(record, tmp_path, add_kind):
-    add_kind("mine".__eq__, Added(interrupt))
+    add_kind("mine".__eq__, added(close=interrupt))
     path = tmp_path / "touch.jsonl"
     outputs = Outputs([str(path), "mine"], context()).__enter__()
     outputs.write(record())
@@ -171,15 +158,8 @@ def test_ctrl_c_while_an_output_closes_spoils_no_other_output(record, tmp_path, 
     assert outputs.not_written == {"mine": None}  # the command must not report success
 
 
-class Changing(Added):
-    """An output that changes the records."""
-
-    def write(self, record):
-        record.charge_pC["A"] = 9.0
-
-
 def test_added_output_cannot_change_the_records_of_other_outputs(record, tmp_path, add_kind):
-    add_kind("mine".__eq__, Changing(lambda: None))
+    add_kind("mine".__eq__, added(lambda record: record.charge_pC.update(A=9.0)))
     path = tmp_path / "touch.jsonl"
     with Outputs(["mine", str(path)], context()) as outputs:
         outputs.write(record(charge_pC={"A": 1.0}))
@@ -195,7 +175,7 @@ def test_added_kind_that_cannot_tell_what_it_accepts_is_named(add_kind):
 @pytest.mark.usefixtures("failing")
 def test_output_that_fails_ends_a_replay_with_its_name(record):
     outputs = Outputs(["broken"], context()).__enter__()
-    with pytest.raises(OutputError, match=r"broken: the output failed \(RuntimeError: no such table\)"):
+    with pytest.raises(OutputError, match=r"broken: the output failed \(RuntimeError: not open\)"):
         outputs.write(record())
 
 
@@ -209,6 +189,6 @@ def test_output_that_fails_does_not_end_the_live_stream(record, caplog):
     assert len(printed) == 100
     assert outputs.not_written == {"broken": None}
     assert (
-        "broken: stopped (broken: the output failed (RuntimeError: no such table)); the records after that are missing"
+        "broken: stopped (broken: the output failed (RuntimeError: not open)); the records after that are missing"
         in caplog.text
     )

@@ -98,7 +98,6 @@ def test_bytes_of_a_board_in_a_file_are_read_by_a_stream_only(tmp_path, text):
 
 
 def test_replay_of_an_mcap_file_names_the_kind_of_the_file(tmp_path):
-    path = tmp_path / "touch.mcap"
-    path.write_bytes(b"\x89MCAP0\r\n" + bytes(range(256)))
+    mcap(tmp_path / "touch.mcap")
     with pytest.raises(RecordingError, match=r"got an MCAP file; MCAP files hold results.*serve replay touch\.rec"):
-        Recording(path)
+        Recording(tmp_path / "touch.mcap")
