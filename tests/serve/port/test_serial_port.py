@@ -57,15 +57,14 @@ def test_chunk_has_the_bytes_unchanged_and_the_time_of_arrival(board):
         ("socket://127.0.0.1:1", r"cannot be opened \(.*refused\); check the host and the port number"),
         ("telepathy://x", r"cannot be opened \(invalid URL"),
         *(
-            (f"udp://{place}", "cannot be opened")
+            (f"udp://{place}", r"cannot be opened \(")
             for place in ("127.0.0.1", "127.0.0.1:99999", "127.0.0.1:9/x", "300.0.0.1:9")
         ),
     ],
 )
 def test_port_that_cannot_be_opened_is_refused(url, message):
-    with pytest.raises(PortError, match=f"^{url}: {message}") as caught, Port(url):
+    with pytest.raises(PortError, match=f"^{url}: {message}"), Port(url):
         pass
-    assert ("baud" in str(caught.value)) == (url == "/dev/null")
 
 
 @pytest.mark.parametrize("make", [Port, open_source])
@@ -172,29 +171,17 @@ def test_port_without_a_descriptor_is_read_by_pyserial():
         assert next(iter(port)).data == b"1,2\n"
 
 
-@pytest.fixture
-def server():
-    """Return a listening TCP socket, whose method `accept` waits for a client."""
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        listening.settimeout(10.0)
-        yield listening
-
-
 @pytest.mark.parametrize("scheme", ["socket", "tcp"])
-def test_socket_returns_all_bytes_until_it_is_closed(server, scheme):
-    with Port(f"{scheme}://127.0.0.1:{server.getsockname()[1]}", silence_s=5.0) as port:
-        with server.accept()[0] as client:
-            client.sendall(b"x" * 1000)
-            time.sleep(0.05)
-            assert next(iter(port)).data == b"x" * 1000
-        with pytest.raises(PortLost, match="the other end has closed"):
-            next(iter(port))
-
-
-def write_until(has_arrived, board, data):
-    """Write the same bytes until they have arrived, because bytes before the opening of the port are lost."""
-    while not has_arrived.wait(0.02):
-        board.write_whole(data)
+def test_socket_returns_all_bytes_until_it_is_closed(scheme):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(10.0)
+        with Port(f"{scheme}://127.0.0.1:{server.getsockname()[1]}", silence_s=5.0) as port:
+            with server.accept()[0] as client:
+                client.sendall(b"x" * 1000)
+                time.sleep(0.05)
+                assert next(iter(port)).data == b"x" * 1000
+            with pytest.raises(PortLost, match="the other end has closed"):
+                next(iter(port))
 
 
 def test_outage_is_measured_and_logged_once(tmp_path, caplog):
@@ -206,7 +193,8 @@ def test_outage_is_measured_and_logged_once(tmp_path, caplog):
 
     def plug_in():
         link.symlink_to(new_board.url)
-        write_until(has_arrived, new_board, b"after")
+        while not has_arrived.wait(0.02):  # bytes before the opening of the port are lost
+            new_board.write_whole(b"after")
 
     link.symlink_to(board.url)
     with Port(str(link), reconnect=True) as port:

@@ -55,7 +55,7 @@ class RandomBoard:
         head = [pick(HEAD_FIELDS) for _ in range(rng.integers(0, 3))]
         # A frame has at most one counter and one clock.
         self.head = list({field.get("name", field.get("value"))[:2]: field for field in head}.values())
-        skips_sync = bool(rng.integers(2))
+        skips_sync = rng.integers(2)
         end = pick((b"", b"", b"\r\n"))
         fields = self.head + [{"name": name, "type": type_name} for name in "ABCD"[:electrodes]]
         sizes = [int(field["type"].strip("iufpad") or 8) // 8 for field in fields]  # a constant has one byte
