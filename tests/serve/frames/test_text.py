@@ -276,17 +276,17 @@ def test_values_that_are_not_numbers_or_out_of_range_are_not_finite():
 @pytest.mark.parametrize(
     ("header", "line", "names"),
     [
-        ("T:time,A,B,C", "T:{n},4.7,-2.2,3.2", ("time", "A", "B", "C")),
-        ("n,mode,phase,A,B", "{n},bare,stance,4.7,-2.2", ("n", "A", "B")),
-        ("state,B,phase,A", "run,{n},idle,-2.2", ("B", "A")),
-        ("t [ms], A [pC], B [pC]", "{n}, 4.7, -2.2", ("t [ms]", "A [pC]", "B [pC]")),
-        ('"A","B"', "{n},4.7", ("A", "B")),
-        ("n\tA B", "{n}\t4.7", ("n", "A B")),
+        ("T:time,A,B,C", "T:{n},4.7,-2.2,3.2", "time,A,B,C"),
+        ("n,mode,phase,A,B", "{n},bare,stance,4.7,-2.2", "n,A,B"),
+        ("state,B,phase,A", "run,{n},idle,-2.2", "B,A"),
+        ("t [ms], A [pC], B [pC]", "{n}, 4.7, -2.2", "t [ms],A [pC],B [pC]"),
+        ('"A","B"', "{n},4.7", "A,B"),
+        ("n\tA B", "{n}\t4.7", "n,A B"),
     ],
 )
 def test_header_names_the_columns_that_contain_numbers(header, line, names):
     frames = feed("booting ...", header, *(line.format(n=1000 + 7 * n) for n in range(4)))
-    assert frames[-1].names == names
+    assert ",".join(frames[-1].names) == names
 
 
 @pytest.mark.parametrize(("lost", "cycles", "malformed"), [(0, [1, 2, 3, 4, 5], 2), (12, [0, 1, 2, 3, 5], 2)])

@@ -80,9 +80,8 @@ def phases_of(results):
 def test_press_is_taken_once_and_the_next_press_after_a_lift():
     results = watch_presses(rest(1), held(2), rest(1), held(2, press=PRESS / 2), rest(1))
     assert phases_of(results) == "waiting settling taken lift waiting settling taken lift waiting"
-    rest_frames = 50
     for press, clean_pC in zip(taken_presses(results), (PRESS, PRESS / 2), strict=True):
-        standard_error_pC = noise_std(clean_pC) * math.sqrt(1 / press.frames + 1 / rest_frames)
+        standard_error_pC = noise_std(clean_pC) * math.sqrt(1 / press.frames + 1 / 50)  # of 50 frames at rest
         assert (np.abs(press.charge_pC - clean_pC) < 4 * standard_error_pC).all()
         np.testing.assert_allclose(press.scatter_pC, noise_std(clean_pC), rtol=0.35)
         assert press.held_s < 0.8

@@ -148,7 +148,7 @@ def test_channel_that_never_changes_is_kept_beside_the_others(channel, constant)
     """The doctor can only report a dead channel that the description contains."""
     values = VALUES.copy()
     values[:, channel] = constant
-    fields = recognised_fields("<H4h", np.arange(FRAMES), values)
+    fields = recognised_fields("<H4h", range(FRAMES), values)
     assert [field["name"] for field in fields] == ["seq", "ch1", "ch2", "ch3", "ch4"]
 
 
