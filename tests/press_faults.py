@@ -20,6 +20,7 @@ from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.forward.whole_film import whole_film_map
 from isocharge.simulate.identifiability.mirror_region import has_mirror
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
+from solved_charges import with_film
 
 FILM_SENSOR = "three-25um-biaxial"
 """Sensor whose film all sensors of the study share; only their electrodes and piezoelectric coefficients differ."""
@@ -56,9 +57,8 @@ def film_map(probe_radius_mm: float = 1.0, **changes: float) -> ForwardMap:
         probe_radius_mm: Radius of the probe, mm.
         changes: Other values of attributes of the film.
     """
-    sensor = load_sensor(FILM_SENSOR)
-    changed = replace(sensor, film=replace(sensor.film, **changes))
-    return ForwardMap.build(changed, Circle(probe_radius_mm), FILM_RADIUS_mm, FORCE_RANGE_N)
+    sensor = with_film(load_sensor(FILM_SENSOR), **changes)
+    return ForwardMap.build(sensor, Circle(probe_radius_mm), FILM_RADIUS_mm, FORCE_RANGE_N)
 
 
 def film_variants() -> dict[str, ForwardMap]:

@@ -12,6 +12,11 @@ def with_film(sensor, **changes):
     return replace(sensor, film=replace(sensor.film, **changes))
 
 
+def with_piezo(sensor, **changes):
+    """Return a sensor with other values of some piezoelectric coefficients, pC/N."""
+    return replace(sensor, piezo=replace(sensor.piezo, **changes))
+
+
 def solved_charge(sensor, probe, at, force, *settings, **options):
     """Solve a press, and return the touch charges, shape (n_electrode,), pC. See `press` for settings and options."""
     return touch_charge(sensor, press(sensor.film, probe, at, force, *settings, **options))

@@ -9,6 +9,7 @@ from svgelements import SVG, Path
 
 from isocharge.simulate import Electrode, load_sensor
 from isocharge.simulate.artwork import draw_layout, to_dxf, to_svg
+from solved_charges import with_film
 
 MICROMETRE = 1e-3
 """One micrometre, mm."""
@@ -51,7 +52,7 @@ def test_dxf_has_the_positions_and_sizes_of_the_sensor(sensor, drawing, tmp_path
 def test_rim_of_an_oval_film_is_not_a_circle():
     """The semi-axes of the rim are 10 % larger and smaller than the radius of 45 mm."""
     sensor = load_sensor("three-25um-biaxial")
-    space = draw_layout(replace(sensor, film=replace(sensor.film, oval=0.1))).modelspace()
+    space = draw_layout(with_film(sensor, oval=0.1)).modelspace()
     (rim,) = space.query('LWPOLYLINE[layer=="FILM"]')
     assert box([*rim.get_points("xy")]) == pytest.approx([-49.5, -40.5, 49.5, 40.5])
     assert not space.query("CIRCLE")

@@ -9,7 +9,7 @@ from isocharge.common.errors import SceneError
 from isocharge.simulate import ChargeSpline
 from isocharge.simulate.numerics.disk import sunflower
 from kept import kept
-from solved_charges import relative_error
+from solved_charges import relative_error, with_piezo
 
 RADIUS = 5.0
 
@@ -33,9 +33,8 @@ def test_spline_includes_the_charge_of_contact_pressure(near_map):
     The slope of these charges has a kink where the edge of the footprint meets a corner of an electrode. The error of
     the spline is therefore 1.1 % with knots every 0.5 mm, and 0.2 % with knots every 0.25 mm.
     """
-    sensor = near_map.sensor
     contact = spread(100)
-    pressed = replace(near_map, sensor=replace(sensor, piezo=replace(sensor.piezo, d33=-30.0)))
+    pressed = replace(near_map, sensor=with_piezo(near_map.sensor, d33=-30.0))
     with_d33, without = (kept(ChargeSpline.of, each, spacing=0.5) for each in (pressed, near_map))
     extra = pressed.charges(contact) - near_map.charges(contact)
     assert np.abs(extra).max() > 10.0

@@ -28,7 +28,7 @@ from isocharge.simulate.forward import forward_map as forward_map_module
 from isocharge.simulate.forward.family import NODE_COUNTS, Family, NodeCount
 from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR
 from kept import kept
-from solved_charges import solved_charge, with_film
+from solved_charges import solved_charge, with_film, with_piezo
 
 QUICK = {"radius": 4.0, "force_range": (0.7, 1.0), "settings": COARSE}
 """A small family without bending: few and cheap solves."""
@@ -92,7 +92,7 @@ def test_forward_map_agrees_with_direct_solves_for_random_orientations(oriented_
 def test_footprint_grows_with_the_cube_root_of_the_force(near_electrodes):
     """The expected charges are those of fingers with the radius that each force has, solved one by one."""
     wide_range = QUICK | {"force_range": (0.125, 1.0)}
-    sensor = replace(near_electrodes, piezo=replace(near_electrodes.piezo, d33=-20.0))
+    sensor = with_piezo(near_electrodes, d33=-20.0)
     growing = ForwardMap.build(sensor, GrowingFinger(2.0), **wide_range)
     contact, _ = draw(growing, 6, seed=3)
     expected = np.array(
@@ -126,7 +126,7 @@ def test_one_family_of_solves_serves_every_readout(near_map, changes):
 def test_contact_pressure(near_map, oriented_map):
     """d33 counts on the electrode under the probe, however the probe is rotated."""
     for plain in (near_map, oriented_map):
-        sensor = replace(plain.sensor, piezo=replace(plain.sensor.piezo, d33=-30.0))
+        sensor = with_piezo(plain.sensor, d33=-30.0)
         contact, rotation = draw(plain, 40, seed=6)
         centres = np.array([electrode.centre for electrode in sensor.electrodes])
         nearest = np.argsort(np.linalg.norm(contact[:, None, :2] - centres, axis=2).min(axis=1))[:4]

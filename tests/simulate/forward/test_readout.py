@@ -29,6 +29,7 @@ from isocharge.simulate.forward.readout import (
     thermal_charge,
 )
 from isocharge.simulate.numerics.polygon import to_corners
+from solved_charges import with_film
 
 UNIAXIAL = load_sensor("four-25um-uniaxial")
 AREA = 9.0
@@ -179,7 +180,7 @@ def test_small_probe_on_a_large_electrode(film, probe):
 
 
 def test_touch_charge_with_another_film_raises_error(solved):
-    other = replace(solved, film=replace(solved.film, young=2500.0))
+    other = with_film(solved, young=2500.0)
     with pytest.raises(SensorError, match=r"another film: expected Film\(.*young=3000.*got .*young=2500"):
         touch_charge(load_sensor("three-25um-biaxial"), other)
 
@@ -251,9 +252,8 @@ def test_thermal_charge():
 
 def test_thermal_charge_of_a_clamped_film_contains_the_charge_of_its_changed_tension():
     """A film that cannot expand has the plane stress -E alpha / (1 - nu) per kelvin in all directions."""
-    sensor = UNIAXIAL
-    film = replace(sensor.film, expansion=(1e-4, 1e-4))
-    sensor = replace(sensor, film=film, piezo=Piezo(20.0, 2.0, pyro=-30.0))
+    film = replace(UNIAXIAL.film, expansion=(1e-4, 1e-4))
+    sensor = replace(UNIAXIAL, film=film, piezo=Piezo(20.0, 2.0, pyro=-30.0))
     stress = -film.young * 1e-4 / (1.0 - film.poisson)  # MPa/K
     expected = 9.0 * 0.5 * (-30.0 + (20.0 + 2.0) * stress)
     np.testing.assert_allclose(thermal_charge(sensor, 0.5), np.full(4, expected), rtol=1e-12)

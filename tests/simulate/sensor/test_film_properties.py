@@ -1,7 +1,6 @@
 """Tests of the properties of real films: each changes what it names and nothing else."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -65,7 +64,7 @@ def test_each_property_changes_what_it_names_and_nothing_else(name):
 def test_all_moduli_change_with_the_modulus_of_the_film():
     """The default of the shear modulus, stated explicitly, describes the same film."""
     shear = 0.5 * SENSOR.film.young / (1.0 + SENSOR.film.poisson)
-    stated = replace(SENSOR, film=replace(SENSOR.film, shear=shear))
+    stated = with_film(SENSOR, shear=shear)
     (changed, _), (default, _) = (changed_film(sensor, Circle(1.0), {"young": 0.2}) for sensor in (stated, SENSOR))
     assert changed.film.shear == pytest.approx(0.5 * default.film.young / (1.0 + default.film.poisson))
 

@@ -45,8 +45,8 @@ def test_compressed_plate_buckles_into_a_stable_equilibrium(film):
 def test_press_under_which_the_film_bulges_against_the_push_is_refused(film):
     plate = replace(film, thickness=0.5, pretension=-1.0)
     with pytest.raises(SolveError, match="bulges against the push"):
-        press(plate, Circle(1.0), (0.0, 0.0), 0.01)
-    pushed = press(plate, Circle(1.0), (0.0, 0.0), 1.0)
+        press(plate, CIRCLE, (0.0, 0.0), 0.01)
+    pushed = press(plate, CIRCLE, (0.0, 0.0), 1.0)
     assert deflection(pushed, np.zeros((1, 2)))[0] > 0.0
 
 
@@ -54,14 +54,14 @@ def test_press_under_which_the_film_bulges_against_the_push_is_refused(film):
 def test_newton_converges_quadratically(film, theory):
     """The last step nearly squares the residual, because the tangent is exact near the solution."""
     residuals = [
-        press(film, Circle(1.0), (3.0, 0.0), 1.0, SolveSettings(theory=theory, tolerance=tolerance)).residual
+        press(film, CIRCLE, (3.0, 0.0), 1.0, SolveSettings(theory=theory, tolerance=tolerance)).residual
         for tolerance in (1e-1, 1e-2, 1e-4)
     ]
     assert residuals[2] < 10.0 * residuals[1] ** 1.5
 
 
 def test_failed_solve_raises_solve_error_or_returns_status(film, monkeypatch):
-    scene = film, Circle(1.0), (2.0, -3.0), 1.5, FAILING
+    scene = film, CIRCLE, (2.0, -3.0), 1.5, FAILING
     message = r"no equilibrium at 1\.5 N, position \(2, -3\) mm: .*; residual .* \(expected 1e-30\) after \d+ steps"
     solved = press(*scene)  # a tolerance that no arithmetic reaches: as good as it gets is no failure
     assert solved.message == f"converged to round-off in {solved.iterations} steps"
@@ -75,9 +75,9 @@ def test_failed_solve_raises_solve_error_or_returns_status(film, monkeypatch):
 
 def test_start_with_nan_fails(film):
     """The press is then solved with increasing forces, with the same result."""
-    good, bad = (press(film, Circle(1.0), (0.0, 0.0), 1.0) for _ in range(2))
+    good, bad = (press(film, CIRCLE, (0.0, 0.0), 1.0) for _ in range(2))
     bad.field[0, 2] = np.nan
-    solved = press(film, Circle(1.0), (0.0, 0.0), 1.0, start=bad)
+    solved = press(film, CIRCLE, (0.0, 0.0), 1.0, start=bad)
     assert solved.message.endswith("the load in parts")
     np.testing.assert_allclose(solved.field, good.field, atol=1e-6)
 
@@ -90,6 +90,6 @@ def test_wrinkling_film_raises_solve_error(film, monkeypatch):
     monkeypatch.setattr("isocharge.simulate.solver.newton.MAX_ITERATIONS", 3)
     mesh = SolveSettings(theory=FULL, resolution=Resolution(5, 8, 6, 1))
     with pytest.raises(SolveError, match=WRINKLES):
-        press(film, Circle(1.0), (0.0, 42.0), 5.0, mesh)
+        press(film, CIRCLE, (0.0, 42.0), 5.0, mesh)
     with pytest.raises(SolveError, match=r"after 6 steps$"):
-        press(film, Circle(1.0), (0.0, 0.0), 5.0, mesh)
+        press(film, CIRCLE, (0.0, 0.0), 5.0, mesh)

@@ -12,6 +12,7 @@ from tests.train.calibration.synthetic_film import SyntheticFilm
 from isocharge.common.errors import PressError, SensorError
 from isocharge.simulate import Circle, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, next_presses
+from solved_charges import with_film
 
 pytestmark = pytest.mark.usefixtures("never_solved")
 
@@ -48,9 +49,8 @@ def test_film_is_solved_beyond_the_radius_but_not_at_the_clamp(problem):
 
 
 def test_described_film_that_cannot_be_found_is_refused(problem):
-    film = replace(problem.sensor.film, pretension=8.0)
     with pytest.raises(SensorError, match=r"pretension_MPa: expected at most 4 MPa.*got 8; train on many presses"):
-        replace(problem, sensor=replace(problem.sensor, film=film))
+        replace(problem, sensor=with_film(problem.sensor, pretension=8.0))
 
 
 @pytest.mark.parametrize("offset", [10.0, -12.0])

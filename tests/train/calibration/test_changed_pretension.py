@@ -11,6 +11,7 @@ from isocharge.train import calibrate
 from isocharge.train.calibration.calibrate import solve_even
 from isocharge.train.calibration.estimator import PLANNED
 from isocharge.train.calibration.film_network import _nodes, _tension_factors
+from solved_charges import with_film
 
 
 @pytest.mark.slow
@@ -20,7 +21,7 @@ def test_charges_of_an_uneven_film_after_warming_agree_with_full_solves(problem)
     sensor, probe = film.layout.prior.film(film.film_values)
     contact = np.array([[0.0, 0.0, 0.5], [5.0, 1.0, 0.3], [-3.0, 4.0, 1.0], [2.0, -6.0, 0.5], [-6.0, -2.0, 1.5]])
     before = solve_charges(sensor, probe, contact)
-    later = replace(sensor, film=replace(sensor.film, pretension=sensor.film.pretension - 0.4))
+    later = with_film(sensor, pretension=sensor.film.pretension - 0.4)
     after = solve_charges(later, probe, contact)
 
     charges = solve_even(problem, values=film.film_values)

@@ -42,14 +42,18 @@ IMPOSSIBLE = {
 }
 
 
+def with_mistake(problem, synthetic, make_mistake):
+    """Return twelve presses of a rig, after a function has changed their contacts and charges."""
+    _, _, presses = rig(problem, synthetic, 12, seed=7)
+    return measured_presses(problem, *make_mistake(presses.contact, presses.charge_pC))
+
+
 @pytest.mark.parametrize("name", EXPLAINED)
 def test_mistake_in_the_presses_is_found(problem, synthetic, name):
     """On this layout, rotated axes and swapped columns have the same effect, so that both are named."""
     make_mistake, message = EXPLAINED[name]
-    _, _, presses = rig(problem, synthetic, 12, seed=7)
-    assert find_mistakes(presses, synthetic) == []
-    contact, charge = make_mistake(presses.contact, presses.charge_pC)
-    mistakes = find_mistakes(measured_presses(problem, contact, charge), synthetic)
+    assert find_mistakes(with_mistake(problem, synthetic, lambda *presses: presses), synthetic) == []
+    mistakes = find_mistakes(with_mistake(problem, synthetic, make_mistake), synthetic)
     assert re.search(message, "; ".join(mistakes))
 
 
@@ -68,7 +72,5 @@ def test_places_near_the_rim_of_an_oval_film(problem, synthetic):
 @pytest.mark.parametrize("name", IMPOSSIBLE)
 def test_impossible_presses_are_refused_with_the_reason(problem, synthetic, name):
     make_mistake, message = IMPOSSIBLE[name]
-    _, _, presses = rig(problem, synthetic, 12, seed=7)
-    contact, charge = make_mistake(presses.contact, presses.charge_pC)
     with pytest.raises(PressError, match=message):
-        calibrate(measured_presses(problem, contact, charge), problem, start=synthetic, accurate=False)
+        calibrate(with_mistake(problem, synthetic, make_mistake), problem, start=synthetic, accurate=False)

@@ -26,7 +26,7 @@ from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.data.contact_errors import position_error
 from isocharge.train.data.presses import draw_contacts
 from kept import kept
-from solved_charges import solved_charge
+from solved_charges import solved_charge, with_film, with_piezo
 
 
 @pytest.fixture(scope="module")
@@ -56,9 +56,9 @@ def test_charges_of_a_similar_film_agree_with_direct_solves(solved):
 
 def test_negative_charges_agree_with_direct_solves(problem):
     """If the wires are swapped, all charges are negative. They have no logarithm, so they change linearly."""
-    sensor = problem.sensor
-    piezo = replace(sensor.piezo, d31=-sensor.piezo.d31, d32=-sensor.piezo.d32)
-    solved = kept(solve_even, replace(problem, sensor=replace(sensor, piezo=piezo)))
+    piezo = problem.sensor.piezo
+    swapped = with_piezo(problem.sensor, d31=-piezo.d31, d32=-piezo.d32)
+    solved = kept(solve_even, replace(problem, sensor=swapped))
     values = solved.prior.mean + 0.3 * solved.prior.std * (np.array(solved.prior.names) == "pretension")
     expected = direct(*solved.prior.film(values), CONTACT)
     change = expected - solved.charges(solved.prior.mean, CONTACT)
@@ -68,8 +68,8 @@ def test_negative_charges_agree_with_direct_solves(problem):
 
 def test_imperfections_of_the_sensor_file_are_changes_of_the_even_film(problem):
     """Without them, the charges differ by up to 6 %."""
-    film = replace(problem.sensor.film, deviator=(0.4, 0.1), young_ratio=1.2, axis=0.5, oval=0.004, oval_axis=1.0)
-    charges = kept(solve_even, replace(problem, sensor=replace(problem.sensor, film=film)))
+    sensor = with_film(problem.sensor, deviator=(0.4, 0.1), young_ratio=1.2, axis=0.5, oval=0.004, oval_axis=1.0)
+    charges = kept(solve_even, replace(problem, sensor=sensor))
     values = charges.prior.mean
     expected = direct(*charges.prior.film(values), CONTACT)
     even = direct(*charges.prior.film(charges.values), CONTACT)
@@ -80,7 +80,7 @@ def test_imperfections_of_the_sensor_file_are_changes_of_the_even_film(problem):
 
 def test_described_shear_modulus_is_solved_with_the_film(problem, solved):
     assert _is_exact(solved, solved.prior.mean, CONTACT)
-    sensor = replace(problem.sensor, film=replace(problem.sensor.film, shear=900.0))
+    sensor = with_film(problem.sensor, shear=900.0)
     assert not _is_exact(replace(solved, prior=FilmPrior(sensor, problem.probe)), solved.prior.mean, CONTACT)
 
 
@@ -191,8 +191,7 @@ def test_film_is_calibrated_and_its_model_finds_contacts(film, tmp_path):
 @pytest.mark.slow
 def test_film_with_charges_of_both_signs_is_calibrated():
     """The electrodes on the x axis have positive charges, and those on the y axis negative charges."""
-    sensor = load_sensor("four-25um-biaxial")
-    sensor = replace(sensor, piezo=replace(sensor.piezo, d31=12.0, d32=-8.0))
+    sensor = with_piezo(load_sensor("four-25um-biaxial"), d31=12.0, d32=-8.0)
     problem = CalibrationProblem(sensor, Circle(1.0), radius=5.0, force_range=(0.1, 1.0))
     prior = problem.prior.layout.prior
     values = prior.mean.copy()

@@ -60,25 +60,22 @@ class Exported:
         self.library.bridge_flags(_pointer(rows), len(rows), _pointer(flags))
         return flags
 
-    def chain(self, values, t_s, dt_s, limited=None, tare=None):
+    def chain(self, values, t_s, dt_s, limited, tare):
         """Process frames with the signal chain.
 
         Args:
             values: Values of the frames, shape (n, electrodes).
             t_s: Times of the frames, shape (n,), s.
             dt_s: Times since the previous frame, shape (n,), s.
-            limited: Whether each frame is limited, shape (n,); by default none.
-            tare: Whether to measure the tare again at each frame, shape (n,); by default never.
+            limited: Whether each frame is limited, shape (n,).
+            tare: Whether to measure the tare again at each frame, shape (n,).
 
         Returns:
             Touch charges, tares, shape (n, electrodes) each, contact states and flags, shape (n,) each.
         """
         count = len(values)
-        no_marks = np.zeros(count, np.int32)
-        limited_marks = no_marks if limited is None else np.int32(limited)
-        tare_marks = no_marks if tare is None else np.int32(tare)
         columns = [np.ascontiguousarray(column, dtype=float) for column in (values, t_s, dt_s)]
-        inputs = [*columns, limited_marks, tare_marks]
+        inputs = [*columns, np.int32(limited), np.int32(tare)]
         charge = np.empty((count, self.electrodes))
         tare_charge = np.empty_like(charge)
         contact = np.empty(count, np.int32)
