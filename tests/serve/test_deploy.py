@@ -249,9 +249,8 @@ def test_the_service_and_the_budget_select_the_pods_of_the_deployment():
     (container,) = pod["containers"]
     assert pod["automountServiceAccountToken"] is False
     labels = deployment["spec"]["template"]["metadata"]["labels"]
-    assert labels == deployment["spec"]["selector"]["matchLabels"]
-    assert labels == service["spec"]["selector"]
-    assert labels == budget["spec"]["selector"]["matchLabels"]
+    selectors = [manifest["spec"]["selector"] for manifest in (deployment, budget, service)]
+    assert selectors == [{"matchLabels": labels}, {"matchLabels": labels}, labels]
     assert service["spec"]["ports"][0]["targetPort"] == container["ports"][0]["containerPort"]
     assert budget["spec"]["minAvailable"] < deployment["spec"]["replicas"]
 

@@ -1,7 +1,6 @@
 """SIGHUP to a running `serve stream`: it goes on with the latest version of its model, and loses nothing by it."""
 
 import fcntl
-import json
 import os
 import pty
 import shutil
@@ -16,6 +15,7 @@ import pytest
 
 from boards import TcpBoard, interrupt, taps, until
 from model_files import golden_fault
+from serve.cli.test_commands import records_of
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def stream(run, repository):
     def follow(rows, *words):
         with TcpBoard(rows) as board:
             result = run("stream", "linear", "--port", board.url, "--models", repository, *words)
-        return [json.loads(line) for line in result.stdout.splitlines()]
+        return records_of(result.stdout)
 
     return follow
 
@@ -87,9 +87,9 @@ def test_a_new_version_serves_without_losing_a_frame(film, repository, stream, c
 
     film.write(repository)
     again = run("replay", tmp_path / "touch.rec", "--models", repository).stdout
-    assert [json.loads(line) for line in again.splitlines()] == records
+    assert records_of(again) == records
     fixed = run("replay", tmp_path / "touch.rec", "--models", repository, "--model", "linear/1").stdout
-    assert {json.loads(line)["model"] for line in fixed.splitlines()} == {"linear/1"}
+    assert {record["model"] for record in records_of(fixed)} == {"linear/1"}
 
 
 def test_closing_the_terminal_still_ends_the_stream(film, repository):

@@ -34,8 +34,8 @@ def charges(film, n=5):
     return np.resize(film.golden_pC(), (n, 3)).astype(np.float32)
 
 
-def tensor(module, values, datatype="FP32"):
-    made = module.InferInput("charge_pC", list(values.shape), datatype)
+def tensor(module, values):
+    made = module.InferInput("charge_pC", list(values.shape), "FP32")
     made.set_data_from_numpy(values)
     return made
 

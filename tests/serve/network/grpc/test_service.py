@@ -248,5 +248,5 @@ def test_new_call_replaces_the_call_that_waits_longest(serve, silent_call):
 def test_bytes_that_are_no_message_are_refused(serve, silent_call):
     """The status states a mistake of the client, not of the server."""
     channel = serve()()
-    assert refusal(silent_call(channel, "ModelInfer", [b"\xff\xff\xff"])) == "INVALID_ARGUMENT"
-    assert refusal(silent_call(channel, "ModelStreamInfer", [b"\xff\xff\xff"])) == "INVALID_ARGUMENT"
+    for name in ("ModelInfer", "ModelStreamInfer"):
+        assert refusal(silent_call(channel, name, [b"\xff\xff\xff"])) == "INVALID_ARGUMENT"

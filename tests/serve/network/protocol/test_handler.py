@@ -93,9 +93,9 @@ def test_outputs_equal_those_of_onnxruntime(ask, bare, film, n, datatype, form):
         np.testing.assert_array_equal(np.float32(output["data"]), rows.ravel())
 
 
-def binary_request(charges, datatype="FP32", **changes):
-    raw = charges.astype({"FP32": "<f4", "FP64": "<f8"}[datatype]).tobytes()
-    tensor = {"name": "charge_pC", "datatype": datatype, "shape": list(charges.shape)}
+def binary_request(charges, **changes):
+    raw = charges.astype("<f4").tobytes()
+    tensor = {"name": "charge_pC", "datatype": "FP32", "shape": list(charges.shape)}
     tensor |= {"parameters": {"binary_data_size": len(raw)}} | changes.pop("tensor", {})
     text = orjson.dumps({"inputs": [tensor]} | changes)
     return text + raw, len(text)
