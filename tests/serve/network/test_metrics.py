@@ -6,14 +6,9 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from infer_requests import BODY, INFER, infer_request
 from isocharge.serve.flags import MISFIT
-from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol import Handler
-
-
-def families(text):
-    return {family.name: family for family in text_string_to_metric_families(text.decode())}
 
 
 def scrape(handler):
@@ -21,7 +16,7 @@ def scrape(handler):
     status, headers, text, _ = handler.answer("GET", "/metrics", [], b"")
     assert status == 200
     assert dict(headers)[b"content-type"].startswith(b"text/plain; version=0.0.4")
-    samples = [sample for family in families(text).values() for sample in family.samples]
+    samples = [sample for family in text_string_to_metric_families(text.decode()) for sample in family.samples]
     samples = [sample for sample in samples if not sample.name.endswith("_created")]
     values = {(sample.name, *sorted(sample.labels.items())): sample.value for sample in samples}
     assert len(values) == len(samples)
@@ -75,8 +70,8 @@ def test_metrics_list_loaded_and_refused_versions(film, tmp_path):
     samples = scrape(Handler(store))
     ready = [value(samples, "model_ready", model="linear", version=v) for v in ("1", "2", "3")]
     assert ready == [1, 1, 0]
-    metadata: ModelMetadata = store.get("linear", "2").metadata
-    facts = {"sensor": metadata.frame_id, "sha256": store.get("linear", "2").model.golden.sha256}
+    loaded = store.get("linear", "2")
+    facts = {"sensor": loaded.metadata.frame_id, "sha256": loaded.model.golden.sha256}
     assert value(samples, "model_info", model="linear", version="2", **facts) == 1
 
 
