@@ -86,8 +86,7 @@ def test_device_file_with_all_sections(device):
 
 
 def test_device_without_a_file_has_tare_and_touch(device):
-    assert set(ANY_BOARD.rules) == {TareRule, TouchRule}
-    assert device("").rules == ANY_BOARD.rules
+    assert device("").rules == ANY_BOARD.rules == {TareRule: TareRule(), TouchRule: TouchRule()}
     assert isinstance(ANY_BOARD.parser(), AutoParser)
 
 

@@ -245,11 +245,10 @@ for record in pickle.load(sys.stdin.buffer):
 os.kill(os.getpid(), signal.SIGKILL)
 """
     written = [press(number) for number in range(120)]
-    lines = [record.to_json() for record in written]
     done = subprocess.run([sys.executable, "-c", code], input=pickle.dumps(written), timeout=60, check=False)
     assert done.returncode == -signal.SIGKILL
     recovered = whole_messages(path.read_bytes())
-    assert recovered == lines[: len(recovered)]
+    assert recovered == [record.to_json() for record in written[: len(recovered)]]
     assert 69 <= len(recovered) < 120  # of 2.4 s, written every second
 
 

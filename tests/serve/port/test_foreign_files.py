@@ -60,13 +60,7 @@ def test_foreign_file_as_a_port_is_refused_with_the_command_that_reads_it(name, 
         pass
 
 
-def test_recording_on_stdin_is_refused(tmp_path):
-    recording(tmp_path / "touch.rec")
-    with (tmp_path / "touch.rec").open("rb") as file, pytest.raises(InputError, match="got a recording"):
-        next(iter(FileSource(file.fileno(), "-")))
-
-
-def test_lines_of_a_board_with_a_name_of_a_table_are_read_from_stdin(tmp_path):
+def test_lines_with_the_names_of_a_table_are_read_from_stdin_but_a_recording_is_not(tmp_path):
     """The error of the file advises this."""
     path = tmp_path / "board.csv"
     path.write_text("A,B,C,flags\n1,2,3,0\n")
@@ -74,6 +68,9 @@ def test_lines_of_a_board_with_a_name_of_a_table_are_read_from_stdin(tmp_path):
         check_file(path)
     with path.open("rb") as file:
         assert next(iter(FileSource(file.fileno(), "-"))).data == path.read_bytes()
+    recording(tmp_path / "touch.rec")
+    with (tmp_path / "touch.rec").open("rb") as file, pytest.raises(InputError, match="got a recording"):
+        next(iter(FileSource(file.fileno(), "-")))
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,9 @@ BIAXIAL = np.column_stack([np.ones(4), np.cos(ANGLE) / 20, np.sin(ANGLE) / 20])
 UNIAXIAL = np.array([1.6, 0.4, 1.6, 0.4])[:, None] * BIAXIAL
 """Matrix from (F, Fx, Fy) to the charges of a uniaxial film, shape (4, 3)."""
 
+CONTACT = [850.0, 3.0, -2.0]
+"""The contact (F, Fx, Fy) of a press."""
+
 NOISE_pC = 2.0
 """Standard deviation of the noise by which the misfit is divided, pC."""
 
@@ -44,12 +47,11 @@ def follow_warming(film, common_charges_pC):
     Returns:
         The estimates, shape (n,), pC, and the last state.
     """
-    rng = np.random.default_rng(0)
-    press_pC = film @ [850.0, 3.0, -2.0]
+    charges_pC = np.random.default_rng(0).normal(np.add.outer(common_charges_pC, film @ CONTACT), 0.5)
     warming = warming_stage(misfit_of(film))
     estimates = []
-    for common_pC in common_charges_pC:
-        warming._estimate(press_pC + common_pC - warming._charge_pC + rng.normal(0, 0.5, 4), 0.05)
+    for charge_pC in charges_pC:
+        warming._estimate(charge_pC - warming._charge_pC, 0.05)
         estimates.append(warming._charge_pC)
     return np.array(estimates), warming
 
@@ -80,7 +82,7 @@ def test_uncertainty_of_the_warming_grows_while_it_is_inseparable_from_force():
     assert warming._charge_pC == pytest.approx(18.0, rel=0.05)
 
 
-PRESS = UNIAXIAL @ [850.0, 3.0, -2.0]
+PRESS = UNIAXIAL @ CONTACT
 """Touch charges of a press on the uniaxial film, shape (4,), pC."""
 
 TARE_PC = np.full(4, 7.0)
