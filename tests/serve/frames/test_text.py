@@ -223,6 +223,11 @@ def test_message_does_not_replace_the_header(message, names):
     assert [frame.names for frame in frames] == [names] * 4
 
 
+def test_header_after_the_first_frames_names_the_next_frames():
+    frames = feed("1,2,3", "2,3,4", "3,4,5", "b,a,c", "4,5,6")
+    assert [frame.names for frame in frames] == [(), (), (), ("b", "a", "c")]
+
+
 MESSAGES = ["Sensor 1 ready", "Sensor 2 ready", "Sensor 3 ready", "load:0x3fff0018,len:4"] + ["rst:0x1,boot:0x13"] * 2
 
 

@@ -23,7 +23,7 @@ from isocharge.serve.port.serial_line import Request
 from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.gain import Gain, GainRule, SaturationRule
 from isocharge.serve.signal_chain.hum import HumRule
-from isocharge.serve.signal_chain.leak import LeakRule
+from isocharge.serve.signal_chain.leak import Leak, LeakRule
 from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.signal_chain.tare import TareRule
 from isocharge.serve.signal_chain.thermal import ThermalRule
@@ -82,6 +82,7 @@ def test_device_file_with_all_sections(device):
         TouchRule(floor_pC=20.0),
     ]
     assert board.rules == {type(rule): rule for rule in rules}
+    assert Leak.c_settings(Setup(ELECTRODES, board))["tau_s"].tolist() == [10.0, 10.2, 9.9]
     assert isinstance(board.parser(), TextParser)
 
 
