@@ -22,6 +22,7 @@ from shared import model_film, options, print_results
 from isocharge.serve import Contact, Predictor
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.charge_file import read_charge_map
+from isocharge.serve.record.record import OtherContact, TrackedContact
 from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.tracking.tracker import Tracker, TrackRule
 from isocharge.simulate import noise_model
@@ -114,7 +115,7 @@ def into_map(contact: np.ndarray, film: ChargeMap) -> np.ndarray:
 
 
 def examine_frame(
-    film: ChargeMap, tracked: Contact, other: Contact | None, truth: np.ndarray, side: float
+    film: ChargeMap, tracked: TrackedContact, other: OtherContact | None, truth: np.ndarray, side: float
 ) -> tuple[bool, bool, bool, float]:
     """Compare the contacts that the tracker reports with the true contact.
 
@@ -131,7 +132,7 @@ def examine_frame(
         mm.
     """
     contacts = [contact for contact in (tracked, other) if contact is not None]
-    reported = np.array([contact[:3] for contact in contacts])
+    reported = np.array([(contact.x_mm, contact.y_mm, contact.force_N) for contact in contacts])
     is_right_side = sides(film, into_map(reported, film)) == side
     error_mm = float(np.hypot(*(reported[0] - truth)[:2]))
     return other is None, bool(is_right_side[0]), bool(is_right_side.any()), error_mm
