@@ -32,7 +32,7 @@ def solved(monkeypatch):
     """What the commands ask for; they get a small map, of film 9 or of the described one."""
     solved = []
 
-    def build(sensor, probe, *, radius, force_range):
+    def build(sensor, probe, *, radius, force_range, executor):  # noqa: ARG001
         solved.append((sensor, probe, radius, force_range))
         return small_map(*(FILM_9 if (sensor, probe) == FILM_9 else DESCRIBED))
 
