@@ -69,8 +69,17 @@ def test_bytes_between_two_frames_damage_no_frame(name, data):
         ),
         ((254, 255, 0, 3), 256, (2, 0, 0), ["", "", "", "gap"]),
         ((None, 5, None, 8), 65536, (2, 0, 0), ["", "", "", "gap"]),
+        ((60_000, 60_001, 0, 1, 30_000), 65536, (29_998, 0, 1), ["", "", "restart", "", "gap"]),
+        ((65_500, 60), 65536, (95, 0, 0), ["", "gap"]),
     ],
-    ids=["wrap", "gaps, a repeat and a restart", "one byte", "some without a number"],
+    ids=[
+        "wrap",
+        "gaps, a repeat and a restart",
+        "one byte",
+        "some without a number",
+        "a restart in the upper half",
+        "a gap at the end of the range",
+    ],
 )
 def test_sequence_gaps_repeats_and_restarts(numbers, modulus, counts, flags):
     parser = BinaryParser()

@@ -17,6 +17,13 @@ from isocharge.serve.flags import GAP, REPEAT, RESTART
 from isocharge.serve.model.contact import Contact, Validity
 from isocharge.serve.record.record import FollowedFilm, Tracking
 
+MAX_WRAPPED_INCREASE = 128
+"""Increase of a frame counter past its largest number from which the counter is assumed to have been restarted.
+
+The increase is half of the range of a counter of one byte. A longer gap rarely coincides with the end of the range of a
+larger counter, whereas a board that restarts often does so in the upper half of this range.
+"""
+
 SEQ_MODULUS = 1 << 16
 """Value at which a 16-bit frame counter wraps to 0."""
 
@@ -304,8 +311,10 @@ class Parser(ABC):
             return (REPEAT,)
         # Modulo `seq_modulus`, a decrease is the same as a large increase. A counter that has exceeded the modulus does
         # not wrap at it, so each decrease is a restart.
-        is_decrease_beyond_modulus = self.seq_modulus <= previous_seq > seq
-        if increase >= self.seq_modulus // 2 or is_decrease_beyond_modulus:
+        max_increase = self.seq_modulus // 2
+        if seq < previous_seq:
+            max_increase = 0 if previous_seq >= self.seq_modulus else min(max_increase, MAX_WRAPPED_INCREASE)
+        if increase >= max_increase:
             self.counts.restarts += 1
             return (RESTART,)
         self.counts.lost += increase - 1
