@@ -370,9 +370,19 @@ class AddedSource:
             self._opened.__exit__(*error)
 
     def __iter__(self) -> Iterator[Chunk]:
-        """Yield chunks as they arrive, until the source ends."""
+        """Yield chunks as they arrive, until the source ends.
+
+        A chunk that is longer than the chunks of a port is divided, so that it fits in a line of a recording.
+        """
         with self._errors_named():
-            yield from self._source
+            for chunk in self._source:
+                if len(chunk.data) <= MAX_READ_BYTES:
+                    yield chunk
+                    continue
+                outage_s = chunk.outage_s
+                for start in range(0, len(chunk.data), MAX_READ_BYTES):
+                    yield chunk._replace(data=chunk.data[start : start + MAX_READ_BYTES], outage_s=outage_s)
+                    outage_s = 0.0  # the outage ended with the first part
 
     @contextlib.contextmanager
     def _errors_named(self) -> Iterator[None]:
