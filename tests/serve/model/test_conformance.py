@@ -64,3 +64,12 @@ def test_answers_are_finite_and_deviations_positive(model):
     one = np.ones_like(xy)
     matrices = np.moveaxis(np.array([[one, xy, xf], [xy, one, yf], [xf, yf, one]]), 2, 0)
     assert np.linalg.eigvalsh(matrices).min() > -2e-5  # a covariance, wherever the model is asked
+
+
+def test_one_press_equals_the_batch(model):
+    released = Predictor(model.folder)
+    batch = released.predict_batch(model.golden.charge_pC)
+    for row, charge_pC in enumerate(model.golden.charge_pC):
+        contact, expected = released.predict(charge_pC), [column[row] for column in batch]
+        assert contact[:6] == pytest.approx(expected[:6], rel=1e-4, abs=1e-4)
+        assert contact[6:] == pytest.approx(expected[6:], rel=1e-4, abs=1e-3)  # float32, sums in another order
