@@ -142,6 +142,12 @@ def test_proposed_device_file_ignores_unused_inputs_and_reads_the_same_charges()
     assert (again.unit, again.unused) == ("pC", ("2", "5"))
 
 
+def test_channel_of_a_device_file_that_the_board_does_not_send_is_reported():
+    device = device_from_table({"channels": {"A": "1", "B": "4", "C": "3"}}, "board.toml")
+    report = examined(charges(), device=device, electrodes=FOUR[:3])
+    assert report.missing[0].startswith('board.toml: [channels] B = "4": no channel is called that; the frames have 1,')
+
+
 def test_gain_of_some_electrodes_is_refused():
     with pytest.raises(DeviceError, match=r"gain\.pC_per_unit: expected a number, or one for each"):
         examined(row, electrodes=FOUR, gain={"pC_per_unit": {"A": 0.5}})

@@ -172,4 +172,5 @@ def test_report_command_takes_the_model_of_the_sensor_unless_another_is_given(
     assert json.loads(command(*words, "--model", f"{NAME}-student", "--json")[1]) == {"datasets": []}
     assert evaluated_models == [find_model(NAME), find_model(f"{NAME}-student")]
     refused(*words, "--model", NAME, "--model", NAME, message="expected one model for each of 1 datasets, got 2")
-    refused(*words, "--sensor", NAME, message="contain their sensors; leave --sensor out")
+    for option, value in (("--sensor", NAME), ("--probe", "circle:2.0")):
+        refused(*words, option, value, message=f"contain sensor and probes; leave {option} out")

@@ -168,9 +168,10 @@ def transmission_sentences(capture: Capture, received: ReceivedData) -> Iterator
 def channel_count_sentences(
     capture: Capture, device: Device, channel_count: int, electrodes: tuple[str, ...]
 ) -> Iterator[str]:
-    """Yield a sentence if the board has more or fewer channels than the model has electrodes.
+    """Yield a sentence if the board lacks a channel, or has more or fewer channels than the model has electrodes.
 
-    No sentence is needed without a model, or if the device file assigns a channel to every electrode. If the names of
+    A channel is lacking if the device file assigns it to an electrode, but the frames do not contain it. The other
+    sentence is not needed without a model, or if the device file assigns a channel to every electrode. If the names of
     the channels are nearly those of the electrodes, the sentence names the difference.
 
     Args:
@@ -179,9 +180,11 @@ def channel_count_sentences(
         channel_count: Number of channels that are used.
         electrodes: Electrodes of the model; empty for any model.
     """
-    if set(electrodes) <= set(device.channels):  # also without a model
-        return
     try:
+        if device.channels:
+            Channels(Setup(tuple(device.channels), device)).channel_indices(capture.frames[-1])
+        if set(electrodes) <= set(device.channels):  # also without a model
+            return
         Channels(Setup(electrodes, reader="the model"), any_unit=True).indices_by_name_or_order(capture.frames[-1])
     except ChargeError as error:
         yield str(error)

@@ -5,12 +5,13 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.forward_maps import ProbeOption
+from isocharge.cli.shared.forward_maps import DEFAULT_PROBE
 from isocharge.cli.shared.options import JsonOption, ModelsOption, NewFolderOption
 from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
 from isocharge.common.errors import InputError
 from isocharge.serve import find_model, read_presses
 from isocharge.simulate import Dataset, load_sensor, parse_probe, read_dataset
+from isocharge.simulate.sensor.probe import PROBE_HELP
 from isocharge.train.data.presses import dataset_of
 from isocharge.train.report import QUICK, Settings, write_report
 
@@ -38,7 +39,10 @@ def report_command(
         str | None,
         typer.Option(metavar="SENSOR", help="Sensor of PRESSES.csv. (default: the sensor of DATASET)"),
     ] = None,
-    probe: ProbeOption = "circle:1.0",
+    probe: Annotated[
+        str | None,
+        typer.Option(metavar="SHAPE", help=f"{PROBE_HELP} (default: {DEFAULT_PROBE})"),
+    ] = None,
     quick: Annotated[
         bool,
         typer.Option(
@@ -62,9 +66,10 @@ def report_command(
     # Find the datasets and, for each of them, the model to compare.
     if model and len(model) != len(datasets):
         raise InputError(f"--model: expected one model for each of {len(datasets)} datasets, got {len(model)}")
-    if sensor is not None and not any(path.is_file() for path in datasets):
-        raise InputError(f"--sensor {sensor}: the dataset folders contain their sensors; leave --sensor out")
-    loaded_datasets = [_read_dataset(path, sensor, probe) for path in datasets]
+    for option, value in (("--sensor", sensor), ("--probe", probe)):
+        if value is not None and not any(path.is_file() for path in datasets):
+            raise InputError(f"{option} {value}: the dataset folders contain sensor and probes; leave {option} out")
+    loaded_datasets = [_read_dataset(path, sensor, probe or DEFAULT_PROBE) for path in datasets]
     model_names = model or [dataset.sensor.name for dataset in loaded_datasets]
     model_folders = [find_model(name, models) for name in model_names]
 
