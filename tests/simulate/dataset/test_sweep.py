@@ -1,6 +1,6 @@
 """Contents and reproducibility of swept datasets, and error messages."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ from tests.simulate.conftest import COARSE
 from isocharge.common.progress import listening
 from isocharge.simulate import (
     Circle,
+    Ellipse,
     ForwardMap,
     Polygon,
     Resolution,
@@ -22,7 +23,8 @@ from isocharge.simulate import (
     run_sweep,
 )
 from isocharge.simulate.dataset import sweep as sweep_module
-from isocharge.simulate.dataset.sweep import outside_map, write_sweep
+from isocharge.simulate.dataset.sweep import outside_map, solve_maps, write_sweep
+from isocharge.simulate.forward.family import NodeCount
 from solved_charges import solved_charge
 
 SENSOR = load_sensor("three-25um-biaxial")
@@ -147,6 +149,15 @@ def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path, monkeypatc
 
 
 # Errors
+
+
+@pytest.mark.parametrize(("orientation", "is_oriented"), [("fixed", True), ("random", False)])
+def test_maps_of_a_sweep_on_an_uneven_film_allow_its_orientations(monkeypatch, orientation, is_oriented):
+    monkeypatch.setattr("isocharge.simulate.forward.family.ASYMMETRIC_NODE_COUNTS", (NodeCount(1, 1, (1, 1)),) * 2)
+    monkeypatch.setattr("isocharge.simulate.forward.forward_map.INTERPOLATION_ERROR", np.inf)
+    sensor = replace(SENSOR, film=replace(SENSOR.film, oval=0.01))
+    (forward_map,) = solve_maps(sensor, (Ellipse(2.0, 1.0),), small(orientation=orientation), COARSE)
+    assert forward_map.family.is_oriented == is_oriented
 
 
 def test_shards_of_a_probe_with_many_corners_fit_into_a_file():
