@@ -168,11 +168,12 @@ def transmission_sentences(capture: Capture, received: ReceivedData) -> Iterator
 def channel_count_sentences(
     capture: Capture, device: Device, channel_count: int, electrodes: tuple[str, ...]
 ) -> Iterator[str]:
-    """Yield a sentence if the board lacks a channel, or has more or fewer channels than the model has electrodes.
+    """Yield a sentence if the channels of the board do not fit the device file or the model.
 
-    A channel is lacking if the device file assigns it to an electrode, but the frames do not contain it. The other
-    sentence is not needed without a model, or if the device file assigns a channel to every electrode. If the names of
-    the channels are nearly those of the electrodes, the sentence names the difference.
+    The sentence states that the board does not send a channel to which the device file refers, or that it has more or
+    fewer channels than the model has electrodes. If the names of the channels are nearly those of the electrodes, the
+    sentence names the difference. The channels are not compared with the model if there is none, or if the device file
+    assigns a channel to every electrode.
 
     Args:
         capture: The frames, at least one.

@@ -17,11 +17,11 @@ from isocharge.serve.flags import GAP, REPEAT, RESTART
 from isocharge.serve.model.contact import Contact, Validity
 from isocharge.serve.record.record import FollowedFilm, Tracking
 
-MAX_WRAPPED_INCREASE = 128
-"""Increase of a frame counter past its largest number from which the counter is assumed to have been restarted.
+SMALLEST_RESTART = 128
+"""Smallest increase of a frame counter across the end of its range that counts as a restart of the board, not as a gap.
 
-The increase is half of the range of a counter of one byte. A longer gap rarely coincides with the end of the range of a
-larger counter, whereas a board that restarts often does so in the upper half of this range.
+The value is half of the range of a counter of one byte. With a larger counter, a gap of so many frames rarely coincides
+with the end of the range. A restart in the upper half of the range is more frequent.
 """
 
 SEQ_MODULUS = 1 << 16
@@ -309,12 +309,13 @@ class Parser(ABC):
         if increase == 0:
             self.counts.repeated += 1
             return (REPEAT,)
-        # Modulo `seq_modulus`, a decrease is the same as a large increase. A counter that has exceeded the modulus does
-        # not wrap at it, so each decrease is a restart.
-        max_increase = self.seq_modulus // 2
+        # Modulo `seq_modulus`, a decrease is the same as an increase across the end of the range. A counter that has
+        # exceeded the modulus does not wrap at it, so each decrease is a restart.
+        smallest_restart = self.seq_modulus // 2
         if seq < previous_seq:
-            max_increase = 0 if previous_seq >= self.seq_modulus else min(max_increase, MAX_WRAPPED_INCREASE)
-        if increase >= max_increase:
+            has_exceeded_modulus = previous_seq >= self.seq_modulus
+            smallest_restart = 0 if has_exceeded_modulus else min(smallest_restart, SMALLEST_RESTART)
+        if increase >= smallest_restart:
             self.counts.restarts += 1
             return (RESTART,)
         self.counts.lost += increase - 1

@@ -174,8 +174,8 @@ class Sweep:
 
         Args:
             count: Number of contacts.
-            stream: Numbers that select a sequence of random numbers: the index of a probe, or 0 and 1 for the presses
-                outside the disk.
+            stream: Numbers that select a sequence of random numbers: `(index,)` for the probe with this index, or
+                `(0, 1)` for the presses outside the disk.
             inner_radius: Radius of the inner circle, mm.
             outer_radius: Radius of the outer circle, mm.
 

@@ -79,8 +79,9 @@ ASYMMETRIC_NODE_COUNTS = (
 )
 """Numbers of nodes that are tried for a film that is not axisymmetric.
 
-Every solve is repeated in several directions, so that more distances cost much. Therefore, the number of forces is
-increased first. A film with a pretension starts with the second entry.
+The number of forces is increased first, because a taut film needs many forces. A further force also costs less than a
+further distance, because its solve starts from the equilibrium under the previous force. A film with a pretension
+starts with the second entry.
 """
 
 
@@ -119,7 +120,7 @@ class Family:
             `distance_coordinate` has Chebyshev nodes.
         force: Forces of the solved presses, shape (n_force,), N. Their logarithms are Chebyshev nodes.
         turns: Directions of the presses on the film, and rotations of the probe.
-        is_oriented: Whether the probe keeps its own orientation in all presses. Otherwise, it may have any orientation.
+        is_oriented: Whether the family only contains presses with the own orientation of the probe.
     """
 
     domain: Domain
@@ -159,7 +160,7 @@ class Family:
 
         period = probe.period
         is_oriented = orientation == "fixed" and not film.is_axisymmetric and not probe.is_axisymmetric
-        if is_oriented:  # the film maps onto itself only after half a turn
+        if is_oriented:  # the film itself only has the symmetry of half a turn
             symmetry_order = round(2.0 * np.pi / period)
             period = 2.0 * np.pi / math.gcd(symmetry_order, 2)
         has_directions = not film.is_axisymmetric and not is_oriented

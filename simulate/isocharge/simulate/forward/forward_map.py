@@ -127,8 +127,8 @@ class ForwardMap:
                 fine as the outermost press requires. The width of the thin rings is that of the geometric mean of the
                 smallest and the largest force.
             orientation: Whether the probe keeps its own orientation ("fixed") or may be rotated ("random"). It only
-                matters if neither the film nor the probe is axisymmetric. The map for a fixed orientation then needs
-                three to eight times fewer solves.
+                matters if neither the film nor the probe is axisymmetric. A fixed orientation then needs fewer solves:
+                a quarter for a rectangle, and two thirds for an equilateral triangle.
             executor: Executor that runs the solves; None for this process. The result does not depend on it.
 
         Raises:

@@ -329,7 +329,7 @@ def scaled_stress(scaled_strain: Array, groups: DimensionlessGroups) -> Array:
 
 
 def press_frame_moduli(film: Film, angle: float) -> Array:
-    """Compute the difference of the elasticity matrix of a film from that of an isotropic film, in the axes of a press.
+    """Compute the elasticity matrix of a film minus that of an isotropic film, in the axes of a press.
 
     The first axis of the press points from the centre of the film to the press.
 

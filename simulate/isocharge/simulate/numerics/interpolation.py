@@ -239,7 +239,8 @@ class Turns:
 
     Attributes:
         direction: Directions from the centre of the film to the presses, plus the rotation of a probe that is not
-            axisymmetric, shape (n_turn,), rad. They are zero if they do not vary.
+            axisymmetric, shape (n_turn,), rad. They are zero if the film is axisymmetric, or if the probe keeps its
+            orientation on the film.
         rotation: Rotations of the probe relative to the direction of the press, evenly spaced over a full turn, shape
             (n_turn,), rad. They are zero if the probe is axisymmetric.
         harmonics: Pairs (2 m, k) of the terms of the Fourier series, shape (n_term, 2).
@@ -255,14 +256,14 @@ class Turns:
 
     @classmethod
     def spread(cls, largest_harmonics: tuple[int, ...], period: float, *, has_directions: bool) -> "Turns":
-        """Choose the turns at which presses are solved, as few as determine the coefficients of a Fourier series.
+        """Choose the smallest number of turns whose presses determine the coefficients of a Fourier series.
 
         Args:
             largest_harmonics: Largest |k| of the terms of the series for |m| = 0, 1, 2, and so on; see the docstring of
                 the class. Without directions, only m = 0 is used. For an axisymmetric probe, only k = 0 is used.
             period: Smallest rotation that maps the probe onto itself, rad; 0 if the probe is axisymmetric.
-            has_directions: Whether the angle d varies. It does not matter if the film is axisymmetric, and it is zero
-                if the probe keeps its orientation on the film.
+            has_directions: Whether the angle d varies. On an axisymmetric film, it has no effect. If the probe keeps
+                its orientation on the film, it is zero.
         """
         largest_m = len(largest_harmonics) - 1 if has_directions else 0
         pairs: list[tuple[int, int]] = []  # (m, k) of each term

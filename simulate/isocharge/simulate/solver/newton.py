@@ -73,8 +73,8 @@ def first_iterate(mesh: PlacedMesh, groups: DimensionlessGroups) -> Array:
     Schwerin's deflection of a membrane is W = (3 / pi)^(1/3) (1 - r^(2/3)), where r is the distance from the origin of
     the template plane. This deflection is exact for a membrane without pretension under a point load if Poisson's ratio
     is 1/3 (Schwerin 1929). In the first iterate, the estimated height of the film under the probe replaces the factor
-    (3 / pi)^(1/3). The deflection under the static pressure is a paraboloid, which is added. Without a probe or without
-    a static pressure, the height of its deflection is zero. The in-plane displacements are zero.
+    (3 / pi)^(1/3). The deflection under the static pressure is a paraboloid, which is added. The deflection of a load
+    that is missing has the height zero. The in-plane displacements are zero.
 
     Args:
         mesh: Mesh of the press.
@@ -85,9 +85,9 @@ def first_iterate(mesh: PlacedMesh, groups: DimensionlessGroups) -> Array:
     """
     circular_points = from_oval(mesh.node_points, mesh.oval)
     template_distance = np.abs(mesh.placement.to_template(circular_points))
-    # The term r0^2, with the radius r0 of the innermost circle, rounds the tip of the deflection under the probe.
-    tip = float(mesh.placement.template_radius) ** 2
-    probe_shape = np.cbrt(1.0 + tip) - np.cbrt(template_distance**2 + tip)
+    # The square of the radius of the innermost circle is added, which rounds the tip of the deflection under the probe.
+    rounding = float(mesh.placement.template_radius) ** 2
+    probe_shape = np.cbrt(1.0 + rounding) - np.cbrt(template_distance**2 + rounding)
     pressure_shape = 1.0 - np.abs(circular_points) ** 2
     field = np.zeros((circular_points.size, 3))
     field[:, 2] = groups.height * probe_shape + groups.static_height * pressure_shape

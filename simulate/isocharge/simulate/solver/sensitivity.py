@@ -88,18 +88,21 @@ def _add_tension(solved: Equilibrium, value: float, direction: tuple[float, floa
         direction: Components (T11, T22, T12) of one unit.
     """
     unit = 1.0 + solved.groups.tension  # divided by E A^2, like all tensions in `groups`
+    # The film has the same stress if a change of the mean pretension is added to `uneven_tension`.
     tension = solved.groups.uneven_tension + value * unit * np.array(direction)
     return replace(solved, groups=replace(solved.groups, uneven_tension=tension))
 
 
 def _add_stiffness(solved: Equilibrium, log_ratio: float, angle: float) -> Equilibrium:
-    """Change the moduli along the axes of the film.
+    """Add a second anisotropy, which may have other axes, to the moduli of the film.
 
     Args:
         solved: The press.
-        log_ratio: Addition to ln(E1 / E2).
-        angle: Angle from the direction of the press to axis 1 of the addition, rad.
+        log_ratio: ln(E1 / E2) of the second anisotropy.
+        angle: Angle from the direction of the press to axis 1 of the second anisotropy, rad.
     """
+    # An anisotropy is a complex number with the magnitude ln(E1 / E2). Its argument is twice the angle from the x axis
+    # to axis 1. The sum of both numbers is the new anisotropy.
     film = solved.film
     addition = cmath.rect(log_ratio, 2.0 * (solved.direction + angle))
     new_log_ratio, axis = increased(math.log(film.young_ratio), film.axis, addition)
