@@ -30,7 +30,7 @@ def spline(film):
 
 @pytest.fixture(scope="session")
 def dataset_folder(film, tmp_path_factory):
-    return write_sweep(tmp_path_factory.mktemp("data") / "presses", (film,), Sweep(samples=6_000))
+    return write_sweep(tmp_path_factory.mktemp("data") / "presses", (film,), Sweep(samples=6_000, outside=4_000))
 
 
 @pytest.fixture(scope="session")

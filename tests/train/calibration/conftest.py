@@ -6,6 +6,7 @@ from tests.benchmarks.measured_films import measured_presses, with_rig_errors
 from tests.train.calibration.synthetic_film import SyntheticFilm
 
 from isocharge.train.calibration import calibrate as calibrate_module
+from isocharge.train.calibration import estimator
 from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.data.presses import draw_contacts
 
@@ -20,6 +21,23 @@ def synthetic(problem):
 def never_solved(monkeypatch):
     """The synthetic film is exact for all properties, and is never solved again."""
     monkeypatch.setattr(calibrate_module, "SAME_FILM_STD", np.inf)
+
+
+FEW_VALUES = {
+    "IMPERFECTION_SCALES": ((0.1, 0.5), (1.5, 0.5)),
+    "DISCREPANCY_SIZES": ((0.001, 0.5), (0.01, 0.5)),
+    "FORCE_SCATTERS": ((0.0, 0.9), (0.03, 0.1)),
+    "POSITION_RATIOS": ((1.0, 0.9), (3.0, 0.1)),
+    "NOISE_RATIOS": ((1.0, 0.5), (8.0, 0.5)),
+}
+"""Values and probabilities of the hypotheses of `few_hypotheses`, by their names in the estimator."""
+
+
+@pytest.fixture
+def few_hypotheses(monkeypatch):
+    """To save time, the estimator compares 128 hypotheses instead of 2,916."""
+    for name, values_and_probabilities in FEW_VALUES.items():
+        monkeypatch.setattr(estimator, name, values_and_probabilities)
 
 
 def rig(problem, charges, count, seed, values=None):

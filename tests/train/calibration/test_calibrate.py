@@ -14,7 +14,7 @@ from isocharge.simulate import Circle, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, next_presses
 from solved_charges import with_film
 
-pytestmark = pytest.mark.usefixtures("never_solved")
+pytestmark = pytest.mark.usefixtures("never_solved", "few_hypotheses")
 
 
 def fit(presses, problem, synthetic):

@@ -15,7 +15,7 @@ from isocharge.simulate import NoiseModel, noise_model
 from isocharge.simulate.mechanics.warming import warmed
 from isocharge.train.calibration import estimator
 from isocharge.train.calibration.contact_error import ContactSensitivity
-from isocharge.train.calibration.estimator import Hypothesis, Prior, estimate, hypotheses
+from isocharge.train.calibration.estimator import NOISE_RATIOS, Hypothesis, Prior, estimate, hypotheses
 from isocharge.train.calibration.film_estimate import SESSION, terms
 from isocharge.train.calibration.press_data import Linearised, PressData, PressErrors
 from isocharge.train.data.presses import draw_contacts
@@ -117,17 +117,11 @@ def test_estimate_minimises_the_sum_of_squares_of_all_unknowns_and_contacts(prob
     np.testing.assert_allclose(found.film.covariance, whole, atol=0.02 * np.diag(whole).max())
 
 
+@pytest.mark.usefixtures("few_hypotheses")
 def test_ellipses_of_contacts_contain_95_percent_on_films_of_all_hypotheses(problem, synthetic, monkeypatch):
-    """The films are drawn from the hypotheses with their probabilities. To save time, there are only 32 hypotheses."""
-    few_values = {
-        "IMPERFECTION_SCALES": ((0.1, 0.5), (1.5, 0.5)),
-        "DISCREPANCY_SIZES": ((0.001, 0.5), (0.01, 0.5)),
-        "FORCE_SCATTERS": ((0.0, 1.0),),
-        "POSITION_RATIOS": ((1.0, 1.0),),
-        "NOISE_RATIOS": ((1.0, 0.5), (8.0, 0.5)),
-    }
-    for name, values_and_probabilities in few_values.items():
-        monkeypatch.setattr(estimator, name, values_and_probabilities)
+    """The films are drawn from the hypotheses with their probabilities, with the stated errors of the contacts."""
+    monkeypatch.setattr(estimator, "FORCE_SCATTERS", ((0.0, 1.0),))
+    monkeypatch.setattr(estimator, "POSITION_RATIOS", ((1.0, 1.0),))
     within = []
     for seed in range(16):
         rng = np.random.default_rng([seed, 3])
@@ -149,6 +143,7 @@ def test_ellipses_of_contacts_contain_95_percent_on_films_of_all_hypotheses(prob
     assert 0.88 < np.mean(within) <= 0.99
 
 
+@pytest.mark.usefixtures("few_hypotheses")
 def test_bad_press_is_left_out_and_hardly_changes_the_estimate(problem, synthetic):
     values, _, presses = rig(problem, synthetic, 12, seed=4)
     good = film_estimate(problem, synthetic, presses)
@@ -162,8 +157,10 @@ def test_bad_press_is_left_out_and_hardly_changes_the_estimate(problem, syntheti
     assert abs(found.film.value("pretension") - values[0]) < 4.0 * found.film.std("pretension")
 
 
+@pytest.mark.usefixtures("few_hypotheses")
 @pytest.mark.parametrize("gain", [0.002, 0.014])
-def test_noise_is_estimated_and_noisy_presses_are_not_bad(problem, synthetic, gain):
+def test_noise_is_estimated_and_noisy_presses_are_not_bad(problem, synthetic, monkeypatch, gain):
+    monkeypatch.setattr(estimator, "NOISE_RATIOS", NOISE_RATIOS)
     estimates = []
     for seed in (0, 1, 3):
         _, _, presses = rig(replace(problem, noise=NoiseModel("bench", 1.0, gain)), synthetic, 30, seed)
@@ -186,6 +183,7 @@ def test_positions_worse_than_stated_are_not_taken_for_noise(problem, synthetic,
     assert abs(found.film.value("pretension") - values[0]) < 3.0 * found.film.std("pretension")
 
 
+@pytest.mark.usefixtures("few_hypotheses")
 def test_touches_at_unknown_places_find_a_change_of_the_pretension(problem, synthetic):
     """Four charges have one number more than a contact has unknowns, and the estimate before knows the rest."""
     values, _, presses = rig(problem, synthetic, 20, seed=5)

@@ -18,9 +18,12 @@ from isocharge.simulate import (
     local_workers,
     parse_probe,
 )
+from isocharge.simulate.forward import derivative_maps
 from isocharge.simulate.forward.charge_map import differences
+from isocharge.simulate.forward.family import NodeCount
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train import CalibrationProblem, FitConfig, TrainingConfig, calibrate, write_calibration
+from isocharge.train.calibration import film_charges
 from isocharge.train.calibration.calibrate import _is_exact, solve_even
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.data.contact_errors import position_error
@@ -33,6 +36,14 @@ from solved_charges import solved_charge, with_film, with_piezo
 def solved(problem) -> FilmCharges:
     """The solved film of the sensor file."""
     return kept(solve_even, problem)
+
+
+@pytest.fixture
+def narrow_problem(problem, monkeypatch):
+    """The problem for presses within 4 mm and of similar forces, for which nine solves suffice."""
+    for module in (film_charges, derivative_maps):
+        monkeypatch.setattr(module, "few_nodes", lambda *_: NodeCount(3, 3))
+    return replace(problem, radius=4.0, force_range=(0.4, 0.6))
 
 
 CONTACT = np.array([[3.0, 2.0, 0.5], [-4.0, 5.0, 1.0], [1.0, -6.0, 0.2]])
@@ -54,28 +65,30 @@ def test_charges_of_a_similar_film_agree_with_direct_solves(solved):
     np.testing.assert_allclose(charge, expected, rtol=0.01)
 
 
-def test_negative_charges_agree_with_direct_solves(problem):
+def test_negative_charges_agree_with_direct_solves(problem, solved):
     """If the wires are swapped, all charges are negative. They have no logarithm, so they change linearly."""
     piezo = problem.sensor.piezo
     swapped = with_piezo(problem.sensor, d31=-piezo.d31, d32=-piezo.d32)
-    solved = kept(solve_even, replace(problem, sensor=swapped))
-    values = solved.prior.mean + 0.3 * solved.prior.std * (np.array(solved.prior.names) == "pretension")
-    expected = direct(*solved.prior.film(values), CONTACT)
-    change = expected - solved.charges(solved.prior.mean, CONTACT)
+    charges = replace(solved, prior=FilmPrior(swapped, problem.probe))
+    prior = charges.prior
+    values = prior.mean + 0.3 * prior.std * (np.array(prior.names) == "pretension")
+    expected = direct(*prior.film(values), CONTACT)
+    change = expected - charges.charges(prior.mean, CONTACT)
     assert expected.max() < 0.0 < np.abs(change).min()
-    np.testing.assert_allclose(solved.charges(values, CONTACT), expected, atol=0.1 * np.abs(change).max())
+    np.testing.assert_allclose(charges.charges(values, CONTACT), expected, atol=0.1 * np.abs(change).max())
 
 
-def test_imperfections_of_the_sensor_file_are_changes_of_the_even_film(problem):
-    """Without them, the charges differ by up to 6 %."""
-    sensor = with_film(problem.sensor, deviator=(0.4, 0.1), young_ratio=1.2, axis=0.5, oval=0.004, oval_axis=1.0)
-    charges = kept(solve_even, replace(problem, sensor=sensor))
+def test_imperfections_of_the_sensor_file_are_changes_of_the_even_film(narrow_problem):
+    """Without them, the charges differ by up to 4 %."""
+    contact = CONTACT[:1]
+    sensor = with_film(narrow_problem.sensor, deviator=(0.4, 0.1), young_ratio=1.2, axis=0.5, oval=0.004, oval_axis=1.0)
+    charges = solve_even(replace(narrow_problem, sensor=sensor))
     values = charges.prior.mean
-    expected = direct(*charges.prior.film(values), CONTACT)
-    even = direct(*charges.prior.film(charges.values), CONTACT)
-    assert np.abs(even / expected - 1.0).max() > 0.05
-    np.testing.assert_allclose(charges.charges(values, CONTACT), expected, rtol=0.015)
-    assert not _is_exact(charges, values, CONTACT)
+    expected = direct(*charges.prior.film(values), contact)
+    even = direct(*charges.prior.film(charges.values), contact)
+    assert np.abs(even / expected - 1.0).max() > 0.03
+    np.testing.assert_allclose(charges.charges(values, contact), expected, rtol=0.007)
+    assert not _is_exact(charges, values, contact)
 
 
 def test_described_shear_modulus_is_solved_with_the_film(problem, solved):
@@ -85,9 +98,9 @@ def test_described_shear_modulus_is_solved_with_the_film(problem, solved):
 
 
 @pytest.mark.parametrize("finger", [Finger(5.0), pytest.param(GrowingFinger(5.0), marks=pytest.mark.slow)])
-def test_fingertip_is_solved_with_its_own_pressure(problem, finger):
+def test_fingertip_is_solved_with_its_own_pressure(narrow_problem, finger):
     """A circle of the same area causes charges that differ by up to 1 %."""
-    charges = solve_even(replace(problem, probe=finger, radius=4.0, force_range=(0.4, 0.6)))
+    charges = solve_even(replace(narrow_problem, probe=finger))
     values = charges.prior.mean
     expected = direct(*charges.prior.film(values), CONTACT[:1])
     np.testing.assert_allclose(charges.charges(values, CONTACT[:1]), expected, rtol=2e-3)

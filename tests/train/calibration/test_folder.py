@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tests.train.calibration.conftest import rig
+from tests.train.calibration.conftest import FEW_VALUES, rig
 from tests.train.short_training import short_training
 
 from isocharge.common.errors import ModelError, OutputExists, PressError
@@ -16,7 +16,7 @@ from isocharge.serve import Predictor, read_presses
 from isocharge.simulate import NoiseModel, load_sensor
 from isocharge.train import CalibrationProblem, calibrate
 from isocharge.train.calibration import calibrate as calibrate_module
-from isocharge.train.calibration import film_network
+from isocharge.train.calibration import estimator, film_network
 from isocharge.train.calibration.folder import calibration_folder, read_earlier, write_calibration
 from kept import kept
 
@@ -31,6 +31,8 @@ def written(problem, synthetic, tmp_path_factory):
         patch.setattr(film_network, "NODES_MPa", (0.0,))
         patch.setattr(film_network, "PRESSES", 6_000)
         patch.setattr(film_network, "_outside_presses", lambda *_: None)
+        for name, values_and_probabilities in FEW_VALUES.items():
+            patch.setattr(estimator, name, values_and_probabilities)
         patch.setattr(film_network, "yield_force", partial(kept, film_network.yield_force))
         values, _, presses = rig(problem, synthetic, 20, seed=31)
         result = calibrate(presses, problem, start=synthetic, accurate=False)
@@ -84,7 +86,8 @@ def test_stale_files_are_mended(written, problem, tmp_path):
 def test_network_is_trained_with_the_noise_of_the_presses(written, tmp_path):
     film = replace(written.result.film, noise=NoiseModel("presses", 1.0, 0.016))
     result = replace(written.result, estimation=replace(written.result.estimation, film=film))
-    noisy = Predictor(write_calibration(result, tmp_path / "film", config=QUICK))
+    few_steps = short_training(32, 16, 100, 50, 1_000)
+    noisy = Predictor(write_calibration(result, tmp_path / "film", config=few_steps))
     quiet = Predictor(written.path)
     assert noisy.metadata.noise.gain == 0.016
     charge_pC = written.result.presses.charge_pC[0]

@@ -44,7 +44,7 @@ class SimulatedRig:
             self.session.take(self.charge(contact), contact)
 
 
-pytestmark = pytest.mark.usefixtures("never_solved")
+pytestmark = pytest.mark.usefixtures("never_solved", "few_hypotheses")
 
 
 @pytest.fixture(autouse=True)

@@ -17,7 +17,7 @@ HERE = Path(__file__).parent
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 
 
-def compile_strictly(compiler, folder, output, *sources, options=("-O2",)):
+def compile_strictly(compiler, folder, output, *sources, options=("-O0",)):
     """Compile sources of an export with all warnings as errors, and return the output file.
 
     If the compiler is not installed, the test is skipped.
@@ -123,7 +123,7 @@ def build(tmp_path_factory):
     """A function that exports a model for a board and compiles it. Each network is compiled only once."""
     networks = {}
 
-    def build(model, device=ANY_BOARD, options=("-O2",), compiler="gcc"):
+    def build(model, device=ANY_BOARD, options=("-O0",), compiler="gcc"):
         folder = export_c(find_model(model), tmp_path_factory.mktemp("c") / "export", device)
         key = (model, compiler, options)
         if key not in networks:

@@ -179,9 +179,7 @@ def test_c_and_python_give_the_same_charges_and_states_for_each_frame(board, bui
 @pytest.mark.parametrize("board", ["any board", "hum"])
 def test_single_precision_changes_charges_by_less_than_a_twentieth_of_a_picocoulomb(board, build, misfit):
     """The compiler option -Wdouble-promotion refuses double precision, which small processors would emulate."""
-    exported = build(
-        "four-25um-biaxial", device(board), options=("-O2", "-DISOCHARGE_CHAIN_FLOAT", "-Wdouble-promotion")
-    )
+    exported = build("four-25um-biaxial", device(board), options=("-DISOCHARGE_CHAIN_FLOAT", "-Wdouble-promotion"))
     frames = draw_frames(board, seed=4)
     frames.values[np.abs(frames.values) > 1e30] = np.inf
     expected_charge, _, expected_contact, expected_flags = python_chain(device(board), frames, misfit)

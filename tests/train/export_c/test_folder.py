@@ -102,7 +102,7 @@ def host(tmp_path_factory, compile_c):
     (folder / "board.toml").write_text(BOARD)
     board = load_device(folder / "board.toml")
     export = export_c(find_model("three-25um-biaxial"), folder / "c", board)
-    options = ("-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    options = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     return compile_c("gcc", export, folder / "host", *EXAMPLE, options=options), board
 
 
@@ -166,7 +166,7 @@ def run_sketch(export, folder, pins, *options, start_us=0):
     objects = []
     for source in sorted(export.glob("*.c")):
         objects.append(folder / f"{source.stem}.o")
-        subprocess.run(["gcc", "-std=c11", "-O2", "-c", source, "-o", objects[-1]], check=True)
+        subprocess.run(["gcc", "-std=c11", "-c", source, "-o", objects[-1]], check=True)
     ino = f'-DSKETCH="{export / "isocharge_sketch.ino"}"'
     words = ["g++", "-Wall", "-Wextra", "-Werror", *options, ino, "-I", export, "-I", HERE / "board"]
     subprocess.run([*words, HERE / "board" / "run_sketch.cpp", *objects, "-o", folder / "sketch"], check=True)

@@ -1,6 +1,7 @@
 """Tests of a report on measured presses, which are tested on held-out presses and never on simulated ones."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,14 +10,7 @@ from tests.train.measured import measured_presses
 from isocharge.common.errors import PressError
 from isocharge.serve import Predictor, check_presses, find_model
 from isocharge.serve.presses.table_file import csv_text
-from isocharge.simulate import (
-    Circle,
-    Domain,
-    ForwardMap,
-    load_sensor,
-    noise_model,
-    virtual_film,
-)
+from isocharge.simulate import Calibration, Circle, Domain, load_sensor, noise_model
 from isocharge.train.data.presses import dataset_of, draw_contacts, position_ranks
 from isocharge.train.report import QUICK, write_report
 from isocharge.train.report.evaluation import DatasetEvaluation
@@ -27,9 +21,10 @@ PRESS_COUNT = 300
 
 
 @pytest.fixture(scope="module")
-def presses():
-    """Presses on a film that differs from the sensor file so much that the released model errs by tenths of a mm."""
-    forward_map = ForwardMap.build(*virtual_film(load_sensor(NAME), PROBE, 4), 8.1, (0.05, 2.0))
+def presses(film):
+    """Presses on a film whose electrodes are shifted so far that the released model errs by tenths of a mm."""
+    shifted = replace(film.sensor, calibration=Calibration(shift=(0.5, -0.3)))
+    forward_map = replace(film, sensor=shifted)
     rng = np.random.default_rng(6)
     contact = draw_contacts(rng, Domain(7.8, (0.06, 1.9)), PRESS_COUNT)
     charge = noise_model("reference").add(forward_map.charges(contact), rng)

@@ -22,8 +22,8 @@ from isocharge.train.model_release.release import release
 from isocharge.train.training.cross_fit import usable_presses
 from kept import ROOT, kept
 
-QUICK = short_training(24, 24, 400, 400, 6_000)
-QUICKER = short_training(24, 24, 200, 200, 6_000)
+QUICK = short_training(24, 24, 250, 200, 6_000)
+QUICKER = short_training(24, 24, 140, 80, 2_000)
 """Training of a network whose errors are not compared with the smallest possible errors."""
 
 SLOPES = np.array([[0.6, 0.1, 2.0], [-0.5, 0.4, 1.0], [0.1, -0.6, 2.0], [0.2, 0.2, -4.0]])
@@ -328,7 +328,8 @@ def test_intact_presses_are_accepted_without_a_warning(caplog):
 
 def test_model_of_three_channels_fits_presses_like_those_of_its_training(fresh, tmp_path):
     """Three charges always fit a plane exactly, but the misfit that the network states is not exactly zero."""
-    fitted = fit_presses(presses_on_l().of_electrodes(CHANNELS[:3], "pad"), "pad", QUICKER)
+    few_steps = short_training(24, 24, 50, 50, 1_000)
+    fitted = fit_presses(presses_on_l().of_electrodes(CHANNELS[:3], "pad"), "pad", few_steps)
     _, _, misfit = fitted.predict(fresh.charge[:, :3])
     assert np.mean(misfit > evaluate(fitted)["misfit_p99"]) < 0.03
     predictor = Predictor(release(fitted, tmp_path / "pad").folder)

@@ -13,7 +13,6 @@ import pytest
 from isocharge.cli.train import fit as fit_command
 from isocharge.common.errors import PressError
 from isocharge.serve import load_model
-from isocharge.train import fit
 from processes import finished
 
 SHORT_CONFIG = """
@@ -89,18 +88,18 @@ OBSTACLES = {"m": "a file", "m/config.pbtxt": "a model of another sensor", "m/1"
 
 
 @pytest.mark.parametrize("obstacle", OBSTACLES, ids=OBSTACLES.values())
-def test_a_training_whose_release_is_refused_costs_no_model(obstacle, dataset_folder, tmp_path, command, monkeypatch):
-    (tmp_path / "short.toml").write_text(SHORT_CONFIG)
-
-    def train_slowly(*arguments):
+def test_a_training_whose_release_is_refused_costs_no_model(
+    obstacle, dataset_folder, fitted, tmp_path, command, monkeypatch
+):
+    def train_slowly(*_):
         path = tmp_path / obstacle
         path.parent.mkdir(exist_ok=True)
         path.write_text("written by another process")
-        return fit(*arguments)
+        return fitted
 
     monkeypatch.setattr(fit_command, "fit", train_slowly)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    code, _, err = command("train", "fit", dataset_folder, "--config", tmp_path / "short.toml", "-o", tmp_path / "m")
+    code, _, err = command("train", "fit", dataset_folder, "-o", tmp_path / "m")
     assert code != 0
     kept_folder = Path(re.search(r"The trained model is kept in (\S+)", err)[1])
     assert kept_folder.parts[-2:] == ("m", "1")
