@@ -7,7 +7,6 @@ import pytest
 from isocharge.simulate import Circle, Film, ForwardMap, Resolution, SolveSettings, Sweep, Theory, load_sensor
 from isocharge.simulate.dataset.sweep import write_sweep
 from kept import kept
-from solved_charges import with_film
 
 COARSE = SolveSettings(theory=Theory(bending=False), resolution=Resolution(4, 8, 4))
 """Membrane theory on a coarse mesh. A small family is solved in half a second."""
@@ -23,16 +22,6 @@ def film() -> Film:
 def three_map() -> ForwardMap:
     """Forward map of the sensor three-25um-biaxial."""
     return kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0))
-
-
-@pytest.fixture(scope="session")
-def taut_map() -> ForwardMap:
-    """Forward map of a film of 0.8 MPa with four electrodes, up to 8 mm and from 0.2 to 1 N.
-
-    The solution does not depend on the electrodes, so a test may replace the sensor by one with the same film.
-    """
-    sensor = with_film(load_sensor("four-25um-biaxial"), pretension=0.8)
-    return kept(ForwardMap.build, sensor, Circle(1.0), 8.0, (0.2, 1.0))
 
 
 @pytest.fixture(scope="session")

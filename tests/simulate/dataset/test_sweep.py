@@ -131,6 +131,7 @@ def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path, monkeypatc
     The sweeps have two shards, and each press has its own charges.
     """
     monkeypatch.setattr(sweep_module, "SHARD_SIZE", 600)
+    monkeypatch.setattr(sweep_module, "yield_force", lambda *_: None)
     probes = [parse_probe(text) for text in ("rectangle:4.0x2.0@30", "triangle:4.0@-30", "circle:1.0@50")]
     for orientation in ("fixed", "random"):
         sweep = Sweep(samples=999, orientation=orientation, outside=0)

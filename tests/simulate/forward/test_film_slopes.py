@@ -8,18 +8,23 @@ import pytest
 from isocharge.common.errors import SceneError
 from isocharge.simulate import (
     Circle,
+    Domain,
     FilmPrior,
     FilmSlopes,
+    ForwardMap,
     Polygon,
+    Resolution,
     SolveSettings,
     load_sensor,
     press,
 )
+from isocharge.simulate.forward.family import NodeCount
 from isocharge.simulate.solver.equilibrium import nodal_stress
 from isocharge.simulate.solver.sensitivity import stress_changes
 from solved_charges import relative_error, solved_charge, with_film
 
 PROBE = Circle(1.0)
+ROUGH = SolveSettings(resolution=Resolution(4, 8, 4))
 
 
 def drawn_sensor():
@@ -28,8 +33,9 @@ def drawn_sensor():
 
 
 @pytest.fixture(scope="module")
-def film_slopes(taut_map) -> FilmSlopes:
-    return FilmSlopes.build(replace(taut_map, sensor=drawn_sensor()))
+def film_slopes() -> FilmSlopes:
+    film = ForwardMap.build_unchecked(drawn_sensor(), PROBE, Domain(4.0, (0.4, 1.0)), NodeCount(5, 5), ROUGH)
+    return FilmSlopes.build(film)
 
 
 STEPS = {
@@ -59,7 +65,9 @@ def test_derivatives_equal_differences_of_direct_solves(film_slopes, name):
         values = prior.described
         values[prior.index(name)] += sign * STEPS[name]
         sensor, probe = prior.film(values)
-        charges.append(np.array([solved_charge(sensor, probe, (x, y), force) for x, y, force in contact.tolist()]))
+        charges.append(
+            np.array([solved_charge(sensor, probe, (x, y), force, ROUGH) for x, y, force in contact.tolist()])
+        )
     expected = (charges[0] - charges[1]) / (2.0 * STEPS[name])
     if name.startswith("tension"):
         expected /= film_slopes.film.sensor.film.pretension  # the property is relative to it, the derivative is not
@@ -85,7 +93,7 @@ def stress_difference(solved, above, below):
 def test_the_pretension_also_changes_the_stress_under_a_static_pressure_before_the_contact():
     """The touch stress is the difference from the stress before the contact, which depends on the pretension, too."""
     film = replace(load_sensor("four-25um-biaxial").film, pretension=0.8, static_pressure=5e-5)
-    solved = press(film, PROBE, (5.0, 0.0), 0.5)
+    solved = press(film, PROBE, (5.0, 0.0), 0.5, ROUGH)
     expected = stress_difference(solved, {"pretension": 0.85}, {"pretension": 0.75}) / 0.1
     change = stress_changes(solved, "middle")[:, :, 0]  # by the mean tension
     stress_unit = film.young * solved.groups.squared_amplitude
@@ -95,7 +103,7 @@ def test_the_pretension_also_changes_the_stress_under_a_static_pressure_before_t
 
 def test_stiffness_of_an_orthotropic_film_changes_relative_to_its_own_axes():
     film = replace(load_sensor("four-25um-biaxial").film, pretension=0.8, young_ratio=2.0, axis=0.3)
-    solved = press(film, PROBE, (5.0, 0.0), 0.5)
+    solved = press(film, PROBE, (5.0, 0.0), 0.5, ROUGH)
     above, below = ({"young_ratio": 2.0 * np.exp(log_ratio)} for log_ratio in (0.01, -0.01))
     expected = stress_difference(solved, above, below) / 0.02
     even, odd = np.moveaxis(stress_changes(solved, "middle")[:, :, 3:5], 2, 0)  # by the stiffness

@@ -20,7 +20,6 @@ from isocharge.simulate import (
     GrowingFinger,
     Polygon,
     Resolution,
-    SolveSettings,
     Theory,
     load_sensor,
 )
@@ -104,8 +103,9 @@ def test_footprint_grows_with_the_cube_root_of_the_force(near_electrodes):
     largest = np.abs(expected).max(axis=1, keepdims=True)
     assert (np.abs(growing.charges(contact) - expected) / largest).max() < 1e-3
     assert (np.abs(ChargeSpline.of(growing).charges(contact) - expected) / largest).max() < 1e-3
-    fixed = ForwardMap.build(sensor, Finger(2.0), **wide_range)
-    assert (np.abs(fixed.charges(contact) - expected) / largest).max() > 0.01, "the radius does not matter"
+    x, y, force = contact[contact[:, 2].argmin()].tolist()
+    fixed = solved_charge(sensor, Finger(2.0), (x, y), force, growing.settings)
+    assert np.abs(fixed / growing.charges(np.array([[x, y, force]])) - 1.0).max() > 0.01, "the radius does not matter"
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,8 @@ FILMS = {
 @pytest.mark.parametrize(("film", "surface", "theory"), FILMS.values(), ids=FILMS)
 def test_forward_map_of_other_films(near_electrodes, film, surface, theory):
     sensor = replace(with_film(near_electrodes, **film), surface=surface)
-    forward_map = kept(ForwardMap.build, sensor, Circle(1.0), 2.0, (0.8, 1.0), SolveSettings(theory=theory))
+    settings = replace(COARSE, theory=theory)
+    forward_map = ForwardMap.build(sensor, Circle(1.0), 2.0, (0.8, 1.0), settings)
     assert forward_map.theory.bending == (film != {"pretension": 0.5})
     assert errors(forward_map, draw(forward_map, 4, seed=7)[0]).max() < 1e-3
 
@@ -241,8 +242,11 @@ UNEVEN_FILMS = {
 @pytest.mark.parametrize(
     ("changes", "probe", "orientation"),
     [
-        (UNEVEN_FILMS["tension"] | UNEVEN_FILMS["moduli"] | UNEVEN_FILMS["oval"], Circle(1.0), "fixed"),
-        (UNEVEN_FILMS["moduli"], Ellipse(2.0, 1.4).rotated(0.5), "fixed"),
+        (
+            UNEVEN_FILMS["tension"] | UNEVEN_FILMS["moduli"] | UNEVEN_FILMS["oval"],
+            Ellipse(2.0, 1.4).rotated(0.5),
+            "fixed",
+        ),
         pytest.param(UNEVEN_FILMS["moduli"], Polygon.triangle(2.5), "fixed", marks=pytest.mark.slow),
         pytest.param(UNEVEN_FILMS["moduli"], Polygon.triangle(2.5), "random", marks=pytest.mark.slow),
         *(pytest.param(changes, Circle(1.0), "fixed", marks=pytest.mark.slow) for changes in UNEVEN_FILMS.values()),
@@ -253,7 +257,7 @@ def test_maps_of_films_that_are_not_axisymmetric_agree_with_direct_solves(near_e
     sensor = with_film(near_electrodes, **changes)
     settings = QUICK | {"force_range": (1.0, 1.0), "orientation": orientation}
     forward_map = kept(ForwardMap.build, sensor, probe, **settings)
-    contact, rotation = draw(forward_map, 10, seed=12)
+    contact, rotation = draw(forward_map, 6, seed=12)
     assert errors(forward_map, contact, rotation if orientation == "random" else 0.0).max() < 1e-3
     film = sensor.film
     deviator = complex(*film.deviator) * np.exp(2j)  # its components are those of twice the angle
@@ -261,7 +265,7 @@ def test_maps_of_films_that_are_not_axisymmetric_agree_with_direct_solves(near_e
         film, oval_axis=film.oval_axis + 1.0, axis=film.axis + 1.0, deviator=(deviator.real, deviator.imag)
     )
     other = replace(forward_map, sensor=replace(sensor, film=turned))
-    assert errors(other, contact).max() > 2e-3, "the direction of the film does not matter"
+    assert errors(other, contact[:2]).max() > 2e-3, "the direction of the film does not matter"
 
 
 @pytest.mark.parametrize(("probe", "solves"), [(Circle(1.0), 7), (Ellipse(2.0, 1.4), 5), (Polygon.triangle(2.5), 9)])

@@ -7,6 +7,7 @@ import pytest
 
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Domain, Resolution, SolveSettings, load_sensor, press
+from isocharge.simulate.forward import whole_film
 from isocharge.simulate.forward.family import check_family
 from isocharge.simulate.forward.whole_film import COARSE_ERROR, COARSE_RESOLUTION, outermost_distance, whole_film_map
 from isocharge.simulate.solver.load_case import check_press
@@ -35,11 +36,16 @@ def test_coarse_map_agrees_with_direct_solves_up_to_the_clamp(pretension):
         np.testing.assert_allclose(coarse.charges(np.array([[*at, force]]))[0], direct, rtol=error)
 
 
-def test_coarse_map_of_a_taut_film_is_accurate_over_a_wide_range_of_forces():
-    """Between 0.005 and 5 N, the charges of this film change from the square of the force to its power of 2/3."""
+def test_coarse_map_of_a_taut_film_is_accurate_over_a_wide_range_of_forces(monkeypatch):
+    """Between 0.005 and 5 N, the charges of this film change from the square of the force to its power of 2/3.
+
+    To save time, the map ends at 18 mm.
+    """
+    monkeypatch.setattr(whole_film, "outermost_distance", lambda *_: 18.0)
+    monkeypatch.setattr(whole_film, "COARSE_DISTANCES", 4)
     sensor = with_film(SENSOR, pretension=2.0)
     coarse = whole_film_map(sensor, Circle(1.0), (0.005, 5.0))
-    for contact in ((9.0, -5.0, 0.026), (-25.0, 16.0, 0.015)):
+    for contact in ((9.0, -5.0, 0.026), (-14.0, 9.0, 0.015)):
         direct = solved_charge(sensor, Circle(1.0), contact[:2], contact[2], FINER)
         assert relative_error(coarse.charges(np.array([contact]))[0], direct) < 0.02
 

@@ -45,8 +45,8 @@ def test_identification_to_dict_can_be_written_as_json(identification):
 
 def test_statistics_agree_with_random_positions(film, identification):
     rng = np.random.default_rng(0)
-    at = 5.0 * np.sqrt(rng.random(2000)) * np.exp(2j * np.pi * rng.random(2000))
-    contacts = (np.column_stack([at.real, at.imag, np.full(2000, force)]) for force in (0.05, 1.0, 2.0))
+    at = 5.0 * np.sqrt(rng.random(800)) * np.exp(2j * np.pi * rng.random(800))
+    contacts = (np.column_stack([at.real, at.imag, np.full(800, force)]) for force in (0.05, 1.0, 2.0))
     limits = [limits_at(film, contact, REFERENCE) for contact in contacts]
     rows = identification.to_dict()["limits_in_working_area"]
     medians = [(row["position_median_mm"], row["force_median_percent"]) for row in rows]

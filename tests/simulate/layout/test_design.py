@@ -16,12 +16,12 @@ from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase
 from isocharge.simulate.layout.design import (
     NOT_SEARCHED,
     UNAMBIGUOUS,
+    Layout,
     Search,
     describe_ambiguities,
     design,
     random_layouts,
 )
-from kept import kept
 
 
 def case_of(sensor, **changes):
@@ -29,9 +29,12 @@ def case_of(sensor, **changes):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _rough(fields, sensor):
-    """Fewer presses, positions and layouts, and stress fields and forward maps that have already been solved."""
-    build = ForwardMap.build
+def _rough(fields, three_map):
+    """Fewer presses, positions and layouts, and stress fields and a forward map that have already been solved."""
+
+    def build(sensor, _, *domain, **__):
+        return replace(three_map, sensor=sensor, family=replace(three_map.family, domain=Domain(*domain)))
+
     with pytest.MonkeyPatch.context() as patch:
         for module, name, value in (
             (case_module, "FINE_PRESSES", 320),
@@ -41,7 +44,7 @@ def _rough(fields, sensor):
         ):
             patch.setattr(module, name, value)
         patch.setattr(design_module, "solve_fields", lambda sensor, *_: fields[sensor.name])
-        patch.setattr(ForwardMap, "build", lambda new, *domain, **_: replace(kept(build, sensor, *domain), sensor=new))
+        patch.setattr(ForwardMap, "build", build)
         yield
 
 
@@ -95,10 +98,17 @@ def test_goal_rms_reduces_the_root_mean_square(centres, sensor, fields):
     assert search.case.all_clearances(found.positions).min() > -1e-3
 
 
+@pytest.fixture
+def _random_layouts(monkeypatch):
+    """Do not improve the random layouts."""
+    monkeypatch.setattr(Search, "optimum", lambda search, start: Layout(start, search.minimised_error(start)))
+    monkeypatch.setattr(Search, "refine", lambda _, layout: layout)
+
+
+@pytest.mark.usefixtures("_random_layouts")
 def test_ambiguous_layout_is_rejected_for_the_next_one(sensor, monkeypatch):
     """If all layouts are ambiguous, the one with the smallest error is returned."""
     answers = iter(["it folds", UNAMBIGUOUS])
-    monkeypatch.setattr(Search, "refine", lambda _, layout: layout)
     monkeypatch.setattr(design_module, "describe_ambiguities", lambda *_: next(answers))
     second = design(case_of(sensor, seed=1))
     monkeypatch.setattr(design_module, "describe_ambiguities", lambda *_: "it folds")
@@ -120,11 +130,11 @@ def test_ambiguities_reports_folds_and_pairs(sensor):
     assert re.fullmatch(r"the map folds 3.0 mm from the centre; \d+ pairs of contacts have the same charges", text)
 
 
+@pytest.mark.usefixtures("_random_layouts")
 def test_design_reports_that_charges_cannot_be_interpolated(sensor, monkeypatch):
     def refuse(*_, **__):
         raise SolveError("rough")
 
     monkeypatch.setattr(ForwardMap, "build", refuse)
-    monkeypatch.setattr(Search, "refine", lambda _, layout: layout)
     found = design(case_of(sensor))
     assert (found.summary, found.unambiguous) == (NOT_SEARCHED, False)

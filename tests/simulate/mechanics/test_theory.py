@@ -27,7 +27,7 @@ def test_modelling_error_is_an_upper_bound_of_the_effect_of_bending():
     The difference is relative to the largest charge of the press, and both theories use the same mesh.
     """
     rng = np.random.default_rng(5)
-    for _ in range(4):
+    for _ in range(3):
         thickness, size, force = np.exp(rng.uniform(np.log([0.005, 0.3, 1e-3]), np.log([0.2, 5.0, 5.0]))).tolist()
         film = Film(45.0, thickness, 3000.0, float(rng.uniform(0.0, 0.49)))
         probe = (

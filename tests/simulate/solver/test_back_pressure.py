@@ -128,7 +128,7 @@ def test_slack_film_with_a_closed_back_equals_a_finer_mesh(probe, at, force):
     """The trapped air lifts a slack film beside the probe, so that narrow strips of the film are bent."""
     sensor = sensor_with(pretension=0.0, back_volume=0.75 * CAVITY)
     solved = press(sensor.film, probe, at, force)
-    expected = solved_charge(sensor, probe, at, force, SolveSettings(resolution=Resolution(8, 8, 20, 3)))
+    expected = solved_charge(sensor, probe, at, force, SolveSettings(resolution=Resolution(7, 8, 12, 4)))
     assert relative_error(touch_charge(sensor, solved), expected) < mesh_error(solved) < 1e-3
 
 

@@ -111,7 +111,7 @@ def test_charges_at_a_surface_under_the_probe_equal_those_of_a_finer_mesh():
     at_the_edge = Electrode.of_square("B", (9.0, 3.0), 0.9)
     stretched = with_film(load_sensor("four-25um-biaxial"), pretension=1.0)
     sensor = replace(stretched, surface="top", electrodes=(inside, at_the_edge))
-    finer = SolveSettings(resolution=Resolution(8, 16, 9, 2))
+    finer = SolveSettings(resolution=Resolution(7, 16, 8, 2))
     charge, expected = (
         solved_charge(sensor, Circle(1.0), (8.0, 3.0), 0.05, settings) for settings in (SolveSettings(), finer)
     )
