@@ -19,6 +19,7 @@ SMALLER = {
     "--radius 8 --force 0.05 2 --samples 6000": "--radius 3 --force 0.5 1 --samples 800",
     "--link film &": "--link film --force-max 0.05 &",
     "--count 2000": "--count 1000",
+    "radius=10.0, force_range=(0.05, 2.0)": "radius=4.0, force_range=(0.5, 1.0)",
     "train/configs/quick.toml": "quick.toml",
 }
 """Parts of examples that would take a test too long, and the shorter parts that the tests run in their place."""

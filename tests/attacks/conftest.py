@@ -1,8 +1,8 @@
 """Fixtures that send faulty inputs to a reader and check its behaviour.
 
 A reader may accept an input or refuse it by an `IsochargeError`. It may not raise other errors, and its time and memory
-are limited. `make attack` sends more than a million inputs, and `make test` a hundredth of the inputs of each kind,
-but at least 20, or a fortieth if reading is slow.
+are limited. `make attack` sends more than a million inputs, and `make test` one in two hundred of each kind,
+but at least 20, or one in eighty if reading is slow.
 """
 
 import random
@@ -13,7 +13,7 @@ import pytest
 
 from isocharge.common.errors import IsochargeError
 
-FAST_SHARE = 0.01
+FAST_SHARE = 0.005
 """Share of the inputs in `make test`."""
 
 LONGEST_S, MOST_BYTES = 3.0, 200e6
@@ -30,7 +30,7 @@ LONGEST_MESSAGE = 5000
 
 
 def pytest_addoption(parser):
-    parser.addoption("--all-attacks", action="store_true", help="send every input, not one in a hundred")
+    parser.addoption("--all-attacks", action="store_true", help="send every input, not one in two hundred")
 
 
 def peak_bytes():
@@ -48,7 +48,7 @@ def attack(request):
 
     def send(name, read, inputs, count, longest_s=LONGEST_S):
         rng, before = random.Random(name), None
-        for _ in range(max(min(20, count // 40), round(count * share))):
+        for _ in range(max(1, min(20, count // 80), round(count * share))):
             judge(name, read, inputs(rng), longest_s)
             before = before or peak_bytes()  # measured after the first input, when the reader has imported its modules
         assert peak_bytes() - before < MOST_BYTES, name

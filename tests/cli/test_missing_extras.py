@@ -1,6 +1,7 @@
 """A command that needs an extra names the install command, and no command ends in a traceback without extras."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -8,6 +9,7 @@ import pytest
 
 from cli.test_help import COMMANDS
 from extras import PACKAGES
+from processes import finished
 
 BASE_COMMANDS = {
     "serve predict",
@@ -23,14 +25,27 @@ BASE_COMMANDS = {
 EXTRAS = {"serve http": "http", "serve plot": "simulate", "serve virtual": "simulate", "simulate design": "design"}
 """The extra of each command that is not that of its group."""
 
-OPTIONS = [
-    ("demo --live", "simulate,http"),
-    ("serve stream three-25um-biaxial --port - --live 0", "http"),
-    ("serve stream three-25um-biaxial --port - --output touch.mcap", "record"),
-    ("serve check three-25um-biaxial presses.parquet", "parquet"),
-    ("serve predict three-25um-biaxial charges.parquet", "parquet"),
-]
-"""Command lines whose options need an extra."""
+OPTIONS = {
+    "demo --live": "simulate,http",
+    "serve stream three-25um-biaxial --port - --live 0": "http",
+    "serve stream three-25um-biaxial --port - --output touch.mcap": "record",
+    "serve check three-25um-biaxial presses.parquet": "parquet",
+    "serve predict three-25um-biaxial charges.parquet": "parquet",
+}
+"""Extra that a command line needs for one of its options."""
+
+RUN_ALL = """
+import sys
+from isocharge.cli.main import main
+
+for line in sys.argv[1:]:
+    sys.argv = ["isocharge", *line.split()]
+    try:
+        main()
+    except SystemExit as end:
+        print("exit code", end.code or 0, file=sys.stderr)
+"""
+"""Runs command lines one after the other, in one process, which imports the packages only once."""
 
 LOAD_ALL = """
 import json
@@ -99,26 +114,23 @@ def extra_of(command):
     return EXTRAS.get(command, "train" if group == "demo" else group)
 
 
-def run(words, environment, folder):
-    done = subprocess.run(
-        [sys.executable, "-m", "isocharge.cli", *words],
-        env=environment,
-        cwd=folder,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=100,
-        check=False,
-    )
-    assert "Traceback" not in done.stderr, done.stderr
-    return done
+@pytest.fixture
+def run(installed, tmp_path):
+    """Return a function that runs command lines in the base install, and returns their messages and exit codes."""
+
+    def run_lines(*lines):
+        words = [sys.executable, "-c", RUN_ALL, *lines]
+        done = finished(words, env=installed(), cwd=tmp_path, stdin=subprocess.DEVNULL, timeout=100)
+        assert "Traceback" not in done.stderr, done.stderr
+        return re.findall(r"(.*?)exit code (\d)\n", done.stderr, re.DOTALL)
+
+    return run_lines
 
 
-@pytest.mark.parametrize(("line", "extra"), OPTIONS)
-def test_an_option_in_the_base_install_names_the_install_command(line, extra, installed, tmp_path):
-    done = run(line.split(), installed(), tmp_path)
-    assert done.returncode == 1
-    assert f"pip install 'isocharge[{extra}]'" in done.stderr
+def test_options_in_the_base_install_name_the_install_command(run):
+    for (message, code), extra in zip(run(*OPTIONS), OPTIONS.values(), strict=True):
+        assert code == "1"
+        assert f"pip install 'isocharge[{extra}]'" in message
 
 
 @pytest.fixture(scope="module")
@@ -126,14 +138,7 @@ def outcomes_without(installed, request):
     """The message of each command, or "" if it is imported, for each extra that is missing in a test that runs."""
     wanted = {item.callspec.params["missing"] for item in request.session.items if "missing" in item.fixturenames}
     absent = {extra: sorted(packages) for extra, packages in ABSENT_PACKAGES.items() if extra in wanted}
-    done = subprocess.run(
-        [sys.executable, "-c", LOAD_ALL, json.dumps(absent)],
-        env=installed("all"),
-        capture_output=True,
-        text=True,
-        timeout=290,
-        check=False,
-    )
+    done = finished([sys.executable, "-c", LOAD_ALL, json.dumps(absent)], env=installed("all"), timeout=290)
     assert done.returncode == 0, done.stderr
     return dict(json.loads(line) for line in done.stdout.splitlines())
 
@@ -158,13 +163,10 @@ def test_commands_are_imported_or_name_the_one_extra_that_is_missing(missing, ou
         assert imported == BASE_COMMANDS | {"demo"}  # the base install writes the playground of the demo
 
 
-def test_the_base_install_writes_the_playground(installed, tmp_path):
-    done = run(["demo", "--playground", "pages/playground.html"], installed(), tmp_path)
-    assert done.returncode == 0
-    assert done.stderr == "wrote pages/playground.html; open it in a browser\n"
+def test_the_base_install_writes_the_playground(run, tmp_path):
+    first, (message, code) = run(*["demo --playground pages/playground.html"] * 2)
+    assert first == ("wrote pages/playground.html; open it in a browser\n", "0")
+    assert ("is already there" in message, code) == (True, "1")
     text = (tmp_path / "pages" / "playground.html").read_text("utf-8")
     assert text.startswith("<!doctype html>")
     assert "{{data}}" not in text
-    again = run(["demo", "--playground", "pages/playground.html"], installed(), tmp_path)
-    assert again.returncode == 1
-    assert "is already there" in again.stderr

@@ -24,7 +24,7 @@ from isocharge.serve.live.steady_press import (
     WatchResult,
 )
 from isocharge.simulate import Circle, load_amplifier, load_sensor
-from isocharge.train import CalibrationProblem, calibrate, next_presses
+from isocharge.train import CalibrationProblem, calibrate
 from isocharge.train.calibration import calibrate as calibrate_module
 from isocharge.train.calibration import session as session_module
 
@@ -179,9 +179,8 @@ def charges(synthetic):
     return partial(synthetic.charges, synthetic.prior.draw(np.random.default_rng(3), 1)[0])
 
 
-@pytest.fixture(scope="module")
-def places(problem, synthetic):
-    return np.array([press.contact for press in next_presses(problem, synthetic, 3)])
+PLACES = np.array([[5.0, 1.0, 0.8], [-3.0, 4.5, 0.3]])
+"""Contacts that the machine presses, mm and N."""
 
 
 def board(charges, places, seed=0):
@@ -197,21 +196,21 @@ def board(charges, places, seed=0):
 
 
 @pytest.fixture
-def desk(charges, places, tmp_path, monkeypatch):
+def desk(charges, tmp_path, monkeypatch):
     """A folder with the bytes of a board, in two parts, and the list of the presses that it makes."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "some.bin").write_bytes(b"".join(board(charges, places[:2])))
-    (tmp_path / "rest.bin").write_bytes(b"".join(board(charges, places[2:], seed=1)))
-    np.savetxt(tmp_path / "list.csv", places, fmt="%.17g", delimiter=",", header="x_mm,y_mm,force_N", comments="")
+    (tmp_path / "some.bin").write_bytes(b"".join(board(charges, PLACES[:1])))
+    (tmp_path / "rest.bin").write_bytes(b"".join(board(charges, PLACES[1:], seed=1)))
+    np.savetxt(tmp_path / "list.csv", PLACES, fmt="%.17g", delimiter=",", header="x_mm,y_mm,force_N", comments="")
     return tmp_path
 
 
-def test_a_press_that_had_begun_is_left_out_and_a_line_is_not(charges, places):
+def test_a_press_that_had_begun_is_left_out_and_a_line_is_not(charges):
     """The board waits in the middle of its first press until the dialogue wants the next."""
     (reader, keyboard), armed = os.pipe(), threading.Event()
 
     def chunks():
-        for number, data in enumerate(board(charges, places[:2])):
+        for number, data in enumerate(board(charges, PLACES)):
             if number == 440:
                 armed.wait(60)
             yield Chunk(data, number / RATE_HZ, 0)
@@ -226,17 +225,15 @@ def test_a_press_that_had_begun_is_left_out_and_a_line_is_not(charges, places):
         press = next(event.press for event in coming if event.press)
         with pytest.raises(SessionEnd):
             list(coming)
-    np.testing.assert_allclose(press.charge_pC, charges(places[1:2])[0], rtol=0.01, atol=2.0)
+    np.testing.assert_allclose(press.charge_pC, charges(PLACES[1:])[0], rtol=0.01, atol=2.0)
     os.close(keyboard)
 
 
 PRESS = ("train", "press", "--sensor", "four-25um-biaxial", "-o", "presses.csv")
 
 
-def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(
-    command, desk, charges, places, monkeypatch, synthetic
-):
-    """The port ends after two presses. The same command continues with the third row of the list.
+def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(command, desk, charges, monkeypatch, synthetic):
+    """The port ends after the first press. The same command continues with the second row of the list.
 
     The charges are those of a closed formula, and no film is solved.
     """
@@ -244,20 +241,20 @@ def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(
     monkeypatch.setattr(calibrate_module, "solve_even", lambda *_: synthetic)
     monkeypatch.setattr(calibrate_module, "SAME_FILM_STD", np.inf)
     _, _, err = command(*PRESS, "--port", "some.bin", "--press-list", "list.csv")
-    assert "presses in presses.csv: 2; the same command continues the session" in err
-    assert len(read_presses(desk / "presses.csv")) == 2
+    assert "presses in presses.csv: 1; the same command continues the session" in err
+    assert len(read_presses(desk / "presses.csv")) == 1
 
     problem = ("--probe", "circle:1.1", "--radius", "7.9")
     code, _, err = command(*PRESS, *problem, "--port", "rest.bin", "--press-list", "list.csv")
     assert code == 0, err
-    assert "presses.csv has 2 presses; the session continues with them" in err
+    assert "presses.csv has 1 presses; the session continues with them" in err
     assert f"isocharge train calibrate presses.csv --sensor four-25um-biaxial {' '.join(problem)} -o my-film" in err
 
     presses = read_presses(desk / "presses.csv", NAMES)
-    clean = charges(places)
+    clean = charges(PLACES)
     std = np.hypot(1.0, 0.002 * clean) * np.sqrt(1 / 90 + 1 / 50)
     assert (np.abs(presses.charge_pC - clean) < 5 * std).all()
-    np.testing.assert_array_equal(presses.contact, places)
+    np.testing.assert_array_equal(presses.contact, PLACES)
 
 
 def test_a_calibration_without_an_output_only_states_the_film(command, desk, monkeypatch, synthetic, problem):

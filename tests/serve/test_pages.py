@@ -74,7 +74,9 @@ def desks(tmp_path_factory):
 def test_examples_of_the_pages_run(page_example, desks, installed, start_http, run_example, run_commands):
     """In the order of the page, in the install that it names; Python prints what the comments say."""
     text, folder, environment = (
-        page_example.text.replace("--link film", "--link film --force-max 0.05"),  # one force: solved sooner
+        page_example.text.replace("--link film", "--link film --force-max 0.05").replace(  # one force: solved sooner
+            "--seconds 10", "--seconds 3"
+        ),
         desks[page_example.page],
         installed(*page_example.extras),
     )

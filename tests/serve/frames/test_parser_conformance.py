@@ -20,7 +20,7 @@ ANY_BYTES = st.one_of(
 
 
 @every_format
-@settings(derandomize=True, max_examples=30)
+@settings(derandomize=True, max_examples=20)
 @given(data=st.data())
 def test_chunks_never_change_frames_or_counters(name, data):
     form = FORMATS[name]
@@ -38,7 +38,7 @@ def test_chunks_never_change_frames_or_counters(name, data):
 
 
 @every_format
-@settings(derandomize=True, database=None, phases=[Phase.generate], max_examples=40)
+@settings(derandomize=True, database=None, phases=[Phase.generate], max_examples=25)
 @given(data=st.data())
 def test_bytes_between_two_frames_damage_no_frame(name, data):
     """The frames are those that a parser reads from the bytes of each single frame."""

@@ -208,7 +208,7 @@ def some_presses(draw):
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet", "PARQUET"])
 @given(presses=some_presses())
-@settings(derandomize=True, max_examples=60)
+@settings(derandomize=True, max_examples=40)
 def test_written_presses_are_read_back(suffix, presses, tmp_path_factory):
     """With the names of the electrodes, and with every other column as an electrode."""
     path = tmp_path_factory.getbasetemp() / f"written.{suffix}"

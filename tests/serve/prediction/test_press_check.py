@@ -235,7 +235,7 @@ def coverage(factor, error, std):
 def test_regions_hold_for_at_least_ninety_percent_of_contacts_on_ninety_percent_of_films(count):
     rng = np.random.default_rng(count)
     holds = []
-    for _ in range(1000):
+    for _ in range(400):
         scale, degrees_of_freedom = rng.uniform(0.3, 4.0), rng.integers(3, 30)
         factor = StdFactor.from_errors(*draw(rng, count, scale, degrees_of_freedom)).factor
         holds.append(coverage(factor, *draw(rng, 2000, scale, degrees_of_freedom)) >= 0.9)

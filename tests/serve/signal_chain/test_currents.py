@@ -13,7 +13,7 @@ from isocharge.serve import device_from_table
 from isocharge.train.export_c.folder import device_header
 from stage_runner import StageRunner
 
-RATE_HZ = 1000.0
+RATE_HZ = 500.0
 T_S = np.arange(0.0, 20.0, 1.0 / RATE_HZ)
 RATIOS = np.array([1.0, -0.6, -0.5])
 """Charges of a press relative to its force. Their sum is negative."""

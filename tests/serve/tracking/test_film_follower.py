@@ -94,7 +94,7 @@ def touches(series, state, rng, count):
     return contact, series.changes(contact, np.array(state)).charge_pC
 
 
-def followed(model, charge, rng, frames=4, noise=NOISE):
+def followed(model, charge, rng, frames=2, noise=NOISE):
     """Return a follower that has observed touches, and whether the film was lost after each of them.
 
     Args:
@@ -155,7 +155,7 @@ def test_a_sudden_change_is_followed_after_twenty_touches(series, model, change_
     rng = np.random.default_rng(1)
     _, charge_before = touches(series, [0.0, 0.7, -0.8], rng, 40)
     contact, charge = touches(series, [change_MPa, 0.7, -0.8], rng, 60)
-    follower, _ = followed(model, np.concatenate([charge_before, charge[:20]]), rng)
+    follower, _ = followed(model, np.concatenate([charge_before, charge[:20]]), rng, frames=4)
     relative, normalised = force_errors(follower, model, contact[20:], NOISE.add(charge[20:], rng))
     assert np.sqrt(np.mean(relative**2)) < 0.05
     assert np.mean(np.abs(normalised) < 2.0) > 0.85

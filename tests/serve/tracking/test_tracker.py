@@ -116,7 +116,7 @@ def test_reported_std_adapts_to_a_board_whose_noise_differs_from_the_training(no
     path, _ = slide(10.0)
     squared_errors = []
     reported_variances = []
-    for _ in range(10):
+    for _ in range(4):
         contacts = noisy_contacts(path, std=noise_ratio * STD)
         settled = track_contacts(contact._replace(x_std_mm=STD, y_std_mm=STD) for contact in contacts)[100:]
         squared_errors.append(np.abs(position_errors(settled, path[100:])) ** 2)
@@ -128,7 +128,7 @@ def test_reported_std_adapts_to_a_board_whose_noise_differs_from_the_training(no
 def test_irregular_times_and_the_beginning_of_a_slide_are_not_taken_for_noise(rate_Hz, lost_share):
     """A slide of 200 mm/s. With second differences for regular times, the ratio of squares would be 0.02 to 0.17."""
     normalised = []
-    for _ in range(20):
+    for _ in range(10):
         path, t = slide(200.0, rate_Hz)
         is_received = RNG.random(t.size) >= lost_share
         path, t = path[is_received], t[is_received]
@@ -146,7 +146,7 @@ def test_slide_is_tracked_without_lag_and_better_than_by_any_moving_average(spee
     is_moving = (t > 0.3) & (t < 0.6)
     errors = []
     measured = []
-    for _ in range(10):
+    for _ in range(4):
         errors.append(position_errors(track_contacts(noisy_contacts(path)), path))
         measured.append([complex(contact.x_mm, contact.y_mm) for contact in noisy_contacts(path)])
     errors = np.array(errors)

@@ -1,6 +1,7 @@
 """The playground in headless Chromium: its answers, charges and flags against the golden vectors and the simulator."""
 
 import json
+from functools import cache
 
 import numpy as np
 import pytest
@@ -49,29 +50,39 @@ def file(tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module")
-def open_page(chromium, file):
+def open_window(chromium, file, width=800, height=600, bypass_csp=True, **options):
     """Open the playground, offline, in a window of a given size, with its errors and its requests as lists.
 
     Scripts of a test do not run under the security policy of the page, so it is bypassed unless it is tested.
     """
-
-    def open_window(width=1280, height=800, bypass_csp=True, **options):
-        viewport = {"width": width, "height": height}
-        context = chromium.new_context(viewport=viewport, offline=True, bypass_csp=bypass_csp, **options)
-        page = context.new_page()
-        page.errors, page.requests = errors_of(page), []
-        page.on("request", lambda request: page.requests.append(request.url))
-        page.goto(file.as_uri())
-        page.locator("#verdict .text:not(:empty)").wait_for()
-        return page
-
-    return open_window
+    viewport = {"width": width, "height": height}
+    context = chromium.new_context(viewport=viewport, offline=True, bypass_csp=bypass_csp, **options)
+    page = context.new_page()
+    page.errors, page.requests = errors_of(page), []
+    page.on("request", lambda request: page.requests.append(request.url))
+    page.goto(file.as_uri())
+    page.locator("#verdict .text:not(:empty)").wait_for()
+    return page
 
 
 @pytest.fixture(scope="module")
-def page(open_page):
-    return open_page()
+def page(chromium, file):
+    """The playground in a window that all tests share."""
+    return open_window(chromium, file)
+
+
+@pytest.fixture
+def open_page(chromium, file):
+    """Return a function that opens the playground in a window, which is closed when the test ends."""
+    pages = []
+
+    def start(*size, **options):
+        pages.append(open_window(chromium, file, *size, **options))
+        return pages[-1]
+
+    yield start
+    for page in pages:
+        page.context.close()
 
 
 def test_the_file_is_small_and_loads_nothing_from_elsewhere(open_page, file):
@@ -92,13 +103,17 @@ def test_answers_are_the_golden_vectors(page, name):
     np.testing.assert_allclose(values, expected, rtol=1e-4, atol=1e-4)
 
 
+solve_press = cache(press)
+"""The films of all models are equal, so that the presses of one model are also those of the others."""
+
+
 @pytest.mark.parametrize("index", range(len(MODELS)))
 def test_charges_are_those_of_the_solver(page, index):
     """Under the centre, between the electrodes, on an electrode, and far outside of the working area."""
     sensor = load_sensor(MODELS[index])
     on_electrode = np.mean(sensor.electrodes[0].corners, axis=0)
     presses = [(0.0, 0.0, 1.0), (3.0, -2.0, 0.05), (*on_electrode, 0.3), (-14.0, 11.0, 2.0), (5.0, 24.0, 0.5)]
-    expected = [touch_charge(sensor, press(sensor.film, Circle(1.0), (x, y), force)) for x, y, force in presses]
+    expected = [touch_charge(sensor, solve_press(sensor.film, Circle(1.0), (x, y), force)) for x, y, force in presses]
     charges = page.evaluate(CHARGES, [index, presses])
     np.testing.assert_allclose(charges, expected, rtol=1e-3)
 
