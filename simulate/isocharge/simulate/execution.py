@@ -103,7 +103,10 @@ def _executor_errors() -> Iterator[None]:
     try:
         yield
     except BrokenExecutor as error:
-        raise WorkersLost("a worker process ended unexpectedly: out of memory, or killed by another program") from error
+        raise WorkersLost(
+            "a worker process ended unexpectedly: out of memory, killed by another program, or started by a script "
+            'without `if __name__ == "__main__":`'
+        ) from error
     except CancelledError as error:
         raise WorkersLost("the executor was shut down, or lost its workers, before the work was done") from error
     except Exception as error:

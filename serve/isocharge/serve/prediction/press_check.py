@@ -42,7 +42,7 @@ MAX_BAD_FRACTION = 0.1
 """Largest fraction of bad presses for which a model may still fit. A single bad press is always allowed."""
 
 MISFIT_FRACTION = 0.01
-"""Fraction of good presses whose misfit is above the limit `misfit_p99` of the model."""
+"""Largest fraction of good presses whose misfit is above `misfit_limit`."""
 
 
 @dataclass(frozen=True)
@@ -263,7 +263,7 @@ def _misfit_statement(errors: PressErrors, is_selected: Booleans, metadata: Mode
     """Return a statement for the user if more presses have a large misfit than chance can explain.
 
     The misfit is the distance between the measured charges and the nearest charges of a single contact. A misfit is
-    large if it is above the limit of the model, which 1 % of good presses exceed. The number of such presses has a
+    large if it is above `misfit_limit`, which at most 1 % of good presses exceed. The number of such presses has a
     binomial distribution.
 
     Args:
@@ -280,8 +280,9 @@ def _misfit_statement(errors: PressErrors, is_selected: Booleans, metadata: Mode
     if misfit_count == 0 or 1.0 - probability_of_at_most[misfit_count - 1] >= TEST_SIGNIFICANCE:
         return ""
     return (
-        f"{misfit_count} of {selected_count} presses have a misfit above {misfit_limit(metadata):.3g}, which 1 % of "
-        "good ones have: no single press on the model's film gives such charges (gain, tare, swapped or dead electrode)"
+        f"{misfit_count} of {selected_count} presses have a misfit above {misfit_limit(metadata):.3g}, which "
+        "1 % of good ones may have: no single press on the model's film gives such charges (gain, tare, swapped or "
+        "dead electrode)"
     )
 
 
