@@ -131,9 +131,9 @@ def start_command():
     """Function that starts `isocharge ...` in a new process. The process is killed at the end of the test."""
     started = []
 
-    def start(*words):
+    def start(*words, program=("-m", "isocharge.cli")):
         process = subprocess.Popen(
-            [sys.executable, "-m", "isocharge.cli", *map(str, words)],
+            [sys.executable, *program, *map(str, words)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

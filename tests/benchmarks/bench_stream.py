@@ -17,6 +17,7 @@ import numpy as np
 from shared import options, percentiles, print_results
 
 from isocharge.serve import Port, Predictor, Script, TouchStream, VirtualSensor, device_from_table, wander
+from isocharge.simulate import noise_model
 
 BOARD = {
     "gain": {"pC_per_unit": 1.0},
@@ -24,11 +25,6 @@ BOARD = {
     "hum": {"frequency_Hz": 50.0},
     "leak": {"tau_s": 1e6},
 }
-
-
-def reference_noise(charge_pC: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """1 pC and 0.2 % on each channel."""
-    return charge_pC + np.hypot(1.0, 0.002 * charge_pC) * rng.standard_normal(charge_pC.shape)
 
 
 def linear_film(electrodes: int) -> Any:
@@ -44,7 +40,7 @@ def linear_film(electrodes: int) -> Any:
 
 def board(pipe: Connection, electrodes: int, script: Script, seed: int) -> None:
     """Play until the other end says so; then tell what was played."""
-    with VirtualSensor(linear_film(electrodes), script, noise=reference_noise, seed=seed) as sensor:
+    with VirtualSensor(linear_film(electrodes), script, noise=noise_model("reference").add, seed=seed) as sensor:
         pipe.send(sensor.url)
         pipe.recv()
     pipe.send({name: getattr(sensor, name) for name in ("sent", "withheld")})

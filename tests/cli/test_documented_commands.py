@@ -98,7 +98,6 @@ def test_the_reference_lists_every_command():
     ],
 )
 def test_live_takes_an_address_or_none(option, address):
-    for words in (["demo"], ["serve", "stream", "three-25um-biaxial", "--port", "film"], ["serve", "replay", "x.rec"]):
-        assert parse([*words, *option])["live"] == address
-    assert parse(["demo", *option, "--seconds", "5"])["live"] == address
+    assert parse(["serve", "stream", "three-25um-biaxial", "--port", "film", *option])["live"] == address
     assert parse(["serve", "replay", *option, "touch.rec"])["live"] == address
+    assert parse(["demo", *option, "--seconds", "5"])["live"] == address

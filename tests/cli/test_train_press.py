@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tests.train.calibration.conftest import rig
+from tests.train.calibration.conftest import few_hypotheses, rig  # noqa: F401
 from tests.train.calibration.synthetic_film import SyntheticFilm
 
 from boards import encoded_frames
@@ -232,6 +232,7 @@ def test_a_press_that_had_begun_is_left_out_and_a_line_is_not(charges):
 PRESS = ("train", "press", "--sensor", "four-25um-biaxial", "-o", "presses.csv")
 
 
+@pytest.mark.usefixtures("few_hypotheses")
 def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(command, desk, charges, monkeypatch, synthetic):
     """The port ends after the first press. The same command continues with the second row of the list.
 
@@ -257,6 +258,7 @@ def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(command, desk
     np.testing.assert_array_equal(presses.contact, PLACES)
 
 
+@pytest.mark.usefixtures("few_hypotheses")
 def test_a_calibration_without_an_output_only_states_the_film(command, desk, monkeypatch, synthetic, problem):
     monkeypatch.setattr(calibrate_command, "calibrate", partial(calibrate, start=synthetic, accurate=False))
     monkeypatch.setattr(calibrate_module, "SAME_FILM_STD", np.inf)
