@@ -22,18 +22,6 @@ def read(text):
     return read_charges(io.StringIO(text, newline=""), NAMES, "presses.csv")
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "A,B,C\n1,2,3\n4,5,6.5\n",
-        "\n A , B,C \n1, 2,3\n,,\n4,5,65e-1\n",
-        '# of "today\n\nA,B,C\n1,2,3,,\n  # 7,8,9\n4,5,6.5\n',
-    ],
-)
-def test_charges_are_the_same_from_every_kind_of_csv(text):
-    np.testing.assert_array_equal(read(text), [[1, 2, 3], [4, 5, 6.5]])
-
-
 EXPORTS = {
     "Excel in German": "\ufeffx_mm;y_mm;force_N;A;B;C\r\n2;-6;0,2;502,3;244,8;215,8\r\n2;4;0,5;423,2;695,6;507,8\r\n",
     "line with the separator": "sep=;\r\nx_mm;A;B;C\r\n2;502.3;244.8;215.8\r\n2;423.2;695.6;507.8\r\n",
@@ -48,6 +36,7 @@ EXPORTS = {
     "points and three decimals": "A,B,C\n502.300,244.800,215.800\n423.200,695.600,507.800\n",
     "pandas in German": ";A;B;C\n0;5,023e+02;2,448e+02;2,158e+02\n1;4,232e+02;6,956e+02;5,078e+02\n",
     "units of names, too": "of;t;A;B;C\nname;s;[pC];[pC];[pC]\nP1;0;502,3;244,8;215,8\nP2;1;423,2;695,6;507,8\n",
+    "blank lines and comments": '# of "today\n\n A , B,C \n502.3, 244.8,215.8,,\n  # 7,8,9\n,,\n4232e-1,695.6,507.8\n',
     "lines above the header": "Date: 2026-11-25, 10:00\n\nt;A;B;C\n10:00;502,3;244,8;215,8\n10:01;423,2;695,6;507,8\n",
 }
 """Exports of other programs that contain the same charges."""
