@@ -19,7 +19,7 @@ SMALLER = {
     "--radius 8 --force 0.05 2 --samples 6000": "--radius 3 --force 0.5 1 --samples 800",
     "--link film &": "--link film --force-max 0.05 &",
     "--count 2000": "--count 1000",
-    "radius=10.0, force_range=(0.05, 2.0)": "radius=4.0, force_range=(0.5, 1.0)",
+    "radius=10.0, force_range=(0.05, 2.0)": "radius=4.0, force_range=(1.0, 1.0)",
     "train/configs/quick.toml": "quick.toml",
 }
 """Parts of examples that would take a test too long, and the shorter parts that the tests run in their place."""
@@ -57,7 +57,7 @@ def presses(tmp_path_factory):
     return write_sweep(
         tmp_path_factory.mktemp("data") / "presses",
         (kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0)),),
-        Sweep(samples=1000),
+        Sweep(samples=1000, outside=2000),
     )
 
 

@@ -76,9 +76,10 @@ def load(group, path):
             outcomes[" ".join(words)] = ""
 
 
-import ezdxf, matplotlib.figure, onnx, onnxruntime, rich.markdown, shapely, torch, typer
-import scipy.optimize, scipy.spatial, scipy.stats
-import sklearn.ensemble, sklearn.gaussian_process, sklearn.neighbors
+if len(absent_packages) > 2:
+    import ezdxf, matplotlib.figure, onnx, onnxruntime, rich.markdown, shapely, torch, typer
+    import scipy.optimize, scipy.spatial, scipy.stats
+    import sklearn.ensemble, sklearn.gaussian_process, sklearn.neighbors
 
 for extra, absent in absent_packages.items():
     if os.fork():
@@ -101,7 +102,7 @@ for extra, absent in absent_packages.items():
 """
 """Loads all commands in one process for each extra, with the packages of this extra absent.
 
-The processes are forked after the large packages are imported, because this takes longer than everything else.
+Several processes are forked after the large packages are imported, because this takes longer than everything else.
 """
 
 
@@ -146,7 +147,7 @@ def outcomes_without(installed, request):
 @pytest.mark.parametrize(
     "missing",
     [
-        pytest.param(extra, marks=[] if extra in {"simulate", "http", "every extra"} else [pytest.mark.slow])
+        pytest.param(extra, marks=[] if extra in {"simulate", "every extra"} else [pytest.mark.slow])
         for extra in ABSENT_PACKAGES
     ],
 )

@@ -24,7 +24,7 @@ BUILD = ForwardMap.build
 
 def small_map(sensor, probe):
     """A map of the middle of the film."""
-    return kept(BUILD, sensor, probe, 3.0, (0.2, 0.5))
+    return kept(BUILD, sensor, probe, 3.0, (0.5, 0.5))
 
 
 @pytest.fixture(autouse=True)
