@@ -192,6 +192,7 @@ def test_doctor_writes_the_order_of_the_channels_found_by_presses(film, models, 
     assert code == 0, err
     assert "the channels of A, B are in another order" in out
     assert "press near electrode A, as close to it as you can, and let go" in err
+    assert "use it with: isocharge serve stream linear --port " in err
     assert dict(load_device(path).channels) == {"A": "2", "B": "1", "C": "3"}
 
 

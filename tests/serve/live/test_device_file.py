@@ -211,7 +211,7 @@ def test_channel_of_each_electrode(names, channels, picked):
         ),
         ("x,y,z", {"A": "zz"}, r'^board\.toml: \[channels\] A = "zz": no channel .* have x, y, z, or 1 to'),
         *(
-            ("", {"A": name}, "no channel is called that")
+            ("", {"A": name}, "no channel is called that; the frames have 1, 2, 3, or 1 to 3")
             for name in ("0", "4", "ch0", "ch4", "ch", "", "-1", "1.0", "99999", "²")
         ),
     ],
