@@ -42,13 +42,11 @@ def ring(radius: float, count: int = 7) -> np.ndarray:
 
 def radial_and_hoop(stress: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the stress in polar coordinates about the origin, (s_r, s_theta, s_r_theta), shapes (n,)."""
-    c, s = (points / np.linalg.norm(points, axis=1, keepdims=True)).T
+    direction = points @ [1.0, 1j] / np.linalg.norm(points, axis=1)
     s11, s22, s12 = stress.T
-    return (
-        c * c * s11 + s * s * s22 + 2 * c * s * s12,
-        s * s * s11 + c * c * s22 - 2 * c * s * s12,
-        c * s * (s22 - s11) + (c * c - s * s) * s12,
-    )
+    mean = 0.5 * (s11 + s22)
+    deviator = (0.5 * (s11 - s22) + 1j * s12) * np.conj(direction) ** 2
+    return mean + deviator.real, mean - deviator.real, deviator.imag
 
 
 def plate_stiffness(film: Film) -> float:

@@ -46,20 +46,7 @@ class FineMap(FunctionMap):
         return differences(self.function, contact, FINE_STEPS)
 
 
-def folded_map(extra: float | None = None, radius: float = 5.0, forces: tuple[float, float] = FORCES) -> FunctionMap:
-    """Three charges that fold at x = FOLD_X, and optionally a fourth whose slope along x is `extra`, 1/mm."""
-
-    def charge(contact):
-        x, y, force = contact.T
-        columns = [3.0 + (x - x**2 / (2.0 * FOLD_X)) / 3.0, 3.0 + 0.3 * y, np.full(len(x), 3.0)]
-        if extra is not None:
-            columns.append(3.0 + extra * x)
-        return 300.0 * force[:, None] ** (2.0 / 3.0) * np.stack(columns, axis=1)
-
-    return FunctionMap(charge, ("A", "B", "C", "D")[: 3 if extra is None else 4], Domain(radius, forces))
-
-
-def shaped_charges(*shapes) -> FunctionMap:
+def shaped_charges(*shapes, radius: float = 5.0, forces: tuple[float, float] = FORCES) -> FunctionMap:
     """Charges that are functions of x and y, and one charge that depends only on the force."""
 
     def charge(contact):
@@ -67,7 +54,20 @@ def shaped_charges(*shapes) -> FunctionMap:
         columns = [3.0 + 0.3 * shape(x, y) for shape in shapes]
         return 300.0 * force[:, None] ** (2.0 / 3.0) * np.stack([*columns, np.full(len(x), 3.0)], axis=1)
 
-    return FineMap(charge, tuple("ABCDE"[: len(shapes) + 1]), Domain(5.0, FORCES))
+    return FineMap(charge, tuple("ABCDE"[: len(shapes) + 1]), Domain(radius, forces))
+
+
+def folded_map(*shapes, **domain) -> FunctionMap:
+    """Three charges that fold at x = FOLD_X, and further charges that are functions of x and y."""
+    return shaped_charges(lambda x, _: x - x**2 / (2.0 * FOLD_X), lambda _, y: y, *shapes, **domain)
+
+
+def constant(x, _):
+    return 0.0 * x
+
+
+def rising(x, _):
+    return x
 
 
 def folds_of(charge_map, rings: Rings | None = None) -> np.ndarray:
@@ -96,7 +96,7 @@ def film():
     ("charge_map", "axis"),
     [
         (folded_map(), 0),
-        (folded_map(0.0), 0),
+        (folded_map(constant), 0),
         (shaped_charges(lambda x, _: x, lambda _, y: y - y**2 / (2.0 * FOLD_X)), 1),
     ],
     ids=["three charges", "constant fourth charge", "fold line along x"],
@@ -112,7 +112,7 @@ def test_find_folds_finds_a_known_fold_line(charge_map, axis):
 
 def test_find_folds_finds_nothing_without_a_fold_line():
     """A fourth charge distinguishes both sides of the fold line, or the fold line is outside the disk."""
-    assert len(folds_of(folded_map(0.3))) == len(folds_of(folded_map(radius=2.5))) == 0
+    assert len(folds_of(folded_map(rising))) == len(folds_of(folded_map(radius=2.5))) == 0
 
 
 def test_find_folds_finds_a_fold_smaller_than_the_rings():
@@ -213,7 +213,7 @@ def test_ambiguous_pairs_of_a_small_film_are_those_of_a_large_one():
 
 
 def test_no_ambiguous_pairs_where_a_charge_distinguishes_the_sides():
-    assert len(find_ambiguous_pairs(folded_map(0.3), REFERENCE, 0.5, places=400)) == 0
+    assert len(find_ambiguous_pairs(folded_map(rising), REFERENCE, 0.5, places=400)) == 0
 
 
 def test_fold_line_bounds_the_working_area():

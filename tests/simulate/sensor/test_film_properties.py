@@ -1,6 +1,8 @@
 """Tests of the properties of real films: each changes what it names and nothing else."""
 
 import math
+from operator import attrgetter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,33 +26,37 @@ def with_value(name, value):
     return PRIOR.film(values)
 
 
+FILM = SENSOR.film
+PIEZO = SENSOR.piezo
 EXPECTED = {
-    "pretension": (0.7, lambda s, _: s.film.pretension, 0.7),
-    "young": (0.1, lambda s, _: s.film.young / SENSOR.film.young, math.exp(0.1)),
-    "thickness": (-0.1, lambda s, _: s.film.thickness / SENSOR.film.thickness, math.exp(-0.1)),
-    "d31": (0.2, lambda s, _: s.piezo.d31 / SENSOR.piezo.d31, math.exp(0.2)),
-    "d32": (0.2, lambda s, _: s.piezo.d32 / SENSOR.piezo.d32, math.exp(0.2)),
-    "d12": (0.3, lambda s, _: s.piezo.d12, 0.3),
-    "shift_x": (0.3, lambda s, _: s.calibration.shift, (0.3, 0.0)),
-    "shift_y": (0.3, lambda s, _: s.calibration.shift, (0.0, 0.3)),
-    "rotation": (0.02, lambda s, _: s.calibration.rotation, 0.02),
-    "tension_difference": (0.2, lambda s, _: s.film.deviator, (0.2 * SENSOR.film.pretension, 0.0)),
-    "tension_shear": (0.2, lambda s, _: s.film.deviator, (0.0, 0.2 * SENSOR.film.pretension)),
-    "stiffness_x": (-0.2, lambda s, _: (s.film.young_ratio, s.film.axis), (math.exp(0.2), math.pi / 2.0)),
-    "stiffness_xy": (0.2, lambda s, _: (s.film.young_ratio, s.film.axis), (math.exp(0.2), math.pi / 4.0)),
-    "oval_x": (0.01, lambda s, _: (s.film.oval, s.film.oval_axis), (0.01, 0.0)),
-    "oval_xy": (-0.01, lambda s, _: (s.film.oval, s.film.oval_axis), (0.01, -math.pi / 4.0)),
-    "crosstalk": (0.01, lambda s, _: s.calibration.crosstalk, 0.01),
-    "probe_radius": (0.2, lambda _, p: p.radius, 1.2),
-    "gain A": (0.05, lambda s, _: s.calibration.gain["A"], math.exp(0.05)),
+    "pretension": (0.7, "film.pretension", 0.7),
+    "young": (0.1, "film.young", FILM.young * math.exp(0.1)),
+    "thickness": (-0.1, "film.thickness", FILM.thickness * math.exp(-0.1)),
+    "d31": (0.2, "piezo.d31", PIEZO.d31 * math.exp(0.2)),
+    "d32": (0.2, "piezo.d32", PIEZO.d32 * math.exp(0.2)),
+    "d12": (0.3, "piezo.d12", 0.3),
+    "shift_x": (0.3, "calibration.shift", (0.3, 0.0)),
+    "shift_y": (0.3, "calibration.shift", (0.0, 0.3)),
+    "rotation": (0.02, "calibration.rotation", 0.02),
+    "tension_difference": (0.2, "film.deviator", (0.2 * FILM.pretension, 0.0)),
+    "tension_shear": (0.2, "film.deviator", (0.0, 0.2 * FILM.pretension)),
+    "stiffness_x": (-0.2, "film.young_ratio film.axis", (math.exp(0.2), math.pi / 2.0)),
+    "stiffness_xy": (0.2, "film.young_ratio film.axis", (math.exp(0.2), math.pi / 4.0)),
+    "oval_x": (0.01, "film.oval film.oval_axis", (0.01, 0.0)),
+    "oval_xy": (-0.01, "film.oval film.oval_axis", (0.01, -math.pi / 4.0)),
+    "crosstalk": (0.01, "calibration.crosstalk", 0.01),
+    "probe_radius": (0.2, "probe.radius", 1.2),
+    "gain A": (0.05, "calibration.gain", {"A": math.exp(0.05)}),
 }
+"""Value of each property, the attributes of the sensor or the probe that it changes, and their values."""
 
 
 @pytest.mark.parametrize("name", EXPECTED)
 def test_each_property_changes_what_it_names_and_nothing_else(name):
-    value, read, expected = EXPECTED[name]
+    value, attributes, expected = EXPECTED[name]
     sensor, probe = with_value(name, value)
-    np.testing.assert_allclose(read(sensor, probe), expected, rtol=1e-12, atol=1e-15)
+    read = attrgetter(*attributes.split())
+    assert read(SimpleNamespace(**vars(sensor), probe=probe)) == pytest.approx(expected, rel=1e-12, abs=1e-15)
     described = PRIOR.film(PRIOR.described)
     changed = [
         key

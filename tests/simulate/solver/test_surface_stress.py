@@ -17,7 +17,6 @@ from isocharge.simulate import (
     touch_charge,
     touch_stress,
 )
-from solved_charges import relative_error, solved_charge, with_film
 
 PLATE = Theory(bending=True)
 MEMBRANE = Theory(bending=False)
@@ -103,16 +102,3 @@ def test_surface_readout_without_bending_raises_error(film):
         touch_charge(sensor, solved)
     bent = press(film, Circle(1.0), (0.0, 0.0), 1.0)
     assert np.isfinite(touch_charge(sensor, bent)).all()
-
-
-def test_charges_at_a_surface_under_the_probe_equal_those_of_a_finer_mesh():
-    """The bending stress changes its sign at the edge of the footprint, whose radius is 1 mm."""
-    inside = Electrode.of_square("A", (8.0, 3.0), 0.9)
-    at_the_edge = Electrode.of_square("B", (9.0, 3.0), 0.9)
-    stretched = with_film(load_sensor("four-25um-biaxial"), pretension=1.0)
-    sensor = replace(stretched, surface="top", electrodes=(inside, at_the_edge))
-    finer = SolveSettings(resolution=Resolution(7, 16, 8, 2))
-    charge, expected = (
-        solved_charge(sensor, Circle(1.0), (8.0, 3.0), 0.05, settings) for settings in (SolveSettings(), finer)
-    )
-    assert relative_error(charge, expected) <= 2e-4

@@ -28,21 +28,26 @@ from isocharge.train.calibration.calibrate import _is_exact, solve_even
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.data.contact_errors import position_error
 from isocharge.train.data.presses import draw_contacts
-from kept import kept
 from solved_charges import solved_charge, with_film, with_piezo
+
+
+def solve_even_at(problem, distances, forces) -> FilmCharges:
+    """Solve the axisymmetric film at a few distances and forces, which suffice for few contacts."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (film_charges, derivative_maps):
+            patch.setattr(module, "few_nodes", lambda *_: NodeCount(distances, forces))
+        return solve_even(problem)
 
 
 @pytest.fixture(scope="module")
 def solved(problem) -> FilmCharges:
-    """The solved film of the sensor file."""
-    return kept(solve_even, problem)
+    """The solved film of the sensor file, for presses like those of `CONTACT`."""
+    return solve_even_at(replace(problem, radius=6.0, force_range=(0.2, 1.0)), 5, 5)
 
 
 @pytest.fixture
-def narrow_problem(problem, monkeypatch):
-    """The problem for presses within 4 mm and of similar forces, for which nine solves suffice."""
-    for module in (film_charges, derivative_maps):
-        monkeypatch.setattr(module, "few_nodes", lambda *_: NodeCount(3, 3))
+def narrow_problem(problem):
+    """The problem for presses within 4 mm and of similar forces."""
     return replace(problem, radius=4.0, force_range=(0.4, 0.6))
 
 
@@ -79,15 +84,15 @@ def test_negative_charges_agree_with_direct_solves(problem, solved):
 
 
 def test_imperfections_of_the_sensor_file_are_changes_of_the_even_film(narrow_problem):
-    """Without them, the charges differ by up to 4 %."""
-    contact = CONTACT[:1]
-    sensor = with_film(narrow_problem.sensor, deviator=(0.4, 0.1), young_ratio=1.2, axis=0.5, oval=0.004, oval_axis=1.0)
-    charges = solve_even(replace(narrow_problem, sensor=sensor))
+    """Without them, the charges differ by up to 6 %."""
+    contact = np.array([[-2.5, 2.9, 0.5]])
+    sensor = with_film(narrow_problem.sensor, deviator=(0.6, 0.1), young_ratio=1.3, axis=0.5, oval=0.004, oval_axis=1.0)
+    charges = solve_even_at(replace(narrow_problem, sensor=sensor), 3, 3)
     values = charges.prior.mean
     expected = direct(*charges.prior.film(values), contact)
     even = direct(*charges.prior.film(charges.values), contact)
-    assert np.abs(even / expected - 1.0).max() > 0.03
-    np.testing.assert_allclose(charges.charges(values, contact), expected, rtol=0.007)
+    assert np.abs(even / expected - 1.0).max() > 0.05
+    np.testing.assert_allclose(charges.charges(values, contact), expected, rtol=0.015)
     assert not _is_exact(charges, values, contact)
 
 
@@ -100,7 +105,7 @@ def test_described_shear_modulus_is_solved_with_the_film(problem, solved):
 @pytest.mark.parametrize("finger", [Finger(5.0), pytest.param(GrowingFinger(5.0), marks=pytest.mark.slow)])
 def test_fingertip_is_solved_with_its_own_pressure(narrow_problem, finger):
     """A circle of the same area causes charges that differ by up to 1 %."""
-    charges = solve_even(replace(narrow_problem, probe=finger))
+    charges = solve_even_at(replace(narrow_problem, probe=finger), 3, 3)
     values = charges.prior.mean
     expected = direct(*charges.prior.film(values), CONTACT[:1])
     np.testing.assert_allclose(charges.charges(values, CONTACT[:1]), expected, rtol=2e-3)

@@ -11,33 +11,28 @@ from isocharge.train.calibration import session as session_module
 from isocharge.train.calibration.session import read_answer
 
 
-class SimulatedRig:
-    """A film drawn from the prior, a rig with the errors that it states, and a session of presses.
+class ExactRig:
+    """A film drawn from the prior, a rig without errors, and a session of presses.
 
     Attributes:
-        values: Properties of the film.
         session: The session.
         saved: Presses that the session has saved, in the order of the changes.
     """
 
-    def __init__(self, problem, synthetic, plan, count=0, **options):
+    def __init__(self, problem, synthetic, plan, count=0):
         """Begin a session, or continue one with the first `count` presses of a plan."""
-        self.problem = problem
+        (self.values,) = problem.prior.layout.prior.draw(np.random.default_rng(5), 1)
         self.charges = synthetic
-        self.rng = np.random.default_rng(5)
-        self.values = problem.prior.layout.prior.draw(self.rng, 1)[0]
         self.saved: list[MeasuredPresses] = []
         contact = np.array([press.contact for press in plan[:count]])
-        presses = measured_presses(problem, contact, np.array([self.charge(row) for row in contact])) if count else None
-        self.session = PressSession(problem, save=self.saved.append, presses=presses, **options)
+        presses = measured_presses(problem, contact, synthetic.charges(self.values, contact)) if count else None
+        self.session = PressSession(problem, save=self.saved.append, presses=presses)
 
     def charge(self, contact):
-        """Return the noisy charges of a press whose measured contact differs from the true one by the rig's errors."""
-        true_contact = contact + self.rng.standard_normal(3) * [0.1, 0.1, 0.01 * contact[2]]
-        exact_charge = self.charges.charges(self.values, true_contact[None])[0]
-        return self.problem.noise.add(exact_charge, self.rng)
+        """Return the charges of a press."""
+        return self.charges.charges(self.values, contact[None])[0]
 
-    def press(self, count=1):
+    def press(self, count):
         """Make the proposed presses."""
         for _ in range(count):
             contact = self.session.proposed.contact
@@ -60,7 +55,7 @@ def plan(problem, synthetic):
 
 
 def test_session_reports_its_errors_and_continues_with_saved_presses(problem, synthetic, plan):
-    rig = SimulatedRig(problem, synthetic, plan)
+    rig = ExactRig(problem, synthetic, plan)
     rig.press(3)
     session = rig.session
     error = session.result.film_error
@@ -85,7 +80,7 @@ def test_press_that_cannot_be_saved_is_not_in_the_session(problem, plan):
 
 
 def test_undo_removes_the_last_press(problem, synthetic, plan):
-    rig = SimulatedRig(problem, synthetic, plan, 3)
+    rig = ExactRig(problem, synthetic, plan, 3)
     session = rig.session
     first_two = session.presses.charge_pC[:2]
     assert session.undo() == 3
@@ -101,7 +96,7 @@ def test_undo_removes_the_last_press(problem, synthetic, plan):
 
 
 def test_press_whose_stated_place_is_wrong_is_named(problem, synthetic, plan):
-    rig = SimulatedRig(problem, synthetic, plan, 5)
+    rig = ExactRig(problem, synthetic, plan, 5)
     charge = rig.charge(np.array([2.0, 3.0, 1.0]))
     rig.session.take(charge, np.array([5.0, 0.0, 1.0]))
     assert rig.session.result.bad_lines == (6,)
@@ -117,7 +112,7 @@ def test_press_whose_stated_place_is_wrong_is_named(problem, synthetic, plan):
     ],
 )
 def test_press_outside_the_domain_is_refused_and_not_saved(problem, synthetic, plan, contact, message):
-    rig = SimulatedRig(problem, synthetic, plan)
+    rig = ExactRig(problem, synthetic, plan)
     with pytest.raises(PressError, match=message):
         rig.session.take(np.full(4, 500.0), np.array(contact))
     assert len(rig.session) == 0
@@ -126,7 +121,7 @@ def test_press_outside_the_domain_is_refused_and_not_saved(problem, synthetic, p
 
 def test_presses_with_an_unknown_place_or_force_are_taken(problem, synthetic, plan):
     """The place is unknown with dead weights, and the force with a stage that has no load cell."""
-    rig = SimulatedRig(problem, synthetic, plan, 2)
+    rig = ExactRig(problem, synthetic, plan, 2)
     x, y, force = plan[2].contact
     for contact in ([np.nan, np.nan, force], [x, y, np.nan]):
         rig.session.take(rig.charge(plan[2].contact), np.array(contact))

@@ -23,7 +23,7 @@ from isocharge.train.training.cross_fit import usable_presses
 from kept import ROOT, kept
 
 QUICK = short_training(24, 24, 250, 200, 6_000)
-QUICKER = short_training(24, 24, 140, 80, 2_000)
+QUICKER = short_training(24, 24, 80, 80, 2_000)
 """Training of a network whose errors are not compared with the smallest possible errors."""
 
 SLOPES = np.array([[0.6, 0.1, 2.0], [-0.5, 0.4, 1.0], [0.1, -0.6, 2.0], [0.2, 0.2, -4.0]])
@@ -268,36 +268,25 @@ def test_faulty_presses_are_refused_before_the_training(fault):
         fit_presses(presses, "pad", QUICK)
 
 
-def flat_presses(force_N, channel_count):
-    """Return presses like a public data set: channels on a circle, positions on a grid, one dead weight, noise of 3 %.
-
-    Args:
-        force_N: Force of all presses; NaN if it is unknown.
-        channel_count: Number of channels.
-    """
-    rng = np.random.default_rng(9)
-    grid = np.stack(np.meshgrid(np.arange(-20.0, 21.0, 4.0), np.arange(-20.0, 21.0, 4.0)), axis=-1).reshape(-1, 2)
-    place = np.repeat(grid, 8, axis=0)
-    angle = np.arange(channel_count) * 2.0 * np.pi / channel_count
-    channel_places = 22.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    distance = np.linalg.norm(place[:, None] - channel_places, axis=2)
-    pressure = 100.0 / (1.0 + (distance / 12.0) ** 2) * (1.0 + 0.03 * rng.standard_normal(distance.shape))
-    contact = np.column_stack([place, np.full(len(place), force_N)])
-    return measured_presses(contact, pressure, tuple(f"s{number}" for number in range(channel_count)))
+def presses_of_one_force(force_N):
+    """Return presses on the L with one dead weight of 2 N, whose stated force is `force_N`; NaN if it is unknown."""
+    contact = contacts_on_l(1_200, 0)
+    contact[:, 2] = 2.0
+    charge = charges_on_l(contact, 1)
+    contact[:, 2] = force_N
+    return measured_presses(contact, charge, CHANNELS)
 
 
 @pytest.mark.first_cases(1)
 @pytest.mark.parametrize(
-    ("force_N", "channel_count", "stated_N", "stated_std", "warning"),
+    ("force_N", "stated_N", "stated_std", "warning"),
     [
-        (2.0, 16, 2.0, 0.005, "all presses have a force of about 2 N: the model can estimate no other force"),
-        (np.nan, 8, 1.0, 1.0, "no press has a known force"),
+        (2.0, 2.0, 0.005, "all presses have a force of about 2 N: the model can estimate no other force"),
+        (np.nan, 1.0, 1.0, "no press has a known force"),
     ],
 )
-def test_presses_of_one_force_or_without_forces_train_x_and_y(
-    force_N, channel_count, stated_N, stated_std, warning, tmp_path, caplog
-):
-    presses = flat_presses(force_N, channel_count)
+def test_presses_of_one_force_or_without_forces_train_x_and_y(force_N, stated_N, stated_std, warning, tmp_path, caplog):
+    presses = presses_of_one_force(force_N)
     fitted = fit_presses(presses, "pad", QUICKER)
     assert warning in caplog.text
     contact, std, _ = fitted.predict(presses.charge_pC)
