@@ -57,10 +57,18 @@ def test_a_setting_without_effect_on_measured_presses_is_refused(refused, tmp_pa
     refused(*words, message=f"training.{setting.split()[0]} has no effect on measured presses")
 
 
-def test_too_few_held_out_presses_are_refused_before_the_film_is_solved(refused, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("charges", "message"),
+    [
+        ("500,500,500,400", "at least 22 held-out presses within 8 mm"),
+        ("500,500,500,500", "line 2: expected held-out presses that are not among those of the calibration"),
+    ],
+    ids=["too few", "of the calibration"],
+)
+def test_wrong_held_out_presses_are_refused_before_the_film_is_solved(charges, message, refused, tmp_path, monkeypatch):
     monkeypatch.setattr(calibrate_module, "calibrate", lambda *_, **__: pytest.fail("the film is solved"))
-    (tmp_path / "p.csv").write_text("x_mm,y_mm,force_N,A,B,C,D\n1,2,1,500,500,500,500\n")
+    for name, row in (("p.csv", "500,500,500,500"), ("h.csv", charges)):
+        (tmp_path / name).write_text(f"x_mm,y_mm,force_N,A,B,C,D\n1,2,1,{row}\n")
     words = "train", "calibrate", tmp_path / "p.csv", "--sensor", "four-25um-biaxial", "-o", tmp_path / "film"
-    message = "at least 22 held-out presses within 8 mm"
-    refused(*words, "--held-out", tmp_path / "p.csv", message=message)
-    assert [path.name for path in tmp_path.iterdir()] == ["p.csv"]
+    refused(*words, "--held-out", tmp_path / "h.csv", message=message)
+    assert {path.name for path in tmp_path.iterdir()} == {"p.csv", "h.csv"}

@@ -5,11 +5,7 @@ import json
 import pytest
 from matplotlib.image import imread
 
-from isocharge.simulate import load_sensor
-from isocharge.simulate.sensor.sensor_file import sensor_to_toml
-from solved_charges import with_film
-
-UNIAXIAL = ("simulate", "identify", "three-25um-uniaxial", "--radius", "3.5", "--force", "1", "1", "--workers", "1")
+UNIAXIAL = ("simulate", "identify", "three-25um-uniaxial", "--radius", "3.5", "--force", "0.9", "1.1", "--workers", "1")
 
 
 def test_a_map_that_folds_is_reported_drawn_and_written(command, refused, tmp_path):
@@ -34,7 +30,5 @@ def test_a_map_that_folds_is_reported_drawn_and_written(command, refused, tmp_pa
     refused(*UNIAXIAL, "-o", tmp_path / "out", message="already there", code=1)  # before anything is solved
 
 
-def test_single_force_on_a_taut_film_is_refused(refused, tmp_path):
-    path = tmp_path / "taut.toml"
-    path.write_text(sensor_to_toml(with_film(load_sensor("three-25um-uniaxial"), pretension=1.5)))
-    refused("simulate", "identify", path, "--force", "1", "1", message="expected a smaller and a larger force")
+def test_a_single_force_is_refused(refused):
+    refused("simulate", "identify", "three-25um-uniaxial", "--force", "1", "1", message="a smaller and a larger force")

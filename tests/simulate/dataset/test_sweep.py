@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from tests.simulate.conftest import COARSE
 
+from isocharge.common.errors import SceneError
 from isocharge.common.progress import listening
 from isocharge.simulate import (
     Circle,
@@ -117,6 +118,8 @@ def test_run_sweep_writes_the_same_bytes_as_write_sweep_and_reports_progress(tmp
     with listening(lambda title, done, total, _: reports.setdefault(title, []).append((done, total))):
         drafted = run_sweep(tmp_path / "b" / "presses", SENSOR, (Circle(1.0),), small(), COARSE)
     maps = [ForwardMap.build(SENSOR, Circle(1.0), 3.0, (1.0, 1.0), COARSE)]
+    with pytest.raises(SceneError, match="one forward map of this sensor for each probe"):
+        run_sweep(tmp_path / "c", SENSOR, (Circle(1.0), Circle(2.0)), small(), maps=maps)
     assert len(read_dataset(drafted).outside) == 50
     assert files(drafted) == files(write_sweep(tmp_path / "a" / "presses", maps, small()))
     assert [path.name for path in drafted.parent.iterdir()] == ["presses"]

@@ -21,6 +21,6 @@ def fields(sensor):
     """Stress fields of two sensors that have the same film, by the name of the sensor."""
     uniaxial = load_sensor("four-25um-uniaxial")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stress_fields, "NODE_COUNT", NodeCount(distances=5, forces=1))  # enough for so small a radius
+        patch.setattr(stress_fields, "NODE_COUNT", NodeCount(distances=4, forces=1))  # enough for so small a radius
         solved = stress_fields.solve_fields(sensor, Circle(1.0), 1.0, RADIUS)
     return {sensor.name: solved, uniaxial.name: replace(solved, sensor=uniaxial)}

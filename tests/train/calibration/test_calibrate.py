@@ -9,7 +9,7 @@ from tests.benchmarks.measured_films import measured_presses
 from tests.train.calibration.conftest import rig
 from tests.train.calibration.synthetic_film import SyntheticFilm
 
-from isocharge.common.errors import PressError, SensorError
+from isocharge.common.errors import PressError, SceneError, SensorError
 from isocharge.simulate import Circle, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, next_presses
 from solved_charges import with_film
@@ -51,6 +51,17 @@ def test_film_is_solved_beyond_the_radius_but_not_at_the_clamp(problem):
 def test_described_film_that_cannot_be_found_is_refused(problem):
     with pytest.raises(SensorError, match=r"pretension_MPa: expected at most 4 MPa.*got 8; train on many presses"):
         replace(problem, sensor=with_film(problem.sensor, pretension=8.0))
+
+
+@pytest.mark.parametrize("radius", [44.5, 100.0, np.inf, np.nan])
+def test_working_area_beyond_the_clamp_is_refused(problem, radius):
+    with pytest.raises(SceneError, match="radius"):
+        replace(problem, radius=radius)
+
+
+def test_sensor_of_two_electrodes_is_refused(problem):
+    with pytest.raises(SceneError, match="at least three electrodes"):
+        replace(problem, sensor=replace(problem.sensor, electrodes=problem.sensor.electrodes[:2]))
 
 
 @pytest.mark.parametrize("offset", [10.0, -12.0])

@@ -10,7 +10,6 @@ from isocharge.cli.shared.forward_maps import ProbeOption, executor_for
 from isocharge.cli.shared.options import ForceRangeOption, JsonOption, NoiseOption, SensorArgument, WorkersOption
 from isocharge.cli.shared.terminal import say, show_result, shown_progress
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
-from isocharge.common.errors import InputError
 from isocharge.common.files import new_folder, refuse_existing
 from isocharge.simulate import identify, load_sensor, noise_model, parse_probe
 from isocharge.simulate.plots.error_maps import identification_picture, mirror_picture
@@ -52,12 +51,6 @@ def identify_command(
     if output is not None:
         refuse_existing(output)
     described_sensor = load_sensor(sensor)
-    smallest_N, largest_N = force
-    if smallest_N == largest_N and described_sensor.film.pretension > 0.0:
-        raise InputError(
-            "--force: expected a smaller and a larger force, which determine how the charges of a taut film change, "
-            f"got {smallest_N:g} N twice"
-        )
     parsed_probe = parse_probe(probe)
     noise_level = noise_model(noise)
     with shown_progress(), executor_for(workers) as pool:

@@ -233,7 +233,7 @@ def run_sweep(
         Path of the folder.
 
     Raises:
-        SceneError: If a press of the sweep cannot exist.
+        SceneError: If a press of the sweep cannot exist, or `maps` are not those of the sensor and the probes.
         SolveError: If a press has no equilibrium, or the interpolation error of a forward map is too large.
         OutputExists: If the folder already exists. This error is raised before the computation starts.
         OutputError: If a file cannot be written.
@@ -242,6 +242,8 @@ def run_sweep(
     folder = Path(folder)
     probes = tuple(probes)
     refuse_existing(folder)
+    if maps and [(one.sensor, one.probe) for one in maps] != [(sensor, probe) for probe in probes]:
+        raise SceneError("maps: expected one forward map of this sensor for each probe, in the order of the probes")
 
     # The presses are computed before files are written, because SciPy ignores an interrupt during this computation.
     presses = sweep.over(probes)

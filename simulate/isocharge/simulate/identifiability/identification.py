@@ -228,11 +228,17 @@ def identify(
         executor: Executor that runs the solves; None for this process.
 
     Raises:
-        SceneError: If there are fewer than three electrodes, if there is no white noise, or if a press in the domain
-            cannot exist.
+        SceneError: If there are fewer than three electrodes, if the forces are equal, if there is no white noise, or if
+            a press in the domain cannot exist.
         SolveError: If a press has no equilibrium, or the interpolation error of the forward map is too large.
     """
     check_electrode_count(len(sensor.electrodes))
+    smallest_force, largest_force = force_range
+    if smallest_force == largest_force:
+        raise SceneError(
+            "force: expected a smaller and a larger force, which determine how the charges change, "
+            f"got {smallest_force:g} N twice"
+        )
     noise = noise or noise_model("reference")
     if noise.white <= 0.0:
         raise SceneError(

@@ -213,7 +213,7 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
         first_stress, first_points = stress_of(first)
         # The nodes move with the press. Subtract the change of the stress that their movement causes.
         change = last_stress - first_stress - change_by_node_shift(mesh, stress, last_points - first_points)
-        if column == "y" and distance < 5.0 * step:  # the mesh turns by a large angle, so read fixed points
+        if column == "y" and distance < 10.0 * step:  # the mesh turns by a large angle, so read fixed points
             difference = touch_stress(last, nodes, surface) - touch_stress(first, nodes, surface)
             change = difference.reshape(stress.shape)
         columns.append(change / (2.0 * step))

@@ -112,8 +112,8 @@ def calibrate_command(
             else read_presses(path, problem.electrodes, position_std_mm=position_std_mm, force_std=force_std)
             for path in (file, held_out)
         )
-        if held_out_presses is not None:
-            held_out_presses = usable_held_out(held_out_presses, problem.domain)  # before anything is solved
+        if presses is not None and held_out_presses is not None:
+            held_out_presses = usable_held_out(held_out_presses, presses, problem)  # before anything is solved
         if earlier is not None:
             problem = replace(problem, earlier=read_earlier(earlier, problem))
         if presses is not None:

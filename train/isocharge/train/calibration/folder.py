@@ -40,10 +40,10 @@ from isocharge.common.structs import Text, plain_values, read_json
 from isocharge.serve.model.charge_file import FILE as CHARGES
 from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.model_folder import check_target, version_folders
-from isocharge.serve.presses.measured_presses import MeasuredPresses
+from isocharge.serve.presses.measured_presses import MeasuredPresses, row_words
 from isocharge.serve.presses.std_factor import FEWEST_HELD_OUT, StdFactor
 from isocharge.serve.presses.table_file import csv_text
-from isocharge.simulate import Domain, NoiseModel
+from isocharge.simulate import NoiseModel
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict, sensor_to_toml
 from isocharge.simulate.solver.assembly import single_threaded_blas
 from isocharge.train.calibration.film_estimate import FilmEstimate
@@ -333,7 +333,7 @@ def write_calibration(
     check_calibration_folder(folder, result.problem.electrodes)
     problem, film = result.problem, result.film
     if held_out is not None:
-        held_out = usable_held_out(held_out.of_electrodes(problem.electrodes, problem.sensor.name), problem.domain)
+        held_out = usable_held_out(held_out, result.presses, problem)
     noisy_problem = replace(problem, noise=film.noise)
     with single_threaded_blas():
         series = compact_charges(noisy_problem, result.charges, film, executor)
@@ -363,16 +363,28 @@ def write_calibration(
     return released_model.folder
 
 
-def usable_held_out(held_out: MeasuredPresses, domain: Domain) -> MeasuredPresses:
-    """Return the held-out presses inside a domain with all charges and a known position or force.
+def usable_held_out(
+    held_out: MeasuredPresses, presses: MeasuredPresses, problem: CalibrationProblem
+) -> MeasuredPresses:
+    """Return the held-out presses that the model will answer, with all charges and a known position or force.
 
     Args:
         held_out: Presses that were not used for the calibration.
-        domain: Contacts that the model will answer.
+        presses: Presses of the calibration.
+        problem: The calibration problem.
 
     Raises:
-        PressError: If these are fewer than the 22 presses from which a factor for standard deviations follows.
+        PressError: If a press was used for the calibration, or if these are fewer than the 22 presses from which a
+            factor for standard deviations follows.
     """
+    domain = problem.domain
+    held_out, presses = (one.of_electrodes(problem.electrodes, problem.sensor.name) for one in (held_out, presses))
+    is_learned = (held_out.charge_pC[:, None] == presses.charge_pC).all(axis=2).any(axis=1)
+    if is_learned.any():
+        raise PressError(
+            f"{row_words(held_out[is_learned].lines, held_out.row_noun)}: expected held-out presses that are not among "
+            "those of the calibration, got the same charges; take them out of one of the files"
+        )
     is_known = np.isfinite(held_out.charge_pC).all(axis=1) & np.isfinite(held_out.contact).any(axis=1)
     usable = held_out[is_known & ~domain.is_outside(held_out.contact)]
     if len(usable) < FEWEST_HELD_OUT:

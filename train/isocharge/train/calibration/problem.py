@@ -6,6 +6,8 @@ from functools import cached_property
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import SensorError
 from isocharge.simulate import Domain, FilmPrior, NoiseModel, Probe, Sensor
+from isocharge.simulate.forward.charge_map import check_electrode_count
+from isocharge.simulate.forward.family import check_family
 from isocharge.simulate.noise import NOISE_LEVELS
 from isocharge.simulate.sensor.film_properties import PRETENSION
 from isocharge.train.calibration.estimator import Prior
@@ -53,8 +55,11 @@ class CalibrationProblem:
         """Check that a calibration can find the film that the sensor file describes.
 
         Raises:
-            SensorError: If its pretension is too large.
+            SceneError: If there are fewer than three electrodes, or if a press in the working area cannot exist.
+            SensorError: If the pretension of the film is too large.
         """
+        check_electrode_count(len(self.sensor.electrodes))
+        check_family(self.sensor.film, self.probe, self.domain)
         _, largest = PRETENSION.limits
         if self.sensor.film.pretension > largest:
             raise SensorError(
