@@ -12,6 +12,7 @@ from tests.train.calibration.synthetic_film import SyntheticFilm
 from isocharge.common.errors import PressError, SceneError, SensorError
 from isocharge.simulate import Circle, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, next_presses
+from isocharge.train.calibration import calibrate as calibrate_module
 from solved_charges import with_film
 
 pytestmark = pytest.mark.usefixtures("never_solved", "few_hypotheses")
@@ -125,6 +126,15 @@ def test_one_press_states_nothing_about_the_noise(problem, synthetic):
     _, _, presses = rig(problem, synthetic, 1, seed=18)
     (caution,) = fit(presses, problem, synthetic).cautions
     assert caution.startswith("all known positions are at one place")
+
+
+@pytest.mark.parametrize("is_exact", [True, False])
+def test_uneven_film_whose_solution_changes_the_estimate_again_is_a_caution(problem, synthetic, monkeypatch, is_exact):
+    monkeypatch.setattr(calibrate_module, "_fit_uneven_film", lambda _problem, _data, estimation, _executor: estimation)
+    monkeypatch.setattr(calibrate_module, "_is_exact", lambda *_: is_exact)
+    _, _, presses = rig(problem, synthetic, 12, seed=11)
+    cautions = calibrate(presses, problem, start=synthetic).cautions
+    assert cautions == (() if is_exact else (calibrate_module.NOT_CONVERGED,))
 
 
 def test_three_charges_need_a_known_contact_inside():

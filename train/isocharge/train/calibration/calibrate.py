@@ -37,6 +37,12 @@ VISIBLE_ASYMMETRY = 0.03
 The neglected second-order effect is about the square of this value.
 """
 
+NOT_CONVERGED = (
+    f"the estimated film differs from the solved one by more than {100.0 * VISIBLE_ASYMMETRY:g} % of the charges, "
+    "so the model may err more than it states: describe the film better in the sensor file, or give more presses"
+)
+"""Caution about an uneven film whose solution changes the estimate again and again."""
+
 MAX_USUAL_NOISE = 0.01
 """Noise that is proportional to the charge, above which a caution is given, dimensionless."""
 
@@ -82,18 +88,19 @@ def calibrate(
         )
     # Presses at the edge may lie outside the working area by their errors.
     is_outside = problem.solved_domain.is_outside(ordered_presses.contact)
-    outside_cautions = []
+    cautions = []
+    outside_words = ""
     used_presses = ordered_presses
     if is_outside.any():
         outside_words = _outside_words(ordered_presses[is_outside], problem)
         used_presses = ordered_presses[~is_outside]
         if len(ordered_presses) == 1 or _is_uninformative(used_presses):
             raise PressError(outside_words)
-        outside_cautions.append(outside_words)
+        cautions.append(f"{outside_words}; left out")
     with single_threaded_blas():
         charges = start or solve_even(problem, executor)
         if is_outside.mean() > 0.5:
-            raise unexplained_error(ordered_presses, charges, outside_cautions[0])
+            raise unexplained_error(ordered_presses, charges, outside_words)
         check_channels(used_presses, charges)
         is_suspicious = not _is_one_place(used_presses) and misfit(used_presses, charges) > SUSPICIOUS_MISFIT
         if is_suspicious and find_mistakes(used_presses, charges):
@@ -102,6 +109,8 @@ def calibrate(
         estimation = _fit_even_film(problem, data, charges, executor)
         if accurate:
             estimation = _fit_uneven_film(problem, data, estimation, executor)
+            if not _is_exact(estimation.charges, estimation.film.film_values, estimation.contact):
+                cautions.append(NOT_CONVERGED)
         if estimation.is_unexplained:
             residual = np.sqrt(estimation.chi2 / estimation.redundancy)
             reason = f"the charges of the best film differ from theirs by {residual:.2g} times the noise"
@@ -113,7 +122,7 @@ def calibrate(
         presses=used_presses,
         estimation=estimation,
         sensitivity=sensitivity,
-        cautions=(*(f"{words}; left out" for words in outside_cautions), *_cautions(used_presses, estimation)),
+        cautions=(*cautions, *_cautions(used_presses, estimation)),
     )
 
 
