@@ -149,7 +149,10 @@ def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path, monkeypatc
         assert (total >= 0.0).all()
         assert (total < 360.0).all()
     assert set(total[read.probe == "triangle:4.0"].round(3).tolist()) != {330.0}
-    assert read_dataset(tmp_path / "fixed").samples.orientation_deg[:3].tolist() == [30.0, 330.0, 0.0]
+    assert read.probes == ("circle:1.0", "rectangle:4.0x2.0", "triangle:4.0")
+    fixed = read_dataset(tmp_path / "fixed").samples
+    assert fixed.orientation_deg[:3].tolist() == [30.0, 330.0, 0.0]
+    assert fixed.probes == ("circle:1.0", "rectangle:4.0x2.0@30", "triangle:4.0@330")
 
 
 # Errors

@@ -77,6 +77,16 @@ class Samples:
     def __len__(self) -> int:
         return len(self.x_mm)
 
+    @property
+    def probes(self) -> tuple[str, ...]:
+        """Notations of the probes. That of a probe with the same rotation in all presses contains the rotation."""
+        notations = []
+        for notation in np.unique(self.probe).tolist():
+            rotations_deg = np.unique(self.orientation_deg[self.probe == notation])
+            is_rotated = rotations_deg.size == 1 and rotations_deg[0] != 0.0
+            notations.append(f"{notation}@{rotations_deg[0]:g}" if is_rotated else notation)
+        return tuple(notations)
+
     def columns(self) -> dict[str, np.ndarray]:
         """Return the array of each column, by the name of the column."""
         columns = {name: getattr(self, name) for name in COLUMNS}

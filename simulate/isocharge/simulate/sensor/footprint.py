@@ -73,6 +73,12 @@ class Probe(ABC):
         """Notation of this probe without its rotation, as `parse_probe` accepts it."""
 
     @property
+    def rotated_notation(self) -> str:
+        """Notation of this probe with its rotation, such as `rectangle:4.0x2.0@30`."""
+        angle_deg = np.rad2deg(self.angle)
+        return f"{self.notation}@{angle_deg:g}" if angle_deg else self.notation
+
+    @property
     @abstractmethod
     def area(self) -> float:
         """Area of the footprint, mm^2."""

@@ -207,7 +207,7 @@ def training_data(
     sensor, probe = charges.prior.film(film.film_values)
     return TrainingData(
         sensor=sensor,
-        probes=(charges.prior.probe.notation,),
+        probes=(charges.prior.probe.rotated_notation,),
         domain=domain,
         presses=LabelledPresses(contact, charge),
         sha256=hashlib.sha256(charge.tobytes()).hexdigest(),

@@ -98,7 +98,7 @@ def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any
     return {
         "format_version": 5,  # the version that `_CalibrationFile` reads
         "sensor": problem.sensor.name,
-        "probe": problem.probe.notation,
+        "probe": problem.probe.rotated_notation,
         "radius_mm": problem.radius,
         "force_range_N": list(problem.force_range),
         "noise": vars(film.noise),
@@ -155,7 +155,7 @@ def _check_same_problem(path: Path, content: _CalibrationFile, problem: Calibrat
     layout = problem.prior.layout
     for key, expected, got in (
         ("sensor", problem.sensor.name, content.sensor),
-        ("probe", problem.probe.notation, content.probe),
+        ("probe", problem.probe.rotated_notation, content.probe),
         ("radius_mm", problem.radius, content.radius_mm),
         ("force_range_N", problem.force_range, content.force_range_N),
         ("unknowns", ", ".join(layout.names), ", ".join(content.unknowns)),
@@ -442,7 +442,7 @@ def _film_section(result: CalibrationResult, made_with: Mapping[str, Any]) -> st
         result: Result of the calibration.
         made_with: Entries of the metadata, which may contain the factor of the standard deviations.
     """
-    problem = result.problem
+    probe = result.problem.probe.rotated_notation
     sentences = [*result.summary, *(f"Caution: {caution}." for caution in result.cautions)]
     if "std_factor" in made_with:
         sentences.append(f"Held-out presses: {StdFactor(**made_with['std_factor']).statement}.")
@@ -454,7 +454,7 @@ def _film_section(result: CalibrationResult, made_with: Mapping[str, Any]) -> st
     )
     return f"""## The film
 
-A calibration estimated the film from {len(result.presses)} presses with `{problem.probe.notation}` (radius as found).
+A calibration estimated the film from {len(result.presses)} presses with `{probe}` (radius as found).
 The model was trained, and its errors below were measured, on simulated films that these presses leave possible.
 
 {summary_list}

@@ -317,7 +317,7 @@ class DatasetEvaluation:
         return Section(
             sensor=self.dataset.sensor.name,
             measured=measured,
-            probes=[str(notation) for notation in np.unique(self.dataset.samples.probe)],
+            probes=list(self.dataset.samples.probes),
             radius_mm=domain.radius,
             force_N=domain.force_range,
             noise=None if measured else NOISE.name,

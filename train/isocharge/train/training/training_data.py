@@ -81,7 +81,7 @@ class TrainingData:
             )
         return cls(
             sensor=dataset.sensor,
-            probes=tuple(sorted({str(probe) for probe in dataset.samples.probe})),
+            probes=dataset.samples.probes,
             domain=domain_of(dataset),
             presses=presses,
             sha256=dataset.sha256,
