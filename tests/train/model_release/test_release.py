@@ -25,6 +25,7 @@ from isocharge.train import (
     release,
 )
 from isocharge.train.data.presses import draw_contacts
+from isocharge.train.model_release import release as release_module
 from isocharge.train.model_release.evaluate import simulated_errors
 from kept import ROOT, kept
 
@@ -158,6 +159,14 @@ def test_the_folder_is_complete_and_its_card_and_metadata_agree(released, datase
     names = ["coverage_68", "coverage_95", "found_gain_20_percent", "found_dead_electrode"]
     expected_fractions = [metadata.errors[name] for name in names]
     np.testing.assert_allclose(np.array(percentages, float) / 100.0, expected_fractions, atol=6e-4)
+
+
+@pytest.mark.parametrize(("misfit", "warnings"), [(5.3, 0), (11.9, 1)])
+def test_probes_whose_differences_hide_faults_cause_a_warning(fitted, tmp_path, monkeypatch, caplog, misfit, warnings):
+    errors = {**evaluate(fitted), "misfit_p999": misfit}
+    monkeypatch.setattr(release_module, "evaluate", lambda _: errors)
+    release(fitted, tmp_path / "mine")
+    assert caplog.text.count(f"misfit above {misfit}") == warnings
 
 
 def test_the_errors_in_the_metadata_are_those_of_the_served_model(fitted, released):

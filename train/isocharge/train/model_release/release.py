@@ -1,5 +1,6 @@
 """Release of a trained network as a model folder with an ONNX graph, measured errors, golden vectors and a card."""
 
+import logging
 import platform
 from dataclasses import dataclass
 from importlib.metadata import version as installed_version
@@ -12,7 +13,7 @@ from isocharge.common.contact_domain import Domain
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import ModelError
 from isocharge.common.structs import convert
-from isocharge.serve.model.contact import disk_corners
+from isocharge.serve.model.contact import MISFIT_LIMIT, disk_corners
 from isocharge.serve.model.metadata import ModelMetadata, ModelNoise
 from isocharge.serve.model.model_folder import write_model
 from isocharge.serve.model.session import contact_floors
@@ -21,6 +22,8 @@ from isocharge.train.data.measured_sensor import PressedArea
 from isocharge.train.model_release.evaluate import evaluate, unnoticed_presses
 from isocharge.train.model_release.onnx_graph import check_graph, write_graph
 from isocharge.train.training.fit import Fitted
+
+log = logging.getLogger(__name__)
 
 LISTED_ERRORS = {
     "position_median_mm": "position, median | {:g} mm",
@@ -196,6 +199,14 @@ def release(
         ModelError: If the folder holds a model with other electrodes.
         TrainingError: If the exported graph and the network disagree.
     """
+    errors = evaluate(fitted)
+    if errors["misfit_p999"] > 2.0 * MISFIT_LIMIT and "measured" not in fitted.made_with:
+        log.warning(
+            "one in a thousand good presses has a misfit above %.3g, because the charges of the probes or of their "
+            "rotations differ by more than the noise: the flag `misfit` notices only larger faults; train a model of "
+            "one probe in one rotation",
+            errors["misfit_p999"],
+        )
     package_versions = {name: installed_version(name) for name in ("isocharge", "numpy", "onnx", "onnxruntime")}
     metadata_without_unnoticed = ModelMetadata(
         name=folder.resolve().name,
@@ -207,7 +218,7 @@ def release(
         force_range_N=fitted.domain.force_range,
         noise=convert(fitted.noise.to_dict(), ModelNoise, "noise of the training", ModelError),
         dataset_sha256=fitted.sha256,
-        errors=evaluate(fitted),
+        errors=errors,
         made_with={
             "command": command,
             **package_versions,
