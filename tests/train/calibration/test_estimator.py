@@ -21,7 +21,7 @@ from isocharge.train.calibration.press_data import Linearised, PressData, PressE
 from isocharge.train.data.presses import draw_contacts
 
 ONE = Hypothesis(
-    1.0,
+    (1.0, 1.0),
     0.003,
     tuple(20.0 if one.name == "offset" else 1e-4 for one in SESSION),
     PressErrors(noise_model("reference")),

@@ -25,6 +25,7 @@ from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.model.robust_estimate import MeasuredContacts, ModelValues, robust_estimate
 from isocharge.serve.model.robust_estimate import Prior as StatePrior
 from isocharge.simulate import NoiseModel, noise_model
+from isocharge.simulate.sensor.film_properties import UNEVEN_TENSIONS
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, Layout, unit_covariance
 from isocharge.train.calibration.press_data import (
@@ -45,8 +46,11 @@ UNEXPLAINED_CHI2 = 9.0
 FEW_PRESSES = 3
 """Largest number of presses that counts as few. Among a few presses, a bad press cannot be recognised."""
 
-IMPERFECTION_SCALES = ((0.1, 0.2), (1.0, 0.7), (2.5, 0.1))
-"""Sizes of the imperfections relative to their prior standard deviations, with their prior probabilities."""
+IMPERFECTION_SCALES = (((0.1, 0.1), 0.1), ((1.0, 0.1), 0.2), ((1.0, 1.0), 0.6), ((2.5, 2.5), 0.1))
+"""Sizes of the uneven tension and of the other imperfections, with their prior probabilities.
+
+The sizes are relative to the prior standard deviations. An uneven tension is the most frequent imperfection.
+"""
 
 DISCREPANCY_SIZES = ((0.001, 0.7), (0.005, 0.2), (0.02, 0.1))
 """Sizes of the discrepancy, relative to the charge, with their prior probabilities."""
@@ -75,14 +79,15 @@ class Hypothesis:
     """One combination of the sizes that are not known beforehand.
 
     Attributes:
-        imperfections: Size of the imperfections, relative to their prior standard deviations.
+        imperfections: Sizes of the uneven tension and of the other imperfections, relative to their prior standard
+            deviations.
         discrepancy: Size of the discrepancy, relative to the charge.
         session_std: Prior standard deviation of each unknown of the session, shape (n_session,).
         errors: Errors of the presses.
         probability: Prior probability.
     """
 
-    imperfections: float
+    imperfections: tuple[float, float]
     discrepancy: float
     session_std: tuple[float, ...]
     errors: PressErrors
@@ -90,8 +95,8 @@ class Hypothesis:
 
     @property
     def variances(self) -> Array:
-        """Factors of the parts of the prior covariance, shape (3 + n_session,); see `Prior.parts`."""
-        return np.array([1.0, self.imperfections, self.discrepancy, *self.session_std]) ** 2
+        """Factors of the parts of the prior covariance, shape (4 + n_session,); see `Prior.parts`."""
+        return np.array([1.0, *self.imperfections, self.discrepancy, *self.session_std]) ** 2
 
 
 def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
@@ -111,10 +116,12 @@ def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
         yield Hypothesis(imperfections, discrepancy, tuple(session_std), errors, float(np.prod(probabilities)))
 
 
-TYPICAL = Hypothesis(1.0, 0.01, tuple(one.stds[-1][0] for one in SESSION), PressErrors(noise_model("reference")), 1.0)
+TYPICAL = Hypothesis(
+    (1.0, 1.0), 0.01, tuple(one.stds[-1][0] for one in SESSION), PressErrors(noise_model("reference")), 1.0
+)
 """Hypothesis with which the most probable unknowns are searched, so that all unknowns can differ from zero."""
 
-PLANNED = Hypothesis(0.5, 0.01, tuple(one.stds[0][0] for one in SESSION), TYPICAL.errors, 1.0)
+PLANNED = Hypothesis((0.5, 0.5), 0.01, tuple(one.stds[0][0] for one in SESSION), TYPICAL.errors, 1.0)
 """Hypothesis with which presses are planned before the first press."""
 
 
@@ -149,15 +156,15 @@ class Prior:
 
     @cached_property
     def parts(self) -> Array:
-        """Parts of the covariance of the unknowns, shape (3 + n_session, n_unknown, n_unknown).
+        """Parts of the covariance of the unknowns, shape (4 + n_session, n_unknown, n_unknown).
 
-        The parts are the covariance that is the same under all hypotheses, and the covariances of the imperfections, of
-        the discrepancy, and of each unknown of the session, all of the size 1. After an earlier calibration, its
-        covariance contains the imperfections, and the discrepancy grows.
+        The parts are the covariance that is the same under all hypotheses, and the covariances of the uneven tension,
+        of the other imperfections, of the discrepancy, and of each unknown of the session, all of the size 1. After an
+        earlier calibration, its covariance contains the imperfections, and the discrepancy grows.
         """
         layout = self.layout
-        parts = np.zeros((3 + len(SESSION), *(layout.coefficients.stop,) * 2))
-        fixed, imperfections, discrepancy, *session = parts
+        parts = np.zeros((4 + len(SESSION), *(layout.coefficients.stop,) * 2))
+        fixed, uneven_tension, others, discrepancy, *session = parts
         discrepancy[layout.coefficients, layout.coefficients] = unit_covariance(
             len(layout.prior.sensor.electrode_names)
         )
@@ -169,8 +176,10 @@ class Prior:
             return parts
         variance = layout.prior.std**2
         is_imperfection = layout.prior.is_imperfection
+        is_tension = np.isin(layout.prior.names, UNEVEN_TENSIONS)
         fixed[layout.film, layout.film] = np.diag(np.where(is_imperfection, 0.0, variance))
-        imperfections[layout.film, layout.film] = np.diag(np.where(is_imperfection, variance, 0.0))
+        uneven_tension[layout.film, layout.film] = np.diag(np.where(is_tension, variance, 0.0))
+        others[layout.film, layout.film] = np.diag(np.where(is_imperfection & ~is_tension, variance, 0.0))
         return parts
 
     def covariance(self, hypothesis: Hypothesis) -> Array:
