@@ -179,7 +179,8 @@ class Prior:
         is_tension = np.isin(layout.prior.names, UNEVEN_TENSIONS)
         fixed[layout.film, layout.film] = np.diag(np.where(is_imperfection, 0.0, variance))
         uneven_tension[layout.film, layout.film] = np.diag(np.where(is_tension, variance, 0.0))
-        others[layout.film, layout.film] = np.diag(np.where(is_imperfection & ~is_tension, variance, 0.0))
+        others[layout.film, layout.film] = np.diag(np.where(is_imperfection, variance, 0.0))
+        others -= uneven_tension
         return parts
 
     def covariance(self, hypothesis: Hypothesis) -> Array:
