@@ -147,9 +147,10 @@ def test_recording_that_begins_later_restarts_the_stream(film, predictor, tmp_pa
     records = live.follow(with_requests(chunks_of_presses(film), requests))
     lines = [record.to_json() for record in records if live.recorder is not None]
     assert len(lines) > 20
-    # The totals continue in spite of the restart. The restart and the outage each cut one of the 80 frames in two.
-    assert stream.totals().frames == 80 - 2
-    assert stream.totals().reconnects == 1
+    # The totals continue in spite of the restart. The restart and the outage each cut one of the 80 frames in two. The
+    # first frame is also the first one of the recording, which continues as after an outage.
+    assert stream.totals().frames == 80 - 2 + 1
+    assert stream.totals().reconnects == 2
 
     markers = []
     replayed = replay(
@@ -159,3 +160,19 @@ def test_recording_that_begins_later_restarts_the_stream(film, predictor, tmp_pa
     assert markers == [Marker(1e9, "now")]
     assert [event.use for event in Recording(path).events() if event.use] == model_changes
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_recording_that_begins_later_contains_the_header_of_the_board(film, predictor, tmp_path):
+    """The film is held when the recording begins, for longer than a first tare is searched."""
+    path = tmp_path / "later.rec"
+    live = RecordedStream(TouchStream(predictor))
+    rows = taps(film, rest=300, press=2_500)
+    lines = [b"C,A,B\n", *(f"{c:.3f},{a:.3f},{b:.3f}\n".encode() for a, b, c in islice(rows, 5_500))]
+    chunks = [Chunk(line, 1e9 + 0.005 * i, 5_000_000 * i) for i, line in enumerate(lines)]
+    request = {400: lambda: live.request_recording(Recorder(path, predictor.metadata.label, {}))}
+    records = list(live.follow(with_requests(chunks, request)))
+    for record in (records[350], records[-1]):
+        assert (record.x_mm, record.y_mm) == pytest.approx((3.0, -2.0), abs=0.1)
+    replayed = [record.to_json() for record in replay(Recording(path), TouchStream(predictor))]
+    assert replayed == [record.to_json() for record in records[-len(replayed) :]]
+    assert len(replayed) == len(lines) - 400 - 1  # the first line may be incomplete

@@ -27,6 +27,9 @@ Load = Callable[[], Predictor]
 
 log = logging.getLogger(__name__)
 
+SHORTEST_OUTAGE_s = 1e-3
+"""Length of the outage that is recorded before the first frames of a requested recording, s."""
+
 
 class RecordedStream:
     """Touch stream that writes its chunks and records to a recording.
@@ -52,6 +55,8 @@ class RecordedStream:
         # A chunk and its records that are not recorded yet
         self._current_chunk: tuple[Chunk, list[PredictionRecord]] | None = None
         self._requests: deque[Callable[[], None]] = deque()
+        self._preamble = b""  # bytes until the first frame, from which the layout of the frames is known
+        self._is_recording_new = False  # whether the present recording was requested and has no chunk yet
         self._loader = ThreadPoolExecutor(1, "model")  # loads one model at a time
 
     def request_tare(self) -> None:
@@ -62,7 +67,8 @@ class RecordedStream:
         """Request to end the present recording, and to begin another recording unless `recorder` is None.
 
         When a recording begins, the stream is restarted and the tare is measured again. A replay can therefore compute
-        the same records from the bytes of the recording alone.
+        the same records from the bytes of the recording alone. The recording begins with the bytes of the stream until
+        its first frame, because a board may send the names of its channels only at its start.
 
         Args:
             recorder: Recorder of the next recording, which this object opens and closes. None to record nothing.
@@ -106,6 +112,10 @@ class RecordedStream:
                 while self._requests:
                     execute_request = self._requests.popleft()
                     execute_request()
+                if self._is_recording_new:
+                    chunk = self._record_preamble(chunk)
+                if self._stream.parser.counts.frames == 0:
+                    self._preamble += chunk.data
 
                 # If the caller closes the generator at a `yield`, the chunk must be recorded with the records that were
                 # yielded until then. Chunk and records are therefore stored for `_record_chunk`.
@@ -146,9 +156,29 @@ class RecordedStream:
             log.error("no recording: %s", error)
             return
         self._stream.restart()
+        self._is_recording_new = True
         present_label = self._stream.predictor.metadata.label
         if recorder.model_label != present_label:  # the model has changed since the request
             recorder.event(use=present_label)
+
+    def _record_preamble(self, chunk: Chunk) -> Chunk:
+        """Repeat the bytes until the first frame as the first chunk of a new recording, without records.
+
+        Args:
+            chunk: The next chunk of the stream.
+
+        Returns:
+            The same chunk. It follows an outage if there were frames before, of which the later ones are missing in the
+            recording.
+        """
+        self._is_recording_new = False
+        if self.recorder is None or not self._preamble:
+            return chunk
+        had_frames = self._stream.totals().frames > 0
+        preamble = chunk._replace(data=self._preamble, outage_s=0.0)
+        deque(self._stream.feed(preamble), maxlen=0)
+        self.recorder.chunk(preamble, [])
+        return chunk._replace(outage_s=max(chunk.outage_s, SHORTEST_OUTAGE_s)) if had_frames else chunk
 
     def _end_recording(self) -> None:
         """End the present recording, and close its recorder unless the caller has opened the recorder."""
