@@ -44,6 +44,16 @@ def test_fit_follows_the_rate_and_smooths_the_jitter(ppm):
     assert (clock.rate - 1.0) * 1e6 == pytest.approx(ppm, abs=20.0)
 
 
+def test_old_readings_in_the_first_chunk_do_not_freeze_the_time():
+    """A board has stored readings ten minutes before the port was opened, and sends them first."""
+    clock = DeviceClock()
+    read(clock, chunk_at(0.0), [1_000_000, 1_005_000, 601_000_000], MODULUS)
+    arrived_s = 0.005 * np.arange(1, 400)
+    host_s = [read(clock, chunk_at(t), [601_000_000 + round(t * 1e6)], MODULUS)[0].host_s for t in arrived_s]
+    assert np.max(host_s[1:] - (START_S + arrived_s[1:])) < 0.31
+    np.testing.assert_allclose(host_s[100:], START_S + arrived_s[100:], atol=1e-3)
+
+
 @pytest.mark.parametrize(
     "jump_us",
     [-1_000_000, 700_000_000, 800_000, MODULUS - 3_000_000_000],

@@ -177,6 +177,8 @@ class DeviceClock:
         was_clock_set = abs(delay_s) > MAX_DELAY_s
         if was_clock_set and not self._is_fit_provisional:
             self._latest_host_s = -math.inf  # allows the host time of the next reading to be earlier
+        # Readings that a board has stored before the connection may have moved a provisional fit far ahead.
+        self._latest_host_s = min(self._latest_host_s, arrival_s + MAX_LEAD_s)
         # A provisional fit relies on the arrival of only one chunk. A fit that begins at this arrival replaces it.
         if was_clock_set or self._is_fit_provisional:
             self._fitted_host_s = arrival_s
