@@ -44,6 +44,21 @@ def test_fit_follows_the_rate_and_smooths_the_jitter(ppm):
     assert (clock.rate - 1.0) * 1e6 == pytest.approx(ppm, abs=20.0)
 
 
+@pytest.mark.parametrize(
+    ("previous_us", "t_us", "is_reset"),
+    [
+        (5_000_000, 77, True),
+        (5_000_000, 4_900_000, False),
+        (MODULUS - 1000, 4000, False),
+        (5_000_000, 9_000_000, False),
+    ],
+    ids=["a restart", "another order", "a wrap", "a gap"],
+)
+def test_clock_that_jumps_back_by_more_than_a_second_was_reset(previous_us, t_us, is_reset):
+    frames = read(DeviceClock(), chunk_at(0.0), [previous_us, t_us], MODULUS)
+    assert [frame.is_clock_reset for frame in frames] == [False, is_reset]
+
+
 def test_old_readings_in_the_first_chunk_do_not_freeze_the_time():
     """A board has stored readings ten minutes before the port was opened, and sends them first."""
     clock = DeviceClock()

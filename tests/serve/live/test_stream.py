@@ -119,3 +119,14 @@ def test_touch_with_negative_charges(film, predictor, press_pC, sensor, is_repla
     assert [record.contact for record in records] == [False] * 10 + [True] * 5
     with pytest.raises(ChargeError, match="model other/1 expects 3 charges"):
         list(touch.feed(chunk(Frame(15, 75_000, (1.0, 2.0)))))
+
+
+def test_board_without_numbers_that_restarts_has_the_flag_restart(predictor):
+    touch = TouchStream(predictor)
+    flags = []
+    for i in range(400):
+        t_us = 60_000_000 + 5000 * i if i < 300 else 5000 * (i - 300)
+        line = f"t_us={t_us} A=0.1 B=0.2 C=0.3\n".encode()
+        flags += [record.flags for record in touch.feed(Chunk(line, 1e9 + 0.005 * i, 5_000_000 * i))]
+    assert [index for index, words in enumerate(flags, 400 - len(flags)) if "restart" in words] == [300]
+    assert touch.totals().restarts == 1

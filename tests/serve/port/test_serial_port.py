@@ -253,6 +253,14 @@ def test_binary_datagrams_that_waited_are_not_joined(address, datagrams, lengths
         assert [len(chunk.data) for chunk in islice(port, len(lengths))] == lengths
 
 
+def test_datagrams_of_a_second_board_cause_one_warning(address, caplog):
+    with udp_port(address, b"1,2,3\n") as port, socket.socket(type=socket.SOCK_DGRAM) as other:
+        for _ in range(3):
+            other.sendto(b"4,5,6\n", address)
+        assert len(next(iter(port)).data) == 24
+    assert caplog.text.count("give each board its own port") == 1
+
+
 TEXT = (b'{"A": 1}', b"A:1\tB:2", "1 µC".encode())
 BYTES = (b"\xaa\x00", b"\xaa\x55", b"1\x002", b"\x7f")
 

@@ -131,6 +131,9 @@ class DeviceClock:
             modulus: Time at which the clock wraps to 0, us.
             arrival_s: Arrival of the chunk that contains the reading, unix seconds.
         """
+        # A clock that decreases by less, for example because datagrams arrived in another order, was not reset.
+        decrease_us = 0 if self._sent_us is None else (self._sent_us - t_us) % modulus
+        frame.is_clock_reset = MAX_DELAY_s * 1e6 < decrease_us <= modulus // 2
         step_us = self._unwrap(t_us, modulus)  # time since the previous reading
         predicted_s = self._predict(self._device_us)
 

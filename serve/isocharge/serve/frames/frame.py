@@ -65,6 +65,7 @@ class Frame:
         host_s: Time of the host, unix seconds. It is computed from the clock of the device. If the device sends no
             clock, it is computed from the arrival time. The time decreases only if a clock was set.
         device_us: Clock of the device after the wraps were removed, us; None if the device sends no clock.
+        is_clock_reset: Whether the clock of the device jumped back by more than a second before this frame.
         dt_s: Time since the previous valid frame, s; 0 for the first frame after a start. It does not depend on the
             wall clock of the host.
         clock_s: Time of the frame on the clock of the device, s. If the device sends no clock, it is a time of the host
@@ -95,6 +96,7 @@ class Frame:
     words: tuple[str, ...] = field(default=(), repr=False, compare=False)
     host_s: float = 0.0
     device_us: int | None = None
+    is_clock_reset: bool = False
     dt_s: float = 0.0
     clock_s: float = 0.0
     sent: Array = field(init=False, repr=False, compare=False)
@@ -133,7 +135,8 @@ class FrameCounts:
         frames: Number of intact frames.
         lost: Number of frames that are missing between received frames.
         repeated: Number of frames with the same counter as the previous frame.
-        restarts: Number of times that the counter decreased without a wrap, for example after a reset of the device.
+        restarts: Number of times that the counter, or without a counter the clock, decreased without a wrap, for
+            example after a reset of the device.
             Frames that were lost during a restart are not counted.
         crc_errors: Number of pieces with a wrong checksum.
         malformed: Number of pieces that were rejected for another reason, such as a wrong length.
@@ -288,17 +291,20 @@ class Parser(ABC):
         self.counts.bytes_dropped += len(self._tail)
         self._tail = b""
 
-    def sequence_flags(self, seq: int | None) -> tuple[str, ...]:
+    def sequence_flags(self, seq: int | None, *, is_clock_reset: bool = False) -> tuple[str, ...]:
         """Compare the counter of the next frame with the counter of the previous frame, and update the counts.
 
         Args:
             seq: Counter of the next frame; None if the format has no counter.
+            is_clock_reset: Whether the clock of the device was reset before this frame. Without a counter, this shows
+                that the device has restarted.
 
         Returns:
             Flags of the frame: empty, or one of `gap`, `repeat` and `restart` (see `isocharge.serve.flags`).
         """
         if seq is None:
-            return ()
+            self.counts.restarts += is_clock_reset
+            return (RESTART,) if is_clock_reset else ()
         previous_seq = self._previous_seq
         self._previous_seq = seq
         if previous_seq is None:  # this is the first frame of a connection

@@ -121,7 +121,7 @@ class ReadingStream:
         self._check_recognised()
         self.clock.stamp(chunk, frames, parser.t_us_modulus)
         for frame in frames:
-            frame.flags = [*self._pending_flags, *parser.sequence_flags(frame.seq)]
+            frame.flags = [*self._pending_flags, *parser.sequence_flags(frame.seq, is_clock_reset=frame.is_clock_reset)]
             self._pending_flags = []
             for stage in self._stages:
                 stage.step(frame)
