@@ -8,6 +8,7 @@ from tests.benchmarks.solved_films import solve_charges
 from tests.train.calibration.conftest import rig, uneven_film
 
 from isocharge.train import calibrate
+from isocharge.train.calibration import film_network
 from isocharge.train.calibration.calibrate import solve_even
 from isocharge.train.calibration.estimator import PLANNED
 from isocharge.train.calibration.film_network import _nodes, _tension_factors
@@ -37,6 +38,22 @@ def test_no_node_makes_a_film_slack_in_one_direction(problem):
     values[film.layout.index("pretension")] = 0.6
     lowest = 0.6 + _nodes(replace(film, values=values)).min()
     assert 0.0 < lowest - 0.25 * 0.6 < 0.05
+
+
+def test_node_at_which_the_charges_are_unknown_is_left_out(problem, synthetic, monkeypatch):
+    """Otherwise, the fit to its charges would also spoil the charges at the other nodes."""
+
+    def factors(_charges, _film, contact, _node_MPa, _executor):
+        ratio = 0.5 * np.random.default_rng(3).standard_normal((len(contact), 3, 4))
+        return 1.0 + ratio * np.array([0.0, 0.0, 1.0])[:, None]
+
+    monkeypatch.setattr(film_network, "_nodes", lambda _: np.array([-0.3, 0.0, 0.9]))
+    monkeypatch.setattr(film_network, "_tension_factors", factors)
+    series = film_network.compact_charges(problem, synthetic, uneven_film(problem), None)
+    assert series.node_MPa.tolist() == [-0.3, 0.0]
+    contact = np.array([[3.0, 2.0, 0.5], [-5.0, 1.0, 1.5]])
+    expected = synthetic.charges(uneven_film(problem).film_values, contact)
+    np.testing.assert_allclose(series.charges(contact), expected, rtol=0.01)
 
 
 @pytest.mark.slow

@@ -41,6 +41,9 @@ DIRECTION_DEGREES = (8, 3)
 MIN_DIRECTION = 0.1
 """Smallest root-mean-square effect of a direction on a charge, in standard deviations of the noise, that is kept."""
 
+MAX_SERIES_ERROR = 0.03
+"""Largest relative error of the series of a film with several nodes. Otherwise, the outermost node is left out."""
+
 NODES_MPa = (-0.7, -0.3, 0.0, 0.4, 0.9)
 """Changes of the pretension at the nodes of a film that can be followed, MPa.
 
@@ -72,6 +75,11 @@ def compact_charges(
     node_MPa = _nodes(film) if len(names) > len(CONTACT) else np.zeros(1)  # three charges only determine the contact
     factors = _tension_factors(charges, film, contact, node_MPa, executor)
     series = fit_film_series(domain, names, contact, charge[:, None] * factors, node_MPa)
+    while series.charge_std > MAX_SERIES_ERROR and node_MPa.size > 1:
+        # The first-order changes by the imperfections are wrong where the pretension nearly cancels a charge.
+        is_near = np.abs(node_MPa) < np.abs(node_MPa).max()
+        node_MPa, factors = node_MPa[is_near], factors[:, is_near]
+        series = fit_film_series(domain, names, contact, charge[:, None] * factors, node_MPa)
 
     contact, charge = contact[:DIRECTION_CONTACTS], charge[:DIRECTION_CONTACTS]
     changes = _directions(charges, film, contact, charge, noise)  # shape (n, n_direction, n_electrode), pC
