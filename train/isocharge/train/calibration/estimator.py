@@ -49,7 +49,7 @@ FEW_PRESSES = 3
 IMPERFECTION_SCALES = (((0.1, 0.1), 0.1), ((1.0, 0.1), 0.2), ((1.0, 1.0), 0.6), ((2.5, 2.5), 0.1))
 """Sizes of the uneven tension and of the other imperfections, with their prior probabilities.
 
-The sizes are relative to the prior standard deviations. An uneven tension is the most frequent imperfection.
+The sizes are relative to the prior standard deviations. An uneven tension may be the only imperfection.
 """
 
 DISCREPANCY_SIZES = ((0.001, 0.7), (0.005, 0.2), (0.02, 0.1))

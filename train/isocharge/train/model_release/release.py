@@ -202,9 +202,8 @@ def release(
     errors = evaluate(fitted)
     if errors["misfit_p999"] > 2.0 * MISFIT_LIMIT and "measured" not in fitted.made_with:
         log.warning(
-            "one in a thousand good presses has a misfit above %.3g, because the charges of the probes or of their "
-            "rotations differ by more than the noise: the flag `misfit` notices only larger faults; train a model of "
-            "one probe in one rotation",
+            "one in a thousand good presses has a misfit above %.3g, because the charges of different probes, "
+            "rotations or possible films differ by more than the noise: the flag `misfit` notices only larger faults",
             errors["misfit_p999"],
         )
     package_versions = {name: installed_version(name) for name in ("isocharge", "numpy", "onnx", "onnxruntime")}
