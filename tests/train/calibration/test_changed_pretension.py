@@ -40,7 +40,7 @@ def test_no_node_makes_a_film_slack_in_one_direction(problem):
     assert 0.0 < lowest - 0.25 * 0.6 < 0.05
 
 
-def test_node_at_which_the_charges_are_unknown_is_left_out(problem, synthetic, monkeypatch):
+def test_node_at_which_the_charges_are_unknown_is_left_out(problem, synthetic, monkeypatch, caplog):
     """Otherwise, the fit to its charges would also spoil the charges at the other nodes."""
 
     def factors(_charges, _film, contact, _node_MPa, _executor):
@@ -51,6 +51,7 @@ def test_node_at_which_the_charges_are_unknown_is_left_out(problem, synthetic, m
     monkeypatch.setattr(film_network, "_tension_factors", factors)
     series = film_network.compact_charges(problem, synthetic, uneven_film(problem), None)
     assert series.node_MPa.tolist() == [-0.3, 0.0]
+    assert "changes from -0.3 to +0 MPa can be followed" in caplog.text
     contact = np.array([[3.0, 2.0, 0.5], [-5.0, 1.0, 1.5]])
     expected = synthetic.charges(uneven_film(problem).film_values, contact)
     np.testing.assert_allclose(series.charges(contact), expected, rtol=0.01)

@@ -131,9 +131,7 @@ class DeviceClock:
             modulus: Time at which the clock wraps to 0, us.
             arrival_s: Arrival of the chunk that contains the reading, unix seconds.
         """
-        # A clock that decreases by less, for example because datagrams arrived in another order, was not reset.
-        decrease_us = 0 if self._sent_us is None else (self._sent_us - t_us) % modulus
-        frame.is_clock_reset = MAX_DELAY_s * 1e6 < decrease_us <= modulus // 2
+        frame.is_clock_reset = self._is_reset(t_us, modulus)
         step_us = self._unwrap(t_us, modulus)  # time since the previous reading
         predicted_s = self._predict(self._device_us)
 
@@ -218,6 +216,20 @@ class DeviceClock:
         """
         fitted_us = self._fitted_us or 0  # None without a fit
         return self._fitted_host_s + self.rate * (device_us - fitted_us) * 1e-6
+
+    def _is_reset(self, t_us: int, modulus: int) -> bool:
+        """Return whether the clock has jumped back by more than `MAX_DELAY_s` since the previous reading.
+
+        A clock that was not reset may jump back by less, for example if datagrams arrive in another order.
+
+        Args:
+            t_us: Clock of the reading as the device sent it, us.
+            modulus: Time at which the clock wraps to 0, us.
+        """
+        if self._sent_us is None:  # this is the first reading
+            return False
+        decrease_us = (self._sent_us - t_us) % modulus  # more than half of the range if the clock has advanced
+        return MAX_DELAY_s * 1e6 < decrease_us <= modulus // 2
 
     def _unwrap(self, t_us: int, modulus: int) -> int:
         """Remove the wraps from the clock value of the next reading, and store the resulting value in `_device_us`.

@@ -135,8 +135,8 @@ class FrameCounts:
         frames: Number of intact frames.
         lost: Number of frames that are missing between received frames.
         repeated: Number of frames with the same counter as the previous frame.
-        restarts: Number of times that the counter, or without a counter the clock, decreased without a wrap, for
-            example after a reset of the device.
+        restarts: Number of times that the counter decreased without a wrap, for example after a reset of the device.
+            If the format has no counter, the clock of the device is used instead.
             Frames that were lost during a restart are not counted.
         crc_errors: Number of pieces with a wrong checksum.
         malformed: Number of pieces that were rejected for another reason, such as a wrong length.
@@ -292,12 +292,12 @@ class Parser(ABC):
         self._tail = b""
 
     def sequence_flags(self, seq: int | None, *, is_clock_reset: bool = False) -> tuple[str, ...]:
-        """Compare the counter of the next frame with the counter of the previous frame, and update the counts.
+        """Find lost and repeated frames and restarts by the frame counter, add them to `counts`, and return the flags.
 
         Args:
             seq: Counter of the next frame; None if the format has no counter.
-            is_clock_reset: Whether the clock of the device was reset before this frame. Without a counter, this shows
-                that the device has restarted.
+            is_clock_reset: Whether the clock of the device was reset before this frame. If the format has no counter,
+                this shows that the device has restarted.
 
         Returns:
             Flags of the frame: empty, or one of `gap`, `repeat` and `restart` (see `isocharge.serve.flags`).

@@ -28,7 +28,7 @@ Load = Callable[[], Predictor]
 log = logging.getLogger(__name__)
 
 SHORTEST_OUTAGE_s = 1e-3
-"""Length of the outage that is recorded before the first frames of a requested recording, s."""
+"""Outage that the first chunk after the beginning of a requested recording states, s."""
 
 
 class RecordedStream:
@@ -55,7 +55,7 @@ class RecordedStream:
         # A chunk and its records that are not recorded yet
         self._current_chunk: tuple[Chunk, list[PredictionRecord]] | None = None
         self._requests: deque[Callable[[], None]] = deque()
-        self._preamble = b""  # bytes until the first frame, from which the layout of the frames is known
+        self._preamble = b""  # chunks up to the one with the first frame, which show the layout of the frames
         self._is_recording_new = False  # whether the present recording was requested and has no chunk yet
         self._loader = ThreadPoolExecutor(1, "model")  # loads one model at a time
 
@@ -67,8 +67,9 @@ class RecordedStream:
         """Request to end the present recording, and to begin another recording unless `recorder` is None.
 
         When a recording begins, the stream is restarted and the tare is measured again. A replay can therefore compute
-        the same records from the bytes of the recording alone. The recording begins with the bytes of the stream until
-        its first frame, because a board may send the names of its channels only at its start.
+        the same records from the bytes of the recording alone. The recording begins with all bytes that
+        the stream had received when its first frame was complete. They contain the names of the channels if the board
+        sends these names only at its start.
 
         Args:
             recorder: Recorder of the next recording, which this object opens and closes. None to record nothing.
@@ -162,14 +163,16 @@ class RecordedStream:
             recorder.event(use=present_label)
 
     def _record_preamble(self, chunk: Chunk) -> Chunk:
-        """Repeat the bytes until the first frame as the first chunk of a new recording, without records.
+        """Process the first bytes of the stream again, and write them as the first chunk of the new recording.
+
+        The restarted stream and a replay then know the layout of the frames. The chunk is written without records.
 
         Args:
             chunk: The next chunk of the stream.
 
         Returns:
-            The same chunk. It follows an outage if there were frames before, of which the later ones are missing in the
-            recording.
+            The next chunk. If frames have arrived between the first bytes and this chunk, they are missing in the
+            recording. The chunk then states an outage, so that the tare and the clock begin again.
         """
         self._is_recording_new = False
         if self.recorder is None or not self._preamble:

@@ -263,8 +263,8 @@ def _misfit_statement(errors: PressErrors, is_selected: Booleans, metadata: Mode
     """Return a statement for the user if more presses have a large misfit than chance can explain.
 
     The misfit is the distance between the measured charges and the nearest charges of a single contact. A misfit is
-    large if it is above `misfit_limit`, which at most 1 % of good presses exceed. The number of such presses has a
-    binomial distribution.
+    large if it is above `misfit_limit`. Each good press has a large misfit with a probability of at most 1 %, so that
+    the number of large misfits of good presses has a binomial distribution.
 
     Args:
         errors: Errors of all presses.
@@ -280,9 +280,9 @@ def _misfit_statement(errors: PressErrors, is_selected: Booleans, metadata: Mode
     if misfit_count == 0 or 1.0 - probability_of_at_most[misfit_count - 1] >= TEST_SIGNIFICANCE:
         return ""
     return (
-        f"{misfit_count} of {selected_count} presses have a misfit above {misfit_limit(metadata):.3g}, which "
-        "1 % of good ones may have: no single press on the model's film gives such charges (gain, tare, swapped or "
-        "dead electrode)"
+        f"{misfit_count} of {selected_count} presses have a misfit above {misfit_limit(metadata):.3g}, although "
+        "at most 1 % of good presses have: no single press on the model's film gives such charges (gain, tare, swapped "
+        "or dead electrode)"
     )
 
 

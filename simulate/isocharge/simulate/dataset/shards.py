@@ -28,6 +28,7 @@ from isocharge.common.arrays import Array, Booleans, npz_arrays
 from isocharge.common.errors import DatasetError, SensorError, cut, error_prefix, shown
 from isocharge.common.files import new_folder, read_needed, sha256_of, write_whole
 from isocharge.common.structs import MAX_JSON_BYTES, Positive, Text, convert, parse_json
+from isocharge.simulate.sensor.footprint import with_rotation
 from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 
@@ -79,12 +80,11 @@ class Samples:
 
     @property
     def probes(self) -> tuple[str, ...]:
-        """Notations of the probes. That of a probe with the same rotation in all presses contains the rotation."""
+        """Notations of the probes. If a probe has the same rotation in all presses, its notation contains it."""
         notations = []
         for notation in np.unique(self.probe).tolist():
             rotations_deg = np.unique(self.orientation_deg[self.probe == notation])
-            is_rotated = rotations_deg.size == 1 and rotations_deg[0] != 0.0
-            notations.append(f"{notation}@{rotations_deg[0]:g}" if is_rotated else notation)
+            notations.append(with_rotation(notation, rotations_deg[0]) if rotations_deg.size == 1 else notation)
         return tuple(notations)
 
     def columns(self) -> dict[str, np.ndarray]:

@@ -111,7 +111,7 @@ def probe_frame_stress(solved: Equilibrium, surface: Surface) -> Array:
 
 @dataclass(frozen=True)
 class Family:
-    """Solved presses, between which the stress under all presses in a domain is interpolated.
+    """Solved presses, from which the stress under every press in a domain is interpolated.
 
     Attributes:
         domain: Presses for which the stress can be interpolated.
@@ -120,7 +120,8 @@ class Family:
             `distance_coordinate` has Chebyshev nodes.
         force: Forces of the solved presses, shape (n_force,), N. Their logarithms are Chebyshev nodes.
         turns: Directions of the presses on the film, and rotations of the probe.
-        is_oriented: Whether the family only contains presses with the own orientation of the probe.
+        is_oriented: Whether the probe has the same orientation on the film in all presses. Otherwise, each press may
+            have another orientation.
     """
 
     domain: Domain

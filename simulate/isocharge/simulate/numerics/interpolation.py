@@ -228,10 +228,9 @@ class Turns:
         sum c_mk exp(i (2 m d + k r)),
 
     where r is the rotation, and d is the direction plus the rotation. The film is the same after half a turn about its
-    centre, so only the even harmonics of d occur. If |m| increases, the coefficients decrease like a power of the
-    unevenness of the film. If |k| increases, they decrease like a power of the size of the probe divided by its
-    distance from the rim. If both increase, they decrease like the product of both powers. Therefore the series is cut
-    off at a smaller |k| if |m| is larger.
+    centre, so only the even harmonics of d occur. The coefficients decrease like u^|m| p^|k|, where u is the unevenness
+    of the film, and p is the size of the probe divided by its distance from the rim. Both numbers are less than 1.
+    Therefore the series is cut off at a smaller |k| if |m| is larger.
 
     The presses are solved at the points of a lattice of rank one: the rotations r are evenly spaced over a full turn,
     and d increases by the same step from each rotation to the next. The step is chosen such that no two terms of the

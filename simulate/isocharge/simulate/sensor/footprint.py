@@ -34,6 +34,11 @@ OUTLINE_POINTS = 1024
 """Number of points of the outline of a curved footprint. The relative error of its area is below 1e-5."""
 
 
+def with_rotation(notation: str, angle_deg: float) -> str:
+    """Return the notation of a probe with its rotation, which is omitted if it is zero."""
+    return f"{notation}@{angle_deg:g}" if angle_deg else notation
+
+
 @dataclass(frozen=True)
 class FootprintTopology:
     """Number and kind of the mesh blocks that a footprint needs.
@@ -75,8 +80,7 @@ class Probe(ABC):
     @property
     def rotated_notation(self) -> str:
         """Notation of this probe with its rotation, such as `rectangle:4.0x2.0@30`."""
-        angle_deg = np.rad2deg(self.angle)
-        return f"{self.notation}@{angle_deg:g}" if angle_deg else self.notation
+        return with_rotation(self.notation, round(math.degrees(self.angle), 9) % 360.0)
 
     @property
     @abstractmethod

@@ -79,16 +79,16 @@ class StressField:
 def _add_tension(solved: Equilibrium, value: float, direction: tuple[float, float, float]) -> Equilibrium:
     """Add a tension to the pretension of the film.
 
-    The unit of the tension is the sum of E A^2 and the mean pretension, where E is Young's modulus and A is the
-    amplitude of the press.
+    The unit of the added tension is E A^2 plus the mean pretension, where E is Young's modulus and A is the amplitude
+    of the press.
 
     Args:
         solved: The press.
-        value: Number of units.
-        direction: Components (T11, T22, T12) of one unit.
+        value: Size of the added tension in this unit.
+        direction: Components (T11, T22, T12) of an added tension of the size 1.
     """
     unit = 1.0 + solved.groups.tension  # divided by E A^2, like all tensions in `groups`
-    # The film has the same stress if a change of the mean pretension is added to `uneven_tension`.
+    # The solver adds `uneven_tension` to the mean pretension, so it may also contain a change of the mean pretension.
     tension = solved.groups.uneven_tension + value * unit * np.array(direction)
     return replace(solved, groups=replace(solved.groups, uneven_tension=tension))
 

@@ -10,6 +10,7 @@ calibrated film, times the ratio of the charges of nearly axisymmetric films wit
 """
 
 import hashlib
+import logging
 from concurrent.futures import Executor
 from dataclasses import replace
 
@@ -29,6 +30,8 @@ from isocharge.train.data.charge_fit import fit_film_series, fit_series
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
 from isocharge.train.training.training_data import TrainingData
 
+log = logging.getLogger(__name__)
+
 SERIES_CONTACTS = 4000
 """Number of contacts to which the series of the charges are fitted."""
 
@@ -42,7 +45,7 @@ MIN_DIRECTION = 0.1
 """Smallest root-mean-square effect of a direction on a charge, in standard deviations of the noise, that is kept."""
 
 MAX_SERIES_ERROR = 0.03
-"""Largest relative error of the series of a film with several nodes. Otherwise, the outermost node is left out."""
+"""Largest relative error of the charges at all nodes. If it is larger, the outermost node is left out."""
 
 NODES_MPa = (-0.7, -0.3, 0.0, 0.4, 0.9)
 """Changes of the pretension at the nodes of a film that can be followed, MPa.
@@ -76,9 +79,15 @@ def compact_charges(
     factors = _tension_factors(charges, film, contact, node_MPa, executor)
     series = fit_film_series(domain, names, contact, charge[:, None] * factors, node_MPa)
     while series.charge_std > MAX_SERIES_ERROR and node_MPa.size > 1:
-        # The first-order changes by the imperfections are wrong where the pretension nearly cancels a charge.
+        # At a distant node, the imperfections may nearly cancel a charge. Their first-order effect is then not enough.
         is_near = np.abs(node_MPa) < np.abs(node_MPa).max()
         node_MPa, factors = node_MPa[is_near], factors[:, is_near]
+        log.warning(
+            "the charges of this film are not known after large changes of its pretension; changes from %+.2g to "
+            "%+.2g MPa can be followed",
+            node_MPa[0],
+            node_MPa[-1],
+        )
         series = fit_film_series(domain, names, contact, charge[:, None] * factors, node_MPa)
 
     contact, charge = contact[:DIRECTION_CONTACTS], charge[:DIRECTION_CONTACTS]

@@ -50,6 +50,7 @@ from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.film_network import compact_charges, training_data
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.calibration.result import CalibrationResult
+from isocharge.train.data.presses import have_charges_of
 from isocharge.train.model_release.release import release
 from isocharge.train.training.config import FitConfig
 from isocharge.train.training.fit import Fitted, fit
@@ -374,12 +375,12 @@ def usable_held_out(
         problem: The calibration problem.
 
     Raises:
-        PressError: If a press was used for the calibration, or if these are fewer than the 22 presses from which a
-            factor for standard deviations follows.
+        PressError: If a held-out press is also one of the calibration, or if fewer than the 22 presses remain from
+            which a factor for standard deviations follows.
     """
     domain = problem.domain
     held_out, presses = (one.of_electrodes(problem.electrodes, problem.sensor.name) for one in (held_out, presses))
-    is_learned = (held_out.charge_pC[:, None] == presses.charge_pC).all(axis=2).any(axis=1)
+    is_learned = have_charges_of(held_out.charge_pC, presses.charge_pC)
     if is_learned.any():
         raise PressError(
             f"{row_words(held_out[is_learned].lines, held_out.row_noun)}: expected held-out presses that are not among "

@@ -52,10 +52,11 @@ class CalibrationProblem:
     noise: NoiseModel = NOISE_LEVELS["reference"]
 
     def __post_init__(self) -> None:
-        """Check that a calibration can find the film that the sensor file describes.
+        """Check the electrodes, the working area, and the pretension of the film that the sensor file describes.
 
         Raises:
-            SceneError: If there are fewer than three electrodes, or if a press in the working area cannot exist.
+            SceneError: If there are fewer than three electrodes, or if a press at the edge of the working area cannot
+                exist.
             SensorError: If the pretension of the film is too large.
         """
         check_electrode_count(len(self.sensor.electrodes))

@@ -280,6 +280,16 @@ def measured_presses_of(dataset: Dataset) -> MeasuredPresses:
     )
 
 
+def have_charges_of(charge: Array, others: Array) -> Booleans:
+    """Return whether each press has the same charges as one of other presses, shape (n,).
+
+    Args:
+        charge: Charges of the presses, shape (n, n_electrode), pC.
+        others: Charges of the other presses, shape (m, n_electrode), pC.
+    """
+    return np.asarray((charge[:, None] == others).all(axis=2).any(axis=1))
+
+
 def complete(presses: MeasuredPresses) -> Booleans:
     """Return whether each press has a known place, a known force and a known charge of every electrode, shape (n,)."""
     return presses.placed & np.isfinite(presses.charge_pC).all(axis=1)

@@ -32,6 +32,7 @@ from isocharge.train.data.presses import (
     LabelledPresses,
     check_enough,
     domain_of,
+    have_charges_of,
     is_measured,
     presses_of,
     split_by_position,
@@ -272,7 +273,7 @@ class DatasetEvaluation:
             check_enough(len(covered.samples), len(samples), dataset.sensor.name)
             presses, held_out = split_by_position(presses_of(covered, FEWEST_PLACES), 1.0 / HELD_PARTS)
             learned_charge = _calibration_charges(model_folder, model)
-            is_learned = (held_out.charge[:, None] == learned_charge).all(axis=2).any(axis=1)
+            is_learned = have_charges_of(held_out.charge, learned_charge)
             if is_learned.all():
                 raise PressError(
                     f"expected held-out presses that the model {model.label} has not learned, got only presses of its "
