@@ -68,6 +68,8 @@ class Frame:
         is_clock_reset: Whether the clock of the device jumped back by more than a second before this frame.
         dt_s: Time since the previous valid frame, s; 0 for the first frame after a start. It does not depend on the
             wall clock of the host.
+        intervals: Number of sampling intervals since the previous valid frame: 1 without a gap, more if frames are
+            missing or invalid, and 0 for a repeated frame. If the frames have no counter, no frame counts as missing.
         clock_s: Time of the frame on the clock of the device, s. If the device sends no clock, it is a time of the host
             that does not jump if the wall clock is set.
         sent: Values of the electrodes in their order, shape (n_electrode,), in the unit of the device.
@@ -98,6 +100,7 @@ class Frame:
     device_us: int | None = None
     is_clock_reset: bool = False
     dt_s: float = 0.0
+    intervals: int = 1
     clock_s: float = 0.0
     sent: Array = field(init=False, repr=False, compare=False)
     is_valid: bool = True

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, NoFramesError, shown
-from isocharge.serve.flags import RECONNECTED, in_order
+from isocharge.serve.flags import RECONNECTED, REPEAT, in_order
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import Frame, FrameCounts
 from isocharge.serve.live.device import ANY_BOARD, create_stages
@@ -121,7 +121,10 @@ class ReadingStream:
         self._check_recognised()
         self.clock.stamp(chunk, frames, parser.t_us_modulus)
         for frame in frames:
-            frame.flags = [*self._pending_flags, *parser.sequence_flags(frame.seq, is_clock_reset=frame.is_clock_reset)]
+            lost_before = parser.counts.lost
+            sequence_flags = parser.sequence_flags(frame.seq, is_clock_reset=frame.is_clock_reset)
+            frame.intervals = 0 if REPEAT in sequence_flags else 1 + parser.counts.lost - lost_before
+            frame.flags = [*self._pending_flags, *sequence_flags]
             self._pending_flags = []
             for stage in self._stages:
                 stage.step(frame)

@@ -67,6 +67,7 @@ class Gain(Stage):
         self.zero = setup.for_each_electrode("gain.offset", rule.offset)
         self.largest = LARGEST / float(np.abs(self.gain_pC).max(initial=np.finfo(float).tiny))
         self._skipped_s = 0.0  # duration of the invalid frames since the last valid frame
+        self._skipped_intervals = 0
 
     def step(self, frame: Frame) -> None:
         """Convert the values of a frame to charges, and mark the frame if a value cannot be a charge."""
@@ -76,11 +77,14 @@ class Gain(Stage):
             frame.raw_pC = (frame.sent - self.zero) * self.gain_pC
         if not is_valid:
             self._skipped_s += frame.dt_s
+            self._skipped_intervals += frame.intervals
             frame.is_valid = False
             frame.flags.append(INVALID)
             return
         frame.dt_s += self._skipped_s
+        frame.intervals += self._skipped_intervals
         self._skipped_s = 0.0
+        self._skipped_intervals = 0
         frame.charge_pC = frame.raw_pC
 
     @classmethod

@@ -220,16 +220,32 @@ class Integrator(Leak):
         """Return whether the board sends currents."""
         return setup.device.has_currents
 
+    def reset(self) -> None:
+        """Discard the state."""
+        super().reset()
+        self._current_pC = np.zeros(len(self._tau_s))  # current of the previous valid frame
+
     def step(self, frame: Frame) -> None:
         """Replace the currents by the charges, and the noise of the currents by the noise of the charges at rest.
+
+        If frames are missing, each of their currents is assumed to be the mean of the currents before and after the
+        gap. A copy of the previous frame adds no charge.
 
         At rest, the charges decay with the time constant `relax_s`. The sum of independent currents then has the
         variance of a current times relax_s / (2 dt).
         """
+        current_pC = frame.charge_pC
+        if current_pC is not None and self._previous is not None:
+            is_copy = frame.intervals == 0 and np.array_equal(frame.sent, self._previous.sent)
+            n_missing = max(frame.intervals - 1, 0)
+            missing_pC = n_missing * (current_pC + self._current_pC) / 2.0
+            frame.charge_pC = np.zeros_like(current_pC) if is_copy else current_pC + missing_pC
         super().step(frame)
+        if current_pC is not None:
+            self._current_pC = current_pC
         if frame.charge_pC is not None and frame.dt_s > 0.0:
             frame.noise_pC = frame.noise_pC * math.sqrt(max(1.0, 0.5 * self._rule.relax_s / frame.dt_s))
 
     def _innovation_pC(self, output_pC: Array, decay: Array) -> Array:
-        """Return the current, plus the change of the charge because of the leak, shape (n_electrode,), pC."""
+        """Return the charge that has arrived, minus the charge that has leaked, shape (n_electrode,), pC."""
         return output_pC - (1.0 - decay) * self._charge_pC
