@@ -66,7 +66,7 @@ def test_damaged_line_of_text_is_refused_with_the_reason(text, reason):
         parse_line(clean_text(text))
 
 
-@pytest.mark.parametrize("text", ["booting v1.2 on ESP32-S3", "{", "ch3,A0", "10.0.0.1", "1_0", ">A"])
+@pytest.mark.parametrize("text", ["booting v1.2 on ESP32-S3", "{", "ch3,A0", "10.0.0.1", "1_0", ">A", "ch-1,ch-2"])
 def test_digits_in_words_are_no_numbers(text):
     assert parse_line(text).numbers == ()
 
@@ -136,6 +136,8 @@ NAMED_NOTATIONS = [
     "A: {a} pC, B: {b} pC, C: {c} pC",
     "A {a} pC B {b} pC C {c} pC",
     "A={a} B={b} C={c}",
+    "A{a:+}B{b:+}C{c:+}",
+    "A{a:e} B{b:e} C{c:e}",
     "A = {a} | B = {b} | C = {c} |",
     "A -> {a}, B -> {b}, C -> {c}",
     "A,{a},B,{b},C,{c}",

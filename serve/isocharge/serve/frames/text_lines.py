@@ -82,6 +82,9 @@ _CHARGE_UNITS = {unit for unit in OTHER_CHARGE_UNITS if unit != "C"}  # C may be
 _SIGNED_NUMBERS = r"(?:[-+][0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?){2,}"
 """Regular expression of a line of numbers with nothing but their signs between them, such as `+003.5-003.4+005.8`."""
 
+_NAMED_NUMBER = r"([A-Za-z]+)([-+]?[0-9]*\.[0-9]+(?:[eE][-+]?[0-9]+(?![.0-9]))?|[-+][0-9]+)[\s,;|]*"
+"""Regular expression of a number directly after its name, as in `A+3.5B-3.4`. The number has a sign or a fraction."""
+
 _TELEPLOT = r">([^\s:>][^:]*):(?:[^|]*;)?(?:([0-9.]+):)?([^:;|]*);?(?:\|.*)?"
 """Regular expression of a line of Teleplot. The groups are the name, the latest time and the latest value."""
 
@@ -171,6 +174,10 @@ def clean_text(text: str) -> str:
     text = re.sub(r"(^|[:=,;(\[] *)([-+]) +(?=[.0-9])", r"\1\2", text)  # a sign apart from its number, as in `A: - 3.5`
     if re.fullmatch(_SIGNED_NUMBERS, text):
         text = re.sub(r"(?<=[0-9])(?=[-+])", " ", text)
+    if re.fullmatch(f"(?:{_NAMED_NUMBER}){{2,}}", text):
+        named_numbers = re.findall(_NAMED_NUMBER, text)
+        if len(dict(named_numbers)) == len(named_numbers):  # not a header such as `ch-1, ch-2`
+            text = " ".join(f"{name}={number}" for name, number in named_numbers)
     if '"' in text or "'" in text:
         text = re.sub(_QUOTED_NUMBER, r"\2", text)
     if text[:1] == ">":
