@@ -204,7 +204,8 @@ class ModelStore:
     def _load_versions(self, name: str, folder: Path) -> None:
         """Load every version in the folder of a model, and replace the versions that were loaded before.
 
-        If a version is refused, or if no version is found, every earlier version that was not replaced remains loaded.
+        Earlier versions that are no longer in the folder are removed, unless a version is refused or the folder
+        contains no version.
 
         Args:
             name: Name of the model.

@@ -227,8 +227,8 @@ def common_error(error: Array, variance: Array, rig_std: Array) -> CommonError:
     """Estimate the errors that are common to all presses, such as a shift of all positions.
 
     The estimates are the means of the errors, weighted with the inverse of their expected variances. If the errors
-    scatter more than their expected variances, the standard errors are increased. For the significance, they include an
-    error of the rig that is equal in all presses, so that averaging does not reduce it.
+    scatter more than their expected variances, the standard errors are increased. The significance is the ratio of a
+    mean to its standard error, which then also contains the part of the rig's error that is equal in all presses.
 
     Args:
         error: Errors of x, y and the force, shape (n, 3); NaN where unknown.

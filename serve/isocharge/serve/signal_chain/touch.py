@@ -1,7 +1,7 @@
 """Detection of a touch from the charges of all electrodes, which are a vector in units of the noise.
 
-Each charge is divided by the touch threshold of its electrode. The length of the vector of these ratios is the size of
-the charges. The size does not depend on the signs of the charges.
+Each charge is divided by the touch threshold of its electrode. The size of the charges is the norm of the vector of
+these ratios, so it does not depend on their signs.
 
 The detection has a hysteresis. A touch begins when the size of the difference from the base exceeds 1. A touch ends
 when the size of the charges falls below a given share of the largest size of this touch. If the threshold for the end

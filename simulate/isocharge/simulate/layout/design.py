@@ -6,8 +6,8 @@ square. For the largest error, a large exponent makes the power mean a smooth ap
 
 Sequential quadratic programming (SLSQP) minimises the logarithm of the power mean from several random layouts, for
 a few presses, under the distance rules. The largest error mostly occurs near the edge of an electrode,
-between these presses. The best layouts are therefore improved further, for the presses with the largest
-errors among many presses, which are selected again after each improvement.
+between these presses. The best layouts are therefore improved further. Each improvement reduces the errors of the worst
+of many presses, and the worst presses are then selected again.
 """
 
 from concurrent.futures import Executor

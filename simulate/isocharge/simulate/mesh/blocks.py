@@ -202,8 +202,8 @@ class Blocks:
     def rotated(self, steps: int, steps_per_turn: int) -> Integers:
         """Return how the elements are renumbered by a rotation of the probe that maps the mesh onto itself.
 
-        The elements of the core polygon are numbered corner by corner. The sectors are numbered layer by layer and ring
-        by ring, and anticlockwise within each layer or ring.
+        In the core polygon, all elements at one corner are numbered before those at the next corner. The sectors are
+        numbered layer by layer and ring by ring, and anticlockwise within each layer or ring.
 
         Args:
             steps: Number of steps by which the probe is rotated.

@@ -385,9 +385,9 @@ def _thin_ring_count(placement: Placement, total_width: float) -> int:
     # Largest and smallest width of the boundary layer in the template plane, as a fraction of the range of ln(r) that
     # all rings cover. The upper limit of 1 / 8 keeps the thin rings near the rim.
     stretch = _stretch(placement)
-    total_depth = -float(np.log(placement.template_radius))
-    largest_width = min(total_width * stretch / total_depth, 1.0 / 8.0)
-    smallest_width = min(min(total_width, 0.2) / stretch / total_depth, 1.0 / 8.0)
+    log_range = -float(np.log(placement.template_radius))
+    largest_width = min(total_width * stretch / log_range, 1.0 / 8.0)
+    smallest_width = min(min(total_width, 0.2) / stretch / log_range, 1.0 / 8.0)
 
     # The logarithm to the base 3 is the number of rings between both widths if each ring is a third as wide. Two rings
     # are needed if one would be much narrower than the strip: for widths from 0.12 to 0.7 film radii, the error of a

@@ -380,7 +380,7 @@ class _Evidence:
 
     @classmethod
     def of(cls, model: ModelValues, data: PressData, contact: Array, unknowns: Array, prior: Prior) -> "_Evidence":
-        """Eliminate the contacts.
+        """Linearise the residuals, and eliminate the contacts from them, so that they only depend on the unknowns.
 
         Args:
             model: Charges at the unknowns, as `model_values` returns them.

@@ -171,7 +171,7 @@ class FitConfig(Settings, frozen=True):
         return json.decode(json.encode(self), type=dict[str, Any])
 
     def checked(self) -> "FitConfig":
-        """Check the ranges of all settings as for settings from a file, and return a copy of the settings.
+        """Check the ranges of all settings, and return a copy of the settings.
 
         Raises:
             ConfigError: If a setting is out of its range.
