@@ -43,9 +43,9 @@ def test_invalid_film_raises_error(film, changes, message):
     ("coefficients", "message"),
     [
         ({"d31": np.nan}, r"piezo d31: expected -100000 to 100000 pC/N, got nan"),
-        ({"d31": 0.0, "d32": 0.0, "d33": -30.0}, "piezo d31 and d32 are both 0: such a film gives no charge"),
-        ({"d32": 8e-12}, r"piezo d32: expected pC/N, got 8e-12 pC/N; 8e-12 C/N are 8 pC/N"),
-        ({"d33": -30e-12}, r"piezo d33: expected pC/N, .* are -30 pC/N"),
+        ({"d31": 0.0, "d32": 0.0, "d33": -30.0}, "piezo d31, d32 and d12 are all 0: such a film gives no charge"),
+        ({"d32": 8e-12}, r"piezo d32: expected pC/N, got 8e-12 pC/N; if this is the value in C/N, write 8"),
+        ({"d33": -30e-12}, r"piezo d33: expected pC/N, .* write -30"),
     ],
 )
 def test_invalid_piezo_coefficients_raise_error(coefficients, message):

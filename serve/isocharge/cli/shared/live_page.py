@@ -222,13 +222,13 @@ class PageFeed:
         Raises:
             InputError: If the page requests a recording while the command records the stream.
         """
-        from isocharge.serve.viewer.live_page import Marker, Record
+        from isocharge.serve.viewer.live_page import Marker, Tare
 
         if isinstance(action, Marker):
             marker = recording.Marker(time.time(), action.text)
             stream.request_marker(marker)
             self._page.add_marker(marker)
-        elif not isinstance(action, Record):
+        elif isinstance(action, Tare):
             stream.request_tare()
         elif self._new_recorder is None:
             raise InputError("the command that runs the stream records it already (--record)")

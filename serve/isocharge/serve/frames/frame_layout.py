@@ -331,7 +331,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 def _parser_arguments(layout: FrameLayout) -> tuple[str, int, int]:
     """Return the arguments of `Parser` for a layout: the description of the format and the two moduli.
 
-    Without a counter or a clock, its modulus is not used.
+    A layout without a counter or a clock has no such modulus, so `Parser` ignores the returned value.
     """
     names = ", ".join(field.name for field in layout.fields)
     columns = layout.columns

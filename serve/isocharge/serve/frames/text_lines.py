@@ -471,10 +471,11 @@ def header_names(header: str, line: Line) -> tuple[str, ...]:
     if separator is None and line_separator is not None:
         return ()
     columns = [column for column in header.split(separator) if column.strip()]
-    if len(columns) != len(starts):
+    if len(columns) != len(starts):  # select the columns of the numbers without names
         first_column = 0 if line_separator is None else -1  # the part before the first separator is the first column
         indices = [len(line.text[:start].split(line_separator)) + first_column for start in starts]
         columns = [columns[index] for index in indices if index < len(columns)]
+    # A label with a colon may stand before a name, as in `Data: A, B, C`.
     names = tuple(column.rpartition(":")[2].strip(" \"'") for column in columns)
     are_names = all(re.match(r"[^\W\d]", name) for name in names)
     are_different = len(names) == len(set(names)) == len(starts)

@@ -241,8 +241,8 @@ class Port:
     def _read(self) -> bytes:
         """Wait for a byte, and return all bytes that have arrived.
 
-        If the program did not read the port for some time, many bytes wait. They belong to one chunk, so that their
-        frames share the time since the previous chunk.
+        If the program did not read the port for some time, many bytes wait. Up to `MAX_READ_BYTES` of them form one
+        chunk, so that the time since the previous chunk is divided among all their frames.
 
         Raises:
             PortLost: If the port disappears, or no byte arrives in time.
@@ -256,7 +256,8 @@ class Port:
                 f"{self.url}: no data for {timeout_s:g} s; check that the board is powered and sends{speed_advice}"
             )
         self._is_starting_up = False
-        if self._line is None or self._requester is not None:  # a board sends nothing without a request
+        has_answered = self._requester is not None  # such a board sends nothing more before the next request
+        if self._line is None or has_answered:
             return data
         with contextlib.suppress(*READ_ERRORS):  # the next call reports the error
             while len(data) < MAX_READ_BYTES and (waiting := self._line.receive_waiting()):

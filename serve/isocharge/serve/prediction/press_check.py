@@ -321,8 +321,8 @@ def _remedies(
     """Yield notes about possible remedies for a model that does not fit.
 
     The first note states how large the uncertainty of the rig would have to be to explain the errors. It is omitted if
-    no such uncertainty explains them, for example because all presses have the same shift. The second note recommends
-    a calibration, or training with the measured presses.
+    no uncertainty of the rig explains the errors, for example if all positions are shifted equally. The second note
+    recommends a calibration, or training with the measured presses.
 
     Args:
         errors: Errors of all presses.

@@ -89,7 +89,7 @@ class Gain(Stage):
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:
-        """Return the conversion of each channel, and the largest valid value."""
+        """Return the offset and the gain of each channel, and the largest valid value, by name."""
         gain = cls(setup)
         return {"zero": gain.zero, "pC": gain.gain_pC, "largest": gain.largest}
 

@@ -115,7 +115,7 @@ class Warming(Stage):
             frame.flags.append(BLIND)
 
     def _estimate(self, charge_pC: Array, dt_s: float) -> float:
-        """Update the estimate, and return the change of p, pC.
+        """Update the estimate of the warming p, and return its change, pC.
 
         If the parabola is too flat, p is not changed, its predicted variance is kept, and the state is blind.
 

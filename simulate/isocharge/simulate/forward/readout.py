@@ -306,8 +306,8 @@ def _area_pieces(electrode: Electrode) -> Iterator[tuple[Array, float, Array]]:
 def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[tuple[Array, float, Array]]:
     """Return the lines of the edge readout (Mirbagheri et al., 2007, equation 3).
 
-    The stress s11 is averaged over the left and right edges of the turned electrode. The stress s22 is averaged over
-    its lower and upper edges. Each line is half of an edge, so that there are sufficiently many points.
+    The stress s11 is averaged over the left and right edges of the turned electrode, and the stress s22 over its lower
+    and upper edges. Each line is half of an edge, so that there are sufficiently many points.
 
     Args:
         electrode: A square electrode.

@@ -135,11 +135,11 @@ class MirrorRegion:
 
 
 def has_mirror(inside: ChargeMap, charge: Array, noise: NoiseModel) -> Booleans:
-    """Return for each press whether a press inside a domain causes charges that agree within the noise.
+    """Return for each press outside a domain whether a press inside it has the same charges within the noise.
 
     Args:
         inside: Charge map of the domain.
-        charge: Charges of the given presses without noise, shape (n, n_electrode), pC.
+        charge: Charges of the presses outside without noise, shape (n, n_electrode), pC.
         noise: Noise of the readings.
 
     Returns:

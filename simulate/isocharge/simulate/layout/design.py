@@ -149,10 +149,12 @@ class Search:
         return self.minimise(self.case.search_presses, start, power)
 
     def refine(self, layout: Layout) -> Layout:
-        """Reduce the largest error of the many presses, and return the layout with the value of the goal.
+        """Reduce the largest error of the fine presses, and return the layout with its largest error.
+
+        If the goal is the mean error, the layout is returned unchanged with this error.
 
         Args:
-            layout: Layout for which the power mean of a few presses is small.
+            layout: Layout for which the power mean of the errors of a few presses is small.
         """
         positions = layout.positions
         if self.case.goal != "worst":

@@ -113,7 +113,8 @@ class Placement:
         map_parameter, template_radius = automorphism_onto(centre, radius)
         circle_stretch = stretch_on_circle(map_parameter, template_radius)
         circle_angles = sector_angles(blocks, inner_points, inner_extent, centroid, centre, radius, circle_stretch)
-        template_thin_ring_width = thin_ring_width * (1.0 + map_parameter) / (1.0 - map_parameter)
+        largest_rim_stretch = (1.0 + map_parameter) / (1.0 - map_parameter)  # of the conformal map, next to the press
+        template_thin_ring_width = thin_ring_width * largest_rim_stretch
         return cls(
             map_parameter=map_parameter,
             template_radius=template_radius,

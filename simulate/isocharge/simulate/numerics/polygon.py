@@ -120,9 +120,9 @@ def gauss_quadrilaterals(corners: Complexes, line_area: Array, count: int) -> tu
     A bilinear function maps the rule of the unit square into each quadrilateral.
 
     Args:
-        corners: Corners x + iy, anticlockwise, shape (n, 4). The last two corners of a triangle are equal. In a line,
-            the first and the last corner are equal, and so are the second and the third.
-        line_area: Area that a line represents, shape (n,). Zero for a quadrilateral.
+        corners: Corners x + iy, anticlockwise, shape (n, 4). The last two corners of a triangle are equal. A line is a
+            quadrilateral whose first and last corners are equal, and whose second and third corners are equal.
+        line_area: Area for which the integral over a line stands, shape (n,); zero for a quadrilateral that is no line.
         count: Number of points along a side.
 
     Returns:

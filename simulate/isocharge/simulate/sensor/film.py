@@ -214,15 +214,16 @@ class Piezo:
             SensorError: If a coefficient is outside its accepted range, or if d31, d32 and d12 are all zero.
         """
         smallest, largest = PIEZO_LIMITS
-        for name, coefficient in vars(self).items():  # d12 may be tiny, because it is an imperfection
+        for name, coefficient in vars(self).items():
             check_range(f"piezo {name}", coefficient, (-largest, largest), "pC/N", SensorError)
-            if name not in ("pyro", "d12") and 0.0 < abs(coefficient) < smallest:
+            may_be_tiny = name in ("pyro", "d12")  # d12 is an imperfection
+            if not may_be_tiny and 0.0 < abs(coefficient) < smallest:
                 raise SensorError(
-                    f"piezo {name}: expected pC/N, got {coefficient:.6g} pC/N; {coefficient:.6g} C/N are "
-                    f"{1e12 * coefficient:.6g} pC/N"
+                    f"piezo {name}: expected pC/N, got {coefficient:.6g} pC/N; if this is the value in C/N, write "
+                    f"{1e12 * coefficient:.6g}"
                 )
         if self.d31 == self.d32 == self.d12 == 0.0:
-            raise SensorError("piezo d31 and d32 are both 0: such a film gives no charge")
+            raise SensorError("piezo d31, d32 and d12 are all 0: such a film gives no charge")
 
 
 OTHER_UNITS = {"mm": ("m", 1e3), "um": ("mm", 1e3), "MPa": ("Pa", 1e-6), "GPa": ("MPa", 1e-3)}

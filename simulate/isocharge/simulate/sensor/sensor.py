@@ -140,7 +140,7 @@ class Electrode:
 
     @cached_property
     def side(self) -> float | None:
-        """Side of an electrode that is like one that `of_square` creates, mm; None for all other electrodes.
+        """Side of a square electrode as `of_square` creates it, mm; None for all other electrodes.
 
         The edge readout accepts only such squares.
         """

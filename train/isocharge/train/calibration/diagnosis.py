@@ -193,8 +193,8 @@ def expected_charges(charges: FilmCharges, contact: Array) -> Array:
 def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     """Find the mistakes whose correction makes the presses agree far better with a film.
 
-    A mistake is returned if its correction makes the presses agree with a film, clearly better than before, and no
-    other correction is clearly better.
+    The misfit of the corrected presses must be small, and clearly smaller than before. Mistakes with clearly larger
+    misfits than the most probable mistake are left out.
 
     Args:
         presses: The measured presses. A press whose place or force is unknown is not used.
@@ -212,9 +212,10 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
         for sentence, contact, charge in _possible_corrections(placed_presses, charges)
     }
     limit = min(BETTER_MISFIT_RATIO * misfit(placed_presses, charges), SUSPICIOUS_MISFIT)
-    best = min(misfits.values())
-    clear = [name for name, value in misfits.items() if value < limit and BETTER_MISFIT_RATIO * value <= best]
-    return sorted(clear, key=lambda sentence: misfits[sentence])
+    smallest = min(misfits.values())
+    is_probable = {mistake: BETTER_MISFIT_RATIO * value <= smallest for mistake, value in misfits.items()}
+    probable = [mistake for mistake, value in misfits.items() if value < limit and is_probable[mistake]]
+    return sorted(probable, key=lambda mistake: misfits[mistake])
 
 
 def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:

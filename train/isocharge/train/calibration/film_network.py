@@ -175,7 +175,7 @@ def _tension_factors(
 
 
 def _directions(charges: FilmCharges, film: FilmEstimate, contact: Array, charge: Array, noise: NoiseModel) -> Array:
-    """Compute the changes of the charges along the directions that are larger than `MIN_DIRECTION`.
+    """Compute the directions in which the charges are uncertain, and omit effects below `MIN_DIRECTION`.
 
     Args:
         charges: Charges of the solved film and of similar films.

@@ -15,9 +15,9 @@ calibration, the copies are written again from the last version, because an earl
 it wrote the copies.
 
 The file `calibration.json` contains the value and the standard deviation of each unknown, in the unit of the property
-of the same name, in pC (offset), or without a unit. `correlations` is the lower triangle of the correlation matrix of
-all unknowns, in this order: one row for each unknown, without the diagonal, rounded to six digits. The correlations of
-an unknown whose standard deviation is zero are zero.
+of the same name. The unit of an offset is pC, and coefficients have no unit. `correlations` is the lower triangle of
+the correlation matrix of all unknowns, in this order: one row for each unknown, without the diagonal, rounded to six
+digits. The correlations of an unknown whose standard deviation is zero are zero.
 """
 
 import json

@@ -65,7 +65,9 @@ def evaluate(fitted: Fitted) -> dict[str, float]:
 
 
 def simulated_errors(predict: Predict, presses: LabelledPresses, noise: Noise, seed: int = 1) -> dict[str, float]:
-    """Measure the errors of a network on simulated presses, with and without noise.
+    """Measure the errors of a network on simulated presses, with and without noise, and how it detects faults.
+
+    A fault counts as detected if the misfit is larger than that of 99 % of good presses.
 
     Args:
         predict: Function that computes the answers of the network.

@@ -53,8 +53,9 @@ class Connection(HttpToolsProtocol):
     def connection_made(self, transport: Any) -> None:
         """Begin the connection. If there are too many connections, end one that waits for a request.
 
-        The earliest deadline selects a connection that has not sent a request before one that was already answered. If
-        every other connection has an open request, the new connection is refused.
+        Of these, the one with the earliest deadline is ended. A connection that has not sent any request has an earlier
+        deadline than one whose requests were answered. If no other connection waits for a request, the new connection
+        is refused.
         """
         super().connection_made(transport)
         now = self.loop.time()
