@@ -68,6 +68,19 @@ def test_held_press_is_found_if_a_channel_sends_no_numbers():
     assert find_held_press(values, T_S).tau_s == pytest.approx(10.0, rel=0.15)
 
 
+@pytest.mark.parametrize("every", [20, 25, 50])
+def test_leak_of_a_slow_board_has_its_time_constant(every):
+    values = board(decays(10.0))[::every]  # 10, 8 and 4 frames per second
+    held = find_held_press(values, T_S[::every])
+    assert held.tau_s == pytest.approx(10.0, rel=0.05)
+    assert 4.5 < held.rest_end_s <= 5.0
+
+
+def test_leak_has_its_time_constant_although_frames_are_lost():
+    has_arrived = (T_S < 6.0) | (T_S % 1.0 < 0.6)
+    assert find_held_press(board(decays(10.0))[has_arrived], T_S[has_arrived]).tau_s == pytest.approx(10.0, rel=0.05)
+
+
 @pytest.mark.parametrize("until_s", [0.0, 7.0])
 def test_no_press_or_a_short_press_has_no_result(until_s):
     assert find_held_press(board(constant, until_s=until_s), T_S) is None

@@ -37,8 +37,8 @@ CHANGE_BLOCKS = 5
 """Number of blocks within which a touch changes the values, which is half a second."""
 
 
-def touched_blocks(values: Array, times_s: Array, min_noise: float = 0.0) -> tuple[Array, Booleans]:
-    """Return the median of each channel in each block, and in which blocks something touches the film.
+def touched_blocks(values: Array, times_s: Array, min_noise: float = 0.0) -> tuple[Reals, Array, Booleans]:
+    """Return the time of each block, the median of each channel in it, and whether something touches the film in it.
 
     The stage `Touch` of a stream detects the touches. While nothing touches the film, the charges at rest are the
     levels half a second ago. A slow change is therefore no touch.
@@ -49,10 +49,14 @@ def touched_blocks(values: Array, times_s: Array, min_noise: float = 0.0) -> tup
         min_noise: Smallest noise of a channel, in the unit of the values.
 
     Returns:
-        The medians, shape (blocks, channels), and whether each block is touched, shape (blocks,). The median of a
-        channel without finite values is 0, so that the channel is not touched.
+        The median times of the frames of the blocks, shape (blocks,), s; the medians of the values, shape (blocks,
+        channels); and whether each block is touched, shape (blocks,). The median of a channel without finite values is
+        0, so that the channel is not touched.
     """
-    levels = np.nan_to_num(block_medians(values, times_s))
+    medians = block_medians(np.column_stack([times_s, values]), times_s)
+    block_times_s = medians[:, 0]
+    steps_s = np.diff(block_times_s, prepend=0.0)  # longer than `BLOCK_S` if frames are rare or were lost
+    levels = np.nan_to_num(medians[:, 1:])
     noise = np.maximum(channel_noise(values), min_noise)
     channels = tuple(map(str, range(len(noise))))
     detector = Touch(Setup(channels, Device(rules={TouchRule: BLOCK_RULE}), has_any_sign=True))
@@ -61,11 +65,11 @@ def touched_blocks(values: Array, times_s: Array, min_noise: float = 0.0) -> tup
     for number, level in enumerate(levels):
         if not is_contact[number - 1]:
             rest = levels[max(number - CHANGE_BLOCKS, 0)]
-        frame = Frame(seq=None, t_us=None, values=(), dt_s=BLOCK_S, charge_pC=level - rest)
+        frame = Frame(seq=None, t_us=None, values=(), dt_s=float(steps_s[number]), charge_pC=level - rest)
         frame.noise_pC = noise
         detector.step(frame)
         is_contact[number] = frame.is_contact
-    return levels, is_contact
+    return block_times_s, levels, is_contact
 
 
 BLOCK_RULE = TouchRule(sigmas=26.0, floor_pC=0.0)
@@ -106,7 +110,7 @@ def find_touch(
     Returns:
         The channel with the largest total change. None if the film is not touched, or if the time is too short.
     """
-    levels, is_touched = touched_blocks(values, times_s, min_noise_pC if unit_is_pC else 0.0)
+    block_times_s, levels, is_touched = touched_blocks(values, times_s, min_noise_pC if unit_is_pC else 0.0)
     if len(levels) == 0:
         return None
     total_changes = np.ptp(levels, axis=0)
@@ -115,7 +119,7 @@ def find_touch(
         return None
     column = int(np.argmax(total_changes))
     begin_block = int(np.argmax(is_touched))
-    return TouchFound(column, float(total_changes[column]), BLOCK_S * begin_block)
+    return TouchFound(column, float(total_changes[column]), float(block_times_s[begin_block]))
 
 
 def block_medians(values: Array, times_s: Array) -> Array:
@@ -129,7 +133,7 @@ def block_medians(values: Array, times_s: Array) -> Array:
         Medians of the finite values, shape (blocks, channels). Blocks without frames are left out, and so is the last
         block, which may be incomplete. NaN if a block of a channel has no finite value.
     """
-    block_numbers = np.floor(times_s / BLOCK_S).astype(int)  # number of the block of each frame
+    block_numbers = np.floor(times_s / BLOCK_S + 1e-6).astype(int)  # a rounding error must not move a frame
     begins_block = np.diff(block_numbers, prepend=-1) != 0  # true for the first frame, whose block has the number 0
     first_rows = np.flatnonzero(begins_block)  # first frame of each block
     blocks = np.split(values, first_rows[1:])
@@ -213,7 +217,7 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     Returns:
         The press; None if no such press is found.
     """
-    levels, is_touched = touched_blocks(values, times_s)
+    block_times_s, levels, is_touched = touched_blocks(values, times_s)
     if not is_touched.any():
         return None
 
@@ -223,20 +227,20 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     settled_block = begin_block + CHANGE_BLOCKS  # the force is constant from here on
     rest_blocks = begin_block - 1  # the force may have begun to rise in the block before
     has_rest = rest_blocks >= 2 * CHANGE_BLOCKS
-    is_long = (end_block - settled_block) * BLOCK_S >= MIN_HELD_S
-    if not (has_rest and is_long):
+    has_levels = end_block - settled_block >= CHANGE_BLOCKS
+    if not (has_rest and has_levels and block_times_s[end_block] - block_times_s[settled_block] >= MIN_HELD_S):
         return None
 
     # Project the levels onto the step. One unit is the charge at the beginning of the press.
     step = levels[settled_block] - levels[rest_blocks - 1]
     component = levels @ step / (step @ step)
-    block_times_s = BLOCK_S * (np.arange(len(component)) + 0.5)  # middle of each block
     rest = component[:rest_blocks]
     drift_per_s = float(np.polyfit(block_times_s[:rest_blocks], rest, deg=1)[0])
     charge = component[settled_block:end_block] - rest.mean()
-    begin_s = BLOCK_S * begin_block
+    block_ends_s = (block_times_s[:-1] + block_times_s[1:]) / 2.0
+    begin_s = block_ends_s[begin_block - 1]
     tau_s, description = _describe(block_times_s[settled_block:end_block] - begin_s, charge, drift_per_s)
-    return HeldPress(BLOCK_S * rest_blocks, tau_s, description)
+    return HeldPress(float(block_ends_s[rest_blocks - 1]), tau_s, description)
 
 
 def _describe(held_times_s: Reals, charge: Reals, drift_per_s: float) -> tuple[float | None, str]:
