@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from isocharge.common.errors import DeviceError, TareError
 from isocharge.serve import BinaryParser, Predictor, device_from_table, encode_frame
-from isocharge.serve.flags import BLIND, DRIFT, INVALID, NEGATIVE, SATURATED, TARE, THERMAL
+from isocharge.serve.flags import BLIND, DRIFT, GAP, INVALID, NEGATIVE, SATURATED, TARE, THERMAL
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import T_US_MODULUS, Frame
 from isocharge.serve.port.file_source import Chunk
@@ -21,13 +21,13 @@ from isocharge.serve.signal_chain.touch import TouchRule
 from isocharge.train.export_c.folder import device_header
 from stage_runner import StageRunner
 
-BITS = {TARE: 1, SATURATED: 2, NEGATIVE: 4, THERMAL: 8, BLIND: 16, INVALID: 32, DRIFT: 128}
+BITS = {TARE: 1, SATURATED: 2, NEGATIVE: 4, THERMAL: 8, BLIND: 16, INVALID: 32, DRIFT: 128, GAP: 4096}
 """Bit of each flag in C."""
 
 TARE_FAILED = 64
 """Bit for a tare that failed."""
 
-ALL_BITS = 255
+ALL_BITS = 255 | BITS[GAP]
 WARMING_BITS = BITS[THERMAL] | BITS[BLIND]
 """Bits of the flags that depend on the estimated warming."""
 

@@ -18,6 +18,10 @@ charge therefore decays exponentially to zero.
 Frames of a touch must not change the estimated inflow. Therefore, three rules are applied. Each change is clipped.
 During a touch, the correction uses the inflow that was estimated `look_back_s` before the touch. After a release, the
 estimate of the inflow pauses for the time `hold_off_s`.
+
+After a gap, the time at which a charge has arrived is unknown. The innovation of a charge that arrived at the beginning
+of the gap is i (1 + 1/a) / 2. If the gap may have falsified the charge of a touch, all frames of the touch have the
+flag `gap`.
 """
 
 import math
@@ -27,6 +31,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.structs import Positive
+from isocharge.serve.flags import GAP
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.signal_chain.stage import LARGEST, Divisor, OffsetStage, Rule, Setting, Setup
 
@@ -150,6 +155,7 @@ class Leak(OffsetStage):
         self._previous: Frame | None = None
         self._output_pC = np.zeros(len(self._tau_s))  # output of the amplifiers above the tare
         self._charge_pC = np.zeros(len(self._tau_s))  # touch charge
+        self._is_falsified = False  # whether a gap may have falsified the charge of this touch
         self._inflow = Inflow(self._rule, len(self._tau_s))
 
     def step(self, frame: Frame) -> None:
@@ -177,7 +183,12 @@ class Leak(OffsetStage):
                     self._inflow.hold_s -= dt_s
                 else:
                     self._inflow.learn(surplus_pC, frame.noise_pC, dt_s)
+            self._is_falsified = self._is_falsified and self._previous.is_contact
+            if dt_s > 1.5 * self._previous.dt_s:  # frames are missing or were invalid
+                surplus_pC = self._examine_gap(frame, output_pC, surplus_pC)
             self._charge_pC = self._charge_pC + surplus_pC
+            if self._is_falsified:
+                frame.flags.append(GAP)
         self._previous = frame
         self._output_pC = output_pC
         frame.charge_pC = self._charge_pC
@@ -191,6 +202,33 @@ class Leak(OffsetStage):
             decay: Share of a charge that the leak leaves until this frame, shape (n_electrode,), dimensionless.
         """
         return (output_pC - decay * self._output_pC) * 2.0 / (1.0 + decay)
+
+    def _examine_gap(self, frame: Frame, output_pC: Array, surplus_pC: Array) -> Array:
+        """Determine whether a touch has ended in a gap, or whether the gap may have falsified its charge.
+
+        A touch has ended if no output remains, and if no charge remains in the case that the new charge arrived at the
+        beginning of the gap. Otherwise, an error of 1 % that exceeds the noise falsifies the touch.
+
+        Args:
+            frame: The frame after the gap.
+            output_pC: Output of the amplifiers above the tare, shape (n_electrode,), pC.
+            surplus_pC: New touch charge, if it arrived evenly in the gap, shape (n_electrode,), pC.
+
+        Returns:
+            The new touch charge, shape (n_electrode,), pC. If the touch has ended, the sum of all charges is 0.
+        """
+        growth = np.exp(np.minimum(frame.dt_s / self._tau_s, 60.0))  # 1 / a, limited to avoid an overflow
+        sign = np.sign(self._charge_pC)
+        margin_pC = 4.0 * growth * frame.noise_pC
+        smallest_pC = self._charge_pC + surplus_pC * (1.0 + growth) / 2.0
+        has_left = (sign * output_pC <= margin_pC) & (sign * smallest_pC <= margin_pC)
+        if self._previous is not None and self._previous.is_contact and has_left.all():
+            self._is_falsified = False
+            return -self._charge_pC
+        error_pC = np.abs(surplus_pC) * (growth - 1.0) / 2.0
+        limit_pC = np.maximum(frame.noise_pC, 0.01 * np.abs(self._charge_pC + surplus_pC))
+        self._is_falsified |= bool((error_pC > limit_pC).any())
+        return surplus_pC
 
     def add_warming(self, warming_pC: Array | float) -> None:
         """Subtract the warming from the touch charge that the stage integrates."""

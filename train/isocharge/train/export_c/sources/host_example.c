@@ -38,7 +38,7 @@ static void print_flags(unsigned flags)
         {ISOCHARGE_INVALID, "invalid"},   {ISOCHARGE_TARE, "tare"},       {ISOCHARGE_SATURATED, "saturated"},
         {ISOCHARGE_NEGATIVE, "negative"}, {ISOCHARGE_THERMAL, "thermal"}, {ISOCHARGE_BLIND, "blind"},
         {ISOCHARGE_OUTSIDE, "outside"},   {ISOCHARGE_BEYOND, "beyond"},   {ISOCHARGE_MISFIT, "misfit"},
-        {ISOCHARGE_STRESS, "stress"},     {ISOCHARGE_DRIFT, "drift"},
+        {ISOCHARGE_STRESS, "stress"},     {ISOCHARGE_DRIFT, "drift"},     {ISOCHARGE_GAP, "gap"},
     };
     const char *between = "";
 

@@ -201,11 +201,34 @@ static void learn_inflow(isocharge_chain *chain, const real surplus_pC[N], real 
     }
 }
 
+/* Set the charges to 0 if the touch ended in a gap; otherwise state whether the gap may have falsified them. */
+static void examine_gap(isocharge_chain *chain, const real output_pC[N], real surplus_pC[N], const real tau_s[N])
+{
+    int left = chain->contact, falsified = chain->falsified;
+
+    EACH(k)
+    {
+        const real charge_pC = chain->charge_pC[k], noise_pC = chain->noise_pC[k];
+        const real sign = (real)((charge_pC > 0) - (charge_pC < 0));
+        const real growth = EXP(smaller(chain->step_s / tau_s[k], 60));
+        const real margin_pC = 4 * growth * noise_pC;
+        const real smallest_pC = charge_pC + surplus_pC[k] * (1 + growth) / 2;
+        const real error_pC = ABS(surplus_pC[k]) * (growth - 1) / 2;
+
+        left = left && sign * output_pC[k] <= margin_pC && sign * smallest_pC <= margin_pC;
+        falsified = falsified || error_pC > larger(noise_pC, (real)0.01 * ABS(charge_pC + surplus_pC[k]));
+    }
+    chain->falsified = falsified && !left;
+    if (left)
+        EACH(k) surplus_pC[k] = -chain->charge_pC[k];
+}
+
 /* Undo the amplifier's decay: charges after the next frame. */
 static void undo_leak(isocharge_chain *chain, const real output_pC[N], real dt_s)
 {
     static const real tau_s[N] = ISOCHARGE_LEAK_TAU_S;
     const real relax = chain->contact ? 1 : EXP(-dt_s / (real)ISOCHARGE_LEAK_RELAX_S); /* of an earlier charge */
+    const int late = dt_s > (real)1.5 * chain->step_s; /* frames are missing or were invalid */
     real surplus_pC[N];
 
     EACH(k)
@@ -214,8 +237,19 @@ static void undo_leak(isocharge_chain *chain, const real output_pC[N], real dt_s
         const real innovation_pC = (output_pC[k] - decay * chain->output_pC[k]) * 2 / (1 + decay);
 
         surplus_pC[k] = innovation_pC - chain->inflow[k] * dt_s;
-        chain->charge_pC[k] = relax * chain->charge_pC[k] + surplus_pC[k];
+        chain->charge_pC[k] *= relax;
         chain->output_pC[k] = output_pC[k];
+    }
+    chain->step_s = dt_s;
+    chain->falsified = chain->falsified && chain->contact;
+    if (late) {
+        real new_pC[N];
+
+        EACH(k) new_pC[k] = surplus_pC[k];
+        examine_gap(chain, output_pC, new_pC, tau_s);
+        EACH(k) chain->charge_pC[k] += new_pC[k];
+    } else {
+        EACH(k) chain->charge_pC[k] += surplus_pC[k];
     }
     if (chain->contact) {
         EACH(k) chain->inflow[k] = chain->candidate[k] = chain->trusted[k];
@@ -229,7 +263,7 @@ static void undo_leak(isocharge_chain *chain, const real output_pC[N], real dt_s
         learn_inflow(chain, surplus_pC, dt_s);
 }
 
-static void start_leak(isocharge_chain *chain, const real output_pC[N])
+static void start_leak(isocharge_chain *chain, const real output_pC[N], real dt_s)
 {
     EACH(k)
     {
@@ -238,6 +272,8 @@ static void start_leak(isocharge_chain *chain, const real output_pC[N])
     }
     chain->candidate_age_s = chain->hold_s = 0;
     chain->learned_s = 1;
+    chain->step_s = dt_s;
+    chain->falsified = 0;
     chain->leak_running = 1;
 }
 #endif
@@ -387,9 +423,10 @@ static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real d
     if (chain->leak_running)
         undo_leak(chain, output_pC, dt_s);
     else
-        start_leak(chain, output_pC);
+        start_leak(chain, output_pC, dt_s);
     decay = EXP(-dt_s / (real)ISOCHARGE_LEAK_RELAX_S);
     EACH(k) charge_pC[k] = chain->charge_pC[k];
+    reading->flags |= chain->falsified ? ISOCHARGE_GAP : 0u;
 #else
     EACH(k) charge_pC[k] = output_pC[k];
 #endif

@@ -28,6 +28,7 @@ typedef double isocharge_real;
 #define ISOCHARGE_INVALID 0x20u      /* a value cannot be a charge; nothing was computed */
 #define ISOCHARGE_DRIFT 0x80u        /* the contact began so slowly that the charge at rest may have drifted */
 #define ISOCHARGE_TARE_FAILED 0x40u  /* the film was not left alone for as long as the device file waits */
+#define ISOCHARGE_GAP 0x1000u        /* missing or invalid frames may have falsified the charge of this touch */
 
 typedef struct {
     isocharge_real raw_pC[ISOCHARGE_ELECTRODES];    /* what the device sent, as charges */
@@ -57,7 +58,8 @@ typedef struct {
     int leak_running;
     isocharge_real charge_pC[ISOCHARGE_ELECTRODES], output_pC[ISOCHARGE_ELECTRODES];
     isocharge_real inflow[ISOCHARGE_ELECTRODES], trusted[ISOCHARGE_ELECTRODES], candidate[ISOCHARGE_ELECTRODES];
-    isocharge_real candidate_age_s, learned_s, hold_s;
+    isocharge_real candidate_age_s, learned_s, hold_s, step_s;
+    int falsified;
 #endif
     int contact, below, saturated, slow;
 #if ISOCHARGE_TOUCH_ON
