@@ -40,12 +40,12 @@ FILM = SENSORS[0].film
 PROBE = Circle(1.0)
 MEMBRANE = Theory(bending=False)
 WITH_BENDING = Theory(bending=True)
-REFERENCE_MESHES = {MEMBRANE: Resolution(10, 8, 8), WITH_BENDING: Resolution(9, 8, 8, 2)}
+REFERENCE_MESHES = {MEMBRANE: Resolution(10, 8, 8), WITH_BENDING: Resolution(9, 8, 8, 3)}
 """Meshes of the reference solves."""
 
 MESHES = {
     MEMBRANE: ((3, 8, 4), (4, 8, 4), (4, 8, 6), (5, 8, 6), (6, 8, 6), (7, 8, 6)),
-    WITH_BENDING: ((3, 8, 4, 1), (4, 8, 6, 1), (5, 8, 6, 1), (6, 8, 6, 1), (7, 8, 6, 2)),
+    WITH_BENDING: ((3, 8, 4, 2), (4, 8, 6, 2), (5, 8, 6, 2), (6, 8, 6, 2), (7, 8, 6, 3)),
 }
 """Meshes that are measured, as the arguments of `Resolution`. The first number is the order of the elements."""
 

@@ -58,12 +58,16 @@ CLOSED = with_film(FOUR, pretension=0.0, back_volume=95_000.0)
 UNEVEN = with_film(FOUR, pretension=2.4, deviator=(1.2, 0.0))
 """The pretension along one axis is three times that along the other, and a small force hardly changes the stress."""
 
+AT_THE_RIM = replace(with_film(FOUR, pretension=0.0), electrodes=(Electrode.of_square("E", (42.0, 0.0), 3.0),))
+"""An electrode that ends 1.5 mm from the rim, where the film bends."""
+
 BENT_MESH = Resolution(order=7, around=8, rings=8, rim=4)
 CHOSEN = {
     "very uneven pretension": (UNEVEN, Circle(1.0), (3.0, 2.0), 0.05, Resolution(5, 20, 7, 2), 3e-4),
     "small film": (square_pair(14.0, 0.104, 0.64), Circle(2.6), (2.8, 0.7), 1.0, BENT_MESH, 1e-4),
     "thick film": (square_pair(30.0, 0.05, 0.0), Circle(1.0), (6.0, 1.5), 0.05, BENT_MESH, 1e-4),
     "surface under the probe": (ON_TOP, Circle(1.0), (8.0, 3.0), 0.05, Resolution(7, 16, 8, 2), 2e-4),
+    "electrode at the rim": (AT_THE_RIM, Circle(1.0), (0.0, 8.0), 0.5, Resolution(8, 16, 8, 3), 1e-4),
     "slack film with a closed back": (CLOSED, Finger(5.0), (22.0, 5.0), 0.05, Resolution(7, 8, 12, 4), 1e-3),
 }
 """Sensor, probe, position, force, a mesh that is finer than the chosen one, and the largest error of a charge."""
