@@ -1,5 +1,6 @@
 """Energy of a static pressure on the film and of the air that is trapped behind it, and its derivatives."""
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -69,14 +70,23 @@ class BackPressure:
         Returns:
             Derivatives, shape (n_node,). They are infinite if the film displaces the whole volume of the air.
         """
-        # At constant temperature, the pressure p0 of the air increases by p0 x / (1 - x), where x = V / V0 is the
-        # displaced share of the volume of the air.
         displaced_share = self.groups.compression * self._volume(deflection)
         if displaced_share >= 1.0:
             return np.full_like(deflection, np.inf)
+        return -self.at_constant_pressure(deflection).static_pressure * self.weights
+
+    def at_constant_pressure(self, deflection: Array) -> DimensionlessGroups:
+        """Return the groups of a film without trapped air, on which the same pressure acts as on this film.
+
+        Args:
+            deflection: Scaled deflection W at the nodes, shape (n_node,).
+        """
+        # At constant temperature, the pressure p0 of the air increases by p0 x / (1 - x), where x = V / V0 is the
+        # displaced share of the volume of the air.
+        displaced_share = self.groups.compression * self._volume(deflection)
         air_pressure = self.groups.ambient_pressure * displaced_share / (1.0 - displaced_share)
-        pressure = air_pressure - self.groups.static_pressure
-        return pressure * self.weights
+        static_pressure = self.groups.static_pressure - air_pressure
+        return replace(self.groups, static_pressure=static_pressure, compression=0.0)
 
     def stiffness(self, deflection: Array) -> float:
         """Compute the factor c in the second derivatives c * weights[i] * weights[j] of the energy.

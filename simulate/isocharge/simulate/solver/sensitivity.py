@@ -179,7 +179,14 @@ def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
             factor_tangent(elastic, assembly(solved.mesh.template, elastic.unknowns_per_node, odd), solved.field)
             for odd in (False, True)
         ]
-        changes = [_change_by_imperfection(solved, field.add, solves[field.odd], surface) for field in FILM_FIELDS]
+        # An odd change does not displace any air on the whole film, so the pressure of trapped air remains constant.
+        presses = [solved, solved]
+        if elastic.back is not None:
+            groups = elastic.back.at_constant_pressure(solved.field[:, 2])
+            presses[True] = replace(solved, groups=groups)
+        changes = [
+            _change_by_imperfection(presses[field.odd], field.add, solves[field.odd], surface) for field in FILM_FIELDS
+        ]
         return np.stack(changes, axis=2)
 
 
