@@ -75,6 +75,13 @@ def test_all_moduli_change_with_the_modulus_of_the_film():
     assert changed.film.shear == pytest.approx(0.5 * default.film.young / (1.0 + default.film.poisson))
 
 
+def test_even_film_keeps_the_axis_of_its_shear_modulus():
+    orthotropic = with_film(SENSOR, young_ratio=1.5, axis=0.6, shear=700.0)
+    prior = FilmPrior(orthotropic, Circle(1.0))
+    even = prior.film(prior.even(prior.described))[0].film
+    assert (even.young_ratio, even.axis, even.shear) == (1.0, 0.6, 700.0)
+
+
 def test_all_properties_are_tested():
     assert {*PRIOR.names} - {*EXPECTED} == {"gain B", "gain C", "gain D"}
 

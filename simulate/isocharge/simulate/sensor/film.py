@@ -263,8 +263,13 @@ def check_range(what: str, value: float, allowed: tuple[float, float], unit: str
 
 
 def increased(size: float, axis: float, addition: complex) -> tuple[float, float]:
-    """Add to a quantity size * exp(2 i axis), and return its new size and axis. The new size is not negative."""
-    if addition == 0.0:  # without rounding errors
+    """Add to a quantity size * exp(2 i axis), and return its new size and axis. The new size is not negative.
+
+    The axis is kept if nothing is added, or if the new size is zero except for rounding.
+    """
+    if addition == 0.0:
         return size, axis
     total = cmath.rect(size, 2.0 * axis) + addition
+    if abs(total) < 1e-12 * abs(size):
+        return 0.0, axis
     return abs(total), 0.5 * cmath.phase(total)
