@@ -80,6 +80,7 @@ def test_message_about_a_wrong_table_is_short(text, message):
     [
         ("", r"presses.csv: empty; expected a header with one column for each of the electrodes \('A', 'B', 'C'\)"),
         ("1,2,3\n4,5,6\n", r"missing: \['A', 'B', 'C'\]"),
+        ("date;A;B;C\n28.11;1.064;832;629\n", "every number with the mark '.' may have .*separator of thousands"),
         ("A\tB\tC\n1,064\t832\t629\n", "every number with the mark ',' may have .*separator of thousands"),
         ("A,B,C\nnC,nC,nC\n1,2,3\n", "line 2, column 'A': expected a charge in pC, got 'nC'$"),
         ('A,B,C\n"1,064",832,629\n', "every number with the mark ',' may have .*separator of thousands"),

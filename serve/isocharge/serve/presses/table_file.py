@@ -120,7 +120,9 @@ class CsvTable(NumberTable):
                 numbers.append(number)
             if not self._is_mark_certain:
                 is_point_between_commas = (self._separator, self._mark) == (",", ".")
-                has_evidence = any(_has_decimal_mark(cell.strip(), self._mark) for cell in cells)
+                read_cells = [cells[column_index] for column_index in column_indices.values()]
+                fractions = [cell for cell in cells if cell.strip().startswith(f"0{self._mark}")]  # these are no dates
+                has_evidence = any(_has_decimal_mark(cell.strip(), self._mark) for cell in read_cells + fractions)
                 self._is_mark_certain = is_point_between_commas or has_evidence
         if self._mark and not self._is_mark_certain:
             raise self.source.error(
