@@ -6,6 +6,7 @@ import pytest
 from isocharge.serve import Frame
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.port.file_source import Chunk
+from isocharge.serve.port.serial_line import MAX_READ_BYTES
 
 MODULUS = 2**32
 START_S = 1_700_000_000.0
@@ -81,6 +82,17 @@ def test_clock_of_a_device_that_jumps(jump_us):
     _, times = follow(t_us, START_S + np.arange(2000) * 1e-3)
     np.testing.assert_allclose(np.diff([time.host_s for time in times]), 1e-3, atol=1e-3)
     assert max(time.dt_s for time in times) == pytest.approx(1e-3)
+
+
+def test_readings_that_waited_for_a_slow_program_have_the_times_at_which_they_were_taken():
+    clock = DeviceClock()
+    errors_s = []
+    for number in range(120):
+        late_s = 0.1 * max(0, number - 60)  # from then on, more bytes wait than a chunk can contain
+        chunk = chunk_at(0.1 * number + late_s)._replace(data=bytes(MAX_READ_BYTES if late_s else 1))
+        (frame,) = read(clock, chunk, [100_000 * number], MODULUS)
+        errors_s.append(frame.host_s - START_S - 0.1 * number)
+    np.testing.assert_allclose(errors_s, 0.0, atol=1e-3)
 
 
 def test_times_never_decrease():

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.port.file_source import Chunk
+from isocharge.serve.port.serial_line import MAX_READ_BYTES
 
 BANDWIDTH_Hz = 0.05
 """Bandwidth of the loop, Hz. A jitter of 1 ms is reduced to 0.2 ms."""
@@ -100,7 +101,8 @@ class DeviceClock:
                 frame.clock_s = self._monotonic_s - before_arrival_s
             else:
                 self._stamp_with_device(frame, frame.t_us, modulus, chunk.timestamp)
-        self._end_chunk(chunk.timestamp)
+        if len(chunk.data) < MAX_READ_BYTES:  # otherwise, the bytes may have waited to be read
+            self._end_chunk(chunk.timestamp)
 
     def _enter_chunk(self, chunk: Chunk) -> float:
         """Return the time from the previous chunk to this chunk, s, and advance the monotonic time of the host.

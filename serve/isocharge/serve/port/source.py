@@ -182,10 +182,13 @@ class Port:
     def __iter__(self) -> Iterator[Chunk]:
         """Yield chunks as they arrive. If the port is lost and `reconnect` is true, open the port again.
 
+        After two full chunks in succession, a warning is logged once, because more bytes were waiting after the first.
+
         Raises:
             PortLost: If the port disappears or stays silent for too long, and `reconnect` is false.
             PortError: If the port is not open.
         """
+        full_chunks = 0  # number in succession
         while True:
             wait_start_s = time.monotonic()
             outage_s = 0.0
@@ -194,6 +197,14 @@ class Port:
             except PortLost as error:
                 data = self._read_after_reconnecting(error)
                 outage_s = time.monotonic() - wait_start_s
+            if full_chunks < 2:
+                full_chunks = full_chunks + 1 if len(data) >= MAX_READ_BYTES else 0
+                if full_chunks == 2:
+                    log.warning(
+                        "%s: the program reads more slowly than the board sends: records are late; do less for each "
+                        "record, or lower the frame rate",
+                        self.url,
+                    )
             yield Chunk(data, time.time(), time.perf_counter_ns(), outage_s)
 
     def read(self, timeout_s: float) -> Chunk | None:

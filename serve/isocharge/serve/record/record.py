@@ -207,7 +207,7 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     ]
     latency_us: Annotated[
         float | None,
-        Meaning("Time from the last byte of the reading to this record, us.", "us", is_shown_live=True),
+        Meaning("Time since the program read the last byte of the frame, us.", "us", is_shown_live=True),
     ]
     model: Annotated[str, Meaning("The model, name/version.")]
     frame_id: Annotated[str, Meaning("Name of the sensor, the frame of x and y.")]
