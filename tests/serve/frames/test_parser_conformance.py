@@ -71,6 +71,9 @@ def test_bytes_between_two_frames_damage_no_frame(name, data):
         ((None, 5, None, 8), 65536, (2, 0, 0), ["", "", "", "gap"]),
         ((60_000, 60_001, 0, 1, 30_000), 65536, (29_998, 0, 1), ["", "", "restart", "", "gap"]),
         ((65_500, 60), 65536, (95, 0, 0), ["", "gap"]),
+        ((30, 32, 31, 33), 65536, (0, 0, 0), ["", "gap", "gap", ""]),
+        ((65_534, 0, 1, 65_535, 2), 65536, (0, 0, 0), ["", "gap", "", "gap", ""]),
+        ((3, 4, 0, 1, 2), 65536, (0, 0, 1), ["", "", "restart", "", ""]),
     ],
     ids=[
         "wrap",
@@ -79,6 +82,9 @@ def test_bytes_between_two_frames_damage_no_frame(name, data):
         "some without a number",
         "a restart in the upper half",
         "a gap at the end of the range",
+        "a late number",
+        "a late number after a wrap",
+        "a restart soon after the start",
     ],
 )
 def test_sequence_gaps_repeats_and_restarts(numbers, modulus, counts, flags):

@@ -292,6 +292,7 @@ def test_frames_without_a_zero_byte_are_divided_after_254_bytes(exported, n_valu
 def test_clock_overflows_and_restarts_in_c_as_in_python(exported):
     """A time stamp that is more than half of the range ahead counts as a step back."""
     t_us = (4_294_000_000 + np.cumsum(np.random.default_rng(0).integers(0, 20_000, 500))) % T_US_MODULUS
+    t_us[[250, 251]] = t_us[[251, 250]]  # these frames were swapped
     t_us[300:] = (t_us[300:] - t_us[300] + 17) % T_US_MODULUS  # the board was reset
     t_us[400:] = (t_us[400:] + (1 << 31) + 500_000) % T_US_MODULUS
     clock = DeviceClock()

@@ -236,25 +236,27 @@ class DeviceClock:
     def _unwrap(self, t_us: int, modulus: int) -> int:
         """Remove the wraps from the clock value of the next reading, and store the resulting value in `_device_us`.
 
-        If the clock jumped back, or jumped ahead by half of its range or more, the device has restarted. The fit is
-        then discarded.
+        If the clock jumped back by at most `MAX_DELAY_s`, the reading arrived late, for example as a datagram that
+        another one has overtaken. If the clock jumped back further, or jumped ahead by half of its range or more, the
+        device has restarted. The fit is then discarded.
 
         Args:
             t_us: Clock of the reading as the device sent it, us.
             modulus: Time at which the clock wraps to 0, us.
 
         Returns:
-            Time since the previous reading, us; 0 for the first reading, and after a restart of the device.
+            Time since the previous reading, us; 0 for the first reading, for a late reading, and after a restart of the
+            device.
         """
         previous_us = self._sent_us
         self._sent_us = t_us
         if previous_us is not None:
-            # The modulo makes the step correct even if the clock has wrapped between the readings. If the clock jumped
-            # back, the modulo converts the negative step to a large positive step.
-            step_us = (t_us - previous_us) % modulus
-            if step_us < modulus // 2:
+            # The modulo makes the step correct even if the clock has wrapped between the readings.
+            half_range_us = modulus // 2
+            step_us = (t_us - previous_us + half_range_us) % modulus - half_range_us
+            if step_us >= -min(MAX_DELAY_s * 1e6, self._device_us):
                 self._device_us += step_us
-                return step_us
+                return max(0, step_us)
 
         # This is the first reading after a start of the device.
         self._device_us = t_us

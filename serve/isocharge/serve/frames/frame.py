@@ -24,6 +24,9 @@ The value is half of the range of a counter of one byte. With a larger counter, 
 with the end of the range. A restart in the upper half of the range is more frequent.
 """
 
+MAX_LATE_FRAMES = 8
+"""Largest decrease of a frame counter that counts as a late frame, for example of datagrams in another order."""
+
 SEQ_MODULUS = 1 << 16
 """Value at which a 16-bit frame counter wraps to 0."""
 
@@ -303,7 +306,8 @@ class Parser(ABC):
                 this shows that the device has restarted.
 
         Returns:
-            Flags of the frame: empty, or one of `gap`, `repeat` and `restart` (see `isocharge.serve.flags`).
+            Flags of the frame: empty, or one of `gap`, `repeat` and `restart` (see `isocharge.serve.flags`). A late
+            frame has the flag `gap`.
         """
         if seq is None:
             self.counts.restarts += is_clock_reset
@@ -325,6 +329,12 @@ class Parser(ABC):
             has_exceeded_modulus = previous_seq >= self.seq_modulus
             smallest_restart = 0 if has_exceeded_modulus else min(smallest_restart, SMALLEST_RESTART)
         if increase >= smallest_restart:
+            decrease = (previous_seq - seq) % self.seq_modulus
+            # A late frame was overtaken by a few others. A board that has restarted counts from 0 or 1.
+            if decrease <= MAX_LATE_FRAMES < seq and not is_clock_reset:
+                self._previous_seq = previous_seq
+                self.counts.lost = max(0, self.counts.lost - 1)
+                return (GAP,)
             self.counts.restarts += 1
             return (RESTART,)
         self.counts.lost += increase - 1

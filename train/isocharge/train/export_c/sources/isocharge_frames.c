@@ -147,8 +147,12 @@ void isocharge_clock_start(isocharge_clock *clock) { memset(clock, 0, sizeof *cl
 double isocharge_clock_read(isocharge_clock *clock, uint32_t t_us, double *t_s)
 {
     uint32_t step_us = t_us - clock->last_us;
+    const uint32_t late_us = clock->last_us - t_us;
 
-    if (!clock->running || step_us >= 0x80000000u) {
+    if (clock->running && late_us <= 1000000u && late_us <= clock->device_us) { /* a frame in another order */
+        clock->device_us -= late_us;
+        step_us = 0;
+    } else if (!clock->running || step_us >= 0x80000000u) {
         clock->device_us = t_us;
         step_us = 0;
     } else {
