@@ -151,6 +151,14 @@ def test_frames_are_withheld_without_a_reader(film):
         sensor.url  # noqa: B018
 
 
+def test_number_of_sent_frames_is_not_negative_if_the_first_frame_is_lost(film):
+    with VirtualSensor(film.charges, steady(), faults=Faults(lose_share=1.0 - 1e-9)) as sensor:
+        for _ in range(100):
+            assert 0 <= sensor.sent <= 1  # the sensor may be counting a frame at present
+            time.sleep(0.001)
+        assert sensor.lost > 0
+
+
 def test_bytes_that_a_sensor_ignores_do_not_block_their_sender(film):
     sensor = VirtualSensor(film.charges, steady(rate_Hz=500.0))
     with sensor, serial.Serial(sensor.url, write_timeout=10.0) as line:

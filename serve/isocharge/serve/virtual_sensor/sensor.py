@@ -234,7 +234,7 @@ class VirtualSensor:
                 yield self._frame_bytes(frame_number, tuple(charge_pC))
 
     def _frame_bytes(self, frame_number: int, charge_pC: tuple[float, ...]) -> bytes:
-        """Encode a frame, and apply the faults of the transmission to its bytes. Count lost and damaged frames.
+        """Encode a frame, and apply the faults of the transmission to its bytes. Count damaged frames.
 
         Args:
             frame_number: Number of the frame since the start of the sensor.
@@ -247,7 +247,6 @@ class VirtualSensor:
         # A random number is drawn only if random frames are to be lost. Otherwise, it would change the noise that
         # belongs to the seed.
         if faults.lose_share > 0.0 and self._rng.random() < faults.lose_share:
-            self.lost += 1
             return b""
         t_us = round(1e6 * frame_number / self.script.rate_Hz) % T_US_MODULUS
         data = self._encode(Frame(frame_number % SEQ_MODULUS, t_us, charge_pC))
@@ -310,10 +309,12 @@ class VirtualSensor:
                 self.paused_s += lateness_s
 
             self._frame_count = frame_number + 1
-            if data:  # otherwise the frame is lost because of a fault
-                port.discard_received()
-                if not port.write_whole(data):
-                    self.withheld += 1
+            if not data:
+                self.lost += 1
+                continue
+            port.discard_received()
+            if not port.write_whole(data):
+                self.withheld += 1
 
 
 def _clean_charges(forward: Charges, script: Script) -> Array:
