@@ -41,6 +41,7 @@ FAULTS = (
     (lambda folder: flip_a_byte(folder / "charges.npz"), "charges.npz: expected sha256"),
     (lambda folder: (folder / "other.npz").write_bytes(b"map") and None, "other.npz: expected sha256 no such file"),
     (lambda folder: shutil.copytree(folder, folder.parent / "17"), "17: expected version 17, got linear/1"),
+    (lambda folder: shutil.copytree(folder, folder.parents[1] / "renamed/1"), "expected the model renamed/1"),
 )
 
 

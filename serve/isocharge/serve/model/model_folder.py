@@ -272,7 +272,7 @@ def load_checked_model(folder: Path) -> Model:
 
     Raises:
         ModelError: If a file is missing, is damaged or belongs to another model, if a computed output differs from the
-            golden vectors, or if the name of the folder is another version number than the number in the metadata.
+            golden vectors, or if the folders have another name and version than the metadata.
     """
     model = load_model(folder)
     is_version_folder = folder.name.isdecimal()
@@ -280,6 +280,12 @@ def load_checked_model(folder: Path) -> Model:
         raise ModelError(
             f"{folder}: expected version {folder.name}, got {model.metadata.label}; "
             "move it into a folder of that version, or export it again"
+        )
+    folder_name = folder.absolute().parent.name
+    if is_version_folder and folder_name not in (model.metadata.name, ".."):
+        raise ModelError(
+            f"{folder}: expected the model {folder_name}/{folder.name}, as the folders say, "
+            f"got {model.metadata.label}; move it into folders of that name and version"
         )
     existing_names = {path.name for path in folder.glob("*.npz")}
     for name in sorted(existing_names | model.golden.files.keys()):

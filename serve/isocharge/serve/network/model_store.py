@@ -233,16 +233,11 @@ class ModelStore:
             folder: Folder of the version.
 
         Raises:
-            ModelError: If a check fails, or if the metadata contain another name than the folder.
+            ModelError: If a check fails.
         """
         statistics = self.metrics.of(name, number)
         statistics.ready.set_function(lambda: len(self.versions_of(name, str(number))))
         model = load_checked_model(folder)
-        if model.metadata.name != name:
-            raise ModelError(
-                f"{folder}: expected the model {name}/{number}, as the folders say, got {model.metadata.label}; "
-                "move it into folders of that name and version"
-            )
         statistics.description.info({"sensor": model.metadata.frame_id, "sha256": model.golden.sha256})
         return LoadedVersion(model, statistics)
 
