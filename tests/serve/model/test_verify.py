@@ -47,7 +47,10 @@ FAULTS = (
 
 @pytest.mark.parametrize(("fault", "message"), FAULTS)
 def test_a_changed_folder_is_refused(refused, folder, fault, message):
-    refused("verify", fault(folder) or folder, message=message)
+    """Of the commands, also those that only use a model make these checks when they start."""
+    changed = fault(folder) or folder
+    for words in (["verify", changed], ["serve", "predict", changed, "-"], ["serve", "stream", changed, "--port", "-"]):
+        refused(*words, message=message)
 
 
 def test_missing_model_is_wrong_input(refused):

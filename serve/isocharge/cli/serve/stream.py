@@ -52,7 +52,6 @@ from isocharge.serve import (
     device_from_table,
     find_labelled_model,
     find_model,
-    load_checked_model,
     load_device,
     open_source,
 )
@@ -225,7 +224,8 @@ def stream_command(
         raise InputError(f"--name: expected printable characters, got {shown(name)}")
 
     # The options take precedence over the settings of the device file.
-    predictor = Predictor(model, models=models)
+    load_latest = partial(Predictor, model, models=models)
+    predictor = load_latest()
     board = load_device(device)
     if track:
         board = with_settings(board, "track", on=True)
@@ -235,10 +235,6 @@ def stream_command(
     recorder = Recorder(record, predictor.metadata.label, board.table, name) if record else None
     stream = RecordedStream(touch, recorder)
     has_expired = Event()
-
-    def load_latest() -> Predictor:
-        """Load the latest version of the model, and check that this machine computes its golden vectors."""
-        return Predictor(load_checked_model(find_model(model, models)).folder)
 
     outputs: Outputs | None = None  # until the port is open
     with (

@@ -24,7 +24,7 @@ from isocharge.common.structs import convert
 from isocharge.serve.flags import BEYOND
 from isocharge.serve.model.contact import Contact, Contacts, Validity, as_batch, as_press, write_finite
 from isocharge.serve.model.metadata import ModelNoise
-from isocharge.serve.model.model_folder import find_model, load_model
+from isocharge.serve.model.model_folder import find_model, load_checked_model
 from isocharge.serve.model.session import COLUMNS, BoundPress, run
 
 log = logging.getLogger(__name__)
@@ -63,10 +63,10 @@ class Predictor:
             models: Repository that is searched first for a model with this name.
 
         Raises:
-            ModelError: If the model is missing or damaged, or has an unsupported format.
+            ModelError: If the model is missing, or `load_checked_model` refuses it.
         """
-        loaded = load_model(find_model(model, models))
-        self.folder = loaded.folder.resolve()
+        loaded = load_checked_model(find_model(model, models))
+        self.folder = loaded.folder.absolute()
         self.metadata = loaded.metadata
         self.validity = Validity.of(loaded.metadata)
         self._session = loaded.session
