@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import re
 import shutil
 import threading
 from datetime import UTC, datetime
@@ -14,6 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from onnx import helper, numpy_helper
+from prometheus_client import generate_latest
 
 from infer_requests import BODY, INFER
 from isocharge.common.errors import ModelError, ModelNotFound
@@ -110,6 +112,10 @@ def test_load_and_unload_add_and_remove_versions(film, store, folder):
     store.load("linear")
     assert labels(store) == ["later/1", "linear/1", "linear/3"]
     assert store.refusals() == []
+    exported = set(
+        re.findall(r'_ready{model="(.*)",version="(.*)"} (.*)', generate_latest(store.metrics.registry).decode())
+    )
+    assert exported == {("later", "1", "1.0"), ("linear", "1", "1.0"), ("linear", "3", "1.0")}
     shutil.rmtree(folder)
     with pytest.raises(ModelNotFound, match="'linear' is not found in the repository"):
         store.load("linear")

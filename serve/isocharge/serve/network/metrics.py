@@ -75,6 +75,11 @@ class ModelMetrics:
         """Return the metrics of a version. Their values continue if the version has been loaded before."""
         return Statistics(**{field: metric.labels(name, version) for field, metric in self._metrics.items()})
 
+    def remove(self, name: str, version: int) -> None:
+        """Remove the metrics of a version whose folder no longer exists. An alarm would otherwise never end."""
+        for metric in self._metrics.values():
+            metric.remove(name, version)
+
 
 @dataclass(frozen=True)
 class Statistics:

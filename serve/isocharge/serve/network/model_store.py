@@ -78,7 +78,7 @@ class ModelStore:
     Any thread may call any method. A lock ensures that only one thread at a time loads or unloads models.
 
     Attributes:
-        metrics: Metrics of the requests to each version. They also contain versions that are no longer loaded.
+        metrics: Metrics of the requests to each version. They also contain versions that were refused or unloaded.
     """
 
     def __init__(self, roots: Sequence[Path]) -> None:
@@ -222,7 +222,10 @@ class ModelStore:
             rows[number] = row
         if not rows or any(row.reason for row in rows.values()):
             rows = earlier | rows
+        removed_numbers = {row.number for row in self._find(name)} - rows.keys()
         self._replace(name, list(rows.values()))
+        for number in removed_numbers:
+            self.metrics.remove(name, number)
 
     def _load_version(self, name: str, number: int, folder: Path) -> LoadedVersion:
         """Load one version of a model, check its files, and return the version.
