@@ -221,9 +221,9 @@ def start_http(stopping):
     """
     started = []
 
-    def start(app, *, tls=None, uds=None):
+    def start(app, *, tls=None, uds=None, beside=None):
         server = HttpServer(app, Address(uds=uds), tls)
-        thread = Thread(target=server.run)
+        thread = Thread(target=server.run, args=[beside])
         thread.start()
         started.append((server, thread))
         return server

@@ -186,6 +186,18 @@ def test_silent_calls_are_closed(serve, silent_call, name, messages):
     assert refusal(call) == "DEADLINE_EXCEEDED"
 
 
+def test_stop_ends_a_stream_that_waits_for_its_next_message(store, start_grpc, silent_call):
+    """Calls whose response is being computed would have 10 s."""
+    server = start_grpc(Handler(store))
+    with grpc.insecure_channel(server.__enter__().removeprefix("grpc://")) as channel:
+        call = silent_call(channel, "ModelStreamInfer", [METHODS["ModelStreamInfer"][0]()])
+        next(call)
+        start_s = time.monotonic()
+        server.__exit__(None, None, None)
+        assert time.monotonic() - start_s < 5.0
+        assert refusal(call) == "DEADLINE_EXCEEDED"
+
+
 def test_silent_connection_is_closed(store, start_grpc):
     """The limit is `header_seconds`, not the default of gRPC, which is two minutes."""
     with start_grpc(Handler(store, ServerLimits(header_seconds=0.1))) as url:

@@ -1,5 +1,6 @@
 """The HTTP server on real sockets: limits, slow clients, TLS, token, and finishing requests at the stop."""
 
+import asyncio
 import http.client
 import json
 import re
@@ -7,7 +8,7 @@ import select
 import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, asynccontextmanager, suppress
 from threading import Event
 
 import numpy as np
@@ -314,6 +315,29 @@ def test_stop_finishes_requests_that_have_begun(server, slow_load):
             assert statuses(data) == [200]
             assert b"connection: close" in data
     wait_until(lambda: is_refused(server))
+
+
+@pytest.mark.parametrize(("stops", "grace_seconds"), [(1, 0.5), (2, 10.0)])
+def test_stop_refuses_unfinished_requests_and_ends_a_server_beside_at_once(store, start_http, stops, grace_seconds):
+    """The server beside, such as that of gRPC, does not wait for the open requests. A second stop waits for nothing."""
+    is_ending = Event()
+
+    @asynccontextmanager
+    async def beside():
+        yield
+        is_ending.set()
+        await asyncio.sleep(60.0)
+
+    server = start_http(Handler(store, ServerLimits(grace_seconds=grace_seconds)), beside=beside())
+    with connect(server) as begun:
+        begun.settimeout(5.0)
+        begun.sendall(infer()[:-5])
+        time.sleep(0.3)
+        for _ in range(stops):
+            server.stop()
+            assert is_ending.wait(0.3)
+        status, error = refused(everything(begun))
+    assert (status, error) == (503, "the server has stopped before it could answer; send the request again")
 
 
 @pytest.mark.parametrize(("certificate", "key"), [("cert.pem", "key.pem"), ("both.pem", None)])

@@ -28,6 +28,8 @@ MIN_PING_MS = 5000
 async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) -> AsyncIterator[str]:
     """Return a context manager that runs a gRPC server in the present event loop until the `async with` block ends.
 
+    At the end of the block, the calls that have begun are finished. If the end is cancelled, they are ended at once.
+
     Args:
         handler: Handler of the HTTP server. The gRPC server uses its models, limits and token. Clients send the token
             in the metadata field `authorization`.
@@ -47,7 +49,8 @@ async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = 
     # The service limits the number of open calls to `connections`. If a new call exceeds this limit, the service ends a
     # waiting call instead of refusing the new call. grpcio would refuse the new call, so its own limit must be higher.
     server = grpc.aio.server(options=_options(limits), maximum_concurrent_rpcs=2 * limits.connections)
-    server.add_generic_rpc_handlers((Service(handler).handlers(),))
+    service = Service(handler)
+    server.add_generic_rpc_handlers((service.handlers(),))
     try:
         if tls is None:
             scheme = "grpc"
@@ -64,7 +67,11 @@ async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = 
     try:
         yield f"{scheme}://{url_host(host)}:{actual_port}"
     finally:
-        await server.stop(limits.grace_seconds)
+        service.end_streams()
+        try:
+            await server.stop(limits.grace_seconds)
+        finally:  # no effect unless the stop is cancelled
+            await server.stop(None)
 
 
 def _options(limits: ServerLimits) -> list[tuple[str, int]]:

@@ -138,6 +138,7 @@ class Service:
         self._traffic = handler.traffic
         self._access = handler.access
         self._open_count = 0
+        self._is_stopping = False
         # One timeout for each call that waits for a message of its client, in the order in which the waits began. The
         # dictionary has no values and serves as an ordered set.
         self._waiting: dict[asyncio.Timeout, None] = {}
@@ -206,7 +207,7 @@ class Service:
                 response = self._respond(name, data, call)
             async with asyncio.timeout(self._limits.body_seconds):
                 await context.write(response)
-            if name != STREAM_METHOD:
+            if name != STREAM_METHOD or self._is_stopping:
                 return
             timeout_s = self._limits.idle_seconds
 
@@ -305,6 +306,12 @@ class Service:
         del self._waiting[oldest_timeout]
         oldest_timeout.reschedule(0.0)
 
+    def end_streams(self) -> None:
+        """End the streams, because the server stops. A call that waits for a message waits for 0.1 s more."""
+        self._is_stopping = True
+        for timeout in self._waiting:
+            timeout.reschedule(asyncio.get_running_loop().time() + 0.1)
+
     async def _next_message(self, context: grpc.aio.ServicerContext, timeout_s: float) -> Any:
         """Wait for the next message of a call.
 
@@ -319,7 +326,7 @@ class Service:
 
         Raises:
             TimeoutError: If the message does not arrive in time, or if the service ends this call because of a new
-                call.
+                call or because the server stops.
         """
         async with asyncio.timeout(timeout_s) as timeout:
             self._waiting[timeout] = None  # `_limit_open_calls` may let this timeout expire early
@@ -332,6 +339,9 @@ class Service:
 def _status_and_message(error: Exception) -> tuple[str, str]:
     """Return the gRPC status and the error message with which a failed call is ended."""
     if isinstance(error, TimeoutError):
-        return "DEADLINE_EXCEEDED", "the call waited too long for its client, or others needed its place"
+        return (
+            "DEADLINE_EXCEEDED",
+            "the call waited too long for its client, others needed its place, or the server stops",
+        )
     _, grpc_status = statuses(error)
     return grpc_status, client_message(error)

@@ -11,8 +11,9 @@ The signals of the process are left to the program that runs the server.
 import asyncio
 import math
 import resource
+import socket
 from collections.abc import Iterator
-from contextlib import AbstractAsyncContextManager, contextmanager, nullcontext
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -144,6 +145,12 @@ class Connection(HttpToolsProtocol):
         else:
             self.transport.abort()
 
+    def refuse_unanswered(self) -> None:
+        """Refuse the open request because the server stops, unless its response has begun."""
+        if self.cycle is not None and not self.cycle.response_started:
+            self.refuse(503, "the server has stopped before it could answer; send the request again")
+            self.cycle.disconnected = True  # uvicorn would otherwise add a response of its own
+
     def send_400_response(self, msg: str) -> None:
         """Refuse data that are not an HTTP request. uvicorn calls this method with a message."""
         self.refuse(400, msg)
@@ -222,11 +229,13 @@ class HttpServer:
         """Answer requests until `stop` is called, and then finish the requests that have already begun.
 
         Args:
-            beside: Context that is open while the server runs, such as a gRPC server in the same event loop.
+            beside: Context that is open until `stop` is called, such as a gRPC server in the same event loop. If `stop`
+                is called again, the exit of the context is cancelled.
         """
 
         async def serve() -> None:
-            async with beside or nullcontext():
+            async with self._server.beside as contexts:
+                await contexts.enter_async_context(beside or nullcontext())
                 await self._server.serve([self._socket])
 
         with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
@@ -247,7 +256,16 @@ class HttpServer:
 
 
 class _Server(uvicorn.Server):
-    """Server of uvicorn that does not handle signals, and ends connections whose deadline has passed."""
+    """Server of uvicorn that does not handle signals, and ends connections whose deadline has passed.
+
+    Attributes:
+        beside: Contexts that are closed as soon as the server is to stop.
+    """
+
+    def __init__(self, config: uvicorn.Config) -> None:
+        """Create a server that does not listen yet."""
+        super().__init__(config)
+        self.beside = AsyncExitStack()
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -261,3 +279,15 @@ class _Server(uvicorn.Server):
         for connection in connections:
             connection.close_if_overdue(now)
         return await super().on_tick(counter)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Finish the open requests, and close `beside` meanwhile. Then refuse the requests that are not finished."""
+        closing = asyncio.create_task(self.beside.aclose())
+        await super().shutdown(sockets)
+        connections: Any = list(self.server_state.connections)
+        for connection in connections:
+            connection.refuse_unanswered()
+        while not (closing.done() or self.force_exit):
+            await asyncio.sleep(0.1)
+        closing.cancel()  # no effect if it is done
+        await asyncio.wait([closing])
