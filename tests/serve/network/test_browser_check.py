@@ -100,11 +100,14 @@ def test_link_on_another_site_is_accepted():
 )
 def test_allow_host_accepts_pages_behind_a_proxy_and_none_of_another_port(host, origin, message):
     expected = pytest.raises(OriginError, match=message) if message else nullcontext()
-    with expected:
-        AccessCheck("0.0.0.0", ["Robot.Example"]).check("POST", headers_of(host=host, origin=origin))
+    for allowed_hosts in (["Robot.Example"], "Robot.Example"):
+        with expected:
+            AccessCheck("0.0.0.0", allowed_hosts).check("POST", headers_of(host=host, origin=origin))
 
 
-@pytest.mark.parametrize("name", ["", " ", "http://robot", "robot:8000", "robot/path", "*", "a b", "ro\nbot", "roböt"])
+@pytest.mark.parametrize(
+    "name", ["", " ", ".", "http://robot", "robot:8000", "robot/path", "*", "a b", "ro\nbot", "roböt"]
+)
 def test_allow_host_expects_a_plain_name(name):
     with pytest.raises(InputError, match="--allow-host: expected a host name without scheme, port and path"):
         host_name(name)

@@ -46,7 +46,7 @@ class AccessCheck:
     Args:
         host: Host name or address on which the server listens.
         allowed_hosts: Further host names of the server, for example the name of a reverse proxy. Pages of these hosts
-            may also send requests.
+            may also send requests. A text is one name.
         token: Token that requests must contain; None if requests need no token. With a token, every value of the header
             `Host` is accepted. DNS rebinding is then harmless, because a page of another site does not have the token.
         any_host: Whether to accept every value of the header `Host` even without a token. This is harmless if the
@@ -65,7 +65,8 @@ class AccessCheck:
         token: str | None = None,
         any_host: bool = False,
     ) -> None:
-        self._allowed_names = frozenset(map(host_name, allowed_hosts))
+        names = [allowed_hosts] if isinstance(allowed_hosts, str) else allowed_hosts
+        self._allowed_names = frozenset(map(host_name, names))
         self._host_names = self._allowed_names | {"localhost", host.lower()}
         if token is not None and not _TOKEN_PATTERN.fullmatch(token):
             raise InputError(
@@ -199,7 +200,7 @@ def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
     return values
 
 
-_HOST_NAME_PATTERN = re.compile(r"[a-z0-9_.-]+")
+_HOST_NAME_PATTERN = re.compile(r"[a-z0-9_-][a-z0-9_.-]*")
 """Host name, or IPv4 address, in lower case."""
 
 
