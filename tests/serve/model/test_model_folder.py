@@ -204,7 +204,7 @@ def test_find_model_returns_the_numerically_highest_version(roots):
     for version in ("1", "10", "9", "011", "draft", ".11.abcd"):
         put(roots["given"], version=version)
     assert find_model("m", roots["given"]).name == "10"
-    assert find_model("m/1", roots["given"]).name == "1"
+    assert find_model("m/1", str(roots["given"])).name == "1"
 
 
 def test_find_model_takes_the_path_of_a_model_a_version_or_an_onnx_file(roots):

@@ -46,7 +46,7 @@ from isocharge.serve.model.session import (
 )
 
 
-def find_model(model: str | Path, models: Path | None = None) -> Path:
+def find_model(model: str | Path, models: str | Path | None = None) -> Path:
     """Find the version folder of a model by its name or path.
 
     Args:
@@ -86,7 +86,7 @@ def find_labelled_model(label: str, models: Path | None = None) -> Path:
     return _first_model([root / label for root in roots], label, roots, is_path=False)
 
 
-def repositories(models: Path | None = None) -> list[Path]:
+def repositories(models: str | Path | None = None) -> list[Path]:
     """Return the repositories in which the name of a model is looked up, in the order of the search.
 
     Args:
@@ -97,9 +97,9 @@ def repositories(models: Path | None = None) -> list[Path]:
     """
     roots: list[Path] = []
     if models is not None:
-        if not models.is_dir():
+        roots.append(Path(models))
+        if not roots[0].is_dir():
             raise ModelError(f"{models}: expected a folder of models, got no folder; correct --models or leave it out")
-        roots.append(models)
     environment_folder = os.environ.get("ISOCHARGE_MODELS")
     if environment_folder:
         roots.append(Path(environment_folder))

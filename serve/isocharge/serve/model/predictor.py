@@ -55,7 +55,7 @@ class Predictor:
         ()
     """
 
-    def __init__(self, model: str | Path, *, models: Path | None = None) -> None:
+    def __init__(self, model: str | Path, *, models: str | Path | None = None) -> None:
         """Load a model.
 
         Args:

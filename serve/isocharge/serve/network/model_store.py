@@ -249,7 +249,7 @@ class ModelStore:
         self._versions = dict(sorted((self._versions | {name: sorted(rows)}).items()))
 
 
-def open_model_store(models: Path | None = None) -> ModelStore:
+def open_model_store(models: str | Path | None = None) -> ModelStore:
     """Load all models in one repository, or in all repositories that `find_model` searches.
 
     Args:
@@ -260,7 +260,7 @@ def open_model_store(models: Path | None = None) -> ModelStore:
         ModelError: If `models` is not a folder or contains no model, or if no version passes its checks.
     """
     roots = repositories(models)
-    return ModelStore(roots if models is None else [models])
+    return ModelStore(roots if models is None else roots[:1])
 
 
 def _refusal_reason(folder: Path, error: Exception) -> str:

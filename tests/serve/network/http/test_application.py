@@ -22,7 +22,7 @@ def ask(models, start_http):
     program = Starlette(
         routes=[
             Route("/", lambda _: PlainTextResponse("the program")),
-            Mount("/touch", asgi_app(models, token="sesame")),
+            Mount("/touch", asgi_app(str(models), token="sesame")),
         ]
     )
     program.limits = ServerLimits()

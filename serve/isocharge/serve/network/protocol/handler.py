@@ -208,7 +208,9 @@ class Handler(Application):
         return answer if isinstance(answer, Response) else json_response(answer)
 
 
-def asgi_app(models: Path | None = None, *, token: str | None = None, allowed_hosts: Iterable[str] = ()) -> Handler:
+def asgi_app(
+    models: str | Path | None = None, *, token: str | None = None, allowed_hosts: Iterable[str] = ()
+) -> Handler:
     """Load models, and return an ASGI application that serves them with the Open Inference Protocol.
 
     The limits of connections belong to the server that runs the program. The application itself limits the size of a
