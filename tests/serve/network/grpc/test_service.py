@@ -80,11 +80,16 @@ def test_charges_as_fp32_contents(serve, film, predictor, datatype):
     ("fields", "status", "message"),
     [
         ({"inputs": []}, "INVALID_ARGUMENT", "expected a list with one tensor"),
-        (
-            {"inputs": [tensor([[1.0] * 3], contents={"bool_contents": [True]})]},
-            "INVALID_ARGUMENT",
-            "expected 3 numbers for the shape",
+        *(
+            ({"inputs": [tensor([[1.0] * 3], contents=contents)]}, "INVALID_ARGUMENT", message)
+            for contents, message in [
+                ({}, "expected 3 numbers for the shape"),
+                ({"bool_contents": [True]}, "expected only fp32_contents, got bool_contents"),
+                ({"fp64_contents": [1.0] * 3}, "expected only fp32_contents, got fp64_contents"),
+                ({"fp32_contents": [1.0], "fp64_contents": [1.0] * 2}, "got fp64_contents"),
+            ]
         ),
+        ({"inputs": [tensor([[1.0] * 3]) | {"datatype": "INT64"}]}, "INVALID_ARGUMENT", "one of FP32, FP64"),
         (
             {"inputs": [tensor([[1.0] * 3])], "raw_input_contents": [bytes(12)]},
             "INVALID_ARGUMENT",

@@ -30,7 +30,7 @@ from isocharge.common.errors import ModelError, RequestError, TooMany
 from isocharge.common.structs import convert
 from isocharge.serve.network.metrics import Exchange
 from isocharge.serve.network.protocol import Handler
-from isocharge.serve.network.protocol.inference import InferBody, infer
+from isocharge.serve.network.protocol.inference import DATATYPES, InferBody, infer
 from isocharge.serve.network.protocol.response import client_message, statuses
 from isocharge.serve.network.protocol.routes import ROUTES, Request
 
@@ -77,7 +77,7 @@ def read_request(message: Any) -> tuple[InferBody, bytes]:
                 "name": tensor.name,
                 "datatype": tensor.datatype,
                 "shape": list(tensor.shape),
-                "data": [*tensor.contents.fp32_contents, *tensor.contents.fp64_contents] or None,
+                "data": _numbers(tensor),
                 "parameters": _unsupported_parameters(tensor),
             }
             for tensor in message.inputs
@@ -86,6 +86,20 @@ def read_request(message: Any) -> tuple[InferBody, bytes]:
         "parameters": {"binary_data_output": len(raw_contents) > 0},
     }
     return convert(content, InferBody, "", RequestError), b"".join(raw_contents)
+
+
+def _numbers(tensor: Any) -> list[Any] | None:
+    """Return the contents of a tensor, or None if it has none.
+
+    Raises:
+        RequestError: If the tensor has contents of another type than its datatype. They could be other numbers.
+    """
+    contents = {field.name: list(values) for field, values in tensor.contents.ListFields()}
+    expected = f"{tensor.datatype.lower()}_contents"
+    numbers = contents.pop(expected, None)
+    if contents and tensor.datatype in DATATYPES:
+        raise RequestError(f"input {tensor.name!r:.50}: expected only {expected}, got {', '.join(contents)}")
+    return numbers
 
 
 def _unsupported_parameters(tensor: Any) -> dict[str, bool]:
