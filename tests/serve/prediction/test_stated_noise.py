@@ -52,7 +52,7 @@ def test_covariance_for_a_stated_noise_is_that_of_the_linearised_problem(release
     steps = 2.0 * np.eye(4)
     charge_pC = np.concatenate([[PRESS_pC], PRESS_pC + steps, PRESS_pC - steps])
     plain, *stepped = np.asarray(released.predict_batch(charge_pC), float)
-    stated = np.asarray(released.with_noise(2.0, 0.005).predict_batch([PRESS_pC]), float)[0]
+    stated = np.asarray(released.with_noise([2.0] * 4, 0.005).predict_batch([PRESS_pC]), float)[0]
     up, down = np.split(np.array(stepped)[:, :3], 2)
     jacobian = (up - down).T / 4.0
     extra = 4.0 - 1.0 + (0.005**2 - 0.002**2) * PRESS_pC**2
@@ -86,9 +86,11 @@ def test_device_file_with_noise_widens_the_contacts_of_a_stream_and_of_predict(r
     assert json.loads(result.stdout)["x_std_mm"] == pytest.approx(expected.x_std_mm, rel=1e-5)
 
 
-@pytest.mark.parametrize("noise", [(-1.0, 0.0), (np.nan, 0.0), (1.0, np.inf), (1.0, -0.01)])
+@pytest.mark.parametrize("noise", [(-1.0, 0.0), (np.nan, 0.0), (1.0, np.inf), (1.0, -0.01), ([1.0] * 3, 0.0)])
 def test_noise_that_is_no_standard_deviation_is_refused(released, noise):
-    with pytest.raises(ChargeError, match=r"noise: (white_pC|gain): expected a number from 0"):
+    with pytest.raises(
+        ChargeError, match=r"noise(: |\.)(white_pC|gain): expected (a number from 0|one number for each of 4)"
+    ):
         released.with_noise(*noise)
 
 

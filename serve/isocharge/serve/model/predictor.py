@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import ArrayLike
 
 from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ChargeError
-from isocharge.common.structs import convert
+from isocharge.common.structs import WrongKey, convert
 from isocharge.serve.flags import BEYOND
 from isocharge.serve.model.contact import Contact, Contacts, Validity, as_batch, as_press, write_finite
 from isocharge.serve.model.metadata import ModelNoise
@@ -75,7 +76,7 @@ class Predictor:
         self._has_warned = False
         self.noise = loaded.metadata.noise
 
-    def with_noise(self, white_pC: float, gain: float) -> "Predictor":
+    def with_noise(self, white_pC: float | Sequence[float], gain: float | Sequence[float]) -> "Predictor":
         """Return a predictor of the same model whose standard deviations are those for another noise of the charges.
 
         The contacts are the same. The covariance of a contact is increased by the covariance that the additional noise
@@ -84,14 +85,21 @@ class Predictor:
         `predict_into` ignores the noise.
 
         Args:
-            white_pC: Standard deviation of the part of the noise that does not depend on the charge, pC.
-            gain: Standard deviation of the part that is proportional to the charge, relative to the charge.
+            white_pC: Standard deviation of the part of the noise that does not depend on the charge, pC. It is one
+                number for all electrodes, or a list with one number for each electrode.
+            gain: Standard deviation of the part that is proportional to the charge, relative to the charge, as one
+                number or as a list.
 
         Raises:
-            ChargeError: If a standard deviation is not a finite number from 0.
+            ChargeError: If a standard deviation is not a finite number from 0, or if a list has another length.
         """
         stated = {"name": "stated", "white_pC": white_pC, "gain": gain}
-        return self._with_stated_noise(convert(stated, ModelNoise, "noise", ChargeError))
+        noise = convert(stated, ModelNoise, "noise", ChargeError)
+        try:
+            structs.replace(self.metadata, noise=noise)  # makes the checks of the metadata
+        except WrongKey as error:
+            raise ChargeError(f"{error.key}: {error}") from error
+        return self._with_stated_noise(noise)
 
     def _with_stated_noise(self, noise: ModelNoise) -> "Predictor":
         """Return a predictor of the same model for another noise. A touch must also exceed this noise."""
