@@ -250,10 +250,24 @@ def test_openapi_describes_each_route(ask):
         (method.upper(), path) for path, item in document["paths"].items() for method in item.keys() - {"parameters"}
     }
     for method, path in sorted(existing, key=lambda row: row[1].endswith("unload")):
-        (kind,) = document["paths"][path][method.lower()]["responses"]["200"]["content"]
+        responses = document["paths"][path][method.lower()]["responses"]
+        assert responses["4XX"] == responses["5XX"] == {"$ref": "#/components/responses/error"}
+        (kind,) = responses["200"]["content"]
         body = orjson.dumps(infer_request()) if path.endswith("/infer") else b""
         status, headers, _ = ask(method, path.format(model="linear", version=1), body)
         assert (status, headers["content-type"].partition(";")[0]) == (200, kind), path
+
+
+@pytest.mark.parametrize(
+    ("data", "status"), [([1, 2.5, 3], 200), ([[1, 2.5, 3]], 200), (["1", 2, 3], 400), ([None, 2, 3], 400), ("1", 400)]
+)
+def test_openapi_accepts_the_numbers_that_the_server_accepts(ask, data, status):
+    request = infer_request()
+    request["inputs"][0]["data"] = data
+    assert ask("POST", INFER, orjson.dumps(request))[0] == status
+    components = orjson.loads(ask("GET", "/openapi.json")[2])["components"]
+    schema = {"$ref": "#/components/schemas/InferBody", "components": components}
+    assert jsonschema_rs.Draft202012Validator(schema).is_valid(request) == (status == 200)
 
 
 @pytest.mark.parametrize(
