@@ -75,7 +75,7 @@ def test_held_press_keeps_its_charge_despite_the_leak():
     ("gap_s", "is_falsified", "touch_end_s"),
     [
         ((2.9, 3.5), True, 11.0),  # contains the beginning of the touch
-        ((10.9, 11.5), False, 11.5),  # contains its end
+        ((10.95, 11.5), False, 11.5),  # contains its end
         ((5.0, 6.0), False, 11.0),  # the charge is constant
         ((3.02, 3.03), False, 11.0),  # short
     ],
@@ -83,8 +83,9 @@ def test_held_press_keeps_its_charge_despite_the_leak():
 def test_touch_has_the_flag_gap_to_its_end_if_missing_frames_falsify_its_charge(
     gap_s, is_falsified, touch_end_s, is_invalid
 ):
-    """The touch of 400 pC begins after 3 s and ends after 11 s."""
-    output_pC = np.tile(amplifier_output(touch_charge())[:, None], 3)
+    """The touch of 400 pC begins after 3 s and ends after 11 s. The inflow is 4 pC/s, so that 8 pC remain at rest."""
+    inflow_pC = 4.0 * np.arange(20.0 * RATE_HZ) / RATE_HZ
+    output_pC = np.tile(amplifier_output(touch_charge() + inflow_pC)[:, None], 3)
     output_pC += np.random.default_rng(0).normal(0.0, 0.3, output_pC.shape)
     chain = StageRunner(tare={"frames": 20}, leak={"tau_s": TAU_S})
     previous_s = 0.0
@@ -99,10 +100,10 @@ def test_touch_has_the_flag_gap_to_its_end_if_missing_frames_falsify_its_charge(
             assert ("gap" in reading.flags) == is_falsified
             assert t_s < touch_end_s + 0.06
             if 3.1 < t_s < 10.9 and not is_falsified:
-                np.testing.assert_allclose(reading.charge_pC, 400.0, rtol=0.01)
+                np.testing.assert_allclose(reading.charge_pC, 400.0, rtol=0.03)
         elif t_s > touch_end_s + 0.1:
             assert "gap" not in reading.flags
-            assert is_falsified or np.abs(reading.charge_pC).max() < 5.0
+            assert is_falsified or np.abs(reading.charge_pC).max() < 20.0
 
 
 @pytest.mark.parametrize("rate_Hz", [10.0, 30.0, 200.0, 1000.0])

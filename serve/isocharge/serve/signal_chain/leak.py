@@ -207,7 +207,8 @@ class Leak(OffsetStage):
         """Determine whether a touch has ended in a gap, or whether the gap may have falsified its charge.
 
         A touch has ended if no output remains, and if no charge remains in the case that the new charge arrived at the
-        beginning of the gap. Otherwise, an error of 1 % that exceeds the noise falsifies the touch.
+        beginning of the gap. Up to 5 % of the charge may remain, because the time constant and the inflow have errors.
+        Otherwise, an error of 1 % that exceeds the noise falsifies the touch.
 
         Args:
             frame: The frame after the gap.
@@ -219,9 +220,9 @@ class Leak(OffsetStage):
         """
         growth = np.exp(np.minimum(frame.dt_s / self._tau_s, 60.0))  # 1 / a, limited to avoid an overflow
         sign = np.sign(self._charge_pC)
-        margin_pC = 4.0 * growth * frame.noise_pC
+        margin_pC = np.maximum(4.0 * frame.noise_pC, 0.05 * np.abs(self._charge_pC))
         smallest_pC = self._charge_pC + surplus_pC * (1.0 + growth) / 2.0
-        has_left = (sign * output_pC <= margin_pC) & (sign * smallest_pC <= margin_pC)
+        has_left = (sign * output_pC <= margin_pC) & (sign * smallest_pC <= growth * margin_pC)
         if self._previous is not None and self._previous.is_contact and has_left.all():
             self._is_falsified = False
             return -self._charge_pC

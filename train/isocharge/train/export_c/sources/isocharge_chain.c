@@ -211,11 +211,11 @@ static void examine_gap(isocharge_chain *chain, const real output_pC[N], real su
         const real charge_pC = chain->charge_pC[k], noise_pC = chain->noise_pC[k];
         const real sign = (real)((charge_pC > 0) - (charge_pC < 0));
         const real growth = EXP(smaller(chain->step_s / tau_s[k], 60));
-        const real margin_pC = 4 * growth * noise_pC;
+        const real margin_pC = larger(4 * noise_pC, (real)0.05 * ABS(charge_pC));
         const real smallest_pC = charge_pC + surplus_pC[k] * (1 + growth) / 2;
         const real error_pC = ABS(surplus_pC[k]) * (growth - 1) / 2;
 
-        left = left && sign * output_pC[k] <= margin_pC && sign * smallest_pC <= margin_pC;
+        left = left && sign * output_pC[k] <= margin_pC && sign * smallest_pC <= growth * margin_pC;
         falsified = falsified || error_pC > larger(noise_pC, (real)0.01 * ABS(charge_pC + surplus_pC[k]));
     }
     chain->falsified = falsified && !left;
