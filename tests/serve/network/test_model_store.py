@@ -120,6 +120,11 @@ def test_load_and_unload_add_and_remove_versions(film, store, folder):
     with pytest.raises(ModelNotFound, match="'linear' is not found in the repository"):
         store.load("linear")
     assert store.get("linear").version == "3"  # nobody unloaded it
+    store.unload("linear")
+    with pytest.raises(ModelNotFound, match="'linear' is not found in the repository"):
+        store.load("linear")
+    assert states(store) == [("later", "1", "READY")]
+    assert b'"linear"' not in generate_latest(store.metrics.registry)
 
 
 @pytest.mark.parametrize("name", ["", "..", "linear/1", "../models/linear", "/"])

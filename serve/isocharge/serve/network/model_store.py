@@ -180,6 +180,7 @@ class ModelStore:
         with self._change_lock:
             folder = self._folders().get(name)
             if folder is None:
+                self._replace(name, [row for row in self._find(name) if row.loaded])
                 raise ModelNotFound(f"model {name!r:.200} is not found in the repository")
             self._load_versions(name, folder)
         # All valid versions are loaded now. The error only reports which versions are refused.
@@ -222,10 +223,7 @@ class ModelStore:
             rows[number] = row
         if not rows or any(row.reason for row in rows.values()):
             rows = earlier | rows
-        removed_numbers = {row.number for row in self._find(name)} - rows.keys()
         self._replace(name, list(rows.values()))
-        for number in removed_numbers:
-            self.metrics.remove(name, number)
 
     def _load_version(self, name: str, number: int, folder: Path) -> LoadedVersion:
         """Load one version of a model, check its files, and return the version.
@@ -245,8 +243,12 @@ class ModelStore:
         return LoadedVersion(model, statistics)
 
     def _replace(self, name: str, rows: list[Version]) -> None:
-        """Replace all versions of a model."""
-        self._versions = dict(sorted((self._versions | {name: sorted(rows)}).items()))
+        """Replace all versions of a model, and remove the metrics of the versions that are no longer listed."""
+        removed_numbers = {row.number for row in self._find(name)} - {row.number for row in rows}
+        versions = self._versions | {name: sorted(rows)}
+        self._versions = {model: versions[model] for model in sorted(versions) if versions[model]}
+        for number in removed_numbers:
+            self.metrics.remove(name, number)
 
 
 def open_model_store(models: str | Path | None = None) -> ModelStore:
