@@ -16,6 +16,8 @@ from isocharge.train.data.presses import (
     dataset_of,
     domain_of,
     is_measured,
+    merged_places,
+    place_count,
     position_ranks,
     presses_of,
     split_by_position,
@@ -98,6 +100,16 @@ def test_split_keeps_positions_together_and_does_not_depend_on_the_order_or_on_o
     part = contact[: len(contact) // 2]
     of_part, of_all = (np.argsort(ranks, kind="stable") for ranks in (position_ranks(part), position_ranks(contact)))
     assert np.array_equal(of_part, of_all[of_all < len(part)])
+
+
+def test_positions_of_an_encoder_with_noise_are_merged_to_places_but_not_scattered_positions():
+    places = np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
+    reported = np.repeat(places, 60, axis=0) + np.random.default_rng(1).normal(0.0, 0.005, (60 * len(places), 2))
+    merged = merged_places(np.column_stack([reported, np.ones(len(reported))]))
+    assert place_count(merged) == len(places)
+    np.testing.assert_allclose(merged[::60, :2], places, atol=0.003)
+    scattered = draw_contacts(3, 5000, 8.0, (0.05, 2.0))
+    assert np.abs(merged_places(scattered) - scattered).max() < 0.04
 
 
 def test_measured_presses_keep_the_orientation_of_their_probe(sensor):

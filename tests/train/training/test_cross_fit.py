@@ -228,6 +228,10 @@ FAULTY_PRESSES = {
         presses_on_l()[:499],
         "expected at least 500 presses at 50 places with .* got 499 at 499; .*train calibrate",
     ),
+    "too few places, which an encoder reports with a noise of 5 um": (
+        replace(presses_on_l(), contact=np.tile(contacts_on_l(12, 0), (100, 1)) + 0.005 * JITTER[:, None]),
+        "expected at least 500 presses at 50 places with .* got 1200 at 12",
+    ),
     "too few channels": (
         presses_on_l().of_electrodes(("Q1", "Q2"), "pad"),
         r"expected 3 to 32 channels, got 2 \(Q1, Q2\)",
@@ -254,7 +258,7 @@ FAULTY_PRESSES = {
     ),
     "positions with one y but for rounding": (
         with_column("contact", 1, lambda _: 3.0 + 1e-9 * JITTER),
-        "got 1200 places on one line; press beside it, too",
+        "places on one line; press beside it, too",
     ),
     "one position": (with_column("contact", slice(2), lambda _: np.ones((1_200, 2))), "got 1200 at 1; measure more"),
 }

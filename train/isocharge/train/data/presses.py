@@ -10,6 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from msgspec import Struct
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import DatasetError, PressError, cut, shown
@@ -34,6 +37,9 @@ YIELD_FORCE = "yield_force_N"
 
 FEWEST = 500
 """Smallest number of presses for a fit."""
+
+PLACE_STEP_mm = 0.02
+"""Largest distance between the reported positions of one place, which is that of an encoder, mm."""
 
 FEWEST_PLACES = 50
 """Smallest number of places for a fit, and smallest number of measured presses for a training or for errors."""
@@ -172,6 +178,33 @@ def split_by_position(presses: LabelledPresses, share: float) -> tuple[LabelledP
 def place_count(contact: Array) -> int:
     """Count the places of contacts (x, y, F), shape (n, 3). Places within a micrometre count as the same place."""
     return len(np.unique(np.round(contact[:, :2], 3), axis=0))
+
+
+def merged_places(contact: Array) -> Array:
+    """Move the positions of all presses at one place to their mean, and return the contacts (x, y, F), shape (n, 3).
+
+    The encoders of a stage report slightly different positions of one place. Positions belong to one place if they are
+    connected by steps of at most `PLACE_STEP_mm`, and if this is also the limit of their rms distance from the mean.
+
+    Args:
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+    """
+    position = contact[:, :2]
+    # A coarse grid limits the number of pairs if many presses are at one place.
+    grid_mm = 0.25 * PLACE_STEP_mm
+    cells, cell_of_press = np.unique(np.round(position / grid_mm), axis=0, return_inverse=True)
+    pairs = cKDTree(cells * grid_mm).query_pairs(PLACE_STEP_mm, output_type="ndarray")
+    steps = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(cells), len(cells)))
+    place_of_press = connected_components(steps, directed=False)[1][cell_of_press.ravel()]
+
+    def mean_of_place(values: Array) -> Array:
+        mean = np.bincount(place_of_press, values) / np.bincount(place_of_press)
+        return np.asarray(mean[place_of_press])
+
+    merged_position = np.column_stack([mean_of_place(coordinate) for coordinate in position.T])
+    mean_square = mean_of_place(((position - merged_position) ** 2).sum(axis=1))
+    is_place = mean_square <= PLACE_STEP_mm**2
+    return np.column_stack([np.where(is_place[:, None], merged_position, position), contact[:, 2]])
 
 
 def position_ranks(contact: Array) -> Array:

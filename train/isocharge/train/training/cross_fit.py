@@ -35,6 +35,7 @@ from isocharge.train.data.presses import (
     LabelledPresses,
     check_known_columns,
     complete,
+    merged_places,
     place_count,
     position_ranks,
     presses_sha256,
@@ -212,6 +213,7 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
     check_known_columns(presses)
     is_complete = complete(presses)  # whether the place, the force and all charges of each press are known
     usable = presses[is_complete]
+    usable = replace(usable, contact=merged_places(usable.contact))
     usable_places = place_count(usable.contact)
     if len(usable) < FEWEST or usable_places < FEWEST_PLACES:
         raise PressError(
