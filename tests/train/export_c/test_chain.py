@@ -47,6 +47,7 @@ BOARDS = {
     "no tare": {"tare": {"on": False}},
     "short tare": {"tare": {"frames": 7, "noise_limit_pC": 3.0}, "touch": {"sigmas": 4.0, "floor_pC": 5.0}},
     "warming": {"common_mode": {}},
+    "warming that is always told": {"common_mode": {"tell_pC": 0.0}},
     "warming and leak": {"common_mode": {"every_s": 0.02, "tell_pC": 3.0}, "leak": {"tau_s": 5.0}, "hum": {}},
 }
 
@@ -54,6 +55,7 @@ BOARDS = {
 ELECTRODES = ("A", "B", "C", "D")
 RATE_Hz = 200.0
 HUM_Hz = 60.0
+T_OF_HOLD_s = np.arange(0.0, 30.0, 1.0 / RATE_Hz)
 
 
 def device(board):
@@ -187,6 +189,19 @@ def test_single_precision_changes_charges_by_less_than_a_twentieth_of_a_picocoul
     np.testing.assert_array_equal(contact, expected_contact)
     np.testing.assert_array_equal(flags, expected_flags)
     np.testing.assert_allclose(charge, expected_charge, rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize(("tau_s", "learn"), [(10.0, True), (1000.0, False)])
+def test_single_precision_does_not_add_up_its_errors_in_a_held_press(tau_s, learn, build):
+    """The sampling interval is constant, so that the errors of all frames have the same sign."""
+    board = device_from_table({"leak": {"tau_s": tau_s, "learn": learn}}, "board")
+    held_pC = np.where(T_OF_HOLD_s < 2.0, 0.0, 850.0 * np.exp(-(T_OF_HOLD_s - 2.0) / tau_s))
+    frames = regular_frames(held_pC[:, None] + np.random.default_rng(1).standard_normal((len(held_pC), 4)))
+    expected_charge, _, expected_contact, _ = python_chain(board, frames, None)
+    exported = build("four-25um-biaxial", board, options=("-DISOCHARGE_CHAIN_FLOAT", "-Wdouble-promotion"))
+    charge, _, contact, _ = exported.chain(*frames)
+    np.testing.assert_array_equal(contact, expected_contact)
+    np.testing.assert_allclose(charge, expected_charge, rtol=0, atol=0.2)
 
 
 def test_contact_that_a_drift_begins_has_the_flag_drift_in_c_as_in_python(build):

@@ -33,7 +33,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.structs import Positive
 from isocharge.serve.flags import GAP
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.stage import LARGEST, Divisor, OffsetStage, Rule, Setting, Setup
+from isocharge.serve.signal_chain.stage import LARGEST, Divisor, OffsetStage, Rule, Setting, Setup, SUM_TOLERANCE_s
 
 
 class LeakRule(Rule, frozen=True, kw_only=True):
@@ -125,7 +125,7 @@ class Inflow:
 
         # Replace the trusted inflow and the candidate if the candidate is old enough.
         self._candidate_age_s += dt_s
-        if self._candidate_age_s >= rule.look_back_s:
+        if self._candidate_age_s >= rule.look_back_s - SUM_TOLERANCE_s:
             self._trusted_pC_per_s = self._candidate_pC_per_s
             self._candidate_pC_per_s = self.pC_per_s
             self._candidate_age_s = 0.0

@@ -25,7 +25,7 @@ from isocharge.common.errors import DeviceError
 from isocharge.common.structs import Finite
 from isocharge.serve.flags import BLIND, SATURATED, THERMAL
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.stage import NOT_IN_C, Divisor, Rule, Setting, Setup, Stage
+from isocharge.serve.signal_chain.stage import NOT_IN_C, Divisor, Rule, Setting, Setup, Stage, SUM_TOLERANCE_s
 
 TRIED_PC = np.array([-20.0, -10.0, 0.0, 10.0, 20.0])
 """Changes of the common charge at which the misfit is evaluated, pC. A parabola is fitted to the squared misfits."""
@@ -125,7 +125,7 @@ class Warming(Stage):
         """
         rule = self._rule
         self._waited_s += dt_s
-        if self._waited_s < rule.every_s:  # no estimate in this frame
+        if self._waited_s < rule.every_s - SUM_TOLERANCE_s:  # no estimate in this frame
             return 0.0
         self._variance_pC2 += rule.wander_pC**2 * self._waited_s
         self._waited_s = 0.0

@@ -14,7 +14,7 @@ from isocharge.common.errors import DeviceError
 from isocharge.common.files import new_folder, refuse_existing, write_whole
 from isocharge.serve.live.device import ANY_BOARD, STAGES
 from isocharge.serve.model.model_folder import load_model
-from isocharge.serve.signal_chain.stage import NOT_IN_C, Device, Setup
+from isocharge.serve.signal_chain.stage import NOT_IN_C, Device, Setup, SUM_TOLERANCE_s
 from isocharge.train.export_c.c_text import c_comment, c_double, source_text
 from isocharge.train.export_c.model_source import model_header, model_source, self_test
 from isocharge.train.model_release.onnx_graph import read_graph
@@ -40,7 +40,7 @@ def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: 
     setup = Setup(electrodes, device, has_any_sign=has_any_sign)
     if setup.device.has_currents:
         raise DeviceError(f"{device.where}: front_end: {NOT_IN_C}")
-    lines = []
+    lines = [f"#define ISOCHARGE_SUM_TOLERANCE_S {_c_literal(SUM_TOLERANCE_s)}"]
     sections_of_host = []
     for stage in STAGES:
         is_on = stage.rule_class in device.rules

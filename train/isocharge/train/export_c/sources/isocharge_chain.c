@@ -11,10 +11,12 @@ typedef isocharge_real real;
 
 #ifdef ISOCHARGE_CHAIN_FLOAT
 #define EXP expf
+#define EXPM1 expm1f
 #define SQRT sqrtf
 #define ABS fabsf
 #else
 #define EXP exp
+#define EXPM1 expm1
 #define SQRT sqrt
 #define ABS fabs
 #endif
@@ -191,7 +193,7 @@ static void learn_inflow(isocharge_chain *chain, const real surplus_pC[N], real 
     }
     chain->learned_s = learned_s;
     chain->candidate_age_s += dt_s;
-    if (chain->candidate_age_s < (real)ISOCHARGE_LEAK_LOOK_BACK_S)
+    if (chain->candidate_age_s < (real)(ISOCHARGE_LEAK_LOOK_BACK_S - ISOCHARGE_SUM_TOLERANCE_S))
         return;
     chain->candidate_age_s = 0;
     EACH(k)
@@ -233,8 +235,8 @@ static void undo_leak(isocharge_chain *chain, const real output_pC[N], real dt_s
 
     EACH(k)
     {
-        const real decay = EXP(-dt_s / tau_s[k]);
-        const real innovation_pC = (output_pC[k] - decay * chain->output_pC[k]) * 2 / (1 + decay);
+        const real lost = -EXPM1(-dt_s / tau_s[k]); /* 1 minus the decay, which single precision would round */
+        const real innovation_pC = (output_pC[k] - chain->output_pC[k] + lost * chain->output_pC[k]) * 2 / (2 - lost);
 
         surplus_pC[k] = innovation_pC - chain->inflow[k] * dt_s;
         chain->charge_pC[k] *= relax;
@@ -373,7 +375,7 @@ static real track_thermal_drift(isocharge_chain *chain, const real charge_pC[N],
     real slope = 0, curvature = 0, estimate_pC2 = 0, predicted_pC2, change_pC, gain;
 
     chain->waited_s += dt_s;
-    if (chain->waited_s < (real)ISOCHARGE_THERMAL_EVERY_S)
+    if (chain->waited_s < (real)(ISOCHARGE_THERMAL_EVERY_S - ISOCHARGE_SUM_TOLERANCE_S))
         return 0;
     predicted_pC2 = chain->drift_pC2 + (real)(ISOCHARGE_THERMAL_WANDER_PC * ISOCHARGE_THERMAL_WANDER_PC) * chain->waited_s;
     chain->waited_s = 0;
@@ -449,7 +451,7 @@ static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real d
 #endif
         }
     }
-    if (!chain->saturated && ABS(chain->drift_pC) >= (real)ISOCHARGE_THERMAL_TELL_PC)
+    if (chain->contact && !chain->saturated && ABS(chain->drift_pC) >= (real)ISOCHARGE_THERMAL_TELL_PC)
         reading->flags |= ISOCHARGE_THERMAL;
     if (!chain->saturated && chain->blind)
         reading->flags |= ISOCHARGE_BLIND;
