@@ -200,7 +200,7 @@ class _Problem:
         measured: MeasuredContacts | None,
         freedom: float,
     ) -> None:
-        """Compute what stays the same during the search.
+        """Compute the quantities that do not depend on the unknowns: whitening, precision and weights.
 
         A residual of the charges is whitened: it is multiplied by a matrix that makes its errors independent, with the
         standard deviation 1. The arguments are those of `robust_estimate`.

@@ -376,8 +376,8 @@ def _exclusion_notes(errors: PressErrors, validity: Validity) -> Iterator[str]:
 def _common_notes(agreement: Agreement) -> Iterator[str]:
     """Yield a note about a common shift of all positions, and a note about a common scale factor of all forces.
 
-    Each of the two notes is only yielded if the shift or the deviation of the scale factor from 1 would be as large by
-    chance with a probability of at most `TEST_SIGNIFICANCE`.
+    A note is only yielded if its shift or change of scale is significant: without a common error, a value of this size
+    would have a probability of at most `TEST_SIGNIFICANCE`.
 
     Args:
         agreement: Tests of the errors, which contain the common errors of x, y and the force.

@@ -393,9 +393,9 @@ class ContactMixture:
 
 
 def _components_at_ends(components: Components, variance_ratio: float = 0.25) -> Components:
-    """Return two narrow components at both ends of the longest axis of the most probable component.
+    """Return two narrow components, one at each end of the longest axis of the most probable component.
 
-    The weight of each is the density of the most probable component there.
+    The weight of each is the density of the most probable component at this end.
 
     Args:
         components: Components, the most probable first.

@@ -167,7 +167,7 @@ class Tracker(Stage):
         """Update the tracked contact with a frame in contact, and return the event that begins.
 
         Args:
-            frame: The frame. A contact of the mixture replaces its contact.
+            frame: The frame. If contacts are tracked by a mixture, its contact is replaced by the most probable one.
             contact: Contact predicted by the model.
         """
         t_s = self._time_s

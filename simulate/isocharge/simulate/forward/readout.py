@@ -351,14 +351,14 @@ class PressMeshes:
         If only half of the film is meshed, points in the other half are reflected into the meshed half.
 
         Args:
-            press_index: Index of the press of each pair, shape (n_pair,).
-            points: Integration points x + iy, shape (n_pair, n_point), in film radii.
+            press_index: For each pair of a press and a group of points, the index of the press, shape (n_pair,).
+            points: Integration points x + iy of each pair, shape (n_pair, n_point), in film radii.
 
         Returns:
             Index of the element, shape (n_pair, n_point). Values of the basis functions, shape (n_pair, n_point,
             n_local). Whether each point was reflected, shape (n_pair, n_point).
         """
-        # Rotate the film so that the press lies on the positive x axis.
+        # Rotate film and points so that the press lies on the positive x axis, and make the clamp circular.
         mesh = self.template
         rotated_points = points * np.exp(-1j * self.direction[press_index])[:, None]
         circular_points = from_oval(rotated_points, self.oval[press_index, None])

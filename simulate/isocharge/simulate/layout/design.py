@@ -108,7 +108,7 @@ def random_layouts(case: DesignCase) -> list[Array]:
 
 @dataclass(frozen=True)
 class Search:
-    """Search for the electrode positions that minimise the goal of a design case.
+    """Search for the electrode positions whose errors, summarised by the goal of a design case, are smallest.
 
     Attributes:
         case: Requirements of the layout.

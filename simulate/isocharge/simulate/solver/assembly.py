@@ -6,9 +6,9 @@ the mesh. Only the matrix of the skeleton unknowns is factorised as a whole. For
 the interior nodes reduces the number of unknowns by a factor of 2.3. The numbering of the unknowns and the sparsity
 pattern of the matrix depend only on the template. Both are therefore computed once for each template.
 
-The unknowns of a node are U1, U2 and W. If the theory includes bending, each node also has the auxiliary unknown of the
-class `mechanics.energy.Bending`. On the rim, U1, U2 and W are zero. On the line of symmetry of a half template, U2 is
-zero if the field is even, and all unknowns except U2 are zero if the field is odd.
+The unknowns of a node are U1, U2 and W. If the theory includes bending, each node also has an auxiliary unknown, which
+the class `mechanics.energy.Bending` describes. On the rim, U1, U2 and W are zero. On the line of symmetry of a half
+template, U2 is zero if the field is even, and all unknowns except U2 are zero if the field is odd.
 
 The trapped air behind the film resists deflections that compress the air. The stiffness matrix of the air is c v v',
 where c is a number. The vector v contains the weights with which the deflections of the nodes contribute to the

@@ -187,11 +187,11 @@ def _solved_distance(estimation: Estimation) -> float:
 
 
 def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
-    """Return whether the solved film has the real probe, and nearly all imperfections and the shear modulus of a film.
+    """Return whether the solved film hardly differs from a film with given properties and with the real probe.
 
     Args:
-        charges: The solved film.
-        values: Properties of the film, shape (n_property,).
+        charges: The solved film, with its charges and their derivatives.
+        values: Properties of the other film, shape (n_property,).
         contact: Contacts at which the effect of the missing imperfections is computed, shape (n, 3).
     """
     solved, described = charges.film, charges.prior
