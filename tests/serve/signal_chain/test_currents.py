@@ -49,7 +49,7 @@ def test_integral_of_currents_is_the_charge_and_detects_touches(tau_s, force):
     np.testing.assert_allclose(integral_pC[is_held], charge_pC[is_held], atol=60.0)
 
 
-@pytest.mark.parametrize("damage", ["lost", "repeated", "counter stands still", "invalid"])
+@pytest.mark.parametrize("damage", ["lost", "repeated", "late", "counter stands still", "invalid"])
 def test_charge_survives_a_damaged_frame_in_a_rise(damage, predictor):
     # 45 frames at rest, a rise of 20 frames with a current that grows and decreases, and a hold
     share = np.arange(20) / 19
@@ -60,6 +60,8 @@ def test_charge_survives_a_damaged_frame_in_a_rise(damage, predictor):
         del frames[52:54]
     elif damage == "repeated":
         frames.insert(54, frames[53])
+    elif damage == "late":
+        frames[53], frames[54] = frames[54], frames[53]
     elif damage == "counter stands still":
         for frame in frames:
             frame.seq = 7

@@ -72,7 +72,8 @@ class Frame:
         dt_s: Time since the previous valid frame, s; 0 for the first frame after a start. It does not depend on the
             wall clock of the host.
         intervals: Number of sampling intervals since the previous valid frame: 1 without a gap, more if frames are
-            missing or invalid, and 0 for a repeated frame. If the frames have no counter, no frame counts as missing.
+            missing or invalid, and 0 for a copy of the previous frame, and for a late frame, which has counted as
+            missing. If the frames have no counter, no frame counts as missing.
         clock_s: Time of the frame on the clock of the device, s. If the device sends no clock, it is a time of the host
             that does not jump if the wall clock is set.
         sent: Values of the electrodes in their order, shape (n_electrode,), in the unit of the device.

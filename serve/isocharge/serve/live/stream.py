@@ -86,6 +86,7 @@ class ReadingStream:
         self.clock = DeviceClock()
         self._stages = create_stages(self._setup)
         self._pending_flags: list[str] = []  # flags that the next frame gets
+        self._previous_values: tuple[float, ...] = ()
 
     def tare(self) -> None:
         """Discard the tare and the present touch, and measure the tare again from the next quiet frames."""
@@ -123,7 +124,10 @@ class ReadingStream:
         for frame in frames:
             lost_before = parser.counts.lost
             sequence_flags = parser.sequence_flags(frame.seq, is_clock_reset=frame.is_clock_reset)
-            frame.intervals = 0 if REPEAT in sequence_flags else 1 + parser.counts.lost - lost_before
+            frame.intervals = 1 + parser.counts.lost - lost_before  # 0 for a late frame, which was counted as lost
+            if REPEAT in sequence_flags and frame.values == self._previous_values:
+                frame.intervals = 0
+            self._previous_values = frame.values
             frame.flags = [*self._pending_flags, *sequence_flags]
             self._pending_flags = []
             for stage in self._stages:

@@ -268,17 +268,15 @@ class Integrator(Leak):
         """Replace the currents by the charges, and the noise of the currents by the noise of the charges at rest.
 
         If frames are missing, each of their currents is assumed to be the mean of the currents before and after the
-        gap. A copy of the previous frame adds no charge.
+        gap. A copy of the previous frame adds no charge, and neither does a frame that arrives late.
 
         At rest, the charges decay with the time constant `relax_s`. The sum of independent currents then has the
         variance of a current times relax_s / (2 dt).
         """
         current_pC = frame.charge_pC
         if current_pC is not None and self._previous is not None:
-            is_copy = frame.intervals == 0 and np.array_equal(frame.sent, self._previous.sent)
-            n_missing = max(frame.intervals - 1, 0)
-            missing_pC = n_missing * (current_pC + self._current_pC) / 2.0
-            frame.charge_pC = np.zeros_like(current_pC) if is_copy else current_pC + missing_pC
+            missing_pC = (frame.intervals - 1) * (current_pC + self._current_pC) / 2.0
+            frame.charge_pC = current_pC + missing_pC if frame.intervals > 0 else np.zeros_like(current_pC)
         super().step(frame)
         if current_pC is not None:
             self._current_pC = current_pC
