@@ -102,11 +102,14 @@ def test_split_keeps_positions_together_and_does_not_depend_on_the_order_or_on_o
     assert np.array_equal(of_part, of_all[of_all < len(part)])
 
 
-def test_positions_of_an_encoder_with_noise_are_merged_to_places_but_not_scattered_positions():
+def test_positions_of_an_encoder_with_noise_are_merged_to_places_but_not_scattered_positions(sensor):
     places = np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
     reported = np.repeat(places, 60, axis=0) + np.random.default_rng(1).normal(0.0, 0.005, (60 * len(places), 2))
-    merged = merged_places(np.column_stack([reported, np.ones(len(reported))]))
+    contact = np.column_stack([reported, np.ones(len(reported))])
+    merged = merged_places(contact)
     assert place_count(merged) == len(places)
+    samples = dataset_of(measured_presses(contact, np.ones((len(contact), 3))), sensor, Circle(1.0)).samples
+    assert np.array_equal(samples.x_mm, merged[:, 0])
     np.testing.assert_allclose(merged[::60, :2], places, atol=0.003)
     scattered = draw_contacts(3, 5000, 8.0, (0.05, 2.0))
     assert np.abs(merged_places(scattered) - scattered).max() < 0.04

@@ -290,7 +290,7 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
     complete_presses = presses[complete(presses)]
     count = len(complete_presses)
     check_enough(count, len(presses), sensor.name)
-    x_mm, y_mm, force_N = complete_presses.contact.T
+    x_mm, y_mm, force_N = merged_places(complete_presses.contact).T
     probe_column = np.full(count, probe.notation)
     orientation_deg = np.full(count, np.rad2deg(probe.angle) % 360.0)  # its notation does not contain its rotation
     samples = Samples(x_mm, y_mm, force_N, probe_column, orientation_deg, complete_presses.charge_pC)
