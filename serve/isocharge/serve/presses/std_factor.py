@@ -1,4 +1,4 @@
-"""Factor for the standard deviations of a model, with which its regions contain a guaranteed share of the contacts.
+"""Factor by which the standard deviations of a model are multiplied to guarantee the coverage of its regions.
 
 The factor is an order statistic of held-out presses (split conformal prediction, Vovk 2012, proposition 2a). For n
 presses that were not used for the training or the calibration, the share of contacts that the k-th smallest score

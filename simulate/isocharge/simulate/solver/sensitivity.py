@@ -180,12 +180,13 @@ def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
             for odd in (False, True)
         ]
         # An odd change does not displace any air on the whole film, so the pressure of trapped air remains constant.
-        presses = [solved, solved]
+        solved_for_odd = solved
         if elastic.back is not None:
             groups = elastic.back.at_constant_pressure(solved.field[:, 2])
-            presses[True] = replace(solved, groups=groups)
+            solved_for_odd = replace(solved, groups=groups)
         changes = [
-            _change_by_imperfection(presses[field.odd], field.add, solves[field.odd], surface) for field in FILM_FIELDS
+            _change_by_imperfection(solved_for_odd if field.odd else solved, field.add, solves[field.odd], surface)
+            for field in FILM_FIELDS
         ]
         return np.stack(changes, axis=2)
 
