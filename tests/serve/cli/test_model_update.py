@@ -43,7 +43,7 @@ BAD = {
     "golden": lambda folder: golden_fault(lambda golden: golden["outputs"]["contact"][0].__setitem__(0, 9.0))(
         folder / "2"
     ),
-    "expected version 9, got linear/2": lambda folder: (folder / "2").rename(folder / "9"),
+    "expected linear/9, as the folders are called, got linear/2": lambda folder: (folder / "2").rename(folder / "9"),
 }
 """What is said, and what has been done to the folder of a model with a version 2."""
 

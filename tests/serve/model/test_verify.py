@@ -40,8 +40,14 @@ FAULTS = (
     (golden_fault(lambda golden: golden["outputs"].pop("misfit")), "'misfit'; the file is damaged"),
     (lambda folder: flip_a_byte(folder / "charges.npz"), "charges.npz: expected sha256"),
     (lambda folder: (folder / "other.npz").write_bytes(b"map") and None, "other.npz: expected sha256 no such file"),
-    (lambda folder: shutil.copytree(folder, folder.parent / "17"), "17: expected version 17, got linear/1"),
-    (lambda folder: shutil.copytree(folder, folder.parents[1] / "renamed/1"), "expected the model renamed/1"),
+    (
+        lambda folder: shutil.copytree(folder, folder.parent / "17"),
+        "17: expected linear/17, as the folders are called, got linear/1",
+    ),
+    (
+        lambda folder: shutil.copytree(folder, folder.parents[1] / "renamed/1"),
+        "expected renamed/1, as the folders are called",
+    ),
 )
 
 

@@ -92,8 +92,8 @@ def test_a_model_in_another_ones_folder_is_refused(film, tmp_path):
     store = open_model_store(tmp_path)
     assert labels(store) == ["linear/1"]
     copied_version, copied_model = store.refusals()
-    assert "expected version 2, got linear/1" in copied_version
-    assert "expected the model other/1" in copied_model
+    assert "expected linear/2, as the folders are called, got linear/1" in copied_version
+    assert "expected other/1, as the folders are called" in copied_model
 
 
 def test_load_and_unload_add_and_remove_versions(film, store, folder):

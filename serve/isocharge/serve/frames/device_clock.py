@@ -236,9 +236,9 @@ class DeviceClock:
     def _unwrap(self, t_us: int, modulus: int) -> int:
         """Remove the wraps from the clock value of the next reading, and store the resulting value in `_device_us`.
 
-        If the clock jumped back by at most `MAX_DELAY_s`, the reading arrived late, for example as a datagram that
-        another one has overtaken. If the clock jumped back further, or jumped ahead by half of its range or more, the
-        device has restarted. The fit is then discarded.
+        If the clock went back by at most `MAX_DELAY_s`, the reading arrived late: for example, another datagram has
+        overtaken it. If the clock went back by more, or ahead by at least half of its range, the device has restarted,
+        and the fit is discarded.
 
         Args:
             t_us: Clock of the reading as the device sent it, us.

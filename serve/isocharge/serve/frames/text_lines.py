@@ -111,7 +111,6 @@ def _token_pattern(number: str) -> re.Pattern[str]:
 _TOKENS = {kind: _token_pattern(_PATTERNS[kind]) for kind in ("number", "number with a decimal comma")}
 """Regular expressions of a part of a line, by the kind of the numbers in the line."""
 
-
 _SEPARATORS = ",;|[("
 """Marks that separate columns or begin a list. A word before such a mark does not name the number after the mark."""
 

@@ -275,17 +275,13 @@ def load_checked_model(folder: Path) -> Model:
             golden vectors, or if the folders have another name and version than the metadata.
     """
     model = load_model(folder)
-    is_version_folder = folder.name.isdecimal()
-    if is_version_folder and folder.name != str(model.metadata.version):
+    name, version = folder.absolute().parts[-2:]
+    is_other_version = version != str(model.metadata.version)
+    is_other_name = name not in (model.metadata.name, "..")
+    if version.isdecimal() and (is_other_version or is_other_name):
         raise ModelError(
-            f"{folder}: expected version {folder.name}, got {model.metadata.label}; "
-            "move it into a folder of that version, or export it again"
-        )
-    folder_name = folder.absolute().parent.name
-    if is_version_folder and folder_name not in (model.metadata.name, ".."):
-        raise ModelError(
-            f"{folder}: expected the model {folder_name}/{folder.name}, as the folders say, "
-            f"got {model.metadata.label}; move it into folders of that name and version"
+            f"{folder}: expected {name}/{version}, as the folders are called, got {model.metadata.label}; move it into "
+            "folders of that name and version, or export it again"
         )
     existing_names = {path.name for path in folder.glob("*.npz")}
     for name in sorted(existing_names | model.golden.files.keys()):

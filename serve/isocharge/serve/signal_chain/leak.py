@@ -159,40 +159,49 @@ class Leak(OffsetStage):
         self._inflow = Inflow(self._rule, len(self._tau_s))
 
     def step(self, frame: Frame) -> None:
-        """Replace the output of the amplifiers by the touch charge, in which the leak of the amplifiers is corrected.
+        """Replace the output of the amplifiers by the touch charge.
 
-        The output v of an amplifier decays with its time constant tau. The innovation i of frame n is the difference
-        between the output and the decayed previous output, in which the decay of the new charge is corrected.
-
-        The innovation consists of the inflow b dt (a slow current into the amplifier), noise and new touch charge. The
-        touch charge is therefore q[n] = q[n-1] + i[n] - b dt. Out of contact, the touch charge also decays to zero, and
-        the inflow is estimated.
+        If missing frames may have falsified the touch charge, the frame gets the flag `gap`.
         """
         output_pC = frame.charge_pC
         if output_pC is None:
             return
         if self._previous is not None:
-            dt_s = frame.dt_s
-            innovation_pC = self._innovation_pC(output_pC, np.exp(-dt_s / self._tau_s))
-            surplus_pC = innovation_pC - self._inflow.pC_per_s * dt_s  # new touch charge and noise
-            if self._previous.is_contact:
-                self._inflow.pause()
-            else:  # any earlier charge is an error, and therefore decays to zero
-                self._charge_pC = self._charge_pC * math.exp(-dt_s / self._rule.relax_s)
-                if self._inflow.hold_s > 0.0 or not self._rule.learn:
-                    self._inflow.hold_s -= dt_s
-                else:
-                    self._inflow.learn(surplus_pC, frame.noise_pC, dt_s)
-            self._is_falsified = self._is_falsified and self._previous.is_contact
-            if dt_s > 1.5 * self._previous.dt_s:  # frames are missing or were invalid
-                surplus_pC = self._examine_gap(frame, output_pC, surplus_pC)
-            self._charge_pC = self._charge_pC + surplus_pC
+            self._advance(frame, self._previous, output_pC)
             if self._is_falsified:
                 frame.flags.append(GAP)
         self._previous = frame
         self._output_pC = output_pC
         frame.charge_pC = self._charge_pC
         frame.base_relax_s = self._rule.relax_s
+
+    def _advance(self, frame: Frame, previous: Frame, output_pC: Array) -> None:
+        """Add the new charge to the touch charge. Out of contact, estimate the inflow, too.
+
+        Args:
+            frame: The frame.
+            previous: The previous frame with charges.
+            output_pC: Output of the amplifiers above the tare, shape (n_electrode,), pC.
+        """
+        dt_s = frame.dt_s
+        innovation_pC = self._innovation_pC(output_pC, np.exp(-dt_s / self._tau_s))
+        surplus_pC = innovation_pC - self._inflow.pC_per_s * dt_s  # new touch charge and noise
+        if previous.is_contact:
+            self._inflow.pause()
+        else:
+            self._is_falsified = False
+            self._charge_pC = self._charge_pC * math.exp(-dt_s / self._rule.relax_s)  # an error, which decays to zero
+            if self._inflow.hold_s > 0.0 or not self._rule.learn:
+                self._inflow.hold_s -= dt_s
+            else:
+                self._inflow.learn(surplus_pC, frame.noise_pC, dt_s)
+        has_gap = dt_s > 1.5 * previous.dt_s  # frames are missing or were invalid
+        if has_gap and previous.is_contact and self._has_ended_in_gap(frame, output_pC, surplus_pC):
+            self._is_falsified = False
+            surplus_pC = -self._charge_pC
+        elif has_gap:
+            self._is_falsified |= self._may_be_falsified(frame, surplus_pC)
+        self._charge_pC = self._charge_pC + surplus_pC
 
     def _innovation_pC(self, output_pC: Array, decay: Array) -> Array:
         """Return the change of the output that the leak does not explain, shape (n_electrode,), pC.
@@ -203,33 +212,40 @@ class Leak(OffsetStage):
         """
         return (output_pC - decay * self._output_pC) * 2.0 / (1.0 + decay)
 
-    def _examine_gap(self, frame: Frame, output_pC: Array, surplus_pC: Array) -> Array:
-        """Determine whether a touch has ended in a gap, or whether the gap may have falsified its charge.
+    def _growth(self, frame: Frame) -> Array:
+        """Return the factor 1 / a by which a charge was larger at the beginning of the gap before a frame.
 
-        A touch has ended if no output remains, and if no charge remains in the case that the new charge arrived at the
-        beginning of the gap. Up to 5 % of the charge may remain, because the time constant and the inflow have errors.
-        Otherwise, an error of 1 % that exceeds the noise falsifies the touch.
+        It is limited to avoid an overflow. The shape is (n_electrode,).
+        """
+        return np.exp(np.minimum(frame.dt_s / self._tau_s, 60.0))
+
+    def _has_ended_in_gap(self, frame: Frame, output_pC: Array, surplus_pC: Array) -> bool:
+        """Return whether a touch has ended in a gap.
+
+        The outputs must then be almost zero, and the touch charges, too, if the new charges arrived at the beginning of
+        the gap. Up to 5 % of a charge may remain, because the time constant and the inflow have errors.
 
         Args:
             frame: The frame after the gap.
             output_pC: Output of the amplifiers above the tare, shape (n_electrode,), pC.
             surplus_pC: New touch charge, if it arrived evenly in the gap, shape (n_electrode,), pC.
-
-        Returns:
-            The new touch charge, shape (n_electrode,), pC. If the touch has ended, the sum of all charges is 0.
         """
-        growth = np.exp(np.minimum(frame.dt_s / self._tau_s, 60.0))  # 1 / a, limited to avoid an overflow
+        growth = self._growth(frame)
         sign = np.sign(self._charge_pC)
         margin_pC = np.maximum(4.0 * frame.noise_pC, 0.05 * np.abs(self._charge_pC))
         smallest_pC = self._charge_pC + surplus_pC * (1.0 + growth) / 2.0
-        has_left = (sign * output_pC <= margin_pC) & (sign * smallest_pC <= growth * margin_pC)
-        if self._previous is not None and self._previous.is_contact and has_left.all():
-            self._is_falsified = False
-            return -self._charge_pC
-        error_pC = np.abs(surplus_pC) * (growth - 1.0) / 2.0
+        return bool(((sign * output_pC <= margin_pC) & (sign * smallest_pC <= growth * margin_pC)).all())
+
+    def _may_be_falsified(self, frame: Frame, surplus_pC: Array) -> bool:
+        """Return whether the touch charge may be wrong by more than 1 % and the noise, because of a gap.
+
+        Args:
+            frame: The frame after the gap.
+            surplus_pC: New touch charge, if it arrived evenly in the gap, shape (n_electrode,), pC.
+        """
+        error_pC = np.abs(surplus_pC) * (self._growth(frame) - 1.0) / 2.0
         limit_pC = np.maximum(frame.noise_pC, 0.01 * np.abs(self._charge_pC + surplus_pC))
-        self._is_falsified |= bool((error_pC > limit_pC).any())
-        return surplus_pC
+        return bool((error_pC > limit_pC).any())
 
     def add_warming(self, warming_pC: Array | float) -> None:
         """Subtract the warming from the touch charge that the stage integrates."""

@@ -307,7 +307,7 @@ def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[tuple[Array, 
     """Return the lines of the edge readout (Mirbagheri et al., 2007, equation 3).
 
     The stress s11 is averaged over the left and right edges of the turned electrode, and the stress s22 over its lower
-    and upper edges. Each line is half of an edge, so that there are sufficiently many points.
+    and upper edges. Each edge is divided into two lines, on which the quadrature has enough points.
 
     Args:
         electrode: A square electrode.

@@ -149,9 +149,9 @@ class Search:
         return self.minimise(self.case.search_presses, start, power)
 
     def refine(self, layout: Layout) -> Layout:
-        """Reduce the largest error of the fine presses, and return the layout with its largest error.
+        """Reduce the largest error over `fine_presses`, and return the new layout and this error.
 
-        If the goal is the mean error, the layout is returned unchanged with this error.
+        If the goal is the root-mean-square error, return the unchanged layout and its root-mean-square error.
 
         Args:
             layout: Layout for which the power mean of the errors of a few presses is small.

@@ -53,7 +53,7 @@ class BackPressure:
         volume = self._volume(deflection)
         energy = -self.groups.static_pressure * volume
         if self.groups.compression != 0.0:
-            displaced_share = self.groups.compression * volume
+            displaced_share = self._displaced_share(deflection)
             if displaced_share >= 1.0:
                 return np.inf
             # The energy of the air is divided by p0 V0. In scaled units, the volume V0 of the air is 1 / compression.
@@ -70,7 +70,7 @@ class BackPressure:
         Returns:
             Derivatives, shape (n_node,). They are infinite if the film displaces the whole volume of the air.
         """
-        displaced_share = self.groups.compression * self._volume(deflection)
+        displaced_share = self._displaced_share(deflection)
         if displaced_share >= 1.0:
             return np.full_like(deflection, np.inf)
         return -self.at_constant_pressure(deflection).static_pressure * self.weights
@@ -81,9 +81,8 @@ class BackPressure:
         Args:
             deflection: Scaled deflection W at the nodes, shape (n_node,).
         """
-        # At constant temperature, the pressure p0 of the air increases by p0 x / (1 - x), where x = V / V0 is the
-        # displaced share of the volume of the air.
-        displaced_share = self.groups.compression * self._volume(deflection)
+        # At constant temperature, the pressure p0 of the air increases by p0 x / (1 - x), where x = V / V0.
+        displaced_share = self._displaced_share(deflection)
         air_pressure = self.groups.ambient_pressure * displaced_share / (1.0 - displaced_share)
         static_pressure = self.groups.static_pressure - air_pressure
         return replace(self.groups, static_pressure=static_pressure, compression=0.0)
@@ -94,10 +93,14 @@ class BackPressure:
         Args:
             deflection: Scaled deflection W at the nodes, shape (n_node,).
         """
-        displaced_share = self.groups.compression * self._volume(deflection)
+        displaced_share = self._displaced_share(deflection)
         pressure_per_volume = self.groups.ambient_pressure * self.groups.compression / (1.0 - displaced_share) ** 2
         return float(self._copies * pressure_per_volume)
 
     def _volume(self, deflection: Array) -> float:
         """Compute the integral of the scaled deflection W over the whole film."""
         return self._copies * float(self.weights @ deflection)
+
+    def _displaced_share(self, deflection: Array) -> float:
+        """Compute the share V / V0 of the volume of the air that the film displaces."""
+        return self.groups.compression * self._volume(deflection)

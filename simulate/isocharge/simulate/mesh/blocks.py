@@ -218,7 +218,7 @@ class Blocks:
         core_elements = np.arange(self.n_quad).reshape(self.n_meshed, -1)  # one row for each corner
         sectors = np.arange(self.n_quad, self.n_element).reshape(-1, self.n_sector)  # one row for each layer and ring
 
-        # Each element is replaced by the element that lies the shift farther in the anticlockwise direction.
+        # The place of an element is taken by the element that lies anticlockwise of it by the shift.
         rotated_core_elements = np.roll(core_elements, -corner_shift, axis=0)
         rotated_sectors = np.roll(sectors, -sector_shift, axis=1)
         return np.concatenate([rotated_core_elements.ravel(), rotated_sectors.ravel()])

@@ -373,26 +373,25 @@ def _thin_ring_count(placement: Placement, total_width: float) -> int:
     """Compute the number of thin rings at the rim.
 
     At the clamped rim, the film bends within a narrow strip, the boundary layer. The mesh is created in a unit disk,
-    the template plane, and a conformal map maps the disk onto the film. Therefore the strip does not have the same
-    width everywhere in the template plane: it is widest next to the probe, and narrowest on the opposite side of the
-    film. Each thin ring is a third as wide as the previous thin ring. The widths of the thin rings cover the range from
-    the largest to the smallest width of the strip.
+    the template plane, and a conformal map maps the disk onto the film. In the template plane, the strip is widest next
+    to the probe, and narrowest on the opposite side of the film. Each thin ring is a third as wide as the previous one,
+    and the widths of the rings cover the range from the largest to the smallest width of the strip.
 
     Args:
         placement: Placement of the mesh under the press.
-        total_width: Total width of the thin rings on the film, in film radii.
+        total_width: Width of the strip on the film, in film radii.
     """
-    # Largest and smallest width of the boundary layer in the template plane, as a fraction of the range of ln(r) that
-    # all rings cover. The upper limit of 1 / 8 keeps the thin rings near the rim.
+    # The widths of the strip in the template plane are divided by the range of ln(r) that all rings cover. The upper
+    # limit of 1 / 8 keeps the thin rings near the rim.
     stretch = _stretch(placement)
     log_range = -float(np.log(placement.template_radius))
     largest_width = min(total_width * stretch / log_range, 1.0 / 8.0)
     smallest_width = min(min(total_width, 0.2) / stretch / log_range, 1.0 / 8.0)
 
-    # The logarithm to the base 3 is the number of rings between both widths if each ring is a third as wide. Two rings
-    # are needed even if the widths are equal. With one ring, the charge of an electrode that ends 1 mm from the rim of
-    # a film of 25 um is wrong by up to 0.4 %. If the strip is 0.12 to 0.7 film radii wide, all charges are wrong by
-    # 0.02 to 0.24 %. With two rings, these errors are 0.003 and 0.002 %.
+    # The logarithm to the base 3 is the number of rings between both widths. Two rings are needed even if the widths
+    # are equal. With one ring, the charge of an electrode that ends 1 mm from the rim of a film of 25 um is wrong by up
+    # to 0.4 %. If the strip is 0.12 to 0.7 film radii wide, all charges are wrong by 0.02 to 0.24 %. With two rings,
+    # these errors are 0.003 and 0.002 %.
     return max(2, 1 + math.floor(THIN_RINGS_PER_FACTOR * math.log(largest_width / smallest_width, 3.0)))
 
 

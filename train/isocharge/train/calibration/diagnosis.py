@@ -213,9 +213,8 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     }
     limit = min(BETTER_MISFIT_RATIO * misfit(placed_presses, charges), SUSPICIOUS_MISFIT)
     smallest = min(misfits.values())
-    is_probable = {mistake: BETTER_MISFIT_RATIO * value <= smallest for mistake, value in misfits.items()}
-    probable = [mistake for mistake, value in misfits.items() if value < limit and is_probable[mistake]]
-    return sorted(probable, key=lambda mistake: misfits[mistake])
+    probable = [name for name, value in misfits.items() if value < limit and BETTER_MISFIT_RATIO * value <= smallest]
+    return sorted(probable, key=lambda name: misfits[name])
 
 
 def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:

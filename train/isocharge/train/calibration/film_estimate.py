@@ -204,9 +204,9 @@ class FilmEstimate:
         """Return the estimate with which a later session begins.
 
         The possible drift of the film since then is added to the covariance. A drift of the pretension comes from a
-        change of the temperature, which adds the same tension in all directions. The uneven parts of the tension do not
-        change, but they are stated as shares of the mean tension, which change. The offset and the other unknowns of
-        the earlier session are removed.
+        change of the temperature, which adds the same tension in all directions. The uneven parts of the tension remain
+        the same, so their shares of the mean tension change, which are unknowns of the estimate. The offset and the
+        other unknowns of the earlier session are removed.
         """
         layout = self.layout
         drift_std = np.zeros(len(self.values))

@@ -39,7 +39,7 @@ FEWEST = 500
 """Smallest number of presses for a fit."""
 
 PLACE_STEP_mm = 0.02
-"""Largest distance between the reported positions of one place, which is that of an encoder, mm."""
+"""Largest distance between neighbouring positions that count as one place, mm. The noise of encoders is smaller."""
 
 FEWEST_PLACES = 50
 """Smallest number of places for a fit, and smallest number of measured presses for a training or for errors."""
@@ -183,8 +183,8 @@ def place_count(contact: Array) -> int:
 def merged_places(contact: Array) -> Array:
     """Move the positions of all presses at one place to their mean, and return the contacts (x, y, F), shape (n, 3).
 
-    The encoders of a stage report slightly different positions of one place. Positions belong to one place if they are
-    connected by steps of at most `PLACE_STEP_mm`, and if this is also the limit of their rms distance from the mean.
+    The encoders of a stage report slightly different positions of one place. Positions belong to one place if steps of
+    at most `PLACE_STEP_mm` connect them, and if their rms distance from their mean is not larger, either.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.

@@ -199,7 +199,8 @@ class Service:
 
         A call of the method `STREAM_METHOD` may contain any number of messages, and every other call contains one
         message. The first message must arrive within `header_seconds`, and each later message within `idle_seconds`
-        after the previous response. The client must read each response within `body_seconds`.
+        after the previous response. The client must read each response within `body_seconds`. If the server is to stop,
+        no message is read after the present one.
 
         Args:
             name: Name of the method.

@@ -281,7 +281,7 @@ class _Server(uvicorn.Server):
         return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Finish the open requests, and close `beside` meanwhile. Then refuse the requests that are not finished."""
+        """Begin to close the contexts, and finish the open requests. Then refuse the requests that took too long."""
         closing = asyncio.create_task(self.beside.aclose())
         await super().shutdown(sockets)
         connections: Any = list(self.server_state.connections)
