@@ -1,5 +1,6 @@
 """Presses outside the working area that have the charges of a press inside it."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -76,3 +77,10 @@ def test_a_film_without_a_working_area_has_no_mirror_region():
     charges = inverse_distance_map(CIRCLE, 8.0)
     assert mirror_region(sensor, Circle(1.0), charges, 0.0, NOISE) is None
     assert mirror_region(sensor, Circle(1.0), charges, 43.5, NOISE) is None
+
+
+def test_a_slack_film_that_wrinkles_has_no_mirror_region_and_logs_a_warning(caplog):
+    sensor = load_sensor("four-25um-biaxial")
+    slack = replace(sensor, film=replace(sensor.film, pretension=-0.5))
+    assert mirror_region(slack, Circle(1.0), inverse_distance_map(CIRCLE, 8.0), 8.0, NOISE) is None
+    assert re.search("the mirror region outside 8 mm is not computed: no equilibrium at .* wrinkles", caplog.text)

@@ -109,7 +109,7 @@ class Identification:
         inner_maps: Error limits within the working area for the same forces; empty if the working area has the
             radius 0.
         mirror: Share of the presses outside the working area that have the charges of a press inside the working area.
-            None if the share was not computed, if there is no working area, or if the working area reaches the clamp.
+            None if the share was not computed; see `mirror_region`.
     """
 
     sensor: Sensor

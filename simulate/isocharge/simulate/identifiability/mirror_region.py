@@ -7,6 +7,7 @@ of the distances to the points of the circle. Point loads at the distances r and
 nearly the same influence on the points of the circle.
 """
 
+import logging
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
+from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate.forward.charge_map import ChargeMap, within
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.identifiability.nearest_contact import search
@@ -22,6 +24,8 @@ from isocharge.simulate.numerics.disk import Rings
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Sensor
+
+_log = logging.getLogger(__name__)
 
 DETECTABLE_SIGMAS = 5.0
 """Difference from the charges of every press in the working area above which a press outside can be noticed.
@@ -178,14 +182,15 @@ def mirror_region(
         executor: Executor that runs the solves; None for this process.
 
     Returns:
-        The mirror region; None if there is no working area, or if the working area reaches the clamp.
-
-    Raises:
-        SceneError: If some presses cannot exist.
-        SolveError: If a press has no equilibrium.
+        The mirror region; None if there is no working area, if the working area reaches the clamp, or if the film
+        cannot be solved up to the clamp. The last case is logged as a warning.
     """
     round_probe = probe if probe.is_axisymmetric else Circle(probe.reach)
     if not 0.0 < radius < outermost_distance(sensor.film, round_probe.under(charges.domain.force_range[1])):
         return None
-    whole_film = whole_film_map(sensor, round_probe, charges.domain.force_range, executor=executor)
+    try:
+        whole_film = whole_film_map(sensor, round_probe, charges.domain.force_range, executor=executor)
+    except (SceneError, SolveError) as error:
+        _log.warning("the mirror region outside %.3g mm is not computed: %s", radius, error)
+        return None
     return MirrorRegion.of(charges, radius, whole_film, noise)
