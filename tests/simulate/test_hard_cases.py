@@ -44,3 +44,10 @@ def test_hard_cases_converge_or_raise_a_clear_error(film, probe, at, force):
     assert np.isfinite(charge).all()
     assert deflection(solved, np.array([at]))[0] > 0.0
     assert 0.0 <= estimated_error(solved) < 0.2
+
+
+def test_more_force_is_advised_on_a_slack_film_and_stretches_it():
+    film = Film(45.0, 0.025, 3000.0, 0.34, -2.0)
+    with pytest.raises(SolveError, match=r"it wrinkles, .* with more force, or give the film a pretension"):
+        press(film, Circle(1.0), (10.0, 0.0), 0.05)
+    assert press(film, Circle(1.0), (10.0, 0.0), 0.5).status == "converged"

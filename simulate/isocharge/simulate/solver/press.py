@@ -374,8 +374,10 @@ def _failure_reason(solved: Equilibrium, tolerance: float) -> str:
         f"residual {solved.residual:.2g} (expected {tolerance:.2g}) after {solved.iterations} steps"
     )
     if smallest_stress < 0.0:
+        # A larger force stretches a film that is slack in a direction, so that fewer wrinkles remain.
+        is_slack = solved.film.pretension < np.hypot(*solved.film.deviator)
         message += (
             f"; the film is compressed to {smallest_stress:.3g} MPa on the way: it wrinkles, which has many solutions; "
-            "press farther from the rim, with less force, or give the film a pretension"
+            f"press farther from the rim, with {'more' if is_slack else 'less'} force, or give the film a pretension"
         )
     return message
