@@ -115,6 +115,20 @@ def test_invalid_sensor_raises_error(three, changes, message):
         replace(three, **changes)
 
 
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        (((0.0, 0.0),), r"expected 2 to 128 points \(x, y\), got \(\(0.0, 0.0\),\)"),
+        (((0.0, 0.0), (9.0, 0.0), (9.0, 0.0), (9.0, 5.0)), r"repeats a point .*, got \(9.0, 0.0\) mm as point 2"),
+        (((0.0, 0.0), (9.0, 0.0), (0.0, 0.0)), r"nor turns back, got \(9.0, 0.0\) mm as point 2"),
+        (((0.0, 0.0), (9.0, 0.0), (9.0, 5.0), (4.0, 5.0), (4.0, -5.0)), r"does not cross itself .*\(4.0, -5.0\)\) mm"),
+    ],
+)
+def test_invalid_path_of_a_trace_raises_error(path, message):
+    with pytest.raises(SensorError, match=f"^trace of electrode 'D': .*{message}$"):
+        SQUARE.with_trace(path, 0.5)
+
+
 def test_area_of_a_union_counts_overlaps_once():
     """The area of a trace is its width times the length of its middle line. Overlapping metal counts once."""
     assert TRACED.area == pytest.approx(9.0 + 0.5 * (14.0 - 1.5), rel=1e-12)

@@ -131,12 +131,27 @@ class Electrode:
             width: Width of the trace, mm.
 
         Raises:
-            SensorError: If the path has fewer than two points or repeats a point, or if the trace crosses itself.
+            SensorError: If the path has too few or too many points, repeats a point or turns back, or if the trace
+                crosses itself.
         """
-        outline = to_corners(trace_outline(to_complex(np.array(path)), width))
-        trace = _as_tuples(outline.tolist())
-        check_polygon(f"trace of electrode {self.name!r}", trace)
-        return replace(self, more=(*self.more, trace))
+        where = f"trace of electrode {self.name!r}"
+        if not 2 <= len(path) <= MAX_CORNERS // 2:
+            raise SensorError(f"{where}: expected 2 to {MAX_CORNERS // 2} points (x, y), got {shown(path)}")
+        outline = trace_outline(to_complex(np.array(path)), width)
+        is_undefined = np.isnan(outline[: len(path)])
+        if is_undefined.any():
+            first = int(is_undefined.argmax())
+            raise SensorError(
+                f"{where}: expected a path that neither repeats a point nor turns back, got {path[first]} mm as point "
+                f"{first + 1}"
+            )
+        corners = to_corners(outline)
+        if not is_simple(corners):
+            raise SensorError(
+                f"{where}: expected a path that does not cross itself and whose bends are farther apart than the "
+                f"width of {width:g} mm, got {shown(path)} mm"
+            )
+        return replace(self, more=(*self.more, _as_tuples(corners.tolist())))
 
     @cached_property
     def side(self) -> float | None:
