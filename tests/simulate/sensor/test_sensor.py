@@ -101,7 +101,7 @@ def test_invalid_electrodes_raise_error(three, corners, message):
         ),
         (
             {"electrodes": (replace(TRACED, back=(SQUARE.corners,)), Electrode.of_square("E", (9.0, 4.0), 3.0))},
-            "'D' and 'E' overlap",  # a short circuit, though the trace collects nothing there
+            "'D' and 'E' touch or overlap",  # a short circuit, though the trace collects nothing there
         ),
         (
             {"electrodes": (replace(TRACED, more=600 * (SQUARE.corners,)),)},
@@ -127,6 +127,16 @@ def test_invalid_sensor_raises_error(three, changes, message):
 def test_invalid_path_of_a_trace_raises_error(path, message):
     with pytest.raises(SensorError, match=f"^trace of electrode 'D': .*{message}$"):
         SQUARE.with_trace(path, 0.5)
+
+
+@pytest.mark.parametrize("x", np.linspace(-9.0, 9.0, 25))
+def test_electrodes_that_touch_except_for_rounding_are_a_short_circuit(three, x):
+    left, right, apart = (
+        Electrode.of_square(name, (x + dx, 0.0), 3.0) for name, dx in (("L", 0), ("R", 3), ("S", 3.01))
+    )
+    with pytest.raises(SensorError, match="'L' and 'R' touch or overlap"):
+        replace(three, electrodes=(left, right))
+    assert replace(three, electrodes=(left, apart)).electrode_names == ("L", "S")
 
 
 def test_area_of_a_union_counts_overlaps_once():

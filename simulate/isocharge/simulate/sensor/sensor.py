@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from isocharge.common.arrays import Array
 from isocharge.common.errors import SensorError, cut, is_printable, shown
 from isocharge.simulate.numerics.polygon import (
+    MERGE_DISTANCE,
     area_of,
     is_convex,
     is_simple,
@@ -64,12 +65,6 @@ RESERVED_NAMES = (
 """Names that an electrode cannot have, because they have another meaning in a file or a frame.
 
 They are keys of the sensor file, columns of tables of presses, and fields of a frame.
-"""
-
-INTERIORS_INTERSECT = "T********"
-"""Pattern of the dimensionally extended nine-intersection model for regions that share an area.
-
-Regions that only touch do not match.
 """
 
 MAX_ELECTRODES = 64
@@ -312,7 +307,7 @@ class Sensor:
         """Check the names, the gains and the positions of the electrodes.
 
         Raises:
-            SensorError: If a value is not allowed, or an electrode overlaps another electrode or the rim.
+            SensorError: If a value is not allowed, or an electrode touches another electrode or the rim.
         """
         object.__setattr__(self, "electrodes", _as_tuples(self.electrodes))  # the dataclass is frozen
 
@@ -423,7 +418,7 @@ def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
 
     Raises:
         SensorError: If a polygon crosses itself, an electrode collects no charge or is too small, or two electrodes
-            overlap.
+            touch or overlap.
     """
     for electrode in electrodes:
         name = f"electrode {electrode.name!r}"
@@ -432,8 +427,10 @@ def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
         corners = np.array(electrode.corners)
         check_range(name, float(np.ptp(corners, axis=0).max()), (MIN_EXTENT, np.inf), "mm", SensorError)
     for first, second in combinations(electrodes, 2):
-        if shapely.relate_pattern(first.region, second.region, INTERIORS_INTERSECT):
-            raise SensorError(f"electrodes {first.name!r} and {second.name!r} overlap; move one of them")
+        if shapely.dwithin(first.region, second.region, MERGE_DISTANCE):
+            raise SensorError(
+                f"electrodes {first.name!r} and {second.name!r} touch or overlap, which connects them; move one of them"
+            )
 
 
 def _check_on_film(electrode: Electrode, film: Film, calibration: Calibration) -> None:
