@@ -164,6 +164,20 @@ def test_sensor_with_one_electrode_logs_a_warning(tmp_path, command, caplog):
     assert message in err
 
 
+@pytest.mark.parametrize(("gap", "warnings"), [(0.0, []), (0.01, ["B"])])
+@pytest.mark.parametrize("angle", np.arange(0.1, 1.5, 0.2))
+def test_trace_that_does_not_touch_its_pad_logs_a_warning(tmp_path, caplog, gap, warnings, angle):
+    """A trace that starts at the edge of its pad touches the pad except for rounding errors."""
+    rotation = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    pad = np.array([[8.0, -1.5], [11.0, -1.5], [11.0, 1.5], [8.0, 1.5]]) @ rotation
+    trace = np.array([[11.0 + gap, 0.0], [30.0, 0.0]]) @ rotation
+    electrodes = (Electrode.of_square("A", (0.0, 0.0), 3.0), Electrode("B", pad).with_trace(trace, 0.5))
+    path = tmp_path / "mine.toml"
+    write_sensor(replace(load_sensor("three-25um-biaxial"), electrodes=electrodes), path)
+    load_sensor(path)
+    assert [message.split("'")[1] for message in caplog.messages if "2 parts that do not touch" in message] == warnings
+
+
 # Writing
 
 

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+import shapely
 from msgspec import Meta, field
 
 from isocharge.common.errors import SensorError, error_prefix
@@ -28,6 +29,7 @@ from isocharge.common.structs import (
     read_toml,
 )
 from isocharge.common.toml_text import to_toml
+from isocharge.simulate.numerics.polygon import MERGE_DISTANCE
 from isocharge.simulate.sensor.film import ALUMINIUM_EXPANSION, FILM_NUMBERS, Film, Piezo, Surface, tidy
 from isocharge.simulate.sensor.sensor import Calibration, Electrode, Readout, Sensor
 
@@ -151,7 +153,8 @@ def built_in_sensors() -> tuple[str, ...]:
 def load_sensor(sensor: str | Path) -> Sensor:
     """Read a sensor file, which belongs to the package (built-in sensor) or to the user.
 
-    If a file of the user describes a sensor with only one electrode, a warning is logged.
+    If a file of the user describes a sensor with only one electrode, or an electrode of several parts that do not
+    touch, a warning is logged.
 
     Args:
         sensor: Name of a built-in sensor such as "three-25um-biaxial", or path of a TOML file.
@@ -176,6 +179,17 @@ def load_sensor(sensor: str | Path) -> Sensor:
             "electrodes or more do",
             path,
         )
+    for electrode in loaded_sensor.electrodes:
+        # The metal is widened, because parts that touch may be apart by a rounding error.
+        part_count = shapely.get_num_geometries(shapely.buffer(electrode.region, MERGE_DISTANCE))
+        if part_count > 1:
+            log.warning(
+                "%s: electrode %r: its metal on the front consists of %d parts that do not touch, whose charges are "
+                "added; if no wire connects them, check polygon_mm, trace_mm and more_mm",
+                path,
+                electrode.name,
+                part_count,
+            )
     return loaded_sensor
 
 
