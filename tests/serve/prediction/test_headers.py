@@ -27,12 +27,15 @@ def write(tmp_path):
     ("header", "message"),
     [
         ("x_mm,y_mm,force_N,Ladung A [pC],B,C", r"got the header \[.*'Ladung A \[pC\]'.*; missing: \['A'\]"),
-        ("x_mm,y_mm,force_N,a,B,C", "rename 'a' to 'A', or remove the column; missing"),
+        ("x_mm,y_mm,force_N,a,B,C", "rename 'a' to 'A' and check its unit, or remove the column; missing"),
         ("x_mm,y_mm,force_N,A [pC],B [pC],C [pC]", r"rename 'A \[pC\]' to 'A'"),
         ("x_mm,y_mm,force_N,A_pC,B_pC,C_pC", "rename 'A_pC' to 'A'"),
         ("x [mm],y_mm,force_N,A,B,C", r"rename 'x \[mm\]' to 'x_mm'"),
         ("x_mm,y_mm,Force (N),A,B,C", r"rename 'Force \(N\)' to 'force_N'"),
         ("x_mm,y_mm,Force_STD,A,B,C", "rename 'Force_STD' to 'force_std'"),
+        ("x_m,y_m,force_N,A,B,C", "rename 'x_m' to 'x_mm' and check its unit"),
+        ("x_mm,y_mm,force (mN),A,B,C", r"rename 'force \(mN\)' to 'force_N' and check"),
+        ("x_mm,y_mm,force_N,A [nC],B,C", r"rename 'A \[nC\]' to 'A' and check"),
     ],
 )
 def test_similar_header_names_the_column_to_rename(write, header, message):
@@ -44,8 +47,9 @@ def test_similar_header_names_the_column_to_rename(write, header, message):
 
 def test_headers_where_every_other_column_is_an_electrode(write):
     """A channel may have any name, but not one that stands for position or force."""
+    assert read_presses(write("X_N,X_P,Y\n1,2,3")).electrodes == ("X_N", "X_P", "Y")
     assert read_presses(write(f"x_mm,y_mm,force_N,a,f,Ladung [pC]\n{ROW}")).electrodes == ("a", "f", "Ladung [pC]")
-    with pytest.raises(PressError, match=r"rename 'force \[N\]' to 'force_N', or remove"):
+    with pytest.raises(PressError, match=r"rename 'force \[N\]' to 'force_N' and check"):
         read_presses(write(f"x_mm,y_mm,force [N],a,b,c\n{ROW}"))
 
 

@@ -101,6 +101,9 @@ class NumberColumns:
             f"{rules[name].description}, got {text}"
         )
 
+_UNITS_AT_END = {"length": "[µμnmc]?m", "force": "(?:[µμmk]?n|m?k?gf?)", "charge": "[µμfpn]?c"}
+"""Patterns of units in lower case that may stand at the end of the name of a column, by their quantity."""
+
 
 @dataclass(frozen=True)
 class TableSource:
@@ -184,7 +187,7 @@ class NumberTable(ABC):
         return chosen_rules
 
     def refuse_similar_names(self, columns: Iterable[str], names: Iterable[str]) -> None:
-        """Refuse a column whose name differs from that of a missing column by case, brackets, blanks or the unit pC.
+        """Refuse a column whose name differs from that of a missing column by case, brackets, blanks or its unit.
 
         Args:
             columns: Names of the columns of the file that are checked.
@@ -194,12 +197,16 @@ class NumberTable(ABC):
             InputError: If a column has such a name.
         """
         absent_names = {
-            _letters_of(f"{name}{unit}"): name for name in names for unit in ("", "pC") if name not in self.header
+            spelling: name
+            for name in names
+            if name not in self.header
+            for spelling in _spellings(name) | _spellings(f"{name}_pC")
         }
         for column in columns:
-            if _letters_of(column) in absent_names:
-                name = absent_names[_letters_of(column)]
-                self._refuse_header(f"rename {shown(column)} to {shown(name)}, or remove the column; missing", [name])
+            for spelling in _spellings(column) & absent_names.keys():
+                name = absent_names[spelling]
+                advice = f"rename {shown(column)} to {shown(name)} and check its unit, or remove the column"
+                self._refuse_header(f"{advice}; missing", [name])
 
     def read(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
         """Read the chosen columns, and check their values.
@@ -244,6 +251,9 @@ class NumberTable(ABC):
         raise self.source.error(f": expected at most {max_rows:,} presses, got more; split the file")
 
 
-def _letters_of(name: str) -> str:
-    """Return the letters and digits of a name in lower case."""
-    return re.sub(r"[\W_]+", "", name.casefold())
+def _spellings(name: str) -> set[str]:
+    """Return the letters and digits of a name in lower case, and the same with the quantity instead of a unit."""
+    with_quantity = name.casefold()
+    for quantity, unit in _UNITS_AT_END.items():
+        with_quantity = re.sub(rf"[\W_]+{unit}[\W_]*$", quantity, with_quantity)
+    return {re.sub(r"[\W_]+", "", text) for text in (name.casefold(), with_quantity)}
