@@ -79,7 +79,7 @@ class Probe(ABC):
 
     @property
     def rotated_notation(self) -> str:
-        """Notation of this probe with its rotation, such as `rectangle:4.0x2.0@30`."""
+        """Notation of this probe, with its angle in degrees behind the mark `@` if the probe is rotated."""
         return with_rotation(self.notation, round(math.degrees(self.angle), 9) % 360.0)
 
     @property
