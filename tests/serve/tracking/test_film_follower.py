@@ -161,6 +161,18 @@ def test_a_sudden_change_is_followed_after_twenty_touches(series, model, change_
     assert np.mean(np.abs(normalised) < 2.0) > 0.85
 
 
+@pytest.mark.parametrize("change_MPa", [0.3, -0.3])
+def test_stated_uncertainty_contains_the_change_as_long_as_the_touches_show_little(series, model, change_MPa):
+    """The estimate is drawn to that of the calibration until a change is clear, but its uncertainty is not."""
+    rng = np.random.default_rng(6)
+    deviations = []
+    for _ in range(12):
+        _, charge = touches(series, [change_MPa, 0.7, -0.8], rng, 3)
+        film = followed(model, charge, rng, 1)[0].film
+        deviations.append(abs(film.pretension_MPa - 1.0 - change_MPa) / film.pretension_std_MPa)
+    assert np.mean(np.array(deviations) < 2.0) > 0.9
+
+
 def test_nearly_slack_film_that_has_not_changed_is_not_lost(series, tmp_path):
     """The pretension is 0.01 MPa and cannot become smaller."""
     rng = np.random.default_rng(2)

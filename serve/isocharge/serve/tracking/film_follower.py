@@ -341,6 +341,9 @@ class FilmFollower:
 
         Before the touches, the probability that the pretension is unchanged is 1/2. The touches change the odds by the
         ratio of the probability densities of t = 0 after and before them (Savage-Dickey ratio, Dickey 1971).
+
+        The covariance remains that of a film which has changed, because hardly any film keeps its pretension exactly.
+        It also contains the distance from the mean of the state to the estimates with and without a change.
         """
         change_MPa = self._state[0]
         variance = self._covariance[0, 0]
@@ -348,11 +351,9 @@ class FilmFollower:
         probability = odds / (1.0 + odds)
 
         # Without a change, the other unknowns have their conditional distribution for t = 0.
-        gain = self._covariance[0] / variance
-        shift = change_MPa * gain
-        spread = probability * (1.0 - probability) * np.outer(shift, shift)
+        shift = change_MPa * self._covariance[0] / variance
         self._applied_state = self._state - probability * shift
-        self._applied_covariance = self._covariance - probability * variance * np.outer(gain, gain) + spread
+        self._applied_covariance = self._covariance + probability * np.outer(shift, shift)
         self._applied_covariance[self._offset, self._offset] += self._error_scale * self._offset_std_pC**2
 
     def _values(self, contacts: Array, state: Array) -> ModelValues:
