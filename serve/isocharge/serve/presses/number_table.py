@@ -101,6 +101,7 @@ class NumberColumns:
             f"{rules[name].description}, got {text}"
         )
 
+
 _UNITS_AT_END = {"length": "[µμnmc]?m", "force": "(?:[µμmk]?n|m?k?gf?)", "charge": "[µμfpn]?c"}
 """Patterns of units in lower case that may stand at the end of the name of a column, by their quantity."""
 
