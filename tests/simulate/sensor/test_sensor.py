@@ -101,7 +101,7 @@ def test_invalid_electrodes_raise_error(three, corners, message):
         ),
         (
             {"electrodes": (replace(TRACED, back=(SQUARE.corners,)), Electrode.of_square("E", (9.0, 4.0), 3.0))},
-            "'D' and 'E' touch or overlap",  # a short circuit, though the trace collects nothing there
+            "'D' and 'E' overlap",  # a short circuit, though the trace collects nothing there
         ),
         (
             {"electrodes": (replace(TRACED, more=600 * (SQUARE.corners,)),)},
@@ -130,13 +130,14 @@ def test_invalid_path_of_a_trace_raises_error(path, message):
 
 
 @pytest.mark.parametrize("x", np.linspace(-9.0, 9.0, 25))
-def test_electrodes_that_touch_except_for_rounding_are_a_short_circuit(three, x):
-    left, right, apart = (
-        Electrode.of_square(name, (x + dx, 0.0), 3.0) for name, dx in (("L", 0), ("R", 3), ("S", 3.01))
+def test_electrodes_that_touch_except_for_rounding_do_not_overlap(three, x):
+    """The gap between the sectors of a disk is usually left out of a description."""
+    left, right, overlapping = (
+        Electrode.of_square(name, (x + dx, 0.0), 3.0) for name, dx in (("L", 0.0), ("R", 3.0), ("O", 2.9999))
     )
-    with pytest.raises(SensorError, match="'L' and 'R' touch or overlap"):
-        replace(three, electrodes=(left, right))
-    assert replace(three, electrodes=(left, apart)).electrode_names == ("L", "S")
+    assert replace(three, electrodes=(left, right)).electrode_names == ("L", "R")
+    with pytest.raises(SensorError, match="'L' and 'O' overlap"):
+        replace(three, electrodes=(left, overlapping))
 
 
 def test_area_of_a_union_counts_overlaps_once():
