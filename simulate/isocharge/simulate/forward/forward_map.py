@@ -285,8 +285,9 @@ class ForwardMap:
                 f"expected a forward map of different forces for derivatives, got one of the force {min_force:g} N; "
                 f"build a map from {0.9 * min_force:.3g} to {1.1 * min_force:.3g} N"
             )
-        # The charges change within the width of the footprint, so the steps of a small probe are shorter.
-        footprint_scale = min(1.0, self.probe.under(min_force).half_width)
+        # The steps of a small probe are shorter, because the charges change within its footprint. With steps in
+        # proportion to the width of a narrow footprint, the error of the readout would dominate the differences.
+        footprint_scale = min(1.0, self.probe.under(min_force).reach)
         steps = np.multiply(STEPS, [footprint_scale, footprint_scale, 1.0])
         return differences(self._unchecked_charges, contact, steps)
 
