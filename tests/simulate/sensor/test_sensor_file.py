@@ -164,18 +164,19 @@ def test_sensor_with_one_electrode_logs_a_warning(tmp_path, command, caplog):
     assert message in err
 
 
-@pytest.mark.parametrize(("gap", "warnings"), [(0.0, []), (0.01, ["B"])])
-@pytest.mark.parametrize("angle", np.arange(0.1, 1.5, 0.2))
-def test_trace_that_does_not_touch_its_pad_logs_a_warning(tmp_path, caplog, gap, warnings, angle):
-    """A trace that starts at the edge of its pad touches the pad except for rounding errors."""
-    rotation = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    pad = np.array([[8.0, -1.5], [11.0, -1.5], [11.0, 1.5], [8.0, 1.5]]) @ rotation
-    trace = np.array([[11.0 + gap, 0.0], [30.0, 0.0]]) @ rotation
-    electrodes = (Electrode.of_square("A", (0.0, 0.0), 3.0), Electrode("B", pad).with_trace(trace, 0.5))
+@pytest.mark.parametrize(
+    ("more", "count"),
+    [
+        ("[[10.728, 3.364], [14.0, 8.0], [10.455, 3.728]]", 0),  # beside the pad by 0.8 um, because of rounding
+        ("[[10.8, 3.4], [14.0, 8.0], [10.6, 3.8]]", 1),
+    ],
+)
+def test_polygon_that_does_not_touch_its_pad_logs_a_warning(tmp_path, caplog, more, count):
     path = tmp_path / "mine.toml"
-    write_sensor(replace(load_sensor("three-25um-biaxial"), electrodes=electrodes), path)
+    polygons = f"{{polygon_mm = [[8.0, 3.0], [11.0, 3.0], [8.0, 7.0]], more_mm = [{more}]}}"
+    path.write_text(WHOLE.replace("edge", "area").replace("[8.660254, 5.0]", polygons))
     load_sensor(path)
-    assert [message.split("'")[1] for message in caplog.messages if "2 parts that do not touch" in message] == warnings
+    assert caplog.text.count("electrode 'B': its metal on the front consists of 2 parts that do not touch") == count
 
 
 # Writing

@@ -29,7 +29,6 @@ from isocharge.common.structs import (
     read_toml,
 )
 from isocharge.common.toml_text import to_toml
-from isocharge.simulate.numerics.polygon import MERGE_DISTANCE
 from isocharge.simulate.sensor.film import ALUMINIUM_EXPANSION, FILM_NUMBERS, Film, Piezo, Surface, tidy
 from isocharge.simulate.sensor.sensor import Calibration, Electrode, Readout, Sensor
 
@@ -180,8 +179,8 @@ def load_sensor(sensor: str | Path) -> Sensor:
             path,
         )
     for electrode in loaded_sensor.electrodes:
-        # The metal is widened, because parts that touch may be apart by a rounding error.
-        part_count = shapely.get_num_geometries(shapely.buffer(electrode.region, MERGE_DISTANCE))
+        # The metal is widened by 1 um, because parts that touch often have rounded coordinates.
+        part_count = shapely.get_num_geometries(shapely.buffer(electrode.region, 1e-3))
         if part_count > 1:
             log.warning(
                 "%s: electrode %r: its metal on the front consists of %d parts that do not touch, whose charges are "
