@@ -187,6 +187,27 @@ def test_counter_of_one_byte_that_restarts_is_recognised():
 
 
 @pytest.mark.parametrize(
+    ("size", "start", "step"), [(1, 0, 1), (2, 0x9000, 1), (2, 0, 1), (3, 0, 5000), (4, 0x03F0_0000, 5000)]
+)
+@pytest.mark.parametrize("header", ["AA 55", "AA 55 00 10"])
+def test_constant_bytes_before_a_counter_or_clock_do_not_belong_to_it(header, size, start, step):
+    """The number wraps or changes its high byte only after the doctor has listened."""
+    numbers = (start + step * np.arange(20 * FRAMES)) % 256**size
+    rows = np.resize(VALUES, (len(numbers), 4)).astype(">i2")
+    heads = [bytes.fromhex(header) + number.to_bytes(size, "big") for number in numbers.tolist()]
+    frames = [head + row.tobytes() for head, row in zip(heads, rows, strict=True)]
+    table = recognise([b"".join(frames[:FRAMES])], FRAMES / RATE_HZ)
+    parser = device_from_table({"frames": table}, "test").parser()
+    parsed = parser.feed(b"".join(frames))
+    for frame in parsed:
+        parser.sequence_flags(frame.seq)
+    assert len(parsed) >= len(frames) - 1
+    assert (parser.counts.lost, parser.counts.repeated, parser.counts.restarts) == (0, 0, 0)
+    if step > 1:
+        assert set(np.diff([frame.t_us for frame in parsed]) % parser.t_us_modulus) == {step}
+
+
+@pytest.mark.parametrize(
     ("notation", "expected"),
     [
         ("{k},{ms},{q}", {"columns": ["seq", "t_ms", "ch1"]}),

@@ -74,6 +74,8 @@ class Weights:
         channel_group: Contribution of a group of adjacent channels of one type.
         channel: Contribution of a channel, in addition to the bits of its steps.
         constant: Contribution of a constant byte without a meaning, or of a constant channel.
+        constant_high: Contribution of a constant byte of a counter or clock, unless the byte is 0. It is larger than
+            `constant`, because a counter that is too wide causes false restarts, and one that is too narrow does not.
         noise: Contribution of a varying byte without a meaning, and of a byte outside of all frames.
         fraction: Share of the bits of a floating-point number that belong to its significant digits, dimensionless.
     """
@@ -81,6 +83,7 @@ class Weights:
     channel_group = 4.0
     channel = 1.65
     constant = 0.8
+    constant_high = 1.3
     noise = 8.0
     fraction = 0.65
 
@@ -198,12 +201,20 @@ def _number_parts(
         counter_steps = (steps + half_range) % (2 * half_range) - half_range  # a counter that overflows restarts at 0
         magnitude = float(np.median(np.abs(values - half_range)))  # distance from the middle of the range
 
+    # If the number has fewer bytes, it wraps without a carry to the bytes above it. A damaged byte may cause the same
+    # step back, but then also an equal step forwards.
+    deviations = counter_steps - np.median(counter_steps)
+    ranges = 256.0 ** np.arange(1, size)  # of numbers with fewer bytes
+    wrap_count = (np.isin(deviations, -ranges) & (counter_steps < 0.0)).sum()
     clock = identify_clock(counter_steps, frame_rate_Hz)
-    if steady_step(counter_steps) == 1.0:
-        yield Part("seq", type_name, size, 0.0, name="seq")  # the values of a counter need no bits
+    high_score = Weights.constant_high * float((is_constant & ~is_zero).sum())
+    if wrap_count > np.isin(deviations, ranges).sum():
+        pass  # neither a counter nor a clock
+    elif steady_step(counter_steps) == 1.0:
+        yield Part("seq", type_name, size, high_score, name="seq")  # the values of a counter need no bits
     elif clock is not None:
         name, tick_duration = clock
-        clock_score = _bits(counter_steps - np.median(counter_steps), unit, size)
+        clock_score = high_score + _bits(deviations, unit, size)
         yield Part("clock", type_name, size, clock_score, name=name, scale=tick_duration)
 
     # The magnitude is counted as one more step. The score of a type is therefore lower if the values in this type are
