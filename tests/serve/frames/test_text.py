@@ -307,6 +307,22 @@ def test_lost_line_of_a_cycle_costs_its_cycle_only(lost, cycles, malformed):
     assert parser.counts.malformed == malformed
 
 
+@pytest.mark.parametrize(
+    "lines",
+    [
+        (">C:{ms}:{k}", ">A:{ms}:{k}", ">B:{ms}:{k}"),
+        (">C:{ms}.1:{k}", ">A:{ms}.3:{k}", ">B:{ms}.6:{k}"),
+        ("t_ms:{ms}", "C:{k}", "A:{k}", "B:{k}"),
+        ("seq:{k}", "t_ms:{ms}", "C:{k}", "A:{k}", "B:{k}"),
+    ],
+)
+def test_frame_in_consecutive_lines_has_the_values_of_one_time(lines):
+    frames = feed(*(line.format(ms=1000 + 20 * k, k=k) for k in range(8) for line in lines))
+    assert len(frames) >= 7
+    for frame in frames:
+        assert set(frame.values) == {(frame.t_us // 1000 - 1000) / 20}
+
+
 def test_unrecognised_lines_use_bounded_memory():
     parser = TextParser()
     parser.feed(b"8" * 100_000 + b"\n")

@@ -320,8 +320,10 @@ class TextParser(DelimitedParser):
 def _frame_lines(lines: Sequence[Line], cycle_length: int) -> Sequence[Line]:
     """Return the lines of one frame in repeated cycles of lines; empty if it is not clear which lines are frames.
 
-    If every value has a name, a frame consists of all lines of a cycle. Otherwise, a frame is a single line, and the
-    other lines of the cycle never change.
+    If every value has a name, a frame consists of all lines of a cycle. If every line has a clock, the lines are
+    grouped so that the clocks of a frame differ least. Otherwise, a frame begins with the counter, the clock, or the
+    first name in alphabetical order. If not every value has a name, a frame is a single line, and the other lines of
+    the cycle never change.
 
     Args:
         lines: Lines of whole cycles; may be empty.
@@ -330,9 +332,20 @@ def _frame_lines(lines: Sequence[Line], cycle_length: int) -> Sequence[Line]:
     cycle = lines[:cycle_length]
     if cycle_length <= 1:
         return cycle
-    line_names = [next((name for name in line.names if name not in TIMES_US), "") for line in cycle]
-    if all(line_names) and all(all(line.names) for line in cycle):
-        first = min(range(cycle_length), key=lambda position: (line_names[position] != SEQ, line_names[position]))
+    if all(all(line.names) for line in cycle):
+        line_names = [next((name for name in line.names if name not in TIMES_US), "") for line in cycle]
+        times = [
+            value
+            for line in lines
+            for name, value in zip(line.names, line_values(skeleton_pattern(line), line.text) or (), strict=False)
+            if name in TIMES_US
+        ]
+        if len(times) != len(lines):
+            times = [0.0] * len(lines)
+        _, _, _, first = min(
+            (times[position + cycle_length - 1] - times[position], name != SEQ, name, position)
+            for position, name in enumerate(line_names)
+        )
         return lines[first : first + cycle_length]
     texts = [{line.text for line in lines[position::cycle_length]} for position in range(cycle_length)]
     varying = [line for line, texts_of_line in zip(cycle, texts, strict=True) if len(texts_of_line) > 1]
