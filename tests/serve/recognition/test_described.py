@@ -225,6 +225,29 @@ def test_counter_and_clock_columns_in_text_are_recognised(notation, expected):
     assert recognise(["\n".join([*lines, ""]).encode()], 0.8) == {"format": "text"} | expected
 
 
+@pytest.mark.parametrize(
+    ("name", "rate_Hz", "spread", "expected"),
+    [
+        ("at", 1000, 1.1, {"t_ms": "at"}),
+        ("at", 1000, 0.0, {"seq": "at"}),
+        ("time_ms", 976, 0.0, {"t_ms": "time_ms"}),
+        ("millis", 1000, 0.0, {"t_ms": "millis"}),
+    ],
+)
+def test_clock_that_counts_about_one_millisecond_per_frame_is_no_frame_counter(name, rate_Hz, spread, expected):
+    rng = np.random.default_rng(0)
+    times = (5000 + 1e3 / rate_Hz * np.arange(2000) + spread * rng.random(2000)).astype(int)
+    lines = [f"{name}:{t},A:{q:.3f}\n" for t, q in zip(times, rng.normal(5.0, 0.3, 2000), strict=True)]
+    assert recognise([b"\n", "".join(lines).encode()], 2000 / rate_Hz) == {"format": "text"} | expected
+
+
+def test_binary_clock_that_repeats_milliseconds_is_no_frame_counter():
+    times = np.arange(FRAMES) + np.random.default_rng(0).random(FRAMES) * 1.1
+    rows = np.column_stack([times, VALUES]).astype(int).tolist()
+    data = b"".join(b"\xaa\x55" + struct.pack("<I4h", *row) for row in rows)
+    assert recognise([data], FRAMES / 1000.0)["fields"][0] == {"name": "t_ms", "type": "u32"}
+
+
 def test_header_of_a_csv_stream_becomes_part_of_the_device_file():
     """A board sends the header only once. A program that starts later reads the columns by the device file."""
     values = np.random.default_rng(0).normal(5.0, 0.3, (400, 2))

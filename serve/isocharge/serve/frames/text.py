@@ -342,7 +342,7 @@ def _frame_lines(lines: Sequence[Line], cycle_length: int) -> Sequence[Line]:
         ]
         if len(times) != len(lines):
             times = [0.0] * len(lines)
-        _, _, _, first = min(
+        *_, first = min(
             (times[position + cycle_length - 1] - times[position], name != SEQ, name, position)
             for position, name in enumerate(line_names)
         )

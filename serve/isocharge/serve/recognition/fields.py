@@ -64,6 +64,18 @@ def identify_clock(steps: Array, frame_rate_Hz: float, tolerance: float = 0.06) 
     return CLOCKS[nearest_tick_rate_Hz] if deviations[nearest_tick_rate_Hz] < tolerance else None
 
 
+def is_counter(steps: Array, clock: tuple[str, float] | None) -> bool:
+    """Return whether the values of consecutive frames are those of a frame counter, which increases by 1.
+
+    At about 1000 frames per second, a clock in ms also increases by 1, but it repeats at least 1 % of its values.
+
+    Args:
+        steps: Differences of the values of consecutive frames, shape (n,).
+        clock: Result of `identify_clock`.
+    """
+    return steady_step(steps) == 1.0 and (clock is None or bool(np.mean(steps == 0.0) < 0.01))
+
+
 class Weights:
     """Contributions of the parts of a frame to the score of a division, in bits.
 
@@ -205,12 +217,11 @@ def _number_parts(
     # step back, but then also an equal step forwards.
     deviations = counter_steps - np.median(counter_steps)
     ranges = 256.0 ** np.arange(1, size)  # of numbers with fewer bytes
-    wrap_count = (np.isin(deviations, -ranges) & (counter_steps < 0.0)).sum()
     clock = identify_clock(counter_steps, frame_rate_Hz)
-    high_score = Weights.constant_high * float((is_constant & ~is_zero).sum())
-    if wrap_count > np.isin(deviations, ranges).sum():
+    high_score = Weights.constant_high * (is_constant & ~is_zero).sum()
+    if (np.isin(deviations, -ranges) & (counter_steps < 0.0)).sum() > np.isin(deviations, ranges).sum():
         pass  # neither a counter nor a clock
-    elif steady_step(counter_steps) == 1.0:
+    elif is_counter(counter_steps, clock):
         yield Part("seq", type_name, size, high_score, name="seq")  # the values of a counter need no bits
     elif clock is not None:
         name, tick_duration = clock

@@ -15,7 +15,7 @@ from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.frames.frame import SEQ, Frame, Parser
 from isocharge.serve.frames.frame_layout import PADDING, SYNC, ByteOrder, Field, FrameLayout
 from isocharge.serve.frames.text import Layout, TextParser
-from isocharge.serve.recognition.fields import Part, Weights, identify_clock, possible_parts, split_frame, steady_step
+from isocharge.serve.recognition.fields import Part, Weights, identify_clock, is_counter, possible_parts, split_frame
 from isocharge.serve.recognition.framing import (
     COVERED_SHARE,
     MAX_CONSTANT_BYTES,
@@ -267,8 +267,9 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
 def _meanings(frames: Sequence[Frame], frame_rate_Hz: float) -> dict[int, str]:
     """Determine which values of the frames are the frame counter and the clock.
 
-    A counter increases by 1 from frame to frame, and a clock increases at one of the usual rates. If the parser has
-    already recognised a counter, the function does not search for another counter. The same applies to the clock.
+    A counter increases by 1 from frame to frame, and a clock increases at one of the usual rates. A clock in ms that
+    increases by about 1 is recognised by its name, or because it repeats some values. If the parser has already
+    recognised a counter, the function does not search for another counter. The same applies to the clock.
 
     Args:
         frames: Frames with the same number of values.
@@ -281,15 +282,15 @@ def _meanings(frames: Sequence[Frame], frame_rate_Hz: float) -> dict[int, str]:
     has_counter = frames[-1].seq is not None
     has_clock = frames[-1].t_us is not None
     steps = np.diff([frame.values for frame in frames], axis=0)  # shape (n - 1, values)
+    names = frames[-1].names or ("",) * len(steps.T)
     for position, value_steps in enumerate(steps.T):
-        if not has_counter and steady_step(value_steps) == 1.0:
+        clock = identify_clock(value_steps, frame_rate_Hz)
+        has_time_name = clock is not None and any(word in names[position].lower() for word in ("ms", "milli", "time"))
+        if not has_counter and not has_time_name and is_counter(value_steps, clock):
             meanings[position] = SEQ
             has_counter = True
-            continue
-        clock = identify_clock(value_steps, frame_rate_Hz)
-        if clock is not None and not has_clock:
-            clock_name, tick_duration = clock
-            if tick_duration == 1.0:  # a device file for lines of text cannot state another duration
-                meanings[position] = clock_name
-                has_clock = True
+        # A device file for lines of text cannot state another duration of a tick.
+        elif clock is not None and clock[1] == 1.0 and not has_clock:
+            meanings[position] = clock[0]
+            has_clock = True
     return meanings
