@@ -93,12 +93,22 @@ def test_forces_that_scatter_more_than_stated_are_named(problem, synthetic):
     assert any("the forces scatter by about 3 % more than stated" in caution for caution in result.cautions)
 
 
-def test_electrodes_far_from_their_places_are_named(problem, synthetic):
+def presses_on_shifted_electrodes(problem, synthetic, shift_mm):
     values = problem.prior.layout.prior.mean.copy()
-    values[problem.prior.layout.index("shift_x")] = 1.1
+    values[problem.prior.layout.index("shift_x")] = shift_mm
     _, _, presses = rig(problem, synthetic, 20, seed=15, values=values)
-    cautions = fit(presses, problem, synthetic).cautions
+    return presses
+
+
+def test_electrodes_far_from_their_places_are_named(problem, synthetic):
+    cautions = fit(presses_on_shifted_electrodes(problem, synthetic, 1.1), problem, synthetic).cautions
     assert any("is the origin of the stage the centre of the film" in caution for caution in cautions)
+
+
+def test_electrodes_that_are_farther_away_than_considered_are_refused(problem, synthetic):
+    """The film would otherwise be fitted with the largest shift, and its uncertainty would not contain the rest."""
+    with pytest.raises(PressError, match=r"along x: the presses agree best with 1\.2 mm or more, .* the origin"):
+        fit(presses_on_shifted_electrodes(problem, synthetic, 2.0), problem, synthetic)
 
 
 @pytest.mark.parametrize("scatter_mm", [0.0, 0.005])

@@ -35,6 +35,11 @@ IMPOSSIBLE = {
     ),
     "all negative": (lambda c, q: (c, -q), "all electrodes have the opposite sign.* d31 and d32"),
     "missing": (lambda c, q: (c, np.where(np.arange(4) == 3, np.nan, q)), "electrode 'D': no press has a charge"),
+    "inches": (lambda c, q: (c / [25.4, 25.4, 1.0], q), "positions are in inch, not mm"),
+    "crosstalk": (
+        lambda c, q: (c, np.where(np.arange(4) == 2, 0.03 * q.mean(axis=1, keepdims=True), q)),
+        "electrode 'C' is dead: .* 3.* % of those of the others",
+    ),
     "too strong": (
         lambda c, q: (c * [1.0, 1.0, 100.0], q),
         "A film would explain them if the forces are in g",

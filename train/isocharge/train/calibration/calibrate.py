@@ -16,11 +16,13 @@ from isocharge.train.calibration.diagnosis import (
     check_channels,
     check_places,
     find_mistakes,
+    is_one_place,
     misfit,
     unexplained_error,
 )
 from isocharge.train.calibration.estimator import Estimation, estimate
 from isocharge.train.calibration.film_charges import PROBE_RADIUS, STEP, FilmCharges, solve_even_map
+from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.press_data import PressData
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.calibration.result import CalibrationResult
@@ -45,6 +47,9 @@ NOT_CONVERGED = (
 
 MAX_USUAL_NOISE = 0.01
 """Noise that is proportional to the charge, above which a caution is given, dimensionless."""
+
+PLACEMENT = ("shift_x", "shift_y", "rotation")
+"""Names of the properties that describe where the electrodes are."""
 
 UNUSUAL_SHIFT = 3.0
 """Ratio of a shift or rotation of the electrodes to its prior standard deviation above which a caution is given."""
@@ -75,8 +80,8 @@ def calibrate(
             to choose further presses.
 
     Raises:
-        PressError: If the records of the presses are impossible, or if no film explains the presses. The message names
-            the reason if it is found.
+        PressError: If the records of the presses are impossible, if no film explains the presses, or if the electrodes
+            would be too far from their described places. The message names the reason if it is found.
     """
     ordered_presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)
     check_places(ordered_presses, problem.sensor.film)
@@ -102,8 +107,7 @@ def calibrate(
         if is_outside.mean() > 0.5:
             raise unexplained_error(ordered_presses, charges, outside_words)
         check_channels(used_presses, charges)
-        is_suspicious = not _is_one_place(used_presses) and misfit(used_presses, charges) > SUSPICIOUS_MISFIT
-        if is_suspicious and find_mistakes(used_presses, charges):
+        if misfit(used_presses, charges) > SUSPICIOUS_MISFIT and find_mistakes(used_presses, charges):
             raise unexplained_error(used_presses, charges, "their charges are very different from those of its films")
         data = PressData.of(used_presses, problem.noise, problem.solved_domain)
         estimation = _fit_even_film(problem, data, charges, executor)
@@ -115,6 +119,7 @@ def calibrate(
             residual = np.sqrt(estimation.chi2 / estimation.redundancy)
             reason = f"the charges of the best film differ from theirs by {residual:.2g} times the noise"
             raise unexplained_error(used_presses, estimation.charges, reason)
+        _check_placement(estimation.film)
         noisy_problem = replace(problem, noise=estimation.film.noise)
         sensitivity = ContactSensitivity.of(noisy_problem, estimation.charges, estimation.film.values)
     return CalibrationResult(
@@ -220,6 +225,25 @@ def _is_uninformative(presses: MeasuredPresses) -> bool:
     return len(presses) > 0 and len(presses.electrodes) <= 3 and bool(np.isnan(presses.contact).all())
 
 
+def _check_placement(film: FilmEstimate) -> None:
+    """Check that the shift and the rotation of the electrodes are within their bounds.
+
+    Raises:
+        PressError: If one of them is at its bound. It is then probably larger, and its standard deviation is too small.
+    """
+    prior = film.layout.prior
+    lowest, highest = prior.bounds
+    for name in PLACEMENT:
+        row = prior.index(name)
+        one = prior.properties[row]
+        if not lowest[row] < film.film_values[row] < highest[row]:
+            raise PressError(
+                f"{one.meaning}: the presses agree best with {film.value(name):.3g} {one.unit} or more, the largest "
+                "value that is considered: is the origin of the stage the centre of the film, are its axes those of "
+                "the film, and are the electrodes where the sensor file describes them?"
+            )
+
+
 def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
     """Return warnings about presses, the session, and electrodes far from their described places."""
     cautions = []
@@ -231,7 +255,7 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
     if errors.noise.gain > MAX_USUAL_NOISE:
         cautions.append(
             f"the charges scatter by about {100.0 * film.noise.gain:.2g} %, which the standard deviations of the model "
-            "contain: are the charges read at rest, and does the film lie still?"
+            "contain: are the charges read at rest, does the film lie still, and is the noise of the board below 1 pC?"
         )
     if errors.position_ratio > 1.0:
         cautions.append(
@@ -245,19 +269,13 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
         )
     cautions.extend(film.session_cautions())
     prior = film.layout.prior
-    for name in ("shift_x", "shift_y", "rotation"):
+    for name in PLACEMENT:
         one = prior.properties[prior.index(name)]
         if abs(film.value(name)) > UNUSUAL_SHIFT * one.std:
             cautions.append(
                 f"{one.meaning}: {film.value(name):.3g} {one.unit}, which is unusually far from the sensor file: is "
                 "the origin of the stage the centre of the film, and are its axes those of the film?"
             )
-    if _is_one_place(presses):
+    if is_one_place(presses):
         cautions.append("all known positions are at one place, so they do not determine where the electrodes are")
     return cautions
-
-
-def _is_one_place(presses: MeasuredPresses) -> bool:
-    """Return whether the presses have known positions, which are the same within their errors."""
-    position = presses.contact[np.isfinite(presses.contact[:, 0]), :2]
-    return len(position) > 0 and float(np.ptp(position, axis=0).max()) <= 6.0 * float(presses.position_std_mm.max())

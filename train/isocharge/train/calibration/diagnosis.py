@@ -18,10 +18,14 @@ from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.simulate.sensor.film import Film
 from isocharge.train.calibration.film_charges import FilmCharges
 
-MAX_DEAD_RATIO = 0.02
+MAX_DEAD_RATIO = 0.1
 """Ratio of the typical charge of a channel to that of all channels, below which the channel counts as dead.
 
-The limit is lower for a channel whose charges are smaller than those of the other channels on some possible film."""
+A dead channel may have some crosstalk or an offset. The limit is lower for a channel whose charges are smaller than
+those of the other channels on some possible film, and for presses of unknown places and forces."""
+
+UNPLACED_RATIO = 0.2
+"""Factor of this limit for presses of unknown places and forces, which may all be near one electrode."""
 
 MIN_LARGEST_DISTANCE_MM = 0.05
 """Smallest credible distance of the outermost press, mm. If it is smaller, the positions were probably in metres."""
@@ -121,7 +125,8 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
     placed = presses[presses.placed]
     film_charges = expected_charges(charges, placed.contact)
     film_ratios = [_charge_ratios(film_charge) for film_charge in film_charges if len(placed)]
-    smallest_film_ratio = np.min([np.ones(len(presses.electrodes)), *film_ratios], axis=0)
+    largest_ratio = 1.0 if len(placed) else UNPLACED_RATIO
+    smallest_film_ratio = np.min([np.full(len(presses.electrodes), largest_ratio), *film_ratios], axis=0)
     ratio = _charge_ratios(presses.charge_pC)
     for channel in np.flatnonzero(ratio < MAX_DEAD_RATIO * smallest_film_ratio):
         typical_charge = np.nanmedian(np.abs(presses.charge_pC[:, channel]))
@@ -262,7 +267,8 @@ def _log_ratio(measured: Array, expected: Array) -> Array:
 def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[tuple[str, Array, Array]]:
     """Yield a corrected copy of the presses for each possible mistake.
 
-    The mistakes are swapped charge columns, rotated or mirrored axes of the rig, and wrong units.
+    The mistakes are swapped charge columns, rotated or mirrored axes of the rig, and wrong units. Presses at one place
+    do not show swapped columns or rotated axes.
 
     Args:
         presses: The measured presses, all with a known place and force.
@@ -274,6 +280,15 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
     """
     contact = presses.contact
     charge = presses.charge_pC
+    for unit, factor in FORCE_UNITS_N.items():
+        yield f"the forces are in {unit}, not N", contact * [1.0, 1.0, factor], charge
+    for unit, factor in POSITION_UNITS_mm.items():
+        yield f"the positions are in {unit}, not mm", contact * [factor, factor, 1.0], charge
+    for unit, factor in CHARGE_UNITS_pC.items():
+        yield f"the charges are in {unit}, not pC", contact, charge * factor
+    if is_one_place(presses):
+        return
+
     electrodes = presses.electrodes
     for electrode_of_column in _plausible_electrode_orders(presses, charges):
         held_names = ", ".join(electrodes[electrode] for electrode in electrode_of_column)
@@ -285,13 +300,6 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
     for description, (correct_x, correct_y) in AXES.items():
         rotated_contact = np.column_stack([coordinates[correct_x], coordinates[correct_y], force])
         yield f"the rig's axes are not the film's: {description}", rotated_contact, charge
-
-    for unit, factor in FORCE_UNITS_N.items():
-        yield f"the forces are in {unit}, not N", contact * [1.0, 1.0, factor], charge
-    for unit, factor in POSITION_UNITS_mm.items():
-        yield f"the positions are in {unit}, not mm", contact * [factor, factor, 1.0], charge
-    for unit, factor in CHARGE_UNITS_pC.items():
-        yield f"the charges are in {unit}, not pC", contact, charge * factor
 
 
 def _plausible_electrode_orders(presses: MeasuredPresses, charges: FilmCharges) -> set[tuple[int, ...]]:
@@ -346,3 +354,9 @@ def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: st
         f"{statement}; is it this layout and this probe ({charges.prior.probe.notation}), do the places and forces "
         "belong to these rows, and are the charges touch charges (reading under load minus reading without load)?"
     )
+
+
+def is_one_place(presses: MeasuredPresses) -> bool:
+    """Return whether the presses have known positions, which are the same within their errors."""
+    position = presses.contact[np.isfinite(presses.contact[:, 0]), :2]
+    return len(position) > 0 and float(np.ptp(position, axis=0).max()) <= 6.0 * float(presses.position_std_mm.max())

@@ -35,18 +35,20 @@ def calibration_picture(result: CalibrationResult) -> Figure:
     x, y, _ = result.estimation.contact.T
     is_bad = result.estimation.is_bad
     map_axes.plot(x[~is_bad], y[~is_bad], "o", color="white", mec=INK, ms=6, label="presses")
-    map_axes.plot(x[is_bad], y[is_bad], "X", color=FELT, mec=INK, ms=9, label="left out")
+    if is_bad.any():
+        map_axes.plot(x[is_bad], y[is_bad], "X", color=FELT, mec=INK, ms=9, label="left out")
     map_axes.legend(loc="upper right", fontsize=8)
 
     # The residual of each press, relative to the expected size. Without redundant measurements, there is none.
     relative_residual = np.sqrt(np.nan_to_num(result.estimation.press_chi2))
+    largest_shown = max(3.0, 1.1 * relative_residual[~is_bad].max(initial=0.0))
     residual_axes.bar(result.presses.lines, relative_residual, color=np.where(is_bad, FELT, FITTED))
+    residual_axes.set_ylim(0.0, largest_shown)  # presses that were left out may extend beyond
     residual_axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     residual_axes.axhline(1.0, color=INK, lw=0.8, ls="--")  # the expected size
     residual_axes.set(
         title="residuals of the presses",
         xlabel=f"{result.presses.row_noun} of the press",
         ylabel="residual, relative to its expected size",
-        yscale="symlog",
     )
     return figure
