@@ -313,7 +313,6 @@ def test_lost_line_of_a_cycle_costs_its_cycle_only(lost, cycles, malformed):
         (">C:{ms}:{k}", ">A:{ms}:{k}", ">B:{ms}:{k}"),
         (">C:{ms}.1:{k}", ">A:{ms}.3:{k}", ">B:{ms}.6:{k}"),
         ("t_ms:{ms}", "C:{k}", "A:{k}", "B:{k}"),
-        ("seq:{k}", "t_ms:{ms}", "C:{k}", "A:{k}", "B:{k}"),
     ],
 )
 def test_frame_in_consecutive_lines_has_the_values_of_one_time(lines):

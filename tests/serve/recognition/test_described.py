@@ -132,11 +132,11 @@ def test_frames_are_recognised_in_a_damaged_stream():
     assert board.is_read_by(recognise([stream.tobytes()], FRAMES / RATE_HZ))
 
 
-def recognised_fields(number_formats, head, values):
+def recognised_fields(number_formats, head, values, rate_Hz=RATE_HZ):
     """Return the recognised fields of frames that begin with AA 55, followed by a number and the values of channels."""
     rows = np.column_stack([head, values]).round().astype(int).tolist()
     data = b"".join(b"\xaa\x55" + struct.pack(number_formats, *numbers) for numbers in rows)
-    return recognise([data], FRAMES / RATE_HZ)["fields"]
+    return recognise([data], FRAMES / rate_Hz)["fields"]
 
 
 VALUES = np.random.default_rng(0).normal(0.0, 300.0, (FRAMES, 4)).round()
@@ -186,9 +186,7 @@ def test_counter_of_one_byte_that_restarts_is_recognised():
     assert (counter["name"], counter["type"]) == ("seq", "u8")
 
 
-@pytest.mark.parametrize(
-    ("size", "start", "step"), [(1, 0, 1), (2, 0x9000, 1), (2, 0, 1), (3, 0, 5000), (4, 0x03F0_0000, 5000)]
-)
+@pytest.mark.parametrize(("size", "start", "step"), [(1, 0, 1), (2, 0x9000, 1), (3, 0, 5000), (4, 0x03F0_0000, 5000)])
 @pytest.mark.parametrize("header", ["AA 55", "AA 55 00 10"])
 def test_constant_bytes_before_a_counter_or_clock_do_not_belong_to_it(header, size, start, step):
     """The number wraps or changes its high byte only after the doctor has listened."""
@@ -202,7 +200,7 @@ def test_constant_bytes_before_a_counter_or_clock_do_not_belong_to_it(header, si
     for frame in parsed:
         parser.sequence_flags(frame.seq)
     assert len(parsed) >= len(frames) - 1
-    assert (parser.counts.lost, parser.counts.repeated, parser.counts.restarts) == (0, 0, 0)
+    assert parser.counts.lost == parser.counts.repeated == parser.counts.restarts == 0
     if step > 1:
         assert set(np.diff([frame.t_us for frame in parsed]) % parser.t_us_modulus) == {step}
 
@@ -229,7 +227,6 @@ def test_counter_and_clock_columns_in_text_are_recognised(notation, expected):
     ("name", "rate_Hz", "spread", "expected"),
     [
         ("at", 1000, 1.1, {"t_ms": "at"}),
-        ("at", 1000, 0.0, {"seq": "at"}),
         ("time_ms", 976, 0.0, {"t_ms": "time_ms"}),
         ("millis", 1000, 0.0, {"t_ms": "millis"}),
     ],
@@ -242,10 +239,8 @@ def test_clock_that_counts_about_one_millisecond_per_frame_is_no_frame_counter(n
 
 
 def test_binary_clock_that_repeats_milliseconds_is_no_frame_counter():
-    times = np.arange(FRAMES) + np.random.default_rng(0).random(FRAMES) * 1.1
-    rows = np.column_stack([times, VALUES]).astype(int).tolist()
-    data = b"".join(b"\xaa\x55" + struct.pack("<I4h", *row) for row in rows)
-    assert recognise([data], FRAMES / 1000.0)["fields"][0] == {"name": "t_ms", "type": "u32"}
+    times_ms = np.arange(FRAMES) + (np.random.default_rng(0).random(FRAMES) < 0.1)
+    assert recognised_fields("<I4h", times_ms, VALUES, 1000.0)[0] == {"name": "t_ms", "type": "u32"}
 
 
 def test_header_of_a_csv_stream_becomes_part_of_the_device_file():
