@@ -186,13 +186,12 @@ def test_counter_of_one_byte_that_restarts_is_recognised():
     assert (counter["name"], counter["type"]) == ("seq", "u8")
 
 
-@pytest.mark.parametrize(("size", "start", "step"), [(1, 0, 1), (2, 0x9000, 1), (3, 0, 5000), (4, 0x03F0_0000, 5000)])
-@pytest.mark.parametrize("header", ["AA 55", "AA 55 00 10"])
-def test_constant_bytes_before_a_counter_or_clock_do_not_belong_to_it(header, size, start, step):
+@pytest.mark.parametrize(("size", "start", "step"), [(1, 0, 1), (2, 0x9000, 1), (4, 0x03F0_0000, 5000)])
+def test_constant_bytes_before_a_counter_or_clock_do_not_belong_to_it(size, start, step):
     """The number wraps or changes its high byte only after the doctor has listened."""
     numbers = (start + step * np.arange(20 * FRAMES)) % 256**size
     rows = np.resize(VALUES, (len(numbers), 4)).astype(">i2")
-    heads = [bytes.fromhex(header) + number.to_bytes(size, "big") for number in numbers.tolist()]
+    heads = [b"\xaa\x55" + number.to_bytes(size, "big") for number in numbers.tolist()]
     frames = [head + row.tobytes() for head, row in zip(heads, rows, strict=True)]
     table = recognise([b"".join(frames[:FRAMES])], FRAMES / RATE_HZ)
     parser = device_from_table({"frames": table}, "test").parser()

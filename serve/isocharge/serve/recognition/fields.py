@@ -86,8 +86,9 @@ class Weights:
         channel_group: Contribution of a group of adjacent channels of one type.
         channel: Contribution of a channel, in addition to the bits of its steps.
         constant: Contribution of a constant byte without a meaning, or of a constant channel.
-        constant_high: Contribution of a constant byte of a counter or clock, unless the byte is 0. It is larger than
-            `constant`, because a counter that is too wide causes false restarts, and one that is too narrow does not.
+        constant_high: Contribution of a constant byte of a counter or clock of three bytes, unless the byte is 0. It is
+            larger than `constant`, because counters of two bytes are more usual, and one that is too wide causes false
+            restarts.
         noise: Contribution of a varying byte without a meaning, and of a byte outside of all frames.
         fraction: Share of the bits of a floating-point number that belong to its significant digits, dimensionless.
     """
@@ -218,7 +219,7 @@ def _number_parts(
     deviations = counter_steps - np.median(counter_steps)
     ranges = 256.0 ** np.arange(1, size)  # of numbers with fewer bytes
     clock = identify_clock(counter_steps, frame_rate_Hz)
-    high_score = Weights.constant_high * (is_constant & ~is_zero).sum()
+    high_score = Weights.constant_high * (is_constant & ~is_zero).sum() if size == 3 else 0.0
     if (np.isin(deviations, -ranges) & (counter_steps < 0.0)).sum() > np.isin(deviations, ranges).sum():
         pass  # neither a counter nor a clock
     elif is_counter(counter_steps, clock):

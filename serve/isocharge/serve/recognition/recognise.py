@@ -97,28 +97,22 @@ def _scored_sections(division: FrameDivision, seconds: float) -> Iterator[tuple[
     frame_rate_Hz = stream_bytes / length / seconds  # as if all bytes of the stream belonged to frames
     for order in ORDERS:
         parts_in_window = possible_parts(rows, order, frame_rate_Hz)  # parts that may begin at each byte
-        # A constant byte after another may be the high byte of a counter or clock, which would change after a while.
-        begins_number = [
-            order == "big" and any(part.name and part.size in (2, 4) for part in parts) for parts in parts_in_window
-        ]
-        is_sync = may_be_sync & ~(np.roll(is_constant, 1) & begins_number)
         if not has_check:  # try frames without a checksum
             starts_and_checks = [(start, Check(0, order)) for start in starts]
         for start, check in starts_and_checks:
             parts_from_start = parts_in_window[start:] + parts_in_window[:start]  # from the first byte of the frame
-            parts_before_check = parts_from_start[: length - check.size]
+            # A checksum covers all bytes of a number or none.
+            parts_before_check = [
+                [part for part in parts if not offset < check.start < offset + part.size]
+                for offset, parts in enumerate(parts_from_start[: length - check.size])
+            ]
             # The sync pattern has at most as many bytes as there are possible sync bytes from its beginning on.
             max_sync_length = int(np.argmin([*np.roll(may_be_sync, -start)[:MAX_CONSTANT_BYTES], False]))
             sync_lengths = range(1, max_sync_length + 1) if has_sync else [0]
             score, sync_length, parts = split_frame(parts_before_check, sync_lengths)
-            if not is_sync[start]:
-                score += Weights.constant_high
             has_channel = any(part.role == "channel" for part in parts)
             if has_channel:
-                # From the first byte that may change on, the sync pattern becomes padding.
-                kept_length = min(sync_length, 1 + int(np.argmin([*np.roll(is_sync, -start)[1:sync_length], False])))
-                parts = (*[parts_from_start[0][0]] * (sync_length - kept_length), *parts)
-                sync = np.roll(usual, -start)[:kept_length].tobytes()
+                sync = np.roll(usual, -start)[:sync_length].tobytes()
                 # Each byte outside of all frames contributes `Weights.noise` bits.
                 bits_per_byte = covered_share * score / length + (1.0 - covered_share) * Weights.noise
                 yield bits_per_byte, _frames_section(division, sync, check, order, parts)
