@@ -59,12 +59,16 @@ def test_live_page_shows_a_press_and_carries_out_requests(board, start, tmp_path
     assert client.session()["film"]["model"] == "linear/1"
 
     client.ask("record", on=True)
+    client.ask("record", on=False)
+    client.ask("record", on=True)  # within the same second
+    status, _, body = client.send("POST", "/request", {"do": "record", "on": True})
+    assert (status, b"recorded already" in body) == (400, True)
     follow(client, lambda _, state: str(state.get("recording", "")).endswith(".rec"))
     client.ask("marker", text="here")
     follow(client, lambda _, state: state.get("markers"))
     client.ask("record", on=False)
     follow(client, lambda _, state: state.get("recording") is None)
-    (path,) = tmp_path.glob("linear-1-*.rec")
+    _, path = sorted(tmp_path.glob("linear-1-*.rec"))
     assert '"here"' in path.read_text()
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -220,7 +221,8 @@ class PageFeed:
         """Carry out a request of the page to write a marker, to begin or end a recording, or to measure a new tare.
 
         Raises:
-            InputError: If the page requests a recording while the command records the stream.
+            InputError: If the page requests a recording while the stream is recorded.
+            OutputError: If the file of the recording cannot be created.
         """
         from isocharge.serve.viewer.live_page import Marker, Tare
 
@@ -234,7 +236,7 @@ class PageFeed:
             raise InputError("the command that runs the stream records it already (--record)")
         elif action.on:
             model_label = self._touch.predictor.metadata.label
-            path = Path(f"{model_label.replace('/', '-')}-{time.strftime('%Y%m%d-%H%M%S')}.rec")
+            path = Path(f"{model_label.replace('/', '-')}-{datetime.now():%Y%m%d-%H%M%S-%f}.rec")
             stream.request_recording(self._new_recorder(path, model_label))
             self._page.update(recording=f"{path.name}, which waits for data")
         else:

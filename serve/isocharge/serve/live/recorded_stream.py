@@ -15,7 +15,7 @@ from functools import partial
 
 from msgspec import structs
 
-from isocharge.common.errors import IsochargeError
+from isocharge.common.errors import InputError
 from isocharge.serve.live.stream import TouchStream
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.file_source import Chunk
@@ -51,6 +51,7 @@ class RecordedStream:
         """
         self._stream = stream
         self.recorder = recorder
+        self._latest_recorder = recorder  # recorder of the latest request, which may not have been executed yet
         self._opened_recorder = ExitStack()  # closes the present recorder if it was opened on request
         # A chunk and its records that are not recorded yet
         self._current_chunk: tuple[Chunk, list[PredictionRecord]] | None = None
@@ -64,16 +65,26 @@ class RecordedStream:
         self._requests.append(self._tare)
 
     def request_recording(self, recorder: Recorder | None) -> None:
-        """Request to end the present recording, and to begin another recording unless `recorder` is None.
+        """Request to begin a recording, or to end the present recording if `recorder` is None.
 
-        When a recording begins, the stream is restarted and the tare is measured again. A replay can therefore compute
-        the same records from the bytes of the recording alone. The recording begins with all bytes that
-        the stream had received when its first frame was complete. They contain the names of the channels if the board
-        sends these names only at its start.
+        The file of the recording is created at once. When a recording begins, the stream is restarted and the tare is
+        measured again. A replay can therefore compute the same records from the bytes of the recording alone. The
+        recording begins with all bytes that the stream had received when its first frame was complete. They contain the
+        names of the channels if the board sends these names only at its start.
 
         Args:
             recorder: Recorder of the next recording, which this object opens and closes. None to record nothing.
+
+        Raises:
+            InputError: If the stream is recorded already.
+            OutputExists: If the file exists already.
+            OutputError: If the file cannot be created.
         """
+        if recorder is not None:
+            if self._latest_recorder is not None:
+                raise InputError(f"the stream is recorded already ({self._latest_recorder.path}): end this recording")
+            recorder.__enter__()
+        self._latest_recorder = recorder
         self._requests.append(partial(self._begin_recording, recorder))
 
     def request_marker(self, marker: Marker) -> None:
@@ -142,20 +153,16 @@ class RecordedStream:
         self._current_chunk = None
 
     def _begin_recording(self, recorder: Recorder | None) -> None:
-        """End the present recording, and begin another recording unless `recorder` is None.
+        """Begin a recording with an open recorder, or end the present recording if `recorder` is None.
 
         When a new recording begins, the stream is restarted. The records of the new recording therefore depend only on
-        the bytes in this recording. If the file of the recording cannot be created, an error is logged, and the stream
-        continues without a recording.
+        the bytes in this recording.
         """
         self._end_recording()
         if recorder is None:
             return
-        try:
-            self.recorder = self._opened_recorder.enter_context(recorder)
-        except IsochargeError as error:
-            log.error("no recording: %s", error)
-            return
+        self.recorder = recorder
+        self._opened_recorder.callback(recorder.close)
         self._stream.restart()
         self._is_recording_new = True
         present_label = self._stream.predictor.metadata.label
