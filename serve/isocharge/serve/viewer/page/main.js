@@ -74,7 +74,7 @@ function key(event) {
     ArrowLeft: !live && (() => page.timeline.step(-1)), ArrowRight: !live && (() => page.timeline.step(1)),
   }[name];
   if (!action || !page.film) return;
-  action();
+  if (!event.repeat || name.startsWith("Arrow")) action();
   event.preventDefault();
 }
 
