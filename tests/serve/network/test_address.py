@@ -69,6 +69,12 @@ def test_server_may_open_as_many_files_as_the_system_permits():
     resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
+@pytest.mark.parametrize("client", ["127.0.0.1", "::1"])
+def test_server_on_all_addresses_accepts_ipv4_and_ipv6(client):
+    with Address("::").listen(1) as listening:
+        socket.create_connection((client, listening.getsockname()[1]), timeout=20).close()
+
+
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "example.org"])
 def test_address_of_other_machines_needs_a_token(host):
     with pytest.raises(InputError, match=f"{host} lets other machines in: give --token TOKEN"):

@@ -24,7 +24,7 @@ class Address:
     """Address on which a server listens.
 
     Attributes:
-        host: Host name or IP address.
+        host: Host name or IP address. At `::`, the server also accepts IPv4 clients, as a gRPC server does.
         port: TCP port. The port 0 selects a free port.
         uds: Path of a Unix socket, to which only its owner can connect. If it is given, it replaces host and port.
     """
@@ -54,7 +54,10 @@ class Address:
             # create_server sets SO_REUSEADDR. The port of an earlier server can therefore be used again at once.
             is_ipv6 = ":" in self.host
             family = socket.AF_INET6 if is_ipv6 else socket.AF_INET
-            return socket.create_server((self.host, self.port), family=family, backlog=backlog)
+            accepts_both = self.host == "::" and socket.has_dualstack_ipv6()
+            return socket.create_server(
+                (self.host, self.port), family=family, backlog=backlog, dualstack_ipv6=accepts_both
+            )
         except (OSError, UnicodeError) as error:  # a host name that cannot be encoded causes a UnicodeError
             place = self.uds or f"{self.host}:{self.port}"
             raise ListenError(f"cannot listen on {place}: {error}; choose another address or port") from error
