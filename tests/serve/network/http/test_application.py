@@ -1,5 +1,6 @@
 """The ASGI application in a program of Starlette, as a user mounts it."""
 
+import asyncio
 import json
 from functools import partial
 
@@ -47,3 +48,12 @@ def test_mounted_asgi_app_checks_token_size_and_origin(ask):
     assert ask("GET", "/touch/v2")[0] == 401
     assert ask("GET", "/touch/v2", Origin="http://evil.example", **bearer)[0] == 403
     assert ask("POST", "/touch" + INFER, bytes((1 << 20) + 1), **bearer)[0] == 413
+
+
+def test_asgi_app_accepts_a_scope_without_the_optional_client(models):
+    sent = asyncio.Queue()
+    received = asyncio.Queue()
+    received.put_nowait({"type": "http.request"})
+    scope = {"type": "http", "method": "GET", "path": "/v2", "headers": [(b"host", b"localhost")]}
+    asyncio.run(asgi_app(str(models))(scope, received.get, sent.put))
+    assert sent.get_nowait()["status"] == 200

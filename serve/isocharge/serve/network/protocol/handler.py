@@ -78,7 +78,7 @@ class Application(ABC):
             body += message.get("body", b"")
             is_complete = not message.get("more_body", False)
         path = scope["path"].removeprefix(scope.get("root_path", ""))  # the root path is the path of a mounted program
-        request = (scope["method"], path, scope["headers"], bytes(body), scope["client"])
+        request = (scope["method"], path, scope["headers"], bytes(body), scope.get("client"))
         if path.startswith(self.blocking_paths):
             response = await asyncio.to_thread(self.answer, *request)
         else:  # most answers take only microseconds
