@@ -20,7 +20,7 @@ STRESS = "stress"
 FILM = "film"
 
 MEANINGS = {
-    RECONNECTED: "the first frame after the port was away; the film is tared again",
+    RECONNECTED: "the first frame after the port was away or a page began a recording; the film is tared again",
     GAP: "frames are missing before this one, or were missing in this press, so that its leak is not known",
     REPEAT: "this frame has the number of the one before",
     RESTART: "the frame numbers went back: the device was restarted",

@@ -16,7 +16,7 @@ from functools import partial
 from msgspec import structs
 
 from isocharge.common.errors import InputError
-from isocharge.serve.live.stream import TouchStream
+from isocharge.serve.live.stream import RESTART_OUTAGE_s, TouchStream
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.file_source import Chunk
 from isocharge.serve.port.recording import Marker, Recorder, Recording
@@ -26,9 +26,6 @@ Load = Callable[[], Predictor]
 """Function that loads a model and returns its predictor."""
 
 log = logging.getLogger(__name__)
-
-SHORTEST_OUTAGE_s = 1e-3
-"""Outage that the first chunk after the beginning of a requested recording states, s."""
 
 
 class RecordedStream:
@@ -188,7 +185,7 @@ class RecordedStream:
         preamble = chunk._replace(data=self._preamble, outage_s=0.0)
         deque(self._stream.feed(preamble), maxlen=0)
         self.recorder.chunk(preamble, [])
-        return chunk._replace(outage_s=max(chunk.outage_s, SHORTEST_OUTAGE_s)) if had_frames else chunk
+        return chunk._replace(outage_s=max(chunk.outage_s, RESTART_OUTAGE_s)) if had_frames else chunk
 
     def _end_recording(self) -> None:
         """End the present recording, and close its recorder unless the caller has opened the recorder."""

@@ -22,6 +22,9 @@ from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.tracker import TrackRule
 
+RESTART_OUTAGE_s = 1e-6
+"""Outage that a chunk states if a new recording begins after the first frames, s. Every outage of a port is longer."""
+
 
 def stream(chunks: Iterable[Chunk], predictor: Predictor, device: Device = ANY_BOARD) -> Iterator[PredictionRecord]:
     """Compute the prediction record of every intact frame in the chunks, and yield the records.
@@ -116,7 +119,7 @@ class ReadingStream:
             NoFramesError: If the stream has contained no intact frame in many bytes.
         """
         if chunk.outage_s > 0.0:
-            self._reconnect()
+            self._reconnect(chunk.outage_s)
         parser = self.parser
         frames = parser.feed(chunk.data)
         self._check_recognised()
@@ -157,13 +160,17 @@ class ReadingStream:
             f"{counts.malformed} of another form{line}); {self.parser.format}: check baud rate and device"
         )
 
-    def _reconnect(self) -> None:
+    def _reconnect(self, outage_s: float) -> None:
         """Discard the state of the parser, the clock and the tare after an outage of the port.
 
         The state before the outage is no longer valid, because frames are missing and the film may have been touched
         during the outage. The next frame gets the flag `reconnected`.
+
+        Args:
+            outage_s: Length of the outage, s. If it only states that a recording has begun, it is not counted.
         """
-        self.parser.counts.reconnects += 1
+        if outage_s > RESTART_OUTAGE_s:
+            self.parser.counts.reconnects += 1
         self.parser.reset()
         self.clock.reset()
         self.tare()
