@@ -13,6 +13,7 @@ from isocharge.common.errors import PressError
 from isocharge.serve import Contact, Predictor, read_presses
 from isocharge.serve.prediction.press_check import check_presses
 from isocharge.serve.presses.measured_presses import write_presses
+from isocharge.simulate import NoiseModel
 from isocharge.train import LabelledPresses, evaluate, fit_presses
 from isocharge.train.data.channel_noise import LocalPlanes
 from isocharge.train.data.measured_sensor import PressedArea, outline
@@ -305,6 +306,19 @@ def test_presses_of_one_force_or_without_forces_train_x_and_y(force_N, stated_N,
     assert f"| forces | not estimated: {stated}" in (folder / "card.md").read_text()
     assert np.isfinite(Predictor(folder).predict(presses.charge_pC[0])[:7]).all()
     assert Predictor(folder).flags(Predictor(folder).predict(presses.charge_pC[0])) == ()
+
+
+def test_unknown_forces_that_vary_are_not_taken_for_noise():
+    rng = np.random.default_rng(0)
+    position = np.repeat(rng.uniform(-8.0, 8.0, (60, 2)), 10, axis=0)
+    distance = np.linalg.norm(position[:, None] - 12.0 * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]), axis=2)
+    charge = 500.0 * draw_forces(rng, 600)[:, None] ** 0.67 * np.exp(-((distance / 20.0) ** 2))
+    charge = NoiseModel("bench", 1.0, 0.005).add(charge, rng)
+    contact = np.column_stack([position, np.full(600, np.nan)])
+    fitted = fit_presses(measured_presses(contact, charge, CHANNELS), "pad", QUICKER)
+    np.testing.assert_allclose(fitted.noise.gain, 0.005, rtol=0.4)
+    faulty_charge = charge * [1.5, 1.0, 1.0, 1.0]  # a wrong gain
+    assert np.median(fitted.predict(faulty_charge).misfit) > 5.0 * np.median(fitted.predict(charge).misfit)
 
 
 def test_intact_presses_are_accepted_without_a_warning(caplog):

@@ -25,7 +25,7 @@ from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import PressError, cut
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.serve.presses.table_file import csv_text
-from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes
+from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes, usual_size
 from isocharge.train.data.contact_errors import rms, rounded
 from isocharge.train.data.measured_sensor import LEAST_RANGE, PressedArea, check_measured_presses
 from isocharge.train.data.presses import (
@@ -114,6 +114,8 @@ def fit_presses(
     labelled = LabelledPresses(usable.contact, usable.charge_pC)
     domain = PressedArea.of_contacts(labelled.contact)
     unit_contact = domain.to_unit(labelled.contact)
+    if force_std is not None and force_std >= 1.0:  # the forces are unknown and may vary
+        unit_contact[:, 2] = _unit_sizes(labelled.charge)
     noise = ChannelNoise.estimate(labelled.charge, unit_contact)
     level = noise.level(labelled.charge)  # charges on a scale on which the noise has the standard deviation 1
     with threads_and_seed(training.threads, training.seed):
@@ -255,6 +257,20 @@ def constant_force_std(presses: MeasuredPresses) -> float | None:
     if force.max() >= LEAST_RANGE * force.min():
         return None
     return float(np.hypot(np.std(np.log(force)), rms(presses.force_std)))
+
+
+def _unit_sizes(charge: Array) -> Array:
+    """Return the logarithm of the common size of the charges of each press, scaled to -1 to 1, shape (n,).
+
+    At one place, the common size shows the force. It replaces an unknown force, whose effect on the charges would
+    otherwise be taken for noise.
+
+    Args:
+        charge: Charges, shape (n, n_channel), pC.
+    """
+    size = np.linalg.norm(charge / usual_size(charge), axis=1)
+    log_size = np.log(np.maximum(size, np.finfo(float).tiny))
+    return np.asarray(np.interp(log_size, [log_size.min(), log_size.max()], [-1.0, 1.0]))
 
 
 def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]:
