@@ -36,6 +36,15 @@ def test_noise_of_contacts_that_are_not_repeated_is_hardly_overestimated():
     assert 0.9 < np.mean(estimated_over_true_noise(1000, 1, 0.014, seed=0)) < 1.5
 
 
+def test_repeated_presses_at_one_reference_do_not_determine_the_noise_of_other_charges():
+    rng = np.random.default_rng(0)
+    contact = np.vstack([rng.uniform(-1.0, 1.0, (600, 3)), np.tile([0.9, 0.9, 0.9], (25, 1))])
+    charge = np.exp(4.0 + contact @ rng.uniform(-1.0, 1.0, (3, 4)))
+    noise = ChannelNoise.estimate(charge * (1.0 + 0.007 * rng.standard_normal(charge.shape)), contact)
+    ratio = np.median(noise.sigma(0.2 * charge) / (0.2 * charge), axis=0)
+    np.testing.assert_allclose(ratio, 0.007, rtol=0.4)
+
+
 def test_copies_of_presses_show_no_noise():
     rng = np.random.default_rng(0)
     contact = rng.uniform(-1.0, 1.0, (300, 3))

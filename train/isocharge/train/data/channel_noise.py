@@ -22,10 +22,11 @@ from isocharge.train.data.contact_errors import rounded
 NEIGHBOURS = 16
 """Number of contacts to which a quadratic function is fitted, which has ten coefficients."""
 
-MIN_REPEATED_PRESSES = 20
-"""Number of presses at repeated contacts from which the noise is estimated from these presses only.
+MIN_REPEATED_CONTACTS = 10
+"""Number of repeated contacts from which the noise is estimated from their presses only.
 
-The standard deviation of the noise of a channel is then known to about 20 %."""
+With three presses at each of them, the standard deviation of the noise of a channel is known to about 20 %. A single
+reference contact would not show how the noise depends on the charge."""
 
 SAME_CONTACT_DECIMALS = 3
 """Decimals of the unit coordinates in which two contacts agree if they count as the same contact."""
@@ -81,11 +82,12 @@ class ChannelNoise(GaussianNoise):
     def estimate(cls, charge: Array, unit_contact: Array) -> "ChannelNoise":
         """Estimate the noise of each channel from measured presses.
 
-        Rows that are copies of other rows are left out, because they contain no further noise. If contacts are
-        repeated, the residuals are the differences between the repeated charges and their means. They contain only
-        noise. Otherwise, the residuals are the differences between the charges of a press and the values of a quadratic
-        function, which is fitted to the neighbours of the press. They contain the noise and the error of the quadratic
-        approximation. The white noise and the noise of the gain are fitted to the residuals. Both kinds of noise have
+        Rows that are copies of other rows are left out, because they contain no further noise. If at least
+        `MIN_REPEATED_CONTACTS` contacts are repeated, the residuals are the differences between the repeated charges
+        and their means. They contain only noise. Otherwise, the residuals are the differences between the charges of a
+        press and the values of a quadratic function, which is fitted to the neighbours of the press. They contain the
+        noise and the error of the quadratic approximation. The white noise and the noise of the gain are fitted to the
+        residuals. Both kinds of noise have
         lower limits.
 
         Args:
@@ -98,7 +100,7 @@ class ChannelNoise(GaussianNoise):
         different_rows = np.unique(np.column_stack([unit_contact, charge]), axis=0)
         unit_contact, charge = np.split(different_rows, [unit_contact.shape[1]], axis=1)
         size, residual = _repeated_residuals(unit_contact, charge)
-        if len(residual) < MIN_REPEATED_PRESSES:
+        if len(np.unique(size, axis=0)) < MIN_REPEATED_CONTACTS:
             planes = LocalPlanes.fit(unit_contact, charge)
             size = planes.value
             residual = planes.residual
