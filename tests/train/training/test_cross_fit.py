@@ -156,7 +156,8 @@ def test_card_of_a_model_of_measured_presses_states_noise_and_coverage(fitted_pa
     metadata = Predictor(released_pad).metadata
     card = (released_pad / "card.md").read_text()
     assert f"```bash\n{metadata.made_with['command']}\n```" in card
-    assert "1200 measured presses at 1200 places, which are in `presses.csv`" in card
+    # A few of the 1,200 random positions are closer to another one than the errors of the positions.
+    assert re.search(r"1200 measured presses at 1[01][0-9]{2} places, which are in `presses\.csv`", card)
     assert "\n| probes | unknown |\n" in card
     percentages = re.findall(r"pC and (\S+) %|intervals \| (\S+)%", card)
     expected = [*fitted_pad.noise.gain, metadata.errors["coverage_68"], metadata.errors["coverage_95"]]
@@ -227,10 +228,10 @@ JITTER = np.random.default_rng(5).standard_normal(1_200)
 FAULTY_PRESSES = {
     "too few presses": (
         presses_on_l()[:499],
-        "expected at least 500 presses at 50 places with .* got 499 at 499; .*train calibrate",
+        "expected at least 500 presses at 50 places with .* got 499 at 4[0-9]+; .*train calibrate",
     ),
-    "too few places, which an encoder reports with a noise of 5 um": (
-        replace(presses_on_l(), contact=np.tile(contacts_on_l(12, 0), (100, 1)) + 0.005 * JITTER[:, None]),
+    "too few places, to which a robot returns with errors of 50 um": (
+        replace(presses_on_l(), contact=np.tile(contacts_on_l(12, 0), (100, 1)) + JITTER[:, None] * [0.05, 0.05, 0.0]),
         "expected at least 500 presses at 50 places with .* got 1200 at 12",
     ),
     "too few channels": (

@@ -180,20 +180,21 @@ def place_count(contact: Array) -> int:
     return len(np.unique(np.round(contact[:, :2], 3), axis=0))
 
 
-def merged_places(contact: Array) -> Array:
+def merged_places(contact: Array, step_mm: float = PLACE_STEP_mm) -> Array:
     """Move the positions of all presses at one place to their mean, and return the contacts (x, y, F), shape (n, 3).
 
-    The encoders of a stage report slightly different positions of one place. Positions belong to one place if steps of
-    at most `PLACE_STEP_mm` connect them, and if their rms distance from their mean is not larger, either.
+    The encoders of a stage report slightly different positions of one place. Positions belong to one place if short
+    steps connect them, and if their rms distance from their mean is not larger than a step, either.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        step_mm: Largest step, mm.
     """
     position = contact[:, :2]
     # A coarse grid limits the number of pairs if many presses are at one place.
-    grid_mm = 0.25 * PLACE_STEP_mm
+    grid_mm = 0.25 * step_mm
     cells, cell_of_press = np.unique(np.round(position / grid_mm), axis=0, return_inverse=True)
-    pairs = cKDTree(cells * grid_mm).query_pairs(PLACE_STEP_mm, output_type="ndarray")
+    pairs = cKDTree(cells * grid_mm).query_pairs(step_mm, output_type="ndarray")
     steps = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(cells), len(cells)))
     place_of_press = connected_components(steps, directed=False)[1][cell_of_press.ravel()]
 
@@ -203,7 +204,7 @@ def merged_places(contact: Array) -> Array:
 
     merged_position = np.column_stack([mean_of_place(coordinate) for coordinate in position.T])
     mean_square = mean_of_place(((position - merged_position) ** 2).sum(axis=1))
-    is_place = mean_square <= PLACE_STEP_mm**2
+    is_place = mean_square <= step_mm**2
     return np.column_stack([np.where(is_place[:, None], merged_position, position), contact[:, 2]])
 
 

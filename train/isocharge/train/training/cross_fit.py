@@ -33,6 +33,7 @@ from isocharge.train.data.presses import (
     FEWEST_PLACES,
     HELD_PARTS,
     LabelledPresses,
+    PLACE_STEP_mm,
     check_known_columns,
     complete,
     merged_places,
@@ -126,7 +127,7 @@ def fit_presses(
             for _ in range(1 + HELD_PARTS)
         )
         # For the cross-validation, train a network for each fold on the presses of all other folds.
-        fold_of_press = (HELD_PARTS * position_ranks(labelled.contact)).astype(int)
+        fold_of_press = (HELD_PARTS * position_ranks(uncertain_places(usable))).astype(int)
         for fold_index, network_of_fold in enumerate(fold_networks):
             fold_config = structs.replace(training, seed=training.seed + fold_index)
             train_presses = labelled[fold_of_press != fold_index]
@@ -158,7 +159,7 @@ def fit_presses(
         "torch": torch.__version__,
         "measured": {
             "presses": len(labelled),
-            "places": place_count(labelled.contact),
+            "places": place_count(uncertain_places(usable)),
             "folds": HELD_PARTS,
             "std_factors": [rounded(position_factor), rounded(force_factor)],
         },
@@ -216,7 +217,7 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
     is_complete = complete(presses)  # whether the place, the force and all charges of each press are known
     usable = presses[is_complete]
     usable = replace(usable, contact=merged_places(usable.contact))
-    usable_places = place_count(usable.contact)
+    usable_places = place_count(uncertain_places(usable))
     if len(usable) < FEWEST or usable_places < FEWEST_PLACES:
         raise PressError(
             f"expected at least {FEWEST} presses at {FEWEST_PLACES} places with known place, force and charges, got "
@@ -240,6 +241,16 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
             usable.contact[:, 2].mean(),
         )
     return usable
+
+
+def uncertain_places(presses: MeasuredPresses) -> Array:
+    """Return contacts (x, y, F) with the same position for all presses at one place, shape (n, 3), mm and N.
+
+    A robot does not return to a place exactly. Presses belong to one place if their distance is less than two standard
+    deviations of the difference of two positions.
+    """
+    step_mm = 2.0 * np.sqrt(2.0) * float(np.median(presses.position_std_mm))
+    return merged_places(presses.contact, max(PLACE_STEP_mm, step_mm))
 
 
 def constant_force_std(presses: MeasuredPresses) -> float | None:
