@@ -69,6 +69,10 @@ def test_a_measured_dataset_is_trained_as_presses_alone(dataset_folder, dataset,
     assert sensor_name == dataset.sensor.name
     assert probes == ("circle:1.0",)
 
+    (tmp_path / "c.toml").write_text("[training]\nhold_out = 0.3\n")
+    words = ("train", "fit", tmp_path / "measured", "--config", tmp_path / "c.toml", "-o", tmp_path / "model")
+    assert "training.hold_out has no effect on measured presses" in command(*words)[2]
+
 
 def test_each_caution_about_a_file_of_presses_is_printed_once(tmp_path, command):
     (tmp_path / "short.toml").write_text(SHORT_CONFIG)

@@ -117,15 +117,12 @@ def fit_command(
         _refuse_options(context, "a dataset folder")
         loaded_dataset = read_dataset(dataset)
         electrodes = loaded_dataset.sensor.electrode_names
+        if is_measured(loaded_dataset):
+            _refuse_settings(config, fit_config)
         train = partial(_fit_dataset, loaded_dataset)
     else:  # a file or a pipe
         _refuse_options(context, "measured presses", "probe", "position_std_mm", "force_std")
-        for setting in ("noise", "hold_out"):
-            if getattr(fit_config.training, setting) != getattr(TrainingConfig(), setting):
-                raise InputError(
-                    f"{config}: training.{setting} has no effect on measured presses, whose noise is estimated, and "
-                    "whose errors are measured by cross-validation; leave it out"
-                )
+        _refuse_settings(config, fit_config)
         presses = read_presses(dataset, position_std_mm=position_std_mm, force_std=force_std)
         electrodes = presses.electrodes
         say(f"{dataset}: {len(presses)} presses of the channels {', '.join(electrodes)}")
@@ -155,6 +152,24 @@ def _refuse_options(context: typer.Context, source: str, *used_options: str) -> 
         origin = context.get_parameter_source(parameter.name or "")
         if parameter.name in unused and origin is not None and origin.name == "COMMANDLINE":
             raise InputError(f"{parameter.opts[0]}: has no effect on {source}; leave the option out")
+
+
+def _refuse_settings(path: Path | None, config: FitConfig) -> None:
+    """Raise an error if a configuration file contains a setting that has no effect on measured presses.
+
+    Args:
+        path: The file; None for the default settings.
+        config: Its settings.
+
+    Raises:
+        InputError: If there is such a setting.
+    """
+    for setting in ("noise", "hold_out"):
+        if getattr(config.training, setting) != getattr(TrainingConfig(), setting):
+            raise InputError(
+                f"{path}: training.{setting} has no effect on measured presses, whose noise is estimated, and whose "
+                "errors are measured by cross-validation; leave it out"
+            )
 
 
 def _release(fitted: Fitted, version_folder: Path) -> Release:
@@ -204,8 +219,8 @@ def _fit_simulated_presses(sensor_name: str, notations: Sequence[str], radius: s
 def _fit_dataset(dataset: Dataset, config: FitConfig) -> Fitted:
     """Train a network on the simulated or the measured presses of a dataset."""
     if is_measured(dataset):
-        probes = tuple(sorted(set(map(str, dataset.samples.probe))))
-        return fit_presses(measured_presses_of(dataset), dataset.sensor.name, config, probes=probes)
+        presses = measured_presses_of(dataset)
+        return fit_presses(presses, dataset.sensor.name, config, probes=dataset.samples.probes)
     data = TrainingData.of(dataset)
     if data.yield_force_N is not None:
         say(f"caution: PVDF yields beyond {data.yield_force_N:g} N, and a dent stays")

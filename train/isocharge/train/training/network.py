@@ -247,7 +247,7 @@ class InverseNetwork(nn.Module):
         if force_std is not None:
             self.output_factor[FORCE_OUTPUTS] = 0.0
             self.output_offset[LOG_STD.stop - 1] = np.log(force_std / domain.scale[2])
-        values = feature_values(features, torch.tensor(charge))
+        values = feature_values(features, torch.tensor(charge, dtype=torch.float64))
         mean = values.mean(dim=0)
         # The rows of `axes` are the principal axes. The standard deviation of the values along an axis is its singular
         # value divided by the square root of the number of values.
