@@ -258,6 +258,20 @@ def test_half_closed_connection_receives_its_responses(server, requests):
         assert statuses(everything(connection)) == [200] * len(requests)
 
 
+@pytest.mark.parametrize(
+    ("requests", "count", "status"),
+    [
+        (infer() * 150, 101, 429),
+        (infer() + b"no request\r\n\r\n", 2, 400),
+        (b"GET /v2 HTTP/1.1\r\na: " + b"b" * 40_000, 1, 431),
+    ],
+)
+def test_refusal_follows_the_responses_to_earlier_requests(server, requests, count, status):
+    """Responses are sent in the order of the requests (RFC 9112, 9.3.2)."""
+    assert statuses(exchange(server, LOAD + requests)) == [200] * count + [status]
+    assert is_well(server)
+
+
 def test_requests_that_wait_for_an_earlier_response_are_limited(server):
     """Otherwise, a client could fill the memory with requests whose responses it does not read."""
     answer = exchange(server, LOAD + infer() * 3000)

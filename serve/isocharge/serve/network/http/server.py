@@ -18,6 +18,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import httptools
 import uvicorn
 import uvloop
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
@@ -50,6 +51,7 @@ class Connection(HttpToolsProtocol):
         self._traffic = traffic
         self._is_reading = False  # whether a request has begun and is not complete
         self._pending_bytes = 0  # bytes since the latest complete head, part of a body, or complete request
+        self._refusal: Any = None  # status and reason of a refusal that follows the responses to earlier requests
 
     def connection_made(self, transport: Any) -> None:
         """Begin the connection. If there are too many connections, end one that waits for a request.
@@ -84,7 +86,7 @@ class Connection(HttpToolsProtocol):
         twice as long.
         """
         limit = self._limits.header_bytes
-        while data and not self.transport.is_closing():
+        while data and not (self._refusal or self.transport.is_closing()):
             size = limit + 1 - self._pending_bytes  # so many bytes of a head show that it is too long
             self._pending_bytes += len(data[:size])
             super().data_received(data[:size])
@@ -107,6 +109,7 @@ class Connection(HttpToolsProtocol):
         most = self._limits.queued_requests
         if len(self.pipeline) >= most:
             self.refuse(429, f"more than {most} requests wait; read the responses first")
+            raise httptools.HttpParserError  # ends the parsing of these data
         super().on_message_begin()
 
     def on_headers_complete(self) -> None:
@@ -148,8 +151,8 @@ class Connection(HttpToolsProtocol):
     def refuse_unanswered(self) -> None:
         """Refuse the open request because the server stops, unless its response has begun."""
         if self.cycle is not None and not self.cycle.response_started:
-            self.refuse(503, "the server has stopped before it could answer; send the request again")
             self.cycle.disconnected = True  # uvicorn would otherwise add a response of its own
+            self.refuse(503, "the server has stopped before it could answer; send the request again")
 
     def send_400_response(self, msg: str) -> None:
         """Refuse data that are not an HTTP request. uvicorn calls this method with a message."""
@@ -158,11 +161,19 @@ class Connection(HttpToolsProtocol):
     def refuse(self, status: int, message: str) -> None:
         """Send a refusal as the last response of the connection, and count it.
 
+        If earlier requests are complete, the refusal follows their responses, and later data are ignored. If the body
+        of the refused request has begun, or the server has stopped, the refusal is sent at once.
+
         Args:
             status: HTTP status.
             message: Reason of the refusal.
         """
         if self.transport.is_closing():
+            return
+        cycle = self.cycle
+        if cycle is not None and not (cycle.response_complete or cycle.more_body or cycle.disconnected):
+            self._refusal = self._refusal or (status, message)
+            self.deadline = math.inf
             return
         response = json_response({"error": message}, status)
         exchange = Exchange("http", "none", status, bytes_out=len(response.body), client=self.client)
@@ -171,6 +182,12 @@ class Connection(HttpToolsProtocol):
         self.transport.write(STATUS_LINE[status] + headers + b"connection: close\r\n\r\n" + response.body)
         self.transport.close()
         self.deadline = self.loop.time() + self._limits.header_seconds
+
+    def on_response_complete(self) -> None:
+        """Begin to answer the next request that waits. If none waits, send the refusal, if there is one."""
+        if self._refusal and not self.pipeline:
+            self.refuse(*self._refusal)
+        super().on_response_complete()
 
 
 class HttpServer:
