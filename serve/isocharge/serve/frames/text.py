@@ -320,10 +320,8 @@ class TextParser(DelimitedParser):
 def _frame_lines(lines: Sequence[Line], cycle_length: int) -> Sequence[Line]:
     """Return the lines of one frame in repeated cycles of lines; empty if it is not clear which lines are frames.
 
-    If every value has a name, a frame consists of all lines of a cycle. If every line has a clock, the lines are
-    grouped so that the clocks of a frame differ least. Otherwise, a frame begins with the counter, the clock, or the
-    first name in alphabetical order. If not every value has a name, a frame is a single line, and the other lines of
-    the cycle never change.
+    If every value has a name, a frame consists of all lines of a cycle. Otherwise, a frame is a single line, and the
+    other lines of the cycle never change.
 
     Args:
         lines: Lines of whole cycles; may be empty.
@@ -333,20 +331,34 @@ def _frame_lines(lines: Sequence[Line], cycle_length: int) -> Sequence[Line]:
     if cycle_length <= 1:
         return cycle
     if all(all(line.names) for line in cycle):
-        line_names = [next((name for name in line.names if name not in TIMES_US), "") for line in cycle]
-        times = [
-            value
-            for line in lines
-            for name, value in zip(line.names, line_values(skeleton_pattern(line), line.text) or (), strict=False)
-            if name in TIMES_US
-        ]
-        if len(times) != len(lines):
-            times = [0.0] * len(lines)
-        *_, first = min(
-            (times[position + cycle_length - 1] - times[position], name != SEQ, name, position)
-            for position, name in enumerate(line_names)
-        )
+        first = _first_line(lines, cycle_length)
         return lines[first : first + cycle_length]
     texts = [{line.text for line in lines[position::cycle_length]} for position in range(cycle_length)]
     varying = [line for line, texts_of_line in zip(cycle, texts, strict=True) if len(texts_of_line) > 1]
     return varying if len(varying) == 1 else []
+
+
+def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
+    """Return the index of the line with which a frame begins in repeated cycles of lines.
+
+    If every line has a clock, the clocks of the lines of a frame differ least. Otherwise, a frame begins with the
+    counter, with a line that only contains the clock, or with the first name in alphabetical order.
+
+    Args:
+        lines: Lines of whole cycles, in which every value has a name.
+        cycle_length: Number of lines in a cycle.
+    """
+    names = [next((name for name in line.names if name not in TIMES_US), "") for line in lines]
+    clocks = [
+        value
+        for line in lines
+        for name, value in zip(line.names, line_values(skeleton_pattern(line), line.text) or (), strict=False)
+        if name in TIMES_US
+    ]
+    has_clocks = len(clocks) == len(lines)
+
+    def order(first: int) -> tuple[float, bool, str]:
+        duration = clocks[first + cycle_length - 1] - clocks[first] if has_clocks else 0.0
+        return duration, names[first] != SEQ, names[first]
+
+    return min(range(cycle_length), key=order)

@@ -214,25 +214,35 @@ def _number_parts(
         counter_steps = (steps + half_range) % (2 * half_range) - half_range  # a counter that overflows restarts at 0
         magnitude = float(np.median(np.abs(values - half_range)))  # distance from the middle of the range
 
-    # If the number has fewer bytes, it wraps without a carry to the bytes above it. A damaged byte may cause the same
-    # step back, but then also an equal step forwards.
-    deviations = counter_steps - np.median(counter_steps)
-    ranges = 256.0 ** np.arange(1, size)  # of numbers with fewer bytes
     clock = identify_clock(counter_steps, frame_rate_Hz)
+    has_all_bytes = not _wraps_early(counter_steps, size)
     high_score = Weights.constant_high * (is_constant & ~is_zero).sum() if size == 3 else 0.0
-    if (np.isin(deviations, -ranges) & (counter_steps < 0.0)).sum() > np.isin(deviations, ranges).sum():
-        pass  # neither a counter nor a clock
-    elif is_counter(counter_steps, clock):
+    if has_all_bytes and is_counter(counter_steps, clock):
         yield Part("seq", type_name, size, high_score, name="seq")  # the values of a counter need no bits
-    elif clock is not None:
+    elif has_all_bytes and clock is not None:
         name, tick_duration = clock
-        clock_score = high_score + _bits(deviations, unit, size)
+        clock_score = high_score + _bits(counter_steps - np.median(counter_steps), unit, size)
         yield Part("clock", type_name, size, clock_score, name=name, scale=tick_duration)
 
     # The magnitude is counted as one more step. The score of a type is therefore lower if the values in this type are
     # close to 0 or, for an unsigned type, close to the middle of its range.
     channel_score = Weights.channel + _bits(np.append(steps, magnitude), unit, size)
     yield Part("channel", type_name, size, channel_score)
+
+
+def _wraps_early(steps: Array, size: int) -> bool:
+    """Return whether a counter or clock has fewer bytes than are read, because it wraps without a carry to the others.
+
+    A damaged byte may cause the same step back, but then also an equal step forwards.
+
+    Args:
+        steps: Differences of the values of consecutive frames, shape (n,).
+        size: Number of bytes that are read.
+    """
+    deviations = steps - np.median(steps)
+    ranges = 256.0 ** np.arange(1, size)  # of numbers with fewer bytes
+    is_wrap = np.isin(deviations, -ranges) & (steps < 0.0)
+    return bool(is_wrap.sum() > np.isin(deviations, ranges).sum())
 
 
 def split_frame(
