@@ -256,5 +256,5 @@ def _spellings(name: str) -> set[str]:
     """Return the letters and digits of a name in lower case, and the same with the quantity instead of a unit."""
     with_quantity = name.casefold()
     for quantity, unit in _UNITS_AT_END.items():
-        with_quantity = re.sub(rf"[\W_]+{unit}[\W_]*$", quantity, with_quantity)
+        with_quantity = re.sub(rf"[\W_]{unit}[\W_]*$", quantity, with_quantity)
     return {re.sub(r"[\W_]+", "", text) for text in (name.casefold(), with_quantity)}
