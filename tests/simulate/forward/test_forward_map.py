@@ -315,6 +315,7 @@ def test_derivatives_of_a_small_sensor_are_those_of_a_large_one_in_other_units(n
     np.testing.assert_allclose(slope / largest, expected / largest, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_under_a_narrow_probe_are_those_of_direct_solves():
     """The electrode has more integration points in a direct solve, so its differences allow short steps."""
     sensor = replace(load_sensor("four-25um-biaxial"), electrodes=(Electrode.of_square("A", (0.0, 3.0), 2.0),))
