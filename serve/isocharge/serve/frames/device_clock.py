@@ -237,8 +237,8 @@ class DeviceClock:
         """Remove the wraps from the clock value of the next reading, and store the resulting value in `_device_us`.
 
         If the clock went back by at most `MAX_DELAY_s`, the reading arrived late: for example, another datagram has
-        overtaken it. If the clock went back by more, or ahead by at least half of its range, the device has restarted,
-        and the fit is discarded.
+        overtaken it. If the clock went back by more, or ahead by at least half of its range, the device has restarted.
+        The fit is then discarded.
 
         Args:
             t_us: Clock of the reading as the device sent it, us.

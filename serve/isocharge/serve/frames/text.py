@@ -341,8 +341,8 @@ def _frame_lines(lines: Sequence[Line], cycle_length: int) -> Sequence[Line]:
 def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
     """Return the index of the line with which a frame begins in repeated cycles of lines.
 
-    If every line has a clock, the clocks of the lines of a frame differ least. Otherwise, a frame begins with the
-    counter, with a line that only contains the clock, or with the first name in alphabetical order.
+    If every line has a clock, the lines whose clocks differ least form a frame. Otherwise, a frame begins with the line
+    of the counter, or else with a line that only contains the clock, or else with the first name in alphabetical order.
 
     Args:
         lines: Lines of whole cycles, in which every value has a name.

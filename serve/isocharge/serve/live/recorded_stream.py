@@ -79,8 +79,8 @@ class RecordedStream:
         """
         if recorder is not None:
             if self._latest_recorder is not None:
-                raise InputError(f"the stream is recorded already ({self._latest_recorder.path}): end this recording")
-            recorder.__enter__()
+                raise InputError(f"the stream is recorded already ({self._latest_recorder.path}); end it first")
+            recorder.open()
         self._latest_recorder = recorder
         self._requests.append(partial(self._begin_recording, recorder))
 

@@ -54,9 +54,9 @@ class Address:
             # create_server sets SO_REUSEADDR. The port of an earlier server can therefore be used again at once.
             is_ipv6 = ":" in self.host
             family = socket.AF_INET6 if is_ipv6 else socket.AF_INET
-            accepts_both = self.host == "::" and socket.has_dualstack_ipv6()
+            accepts_ipv4_too = self.host == "::" and socket.has_dualstack_ipv6()
             return socket.create_server(
-                (self.host, self.port), family=family, backlog=backlog, dualstack_ipv6=accepts_both
+                (self.host, self.port), family=family, backlog=backlog, dualstack_ipv6=accepts_ipv4_too
             )
         except (OSError, UnicodeError) as error:  # a host name that cannot be encoded causes a UnicodeError
             place = self.uds or f"{self.host}:{self.port}"

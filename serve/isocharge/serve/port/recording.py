@@ -91,7 +91,7 @@ class Recorder:
         self._last_chunk: Chunk | None = None  # chunk of the latest call of `chunk`
         self._size_before_last_chunk = 0  # size of the file before the last chunk was written, bytes
 
-    def __enter__(self) -> Self:
+    def open(self) -> None:
         """Create the file, and write its first line.
 
         Raises:
@@ -100,6 +100,10 @@ class Recorder:
         """
         self._file = AtomicWriter(self.path)
         self._write(json.dumps(self._header))
+
+    def __enter__(self) -> Self:
+        """Create the file, and return the recorder; see `open`."""
+        self.open()
         return self
 
     def __exit__(self, *_: object) -> None:

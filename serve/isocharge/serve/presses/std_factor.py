@@ -1,8 +1,8 @@
 """Factor by which the standard deviations of a model are multiplied to guarantee the coverage of its regions.
 
-The factor is an order statistic of held-out presses (split conformal prediction, Vovk 2012, proposition 2a). For n
-presses that were not used for the training or the calibration, the share of contacts that the k-th smallest score
-covers has the distribution Beta(k, n + 1 - k), whatever the distribution of the errors.
+The factor is an order statistic of held-out presses (split conformal prediction, Vovk 2012, proposition 2a). With n
+presses that were not used for the training or the calibration, the share of future contacts whose score is at most the
+k-th smallest score has the distribution Beta(k, n + 1 - k). This holds for any distribution of the errors.
 """
 
 import math

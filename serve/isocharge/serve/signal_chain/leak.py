@@ -176,7 +176,10 @@ class Leak(OffsetStage):
         frame.base_relax_s = self._rule.relax_s
 
     def _advance(self, frame: Frame, previous: Frame, output_pC: Array) -> None:
-        """Add the new charge to the touch charge. Out of contact, estimate the inflow, too.
+        """Add the charge that is new since the previous frame to the touch charge.
+
+        Out of contact, any touch charge is an error and decays to zero, and the new charge shows the inflow. If frames
+        are missing, the touch may have ended meanwhile, or its charge may have become wrong.
 
         Args:
             frame: The frame.
@@ -190,7 +193,7 @@ class Leak(OffsetStage):
             self._inflow.pause()
         else:
             self._is_falsified = False
-            self._charge_pC = self._charge_pC * math.exp(-dt_s / self._rule.relax_s)  # an error, which decays to zero
+            self._charge_pC = self._charge_pC * math.exp(-dt_s / self._rule.relax_s)
             if self._inflow.hold_s > 0.0 or not self._rule.learn:
                 self._inflow.hold_s -= dt_s
             else:
@@ -198,7 +201,7 @@ class Leak(OffsetStage):
         has_gap = dt_s > 1.5 * previous.dt_s  # frames are missing or were invalid
         if has_gap and previous.is_contact and self._has_ended_in_gap(frame, output_pC, surplus_pC):
             self._is_falsified = False
-            surplus_pC = -self._charge_pC
+            surplus_pC = -self._charge_pC  # so that no touch charge remains
         elif has_gap:
             self._is_falsified |= self._may_be_falsified(frame, surplus_pC)
         self._charge_pC = self._charge_pC + surplus_pC
@@ -213,9 +216,9 @@ class Leak(OffsetStage):
         return (output_pC - decay * self._output_pC) * 2.0 / (1.0 + decay)
 
     def _growth(self, frame: Frame) -> Array:
-        """Return the factor 1 / a by which a charge was larger at the beginning of the gap before a frame.
+        """Return the charge at the previous frame divided by the part that the leak has left, shape (n_electrode,).
 
-        It is limited to avoid an overflow. The shape is (n_electrode,).
+        The ratio is limited to avoid an overflow.
         """
         return np.exp(np.minimum(frame.dt_s / self._tau_s, 60.0))
 

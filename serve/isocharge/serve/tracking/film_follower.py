@@ -343,7 +343,7 @@ class FilmFollower:
         ratio of the probability densities of t = 0 after and before them (Savage-Dickey ratio, Dickey 1971).
 
         The covariance remains that of a film which has changed, because hardly any film keeps its pretension exactly.
-        It also contains the distance from the mean of the state to the estimates with and without a change.
+        The square of the shift to the estimate without a change is added to it, times the probability of this estimate.
         """
         change_MPa = self._state[0]
         variance = self._covariance[0, 0]

@@ -267,8 +267,8 @@ def _log_ratio(measured: Array, expected: Array) -> Array:
 def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[tuple[str, Array, Array]]:
     """Yield a corrected copy of the presses for each possible mistake.
 
-    The mistakes are swapped charge columns, rotated or mirrored axes of the rig, and wrong units. Presses at one place
-    do not show swapped columns or rotated axes.
+    The mistakes are wrong units, swapped charge columns, and rotated or mirrored axes of the rig. For presses at one
+    place, only wrong units are considered, because another order of the columns may fit their charges by chance.
 
     Args:
         presses: The measured presses, all with a known place and force.

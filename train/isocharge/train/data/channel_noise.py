@@ -87,8 +87,7 @@ class ChannelNoise(GaussianNoise):
         and their means. They contain only noise. Otherwise, the residuals are the differences between the charges of a
         press and the values of a quadratic function, which is fitted to the neighbours of the press. They contain the
         noise and the error of the quadratic approximation. The white noise and the noise of the gain are fitted to the
-        residuals. Both kinds of noise have
-        lower limits.
+        residuals. Both kinds of noise have lower limits.
 
         Args:
             charge: Measured charges, shape (n, n_electrode), pC.

@@ -244,10 +244,11 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
 
 
 def uncertain_places(presses: MeasuredPresses) -> Array:
-    """Return contacts (x, y, F) with the same position for all presses at one place, shape (n, 3), mm and N.
+    """Return the contacts (x, y, F), in which all presses at one place have the same position, shape (n, 3), mm and N.
 
-    A robot does not return to a place exactly. Presses belong to one place if their distance is less than two standard
-    deviations of the difference of two positions.
+    A robot does not return to a place exactly, and the errors of its positions are known from `position_std_mm`.
+    Neighbouring positions count as one place if their distance is at most twice the standard deviation of the
+    difference between two positions.
     """
     step_mm = 2.0 * np.sqrt(2.0) * float(np.median(presses.position_std_mm))
     return merged_places(presses.contact, max(PLACE_STEP_mm, step_mm))
@@ -273,8 +274,8 @@ def constant_force_std(presses: MeasuredPresses) -> float | None:
 def _unit_sizes(charge: Array) -> Array:
     """Return the logarithm of the common size of the charges of each press, scaled to -1 to 1, shape (n,).
 
-    At one place, the common size shows the force. It replaces an unknown force, whose effect on the charges would
-    otherwise be taken for noise.
+    If the force at a place changes, all charges change by about the same factor, which their common size shows. The
+    size therefore replaces an unknown force, whose effect on the charges would otherwise be taken for noise.
 
     Args:
         charge: Charges, shape (n, n_channel), pC.
