@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from isocharge.serve.frames.binary import BinaryParser, encode_frame
     from isocharge.serve.frames.formats import AutoParser
     from isocharge.serve.frames.frame import Frame
-    from isocharge.serve.frames.text_lines import encode_text
+    from isocharge.serve.frames.text import encode_text
     from isocharge.serve.live.device import device_from_table, load_device
     from isocharge.serve.live.steady_press import PressWatch
     from isocharge.serve.live.stream import ReadingStream, TouchStream, stream

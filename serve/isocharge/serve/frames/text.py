@@ -1,4 +1,4 @@
-"""Parser for boards that send frames as lines of text.
+"""Parser for boards that send frames as lines of text, and function that writes such lines.
 
 A board writes each frame as one line, or as a cycle of lines that together contain all values of the frame. The module
 `isocharge.serve.frames.text_lines` reads the numbers of each line. Lines with the same text between their numbers
@@ -25,8 +25,11 @@ then at 65536, unless it returns to a small number after 99, 999 or 9999. A cloc
 bits, and a clock in s is assumed to be a time of day.
 """
 
+import json
 from collections import deque
 from collections.abc import Mapping, Sequence
+from string import ascii_uppercase
+from typing import Literal
 
 from isocharge.common.errors import printable
 from isocharge.serve.frames.frame import (
@@ -362,3 +365,22 @@ def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
         return duration, names[first] != SEQ, names[first]
 
     return min(range(cycle_length), key=order)
+
+
+def encode_text(frame: Frame, notation: Literal["csv", "json"]) -> bytes:
+    """Encode a frame as a line of text, in which the values of the channels have seven significant digits.
+
+    Channels without names are called A, B, C, and so on.
+
+    Args:
+        frame: Frame to write.
+        notation: Whether the line is a CSV row that contains only the channels, or a JSON object that also contains the
+            frame counter and the clock.
+    """
+    values = [f"{value:.7g}" for value in frame.values]
+    if notation == "csv":
+        return (",".join(values) + "\n").encode()
+    names = frame.names or ascii_uppercase
+    fields = {SEQ: frame.seq, "t_us": frame.t_us, **dict(zip(names, values, strict=False))}
+    members = (f"{json.dumps(name)}: {value}" for name, value in fields.items() if value is not None)
+    return ("{" + ", ".join(members) + "}\n").encode()

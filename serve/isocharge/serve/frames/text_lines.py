@@ -1,4 +1,4 @@
-"""Numbers in the lines of text that boards send, and functions that write frames as lines of text.
+"""Numbers in the lines of text that boards send.
 
 Text is numbers with something between them. The numbers are taken out of a line, and the rest of the line is its
 skeleton. Lines with the same skeleton are frames of one layout, in whatever notation the board writes them:
@@ -17,17 +17,15 @@ followed by a colon or an equals sign may change from line to line, except units
 number have no meaning.
 """
 
-import json
 import math
 import re
 from collections.abc import Collection
 from functools import reduce
 from itertools import pairwise
 from operator import xor
-from string import ascii_uppercase
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
-from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, SEQ, TIMES_US, Frame
+from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, SEQ, TIMES_US
 
 _INDEX = r"\[\w*\](?!\s*[,;]?\s*(?:$|[^\W\d]))"  # not the value in `C[7] A[3]`, which stands before a name or the end
 
@@ -479,22 +477,3 @@ def header_names(header: str, line: Line) -> tuple[str, ...]:
     are_names = all(re.match(r"[^\W\d]", name) for name in names)
     are_different = len(names) == len(set(names)) == len(starts)
     return names if are_names and are_different else ()
-
-
-def encode_text(frame: Frame, notation: Literal["csv", "json"]) -> bytes:
-    """Encode a frame as a line of text, in which the values of the channels have seven significant digits.
-
-    Channels without names are called A, B, C, and so on.
-
-    Args:
-        frame: Frame to write.
-        notation: Whether the line is a CSV row that contains only the channels, or a JSON object that also contains the
-            frame counter and the clock.
-    """
-    values = [f"{value:.7g}" for value in frame.values]
-    if notation == "csv":
-        return (",".join(values) + "\n").encode()
-    names = frame.names or ascii_uppercase
-    fields = {SEQ: frame.seq, "t_us": frame.t_us, **dict(zip(names, values, strict=False))}
-    members = (f"{json.dumps(name)}: {value}" for name, value in fields.items() if value is not None)
-    return ("{" + ", ".join(members) + "}\n").encode()
