@@ -177,6 +177,11 @@ NOTATIONS = {
     "A nC: {a} B nC: {b} C nC: {c}": ("A_nC", "B_nC", "C_nC"),
     "A [nC]: {a}, B [nC]: {b}, C [nC]: {c}": ("ch1_nC", "ch2_nC", "ch3_nC"),
     "Q[0]:{a} Q[1]:{b} Q[2]:{c}": ("Q[0]", "Q[1]", "Q[2]"),
+    "Channel 1 = {a} nC, Channel 2 = {b} nC, Channel 3 = {c} nC": ("1_nC", "2_nC", "3_nC"),
+    "CH 1: {a}\nCH 2: {b}\nCH 3: {c}": "123",
+    "12:34:56.789 -> {{1: {a}, 4: {b}, 7: {c}}}": "147",
+    "pad #0 {a} pC pad #1 {b} pC pad #2 {c} pC": "012",
+    "[1] {a} [2] {b} [3] {c}": "123",
 }
 """Names of the channels by the notation of a frame."""
 
@@ -243,6 +248,7 @@ MESSAGES = ["Sensor 1 ready", "Sensor 2 ready", "Sensor 3 ready", "load:0x3fff00
         (["7,0x1F", "8,-0x20", "9,0x0"], [(7, 31), (8, -32), (9, 0)]),
         ([f"seq=0x{n:X} A=-{n}" for n in range(12)], [(-n,) for n in range(12)]),
         (["850 pC 3 pC 5 pC"] * 3, [(850, 3, 5)] * 3),
+        (["x 0 7 y 1 8", "x 0 7 y 2 8", "x 1 7 y 2 8"] * 4, [(0, 7, 1, 8), (0, 7, 2, 8), (1, 7, 2, 8)] * 4),
     ],
     ids=[
         "a header after a reset",
@@ -252,6 +258,7 @@ MESSAGES = ["Sensor 1 ready", "Sensor 2 ready", "Sensor 3 ready", "load:0x3fff00
         "mixed",
         "a hexadecimal counter",
         "units",
+        "two values behind each name, which are no index and value",
     ],
 )
 def test_lines_that_are_frames(lines, values):

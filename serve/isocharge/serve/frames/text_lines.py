@@ -12,9 +12,9 @@ skeleton. Lines with the same skeleton are frames of one layout, in whatever not
 | `{"charge": {"A": 801.2, "B": 3}}` | A, B | 801.2, 3 |
 
 A word directly before a number is the name of the number. If different words and numbers alternate, as in `C,7,A,3` and
-`7 C, 3 A`, the words are names, too. Digits in a word, as in `ch3`, are not a number. Words that are neither names nor
-followed by a colon or an equals sign may change from line to line, except units of charge and voltage. Quotes around a
-number have no meaning.
+`7 C, 3 A`, the words are names, too. Digits in a word, as in `ch3`, are not a number, and an index such as that in
+`ch 3: 801` is a name. Words that are neither names nor followed by a colon or an equals sign may change from line to
+line, except units of charge and voltage. Quotes around a number have no meaning.
 """
 
 import math
@@ -111,6 +111,9 @@ _TOKENS = {kind: _token_pattern(_PATTERNS[kind]) for kind in ("number", "number 
 
 _SEPARATORS = ",;|[("
 """Marks that separate columns or begin a list. A word before such a mark does not name the number after the mark."""
+
+_SHAPES = {"number": "0", "hexadecimal": "0", "time": "", "uptime": "", "word": "w", "key": "k", "quoted": "k"}
+"""Character that stands for a part of a line in its shape, by the kind of the part. A mark stands for itself."""
 
 
 class _Token(NamedTuple):
@@ -296,15 +299,33 @@ def _tokens(text: str, number_kind: str) -> list[_Token]:
         is_after_blank = text[match.start() - 1 : match.start()].isspace()
         tokens.append(_Token(kind, content.strip(), match.start(), is_after_blank))
 
-    # In pairs of numbers, such as `1:801,2:799`, the first number of each pair is a name.
-    shape = "".join("#" if token.kind in _NUMBER_KINDS else token.content for token in tokens)
-    if re.fullmatch(r"(?:#[:=]#[,;]*)+", shape):
-        is_name = [token.content in ":=" for token in tokens[1:]] + [False]
-        tokens = [
-            token._replace(kind="key") if is_name_of_next else token
-            for token, is_name_of_next in zip(tokens, is_name, strict=True)
-        ]
+    for position in _index_positions(tokens):
+        tokens[position] = tokens[position]._replace(kind="key")
     return tokens
+
+
+def _index_positions(tokens: list[_Token]) -> list[int]:
+    """Return the positions of the numbers that are indices of channels, and therefore names.
+
+    Each number before a colon or an equals sign is an index, as in `1:801,2:799` and `ch 1 = 801 pC`. In lines such as
+    `pad #1 801 pad #2 799`, the indices count the channels from 0 or 1, and follow the same word or mark.
+
+    Args:
+        tokens: Parts of the line.
+    """
+    shape = "".join(_SHAPES.get(token.kind, token.content) for token in tokens)
+    numbers = [position for position, token in enumerate(tokens) if _SHAPES.get(token.kind) == "0"]
+    before_colons = re.search(r"(?:[^0]*+0[)\]]?[:=]0)+[^0]*+$", shape)
+    if before_colons is not None and (before_colons.start() == 0 or before_colons[0].count("0") > 2):
+        return numbers[-before_colons[0].count("0") :: 2]
+
+    after_words = re.search(r"(?:[^0]*[w#(\[]0[)\]]?0)+[^0]*$", shape)
+    positions = numbers[-after_words[0].count("0") :: 2] if after_words is not None else []
+    indices = [tokens[position].content for position in positions]
+    counts = [str(count) for count in range(len(indices) + 1)]
+    are_counts = len(indices) > 1 and indices in (counts[:-1], counts[1:])
+    is_prefix_equal = len({tokens[position - 1].content for position in positions}) == 1
+    return positions if are_counts and is_prefix_equal else []
 
 
 def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], list[str]]:
