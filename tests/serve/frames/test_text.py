@@ -94,6 +94,14 @@ def feed(*lines, parser=None):
     return (parser or TextParser()).feed("".join(f"\n{line}" for line in lines).encode() + b"\n")
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_unit_and_degrees_in_two_encodings(encoding):
+    text = "".join(f"\nA: {k} µC, B: -2.5 µC, T: 23.5 °C" for k in range(12)) + "\n"
+    frames = TextParser().feed(text.encode(encoding))
+    assert [frame.values for frame in frames] == [(k, -2.5, 23.5) for k in range(12)]
+    assert frames[-1].names == ("A_µC", "B_µC", "T")
+
+
 def test_layout_is_recognised_from_the_first_good_lines():
     parser = TextParser()
     assert feed("booting v1.2 ...", "3.3,801.2", "801.0,799.0,803.0", "801.1,799.1,803.1", parser=parser) == []
@@ -182,6 +190,7 @@ NOTATIONS = {
     "12:34:56.789 -> {{1: {a}, 4: {b}, 7: {c}}}": "147",
     "pad #0 {a} pC pad #1 {b} pC pad #2 {c} pC": "012",
     "[1] {a} [2] {b} [3] {c}": "123",
+    '<ch id="1">{a}</ch><ch id="2">{b}</ch><ch id="3">{c}</ch>': "123",
 }
 """Names of the channels by the notation of a frame."""
 

@@ -154,7 +154,7 @@ class TextParser(DelimitedParser):
         is_first_line = self._is_first_line
         self._is_first_line = False
         try:
-            line = piece.strip(CONTROL_CHARACTERS).decode()
+            line = _decoded(piece.strip(CONTROL_CHARACTERS))
             text = clean_text(line)
             if not text:
                 self.unread_line = line.strip() or self.unread_line
@@ -318,6 +318,14 @@ class TextParser(DelimitedParser):
             self.seq_modulus = largest_seq + 1
         elif seq >= self.seq_modulus:
             self.seq_modulus = SEQ_MODULI[0] if seq < SEQ_MODULI[0] else SEQ_MODULUS
+
+
+def _decoded(line: bytes) -> str:
+    """Decode a line in UTF-8, or else in Latin-1, in which some instruments write the signs of micro and degree."""
+    try:
+        return line.decode()
+    except UnicodeDecodeError:
+        return line.decode("latin-1")
 
 
 def _frame_lines(lines: Sequence[Line], cycle_length: int) -> Sequence[Line]:
