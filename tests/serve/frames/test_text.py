@@ -190,6 +190,7 @@ NOTATIONS = {
     "12:34:56.789 -> {{1: {a}, 4: {b}, 7: {c}}}": "147",
     "pad #0 {a} pC pad #1 {b} pC pad #2 {c} pC": "012",
     "[1] {a} [2] {b} [3] {c}": "123",
+    "ch 1[{a}] ch 2[{b}] ch 3[{c}]": "123",
     '<ch id="1">{a}</ch><ch id="2">{b}</ch><ch id="3">{c}</ch>': "123",
 }
 """Names of the channels by the notation of a frame."""

@@ -319,7 +319,7 @@ def _index_positions(tokens: list[_Token]) -> list[int]:
     if before_colons is not None and (before_colons.start() == 0 or before_colons[0].count("0") > 2):
         return numbers[-before_colons[0].count("0") :: 2]
 
-    after_words = re.search(r"(?:[^0]*[w#(\[=]0[)\]>]?0)+[^0]*$", shape)
+    after_words = re.search(r"(?:[^0]*[w#(\[=]0[)\]>(\[]?0)+[^0]*$", shape)
     positions = numbers[-after_words[0].count("0") :: 2] if after_words is not None else []
     indices = [tokens[position].content for position in positions]
     counts = [str(count) for count in range(len(indices) + 1)]
