@@ -35,7 +35,7 @@ from tempfile import TemporaryDirectory, mkdtemp
 import numpy as np
 from measured_films import measured_presses, with_rig_errors
 from scipy.special import chdtri
-from shared import arguments, print_results, report_progress
+from shared import arguments, print_results, report_progress, whitened_errors
 from solved_films import FILMS, SolvedFilm, solved_film
 
 from isocharge.serve import Contact, Predictor
@@ -56,22 +56,14 @@ GAINS = np.array([1.03, 1.0, 1.0, 1.0])
 
 def errors(answers: list[Contact], truth: np.ndarray) -> dict[str, float]:
     """Return the errors of contacts and the shares within the reported regions."""
-    contact = np.array([answer[:3] for answer in answers])
-    std = np.array([[answer.x_std_mm, answer.y_std_mm, answer.force_std_N] for answer in answers])
-    xy, xf, yf = np.array([answer[7:10] for answer in answers]).T
-    one = np.ones_like(xy)
-    correlation = np.array([[one, xy, xf], [xy, one, yf], [xf, yf, one]]).transpose(2, 0, 1)
-    normalised = (contact - truth) / std
-    shares = {}
-    for name, size in (("ellipse_95", 2), ("ellipsoid_95", 3)):
-        part = normalised[:, :size, None]
-        distance = (part * np.linalg.solve(correlation[:, :size, :size], part)).sum(axis=(1, 2))
-        shares[name] = float(np.mean(distance < chdtri(size, 0.05)))
+    contact, std, _, correlation = np.split(np.array(answers), [3, 6, 7], axis=1)
+    squared_error = whitened_errors(contact, truth, std, correlation) ** 2
     return {
         "position_mm": rms(position_error(contact, truth)),
         "force_percent": 100.0 * rms(contact[:, 2] / truth[:, 2] - 1.0),
-        "force_coverage": float(np.mean(np.abs(normalised[:, 2]) < 2.0)),
-        **shares,
+        "force_coverage": float(np.mean(np.abs(contact - truth)[:, 2] < 2.0 * std[:, 2])),
+        "ellipse_95": float(np.mean(squared_error[:, :2].sum(axis=1) < chdtri(2, 0.05))),
+        "ellipsoid_95": float(np.mean(squared_error.sum(axis=1) < chdtri(3, 0.05))),
     }
 
 

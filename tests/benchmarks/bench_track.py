@@ -22,14 +22,17 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from shared import draw_lines, model_film, options, print_results
+from scipy.signal import lfilter
+from shared import model_film, options, print_results
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve import Contact, Predictor
 from isocharge.serve.frames.frame import Frame
+from isocharge.serve.model.contact import Contacts
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.tracking.tracker import Tracker
 from isocharge.simulate import ForwardMap, noise_model
+from isocharge.simulate.plots.figure import new_figure
 
 SPEEDS_mm_per_s = (0.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
 """Speeds of the moving contacts, mm/s."""
@@ -60,10 +63,8 @@ def moving_average(count: int) -> Smooth:
     """Return the moving average over a number of frames."""
 
     def smooth(position: np.ndarray) -> np.ndarray:
-        total = np.concatenate([np.zeros((len(position), 1)), np.cumsum(position, axis=1)], axis=1)
-        ends = np.arange(1, position.shape[1] + 1)
-        starts = np.maximum(ends - count, 0)
-        return (total[:, ends] - total[:, starts]) / (ends - starts)
+        frames_so_far = np.arange(1, position.shape[1] + 1)
+        return lfilter(np.ones(count), 1.0, position) / np.minimum(frames_so_far, count)
 
     return smooth
 
@@ -222,12 +223,11 @@ def measure_speed(asked: argparse.Namespace, predictor: Predictor, film: Forward
     force_N = np.full(true_position.shape, asked.force)
     true_contact = np.stack([true_position.real, true_position.imag, force_N], axis=-1).reshape(-1, 3)
     charge = noise_model(asked.noise).add(film.charges(true_contact), rng)
-    columns = np.stack(predictor.predict_batch(charge), axis=1).astype(float)
-    contacts = [[Contact(*row) for row in path] for path in columns.reshape(*true_position.shape, -1).tolist()]
-    position = np.array([[complex(contact.x_mm, contact.y_mm) for contact in path] for path in contacts])
-    xy_correlation = np.array([[contact.xy_correlation for contact in path] for path in contacts])
-    stds = [(contact.x_std_mm, contact.y_std_mm) for path in contacts for contact in path]
-    typical_std_mm = float(np.median(stds))
+    columns = np.stack(predictor.predict_batch(charge)).astype(float).reshape(-1, *true_position.shape)
+    contacts = [[Contact(*row) for row in path] for path in np.moveaxis(columns, 0, -1).tolist()]
+    measured = Contacts(*columns)
+    position = measured.x_mm + 1j * measured.y_mm
+    typical_std_mm = float(np.median([measured.x_std_mm, measured.y_std_mm]))
 
     t_s = np.arange(true_position.shape[1]) * dt_s
     is_settled = t_s > SETTLING_TIME_s
@@ -257,8 +257,9 @@ def measure_speed(asked: argparse.Namespace, predictor: Predictor, film: Forward
     row["ours_jitter_mm"] = float(np.sqrt(np.mean(np.var(tracked.position[:, is_before], axis=1)) / 2.0))
     error = tracked.position - true_position
     x_deviation, y_deviation = np.moveaxis(np.stack([error.real, error.imag], axis=-1) / tracked.std, -1, 0)
-    mixed_term = 2.0 * xy_correlation * x_deviation * y_deviation
-    squared_distance = (x_deviation**2 + y_deviation**2 - mixed_term) / (1.0 - xy_correlation**2)
+    correlation = measured.xy_correlation
+    mixed_term = 2.0 * correlation * x_deviation * y_deviation
+    squared_distance = (x_deviation**2 + y_deviation**2 - mixed_term) / (1.0 - correlation**2)
     row["ours_95"] = float(np.mean(squared_distance[:, is_settled] < MAX_SQUARED_DISTANCE_95))
     return row
 
@@ -271,11 +272,13 @@ def main() -> None:
     if asked.plot:
         moving = [row for row in rows if row["speed_mm_s"]]
         names = (NO_FILTER, "moving average", "1 euro", "plain Kalman", OURS)
-        lines = {
-            name: ([row[f"{name}_lag_ms"] for row in moving], [row[f"{name}_mm"] for row in moving]) for name in names
-        }
-        title = "slides of 5 to 200 mm/s"
-        draw_lines(asked.plot, lines, xlabel="mean lag of a slide, ms", ylabel="error, rms, mm", title=title)
+        axes = new_figure(7.0, 4.5).subplots()
+        for name in names:
+            lag_ms = [row[f"{name}_lag_ms"] for row in moving]
+            axes.plot(lag_ms, [row[f"{name}_mm"] for row in moving], "o-", label=name, ms=4)
+        axes.set(xlabel="mean lag of a slide, ms", ylabel="error, rms, mm", title="slides of 5 to 200 mm/s")
+        axes.legend(fontsize=8)
+        axes.figure.savefig(asked.plot, dpi=120)
     print_results("track", asked, {"slides": rows})
 
 

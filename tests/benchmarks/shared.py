@@ -14,7 +14,6 @@ from isocharge.common.arrays import Array
 from isocharge.serve import Predictor
 from isocharge.serve.benchmark import Contender, machine, take_turns
 from isocharge.simulate import Circle, ForwardMap
-from isocharge.simulate.plots.figure import new_figure
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 from isocharge.train.data.contact_errors import contact_error_statistics
 
@@ -130,21 +129,23 @@ def percent(share: float) -> str:
     return f"{share:.1f}" if share < 1.0 else f"{share:.0f}"
 
 
-def draw_lines(path: Path, lines: dict[str, tuple[list[float], list[float]]], **labels: str) -> None:
-    """Draw lines with a point for each measurement, and save the picture.
+def whitened_errors(contact: Array, truth: Array, std: Array, correlation: Array) -> Array:
+    """Divide the errors of contacts by their standard deviations, and remove their correlations.
 
     Args:
-        path: The picture.
-        lines: Coordinates x and y of the points of each line, by its name in the legend.
-        labels: Title, names and scales of the axes, as `Axes.set` expects them.
+        contact: Estimated contacts (x, y, F), shape (n, 3), mm and N.
+        truth: True contacts, shape (n, 3).
+        std: Stated standard deviations, shape (n, 3).
+        correlation: Stated correlations of x and y, x and F, y and F, shape (n, 3).
+
+    Returns:
+        Errors, shape (n, 3), which are independent and standard normal if the stated covariances are correct. The first
+        two are those of the position alone.
     """
-    figure = new_figure(7.0, 4.5)
-    axes = figure.add_subplot()
-    for name, (x, y) in lines.items():
-        axes.plot(x, y, "o-", label=name, ms=4)
-    axes.set(**labels)
-    axes.legend(fontsize=8)
-    figure.savefig(path, dpi=120)
+    xy, xf, yf = correlation.T
+    one = np.full(len(xy), 1.0 + 1e-6)  # a correlation that float32 rounds to 1 would give a singular matrix
+    matrix = np.moveaxis(np.array([[one, xy, xf], [xy, one, yf], [xf, yf, one]]), 2, 0)
+    return np.linalg.solve(np.linalg.cholesky(matrix), ((contact - truth) / std)[..., None])[..., 0]
 
 
 def report_progress(title: str, result: dict[str, float]) -> None:

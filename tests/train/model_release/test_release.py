@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2, halfnorm
+from shared import whitened_errors
 
 from isocharge.common.errors import ConfigError
 from isocharge.common.structs import convert
@@ -204,12 +205,10 @@ def whitened(truth, predictor):
     """Contacts, and their errors whitened by the stated covariance, which should be independent standard normal."""
     rows = truth[np.arange(30_000) % len(truth)]
     found = np.stack(predictor.predict_batch(rows.noisy(REFERENCE, seed=8)), axis=1).astype(float)
-    error = rows.contact - found[:, :3]
-    error[:, 2] = found[:, 2] * np.log(rows.contact[:, 2] / found[:, 2])
-    one = np.full(len(found), 1.0 + 1e-6)  # a correlation that float32 rounds to 1 would give a singular matrix
-    xy, xf, yf = found[:, 7:].T
-    factor = np.linalg.cholesky(np.moveaxis(np.array([[one, xy, xf], [xy, one, yf], [xf, yf, one]]), 2, 0))
-    return rows.contact, np.linalg.solve(factor, (error / found[:, 3:6])[..., np.newaxis])[..., 0]
+    contact, std, _, correlation = np.split(found, [3, 6, 7], axis=1)
+    truth = rows.contact.copy()
+    truth[:, 2] = contact[:, 2] * (1.0 + np.log(rows.contact[:, 2] / contact[:, 2]))  # the error of ln F
+    return rows.contact, whitened_errors(contact, truth, std, correlation)
 
 
 def test_ellipses_and_ellipsoids_contain_the_stated_fraction_of_the_contacts(whitened, predictor):
