@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from isocharge.simulate import press, touch_charge
+from isocharge.simulate import SolveSettings, press, touch_charge
 
 
 def with_film(sensor, **changes):
@@ -20,6 +20,25 @@ def with_piezo(sensor, **changes):
 def solved_charge(sensor, probe, at, force, *settings, **options):
     """Solve a press, and return the touch charges, shape (n_electrode,), pC. See `press` for settings and options."""
     return touch_charge(sensor, press(sensor.film, probe, at, force, *settings, **options))
+
+
+def solved_charges(sensor, probe, contact, settings=SolveSettings(), rotation=0.0):
+    """Solve presses one by one, and return the touch charges, shape (n, n_electrode), pC.
+
+    Args:
+        sensor: The sensor.
+        probe: The probe.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        settings: Settings of `press`.
+        rotation: Rotations of the probe, shape () or (n,), rad.
+    """
+    rotations = np.broadcast_to(rotation, len(contact)).tolist()
+    return np.array(
+        [
+            solved_charge(sensor, probe.rotated(angle), (x, y), force, settings)
+            for (x, y, force), angle in zip(contact.tolist(), rotations, strict=True)
+        ]
+    )
 
 
 def relative_error(values, exact):

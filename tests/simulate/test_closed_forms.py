@@ -127,9 +127,11 @@ LINEAR_FILMS = {
         lambda z, c, radius: THICK.radius**2 / plate_stiffness(THICK) * michell_under_a_disk(z, c, radius),
     ),
 }
-"""Film that a small force does not stretch, its theory, the largest relative error of the deflection, and the deflection
-by the force, mm/N, outside a disk of loads. The lengths are in film radii. Green's function of the membrane is harmonic, so
-that its mean over the disk is its value at the centre."""
+"""Film that a small force does not stretch, its theory, the largest relative error, and a function that returns the
+deflection by the force, mm/N, outside a disk of loads.
+
+The lengths are in film radii. Green's function of the membrane is harmonic, so that its mean over the disk is its value
+at the centre."""
 
 
 @pytest.mark.first_cases(6)

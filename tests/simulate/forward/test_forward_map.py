@@ -28,7 +28,7 @@ from isocharge.simulate.forward.charge_map import differences
 from isocharge.simulate.forward.family import NODE_COUNTS, Family, NodeCount
 from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR
 from kept import kept
-from solved_charges import relative_error, solved_charge, with_film, with_piezo
+from solved_charges import relative_error, solved_charge, solved_charges, with_film, with_piezo
 
 QUICK = {"radius": 4.0, "force_range": (0.7, 1.0), "settings": COARSE}
 """A small family without bending: few and cheap solves."""
@@ -49,13 +49,7 @@ def errors(forward_map: ForwardMap, contact: np.ndarray, rotation: np.ndarray | 
 
     An error is relative to the charge, or to a tenth of the largest charge of the press if this is larger.
     """
-    sensor, settings, probe = forward_map.sensor, forward_map.settings, forward_map.probe
-    expected = np.array(
-        [
-            solved_charge(sensor, probe.rotated(angle), (x, y), force, settings)
-            for (x, y, force), angle in zip(contact.tolist(), np.broadcast_to(rotation, len(contact)), strict=True)
-        ]
-    )
+    expected = solved_charges(forward_map.sensor, forward_map.probe, contact, forward_map.settings, rotation)
     scale = np.maximum(np.abs(expected), 0.1 * np.abs(expected).max(axis=1, keepdims=True))
     return np.abs(forward_map.charges(contact, rotation) - expected) / scale
 
@@ -321,8 +315,5 @@ def test_derivatives_under_a_narrow_probe_are_those_of_direct_solves():
     sensor = replace(load_sensor("four-25um-biaxial"), electrodes=(Electrode.of_square("A", (0.0, 3.0), 2.0),))
     narrow = kept(ForwardMap.build, sensor, Ellipse(2.0, 0.1), 3.5, (0.9, 1.1), COARSE)
     contact = np.array([[-0.11, 3.12, 1.0], [0.19, 3.29, 1.0], [0.55, 3.2, 1.0]])
-
-    def solved(contact):
-        return np.array([solved_charge(sensor, narrow.probe, (x, y), F, narrow.settings) for x, y, F in contact])
-
+    solved = partial(solved_charges, sensor, narrow.probe, settings=narrow.settings)
     assert relative_error(narrow.derivatives(contact), differences(solved, contact, (0.02, 0.02, 1e-3))) < 0.02

@@ -28,7 +28,7 @@ from isocharge.train.calibration.calibrate import _is_exact, solve_even
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.data.contact_errors import position_error
 from isocharge.train.data.presses import draw_contacts
-from solved_charges import solved_charge, with_film, with_piezo
+from solved_charges import solved_charges, with_film, with_piezo
 
 
 def solve_even_at(problem, distances, forces) -> FilmCharges:
@@ -54,17 +54,12 @@ def narrow_problem(problem):
 CONTACT = np.array([[3.0, 2.0, 0.5], [-4.0, 5.0, 1.0], [1.0, -6.0, 0.2]])
 
 
-def direct(sensor, probe, contact):
-    """Charges of contacts, each of which is solved."""
-    return np.array([solved_charge(sensor, probe, (x, y), force) for x, y, force in contact.tolist()])
-
-
 def test_charges_of_a_similar_film_agree_with_direct_solves(solved):
     """All properties differ at the same time. The change of the charges is about 5 %."""
     prior = solved.prior
     values = prior.mean + 0.3 * prior.std * np.random.default_rng(1).standard_normal(len(prior.names))
     charge = solved.charges(values, CONTACT)
-    expected = direct(*prior.film(values), CONTACT)
+    expected = solved_charges(*prior.film(values), CONTACT)
     change = np.abs(expected / solved.charges(prior.mean, CONTACT) - 1.0)
     assert change.max() > 0.04
     np.testing.assert_allclose(charge, expected, rtol=0.01)
@@ -77,7 +72,7 @@ def test_negative_charges_agree_with_direct_solves(problem, solved):
     charges = replace(solved, prior=FilmPrior(swapped, problem.probe))
     prior = charges.prior
     values = prior.mean + 0.3 * prior.std * (np.array(prior.names) == "pretension")
-    expected = direct(*prior.film(values), CONTACT)
+    expected = solved_charges(*prior.film(values), CONTACT)
     change = expected - charges.charges(prior.mean, CONTACT)
     assert expected.max() < 0.0 < np.abs(change).min()
     np.testing.assert_allclose(charges.charges(values, CONTACT), expected, atol=0.1 * np.abs(change).max())
@@ -89,8 +84,8 @@ def test_imperfections_of_the_sensor_file_are_changes_of_the_even_film(narrow_pr
     sensor = with_film(narrow_problem.sensor, deviator=(0.6, 0.1), young_ratio=1.3, axis=0.5, oval=0.004, oval_axis=1.0)
     charges = solve_even_at(replace(narrow_problem, sensor=sensor), 3, 3)
     values = charges.prior.mean
-    expected = direct(*charges.prior.film(values), contact)
-    even = direct(*charges.prior.film(charges.values), contact)
+    expected = solved_charges(*charges.prior.film(values), contact)
+    even = solved_charges(*charges.prior.film(charges.values), contact)
     assert np.abs(even / expected - 1.0).max() > 0.05
     np.testing.assert_allclose(charges.charges(values, contact), expected, rtol=0.015)
     assert not _is_exact(charges, values, contact)
@@ -107,7 +102,7 @@ def test_fingertip_is_solved_with_its_own_pressure(narrow_problem, finger):
     """A circle of the same area causes charges that differ by up to 1 %."""
     charges = solve_even_at(replace(narrow_problem, probe=finger), 3, 3)
     values = charges.prior.mean
-    expected = direct(*charges.prior.film(values), CONTACT[:1])
+    expected = solved_charges(*charges.prior.film(values), CONTACT[:1])
     np.testing.assert_allclose(charges.charges(values, CONTACT[:1]), expected, rtol=2e-3)
 
 
@@ -130,7 +125,7 @@ def test_derivatives_are_those_of_direct_solves(solved, name):
     for sign in (1.0, -1.0):
         values = prior.mean.copy()
         values[index] += sign * step
-        charges.append(direct(*prior.film(values), contact))
+        charges.append(solved_charges(*prior.film(values), contact))
     expected = (charges[0] - charges[1]) / (2.0 * step)
     _, jacobian = solved.linearised(prior.mean, contact)
     tolerance = 0.08 if name == "probe_radius" else 0.03  # the step of the radius is 10 %
@@ -160,7 +155,7 @@ def calibrated(problem, sensor, probe, path, count=15, seed=3):
     rng = np.random.default_rng(seed)
     contact = draw_contacts(rng, problem.domain, count + 40)
     contact[:, 2] = np.clip(contact[:, 2], 0.15, 1.5)
-    charge = problem.noise.add(direct(sensor, probe, contact), rng)
+    charge = problem.noise.add(solved_charges(sensor, probe, contact), rng)
     presses = measured_presses(problem, with_rig_errors(contact[:count], rng), charge[:count])
     quick = FitConfig(training=TrainingConfig(steps=600, misfit_steps=200, misfit_charges=2_000))
     with local_workers(2) as executor:
