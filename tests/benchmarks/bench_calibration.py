@@ -1,8 +1,7 @@
 """Errors of calibrated, faulty and changed films with imperfections, whose presses are solved one by one.
 
-    python tests/benchmarks/bench_calibration.py [--sensor four-25um-biaxial] [--films typical] [--seeds 0,1,2,3]
-        [--presses 1,5,8,20] [--changes 0,0.3,-0.4] [--frames 10] [--cases all] [--gain-noise 0.002]
-        [--folder build/solved_films] [--json]
+    python tests/benchmarks/bench_calibration.py [--films typical] [--seeds 0,1,2,3] [--presses 1,5,8,20]
+        [--changes 0,0.3,-0.4] [--cases all] [--gain-noise 0.002] [--json]
 
 The films are those of `solved_films.py`: orthotropic, unevenly stretched, with an oval clamp and wrong gains. With
 `--films moduli`, E1 / E2 is 1.6; with `--films tension`, the ratio of the pretensions along two axes is 3. The presses
@@ -23,7 +22,7 @@ reported standard deviations, and the shares within the reported 95 % ellipse (x
 The errors of followed contacts are means over four draws of the noise.
 
 `--gain-noise` is the true noise relative to the charge, which the calibration does not know. Solved charges are stored
-in the folder. Solving a film takes some minutes. `--cases calibrated` leaves all rows out but the first.
+in build/solved_films. Solving a film takes some minutes. `--cases calibrated` leaves all rows out but the first.
 """
 
 from concurrent.futures import ProcessPoolExecutor
@@ -43,6 +42,12 @@ from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.simulate import Circle, NoiseModel, load_sensor, local_workers
 from isocharge.train import CalibrationProblem, calibrate, write_calibration
 from isocharge.train.data.contact_errors import position_error, rms
+
+FOLDER = Path("build/solved_films")
+"""Folder in which the charges of solved films are stored."""
+
+FRAMES = 10
+"""Number of frames of a touch."""
 
 TOUCHES = 60
 SUDDEN_TOUCHES = 20
@@ -111,10 +116,10 @@ class Bench:
         film = self.films[change]
         return film.later_contact[TOUCHES:], self.noise.add(film.later_charge[TOUCHES:], self.rng)
 
-    def touches(self, change: float, frames: int) -> np.ndarray:
+    def touches(self, change: float) -> np.ndarray:
         """Return the charges of the frames of each touch, with noise, shape (n_touch, n_frame, n_electrode)."""
         charge = self.films[change].later_charge[:TOUCHES]
-        return self.noise.add(np.repeat(charge[:, None], frames, axis=1), self.rng)
+        return self.noise.add(np.repeat(charge[:, None], FRAMES, axis=1), self.rng)
 
 
 def follower_after(predictor: Predictor, touches: np.ndarray) -> FilmFollower:
@@ -131,10 +136,10 @@ def follower_after(predictor: Predictor, touches: np.ndarray) -> FilmFollower:
 
 
 def followed_errors(
-    bench: Bench, predictor: Predictor, change: float, gains: np.ndarray, frames: int
+    bench: Bench, predictor: Predictor, change: float, gains: np.ndarray
 ) -> dict[str, dict[str, float]]:
     """Return the errors of contacts after a change, for one draw of the noise of touches and contacts."""
-    touches = gains * bench.touches(change, frames)
+    touches = gains * bench.touches(change)
     truth, charge = bench.later(change)
     charge = gains * charge
 
@@ -147,7 +152,7 @@ def followed_errors(
         "followed": errors_after(touches),
     }
     if change != 0.0:
-        before = bench.touches(0.0, frames)
+        before = bench.touches(0.0)
         ways["followed suddenly"] = errors_after(np.concatenate([before, touches[:SUDDEN_TOUCHES]]))
     return ways
 
@@ -157,7 +162,7 @@ def mean_values(rows: list[dict[str, float]]) -> dict[str, float]:
     return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
 
 
-def film_results(bench: Bench, counts: list[int], frames: int, *, has_all_cases: bool) -> dict[str, dict[str, float]]:
+def film_results(bench: Bench, counts: list[int], *, has_all_cases: bool) -> dict[str, dict[str, float]]:
     """Return the errors of all cases of one film."""
     results = {}
     truth, charge = bench.later(0.0)
@@ -178,12 +183,12 @@ def film_results(bench: Bench, counts: list[int], frames: int, *, has_all_cases:
 
     cases = [(f"{change:+g} MPa", change, np.ones(len(GAINS))) for change in bench.films]
     for name, change, gains in (*cases, ("gain", 0.0, GAINS)):
-        draws = [followed_errors(bench, predictor, change, gains, frames) for _ in range(DRAWS)]
+        draws = [followed_errors(bench, predictor, change, gains) for _ in range(DRAWS)]
         for way in draws[0]:
             results[f"{way}, {name}"] = mean_values([draw[way] for draw in draws])
         if change != 0.0:
             problem = replace(bench.problem, earlier=result.film.drifted())
-            mean_charge = bench.touches(change, frames).mean(axis=1)
+            mean_charge = bench.touches(change).mean(axis=1)
             _, again = bench.calibrated(np.full((TOUCHES, 3), np.nan), mean_charge, problem)
             truth, charge = bench.later(change)
             results[f"again, {name}"] = errors([again.predict(row) for row in charge], truth)
@@ -195,18 +200,15 @@ def film_results(bench: Bench, counts: list[int], frames: int, *, has_all_cases:
 def main() -> None:
     asked = arguments(
         __doc__,
-        sensor="four-25um-biaxial",
         films="typical",
         seeds="0,1,2,3",
         presses="1,5,8,20",
         changes="0,0.3,-0.4",
-        frames=10,
         cases="all",
         gain_noise=0.002,
-        folder=Path("build/solved_films"),
         json=False,
     )
-    problem = CalibrationProblem(load_sensor(asked.sensor), Circle(1.0))
+    problem = CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))
     noise = NoiseModel("bench", problem.noise.white, asked.gain_noise)
     changes = [float(change) for change in asked.changes.split(",")]
     counts = [int(count) for count in asked.presses.split(",")]
@@ -216,14 +218,14 @@ def main() -> None:
         for seed in (int(text) for text in asked.seeds.split(",")):
             films = {
                 change: solved_film(
-                    problem, FILMS[asked.films], seed, change, counts_of_solves, asked.folder / asked.films, pool
+                    problem, FILMS[asked.films], seed, change, counts_of_solves, FOLDER / asked.films, pool
                 )
                 for change in changes
             }
             report_progress("film", {"seed": float(seed)})
             with TemporaryDirectory() as folder:
                 bench = Bench(problem, noise, films, seed, executor, folder)
-                all_results.append(film_results(bench, counts, asked.frames, has_all_cases=asked.cases == "all"))
+                all_results.append(film_results(bench, counts, has_all_cases=asked.cases == "all"))
     summary = {}
     for name in all_results[0]:
         rows = [results[name] for results in all_results]

@@ -9,11 +9,11 @@ film with a closed cavity behind it. The benchmark takes about two minutes.
 from dataclasses import replace
 
 import numpy as np
-from shared import arguments, percentiles, print_results
+from shared import arguments, percentiles, print_results, training_data
 
 from isocharge.common.arrays import Array
 from isocharge.simulate import Circle, ForwardMap, Sensor, Sweep, load_sensor, noise_model
-from isocharge.train import Fitted, LabelledPresses, TrainingData, fit
+from isocharge.train import Fitted, fit
 from isocharge.train.data.contact_errors import force_error_percent, position_error, rms
 
 PROBE = Circle(1.0)
@@ -52,16 +52,7 @@ def main() -> None:
     sensor = replace(sensor, film=replace(sensor.film, pretension=PRETENSION_MPa))
     contact = Sweep(0.999 * RADIUS_mm, FORCE_RANGE_N, asked.presses, 1).contacts()
     vented = ForwardMap.build(sensor, PROBE, RADIUS_mm, FORCE_RANGE_N)
-    training_contact = Sweep(RADIUS_mm, FORCE_RANGE_N, 24_000, 0).contacts()
-    fitted = fit(
-        TrainingData(
-            sensor=sensor,
-            probes=(PROBE.notation,),
-            domain=vented.domain,
-            presses=LabelledPresses(training_contact, vented.charges(training_contact)),
-            sha256="-",
-        )
-    )
+    fitted = fit(training_data(vented, 24_000))
     rng = np.random.default_rng(1)
     vented_charge = vented.charges(contact)
     results = {}

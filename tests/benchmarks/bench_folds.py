@@ -28,6 +28,7 @@ from isocharge.serve.tracking.tracker import Tracker, TrackRule
 from isocharge.simulate import noise_model
 from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
+from isocharge.simulate.identifiability.nearest_contact import into_domain
 
 RISE_TIME_s = 0.03
 """Time in which the force rises, s."""
@@ -105,15 +106,6 @@ def is_counted(slide: Slide) -> np.ndarray:
     return (t_s >= crossing_s[0]) & ~is_after_crossing.any(axis=1)
 
 
-def into_map(contact: np.ndarray, film: ChargeMap) -> np.ndarray:
-    """Return contacts (x, y, F), shape (n, 3), moved to the nearest contacts of the map."""
-    moved = contact.copy()
-    moved[:, 2] = np.clip(contact[:, 2], *film.domain.force_range)
-    distance = np.hypot(contact[:, 0], contact[:, 1])
-    moved[:, :2] *= np.minimum(film.domain.radius / distance, 1.0)[:, None]
-    return moved
-
-
 def examine_frame(
     film: ChargeMap, tracked: TrackedContact, other: OtherContact | None, truth: np.ndarray, side: float
 ) -> tuple[bool, bool, bool, float]:
@@ -133,7 +125,8 @@ def examine_frame(
     """
     contacts = [contact for contact in (tracked, other) if contact is not None]
     reported = np.array([(contact.x_mm, contact.y_mm, contact.force_N) for contact in contacts])
-    is_right_side = sides(film, into_map(reported, film)) == side
+    in_map = film.domain.to_contact(into_domain(film.domain.to_unit(reported)))
+    is_right_side = sides(film, in_map) == side
     error_mm = float(np.hypot(*(reported[0] - truth)[:2]))
     return other is None, bool(is_right_side[0]), bool(is_right_side.any()), error_mm
 

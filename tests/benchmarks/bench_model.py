@@ -25,7 +25,7 @@ MAX_PRESSES = 40_000
 """Largest number of presses."""
 
 NOISE = noise_model("reference")
-LEVELS = np.array([0.68, 0.95])
+LEVELS = (0.68, 0.95)
 """Levels of the intervals whose coverage is measured."""
 
 
@@ -67,26 +67,8 @@ def measure_errors(case: ModelCase, count: int) -> dict[str, Any]:
     return {"presses": count, **errors_over_limit(contact, bayes_contact, truth)}
 
 
-def interval_coverage(estimate: np.ndarray, std: np.ndarray, truth: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """Compute the fraction of true values that lie in the central intervals of normal distributions.
-
-    Args:
-        estimate: Estimated contacts (x, y, F), shape (n, 3), mm and N: the means of the distribution.
-        std: Standard deviations of the estimates, shape (n, 3), mm and N.
-        truth: True contacts (x, y, F), shape (n, 3), mm and N.
-        levels: Nominal probabilities of the intervals, shape (n_level,), 0 to 1.
-
-    Returns:
-        Fractions for x, y and F, shape (n_level, 3). They equal the levels if the standard deviations are correct.
-    """
-    standardised_error = np.abs(estimate - truth) / std
-    half_width = norm.ppf(0.5 + 0.5 * levels)  # in standard deviations, shape (n_level,)
-    is_inside = standardised_error[None] <= half_width[:, None, None]  # shape (n_level, n, 3)
-    return np.asarray(np.mean(is_inside, axis=1))
-
-
 def coverage(case: ModelCase, count: int) -> dict[str, Any]:
-    """Measure how often the 68 and 95 % intervals contain the true coordinates.
+    """Measure how often the central 68 and 95 % intervals of normal distributions contain the true coordinates.
 
     Returns:
         Smallest and largest coverage of x, y and the force: over all presses, and over thirds of the presses by radius
@@ -94,17 +76,16 @@ def coverage(case: ModelCase, count: int) -> dict[str, Any]:
     """
     truth = case.presses[:count]
     contact, std = case.estimate(case.noisy_charge(truth))
+    standardised_error = np.abs(contact - truth) / std
     by_radius = np.argsort(np.hypot(truth[:, 0], truth[:, 1]))
     by_force = np.argsort(truth[:, 2])
-    thirds = [*np.array_split(by_radius, 3), *np.array_split(by_force, 3)]
-    total_coverage = interval_coverage(contact, std, truth, LEVELS)
-    third_coverage = np.stack([interval_coverage(contact[rows], std[rows], truth[rows], LEVELS) for rows in thirds])
+    groups = {"all": [by_force], "a third": [*np.array_split(by_radius, 3), *np.array_split(by_force, 3)]}
     results: dict[str, Any] = {"draws": count}
-    for index, level in enumerate(LEVELS):
-        of_all = total_coverage[index]
-        of_thirds = third_coverage[:, index]
-        results[f"{level:.0%} of all"] = [float(of_all.min()), float(of_all.max())]
-        results[f"{level:.0%} of a third"] = [float(of_thirds.min()), float(of_thirds.max())]
+    for level in LEVELS:
+        is_inside = standardised_error <= norm.ppf(0.5 + 0.5 * level)
+        for name, row_groups in groups.items():
+            shares = [is_inside[rows].mean(axis=0) for rows in row_groups]
+            results[f"{level:.0%} of {name}"] = [float(np.min(shares)), float(np.max(shares))]
     return results
 
 

@@ -16,14 +16,13 @@ from typing import Any
 
 import numpy as np
 from bayes.posterior import Posterior
-from shared import arguments, errors_over_limit, print_results
+from shared import arguments, errors_over_limit, print_results, training_data
 
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import IsochargeError
 from isocharge.simulate import (
     ChargeSpline,
     Circle,
-    Domain,
     Electrode,
     Film,
     ForwardMap,
@@ -33,7 +32,7 @@ from isocharge.simulate import (
     load_sensor,
     noise_model,
 )
-from isocharge.train import LabelledPresses, TrainingData, fit
+from isocharge.train import fit
 
 NOISE = noise_model("reference")
 
@@ -87,10 +86,7 @@ def measure(sensor: Sensor, probe: Circle, n_sample: int, n_press: int) -> dict[
         IsochargeError: If the sensor is refused.
     """
     charge_map = ForwardMap.build(sensor, probe, DEFAULT_RADIUS, DEFAULT_FORCE_RANGE)
-    contact = Sweep(DEFAULT_RADIUS, DEFAULT_FORCE_RANGE, n_sample, 0).contacts()
-    presses = LabelledPresses(contact, charge_map.charges(contact))
-    domain = Domain(DEFAULT_RADIUS, DEFAULT_FORCE_RANGE)
-    data = TrainingData(sensor=sensor, probes=(probe.notation,), domain=domain, presses=presses, sha256="random")
+    data = training_data(charge_map, n_sample)
     started = time.process_time()
     fitted = fit(data)
     seconds = time.process_time() - started

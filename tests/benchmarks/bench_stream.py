@@ -4,7 +4,7 @@
 
 The virtual sensor plays in a process of its own; the reader's processor time is its own alone, all stages of the signal
 chain on, each record turned into a line of JSON. The latency is that of the record itself: from the arrival of the last
-byte. The charges are those of a made-up linear film: nothing here depends on what the model answers.
+byte. Every electrode has 800 pC/N: nothing here depends on what the model answers.
 """
 
 import multiprocessing
@@ -27,20 +27,13 @@ BOARD = {
 }
 
 
-def linear_film(electrodes: int) -> Any:
-    """Charges of a film on which they are proportional to the force."""
-    direction = np.exp(2j * np.pi * np.arange(electrodes) / electrodes)
-
-    def charges(contact: np.ndarray) -> np.ndarray:
-        x, y, force = contact.T
-        return 800.0 * force[:, None] * (1.0 + ((x + 1j * y)[:, None] * direction.conj()).real / 20.0)
-
-    return charges
-
-
 def board(pipe: Connection, electrodes: int, script: Script, seed: int) -> None:
     """Play until the other end says so; then tell what was played."""
-    with VirtualSensor(linear_film(electrodes), script, noise=noise_model("reference").add, seed=seed) as sensor:
+
+    def charges(contact: np.ndarray) -> np.ndarray:
+        return 800.0 * np.repeat(contact[:, 2:], electrodes, axis=1)
+
+    with VirtualSensor(charges, script, noise=noise_model("reference").add, seed=seed) as sensor:
         pipe.send(sensor.url)
         pipe.recv()
     pipe.send({name: getattr(sensor, name) for name in ("sent", "withheld")})

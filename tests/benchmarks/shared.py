@@ -13,8 +13,9 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve import Predictor
 from isocharge.serve.benchmark import Contender, machine, take_turns
-from isocharge.simulate import Circle, ForwardMap
+from isocharge.simulate import Circle, ForwardMap, Sweep
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
+from isocharge.train import LabelledPresses, TrainingData
 from isocharge.train.data.contact_errors import contact_error_statistics
 
 
@@ -81,6 +82,15 @@ def model_film(predictor: Predictor, radius_mm: float) -> ForwardMap:
 def inner_radius_mm(predictor: Predictor) -> float:
     """Return the radius of the largest disk within the working area of a model, mm."""
     return math.sqrt(predictor.validity.inscribed_radius_squared_mm2)
+
+
+def training_data(charge_map: ForwardMap, count: int) -> TrainingData:
+    """Simulate a number of presses over the domain of a forward map for a training."""
+    domain = charge_map.domain
+    contact = Sweep(domain.radius, domain.force_range, count, 0).contacts()
+    presses = LabelledPresses(contact, charge_map.charges(contact))
+    notations = (charge_map.probe.notation,)
+    return TrainingData(sensor=charge_map.sensor, probes=notations, domain=domain, presses=presses, sha256="-")
 
 
 def errors_over_limit(contact: Array, limit: Array, truth: Array) -> dict[str, float]:
