@@ -208,18 +208,13 @@ def largest_errors(script: Script, records: list[PredictionRecord], begin_s: flo
     """
     first_frame = round((begin_s + 0.12) * RATE_Hz)
     last_frame = round((end_s - 0.12) * RATE_Hz)
-    true_position = complex(script.x_mm[first_frame], script.y_mm[first_frame])
-    force_errors = []
-    distances_mm = []
-    for start in range(first_frame, last_frame, 20):
-        frames = records[start : start + 20]
-        force_N = np.mean([record.force_N or np.nan for record in frames])
-        position = np.mean([complex(record.x_mm or np.nan, record.y_mm or np.nan) for record in frames])
-        force_errors.append(abs(force_N - 1.0))
-        distances_mm.append(abs(position - true_position))
+    answers = np.array([(record.force_N or np.nan, record.x_mm or np.nan, record.y_mm or np.nan) for record in records])
+    truth = (1.0, script.x_mm[first_frame], script.y_mm[first_frame])
+    starts = range(first_frame, last_frame, 20)
+    error = np.abs([answers[start : start + 20].mean(axis=0) - truth for start in starts])
     return {
-        "force_percent": round(100 * float(np.max(force_errors)), 1),
-        "mm": round(float(np.max(distances_mm)), 2),
+        "force_percent": round(100 * float(error[:, 0].max()), 1),
+        "mm": round(float(np.hypot(error[:, 1], error[:, 2]).max()), 2),
     }
 
 

@@ -64,9 +64,8 @@ class ReferenceCase:
     def __str__(self) -> str:
         film = self.film
         x, y = self.at
-        turn = f"@{np.rad2deg(self.probe.angle):.0f}" if self.probe.angle else ""
-        scene = f"{film.thickness * 1e3:.0f}um-{film.pretension:g}MPa-{self.probe.notation}{turn}"
-        return f"{scene}-at({x:.0f},{y:.0f})-{self.force:g}N"
+        probe = self.probe.rotated_notation
+        return f"{film.thickness * 1e3:.0f}um-{film.pretension:g}MPa-{probe}-at({x:.0f},{y:.0f})-{self.force:g}N"
 
 
 def read(name: str, source: str) -> list[ReferenceCase]:
