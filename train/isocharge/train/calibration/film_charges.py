@@ -86,9 +86,7 @@ class FilmCharges:
 
     def charges(self, values: Array, contact: Array) -> Array:
         """Compute the charges of presses on a film with given properties, shape (n, n_electrode), pC."""
-        sensor = self._electrodes(values)
-        solved_charge = _read(self.film, sensor).charges(contact)
-        stress_derivatives = self._stress_derivatives(sensor, contact, solved_charge)
+        solved_charge, stress_derivatives = self._solved_charges(self._electrodes(values), contact)
         charge, _ = self._changed(values, solved_charge, stress_derivatives)
         return charge
 
@@ -104,8 +102,7 @@ class FilmCharges:
             of the property.
         """
         sensor = self._electrodes(values)
-        solved_charge = _read(self.film, sensor).charges(contact)
-        stress_derivatives = self._stress_derivatives(sensor, contact, solved_charge)
+        solved_charge, stress_derivatives = self._solved_charges(sensor, contact)
         charge, factor = self._changed(values, solved_charge, stress_derivatives)
 
         derivatives = {**stress_derivatives, "crosstalk": solved_charge.sum(axis=1, keepdims=True) - solved_charge}
@@ -113,10 +110,8 @@ class FilmCharges:
             share = values[self.prior.index(name)]
             derivatives[PRETENSION.name] = derivatives[PRETENSION.name] + share * derivatives[name]
             derivatives[name] = values[self.prior.index(PRETENSION.name)] * derivatives[name]
-        for electrode, name in enumerate(sensor.electrode_names):
-            own_charge = np.zeros_like(solved_charge)
-            own_charge[:, electrode] = solved_charge[:, electrode]
-            derivatives[f"gain {name}"] = own_charge
+        for name, is_own in zip(sensor.electrode_names, np.eye(len(sensor.electrodes)), strict=True):
+            derivatives[f"gain {name}"] = is_own * solved_charge
         columns = [
             derivatives[one.name] if one.name in derivatives else self._read_difference(sensor, one, contact)
             for one in self.prior.properties
@@ -133,18 +128,15 @@ class FilmCharges:
         Args:
             values: Properties of the film, shape (n_property,).
             solved_charge: Charges of the solved film, shape (n, n_electrode), pC.
-            stress_derivatives: See `_stress_derivatives`.
+            stress_derivatives: See `_solved_charges`.
 
         Returns:
             Charges, shape (n, n_electrode), pC, and the factors by which the derivatives change, of the same shape.
         """
-        change = dict(zip(self.prior.names, (values - self.values).tolist(), strict=True))
-        solved_MPa = self._tensions(self.values)
-        # The derivatives with respect to the tensions are those per MPa.
-        change |= {name: tension_MPa - solved_MPa[name] for name, tension_MPa in self._tensions(values).items()}
+        solved, changed = self._mechanics(self.values), self._mechanics(values)
         charge_change = np.zeros_like(solved_charge)
         for name, derivative in stress_derivatives.items():
-            charge_change += change[name] * derivative
+            charge_change += (changed[name] - solved[name]) * derivative
         log_change = np.divide(charge_change, solved_charge, out=np.zeros_like(solved_charge), where=solved_charge > 0)
         is_logarithmic = (solved_charge > 0.0) & (np.abs(log_change) < MAX_LOG_CHANGE)
         factor = np.where(is_logarithmic, np.exp(np.where(is_logarithmic, log_change, 0.0)), 1.0)
@@ -169,18 +161,22 @@ class FilmCharges:
         sensor, _ = self.prior.film(np.where(self.prior.changes_stress, self.values, values))
         return sensor
 
-    def _tensions(self, values: Array) -> dict[str, float]:
-        """Return the mean pretension and its uneven parts, MPa, by the names of their properties."""
+    def _mechanics(self, values: Array) -> dict[str, float]:
+        """Return values by the names of their properties, with the uneven parts of the pretension in MPa, not shares.
+
+        Args:
+            values: Properties of a film, shape (n_property,).
+        """
         value = dict(zip(self.prior.names, values.tolist(), strict=True))
-        pretension = value[PRETENSION.name]
-        described = zip(UNEVEN_TENSIONS, self.prior.sensor.film.deviator, strict=True)
-        uneven = {name: described_MPa + value[name] * pretension for name, described_MPa in described}
-        return {PRETENSION.name: pretension} | uneven
+        for name, described_MPa in zip(UNEVEN_TENSIONS, self.prior.sensor.film.deviator, strict=True):
+            value[name] = described_MPa + value[name] * value[PRETENSION.name]
+        return value
 
-    def _stress_derivatives(self, sensor: Sensor, contact: Array, charge: Array) -> dict[str, Array]:
-        """Compute the derivatives with respect to the properties that change the stress, by the name of the property.
+    def _solved_charges(self, sensor: Sensor, contact: Array) -> tuple[Array, dict[str, Array]]:
+        """Compute the charges of the solved film, and their derivatives with respect to properties.
 
-        The derivatives with respect to the uneven parts of the pretension are those per MPa.
+        The properties are those that change the stress. The derivatives with respect to the uneven parts of the
+        pretension are those per MPa.
 
         The stress in units of Young's modulus E depends on E, the thickness h and the force F only through F / (E h)
         and the tensions divided by E. The small effect of the bending is neglected here.
@@ -188,23 +184,26 @@ class FilmCharges:
         Args:
             sensor: Sensor with the electrodes and the coefficients.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            charge: Charges of the solved film at these contacts, shape (n, n_electrode), pC.
 
         Returns:
-            Derivatives, each of shape (n, n_electrode), pC per unit.
+            Charges, shape (n, n_electrode), pC, and derivatives by the name of the property, each of shape (n,
+            n_electrode), pC per unit.
         """
+        solved_film = _read(self.film, sensor)
+        charge = solved_film.charges(contact)
         film, fields = _read(self.slopes.film, sensor), _read(self.slopes.fields, sensor)
         derivatives = replace(self.slopes, film=film, fields=fields).jacobian(contact)
-        force_slope = _read(self.film, sensor).derivatives(contact)[:, :, 2]
+        force_slope = solved_film.derivatives(contact)[:, :, 2]
         derivatives["thickness"] = -force_slope
-        tension_terms = (tension * derivatives[name] for name, tension in self._tensions(self.values).items())
+        mechanics = self._mechanics(self.values)
+        tension_terms = (mechanics[name] * derivatives[name] for name in (PRETENSION.name, *UNEVEN_TENSIONS))
         derivatives["young"] = charge - force_slope - sum(tension_terms)
         if self.larger_probe is not None:
             step = STEP * self.prior.std[self.prior.index(PROBE_RADIUS)]
             derivatives[PROBE_RADIUS] = (
                 _read(self.larger_probe, sensor).charges(contact) - film.charges(contact)
             ) / step
-        return derivatives
+        return charge, derivatives
 
     def _read_difference(self, sensor: Sensor, one: FilmProperty, contact: Array) -> Array:
         """Compute the derivative with respect to a property that does not change the stress, by central differences."""
