@@ -31,8 +31,7 @@ from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.virtual_sensor.script import load_script
 from isocharge.simulate import Circle, Samples, load_amplifier, load_sensor, parse_probe, read_dataset, write_dataset
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
-from isocharge.train import CalibrationProblem, FilmEstimate, read_earlier
-from isocharge.train.calibration.estimator import PLANNED
+from isocharge.train import CalibrationProblem, read_earlier
 from isocharge.train.calibration.folder import film_table, json_text
 from isocharge.train.training.config import load_config
 from model_files import put_charge_map, put_graph
@@ -267,9 +266,8 @@ def dataset(tmp_path):
 def test_calibrations_with_faults(tmp_path, attack_file):
     """A film that is taken from a file with faults is finite, and the next calibration can begin with it."""
     problem = CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))
-    prior = problem.prior
     path = tmp_path / "calibration.json"
-    path.write_text(json_text(film_table(problem, FilmEstimate(prior.layout, prior.mean, prior.covariance(PLANNED)))))
+    path.write_text(json_text(film_table(problem, problem.film_before)))
 
     def read(_):
         film = read_earlier(tmp_path, problem)

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from isocharge.common.errors import PressError
 from isocharge.simulate import Circle, NoiseModel, load_sensor
 from isocharge.train import CalibrationProblem, FilmEstimate
-from isocharge.train.calibration.estimator import PLANNED
 from isocharge.train.calibration.folder import film_table, json_text, read_film
 
 PROBLEM = CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))
@@ -80,8 +79,7 @@ def test_sensor_file_of_the_earlier_calibration_is_required(tmp_path):
 
 @pytest.mark.parametrize(("key", "value", "message"), FAULTS.values(), ids=FAULTS)
 def test_damaged_files_are_refused_with_the_key(tmp_path, key, value, message):
-    film = FilmEstimate(PROBLEM.prior.layout, PROBLEM.prior.mean, PROBLEM.prior.covariance(PLANNED))
-    table = json.loads(json_text(film_table(PROBLEM, film)))
+    table = json.loads(json_text(film_table(PROBLEM, PROBLEM.film_before)))
     *parents, last = key.split(".")
     entries = table[parents[0]] if parents else table
     entries[last] = value

@@ -10,7 +10,6 @@ from tests.train.calibration.conftest import rig, uneven_film
 from isocharge.train import calibrate
 from isocharge.train.calibration import film_network
 from isocharge.train.calibration.calibrate import solve_even
-from isocharge.train.calibration.estimator import PLANNED
 from isocharge.train.calibration.film_network import _nodes, _tension_factors
 from solved_charges import with_film
 
@@ -49,7 +48,7 @@ def test_node_at_which_the_charges_are_unknown_is_left_out(problem, synthetic, m
 
     monkeypatch.setattr(film_network, "_nodes", lambda _: np.array([-0.3, 0.0, 0.9]))
     monkeypatch.setattr(film_network, "_tension_factors", factors)
-    series = film_network.compact_charges(problem, synthetic, uneven_film(problem), None)
+    series = film_network.compact_charges(problem.domain, synthetic, uneven_film(problem), None)
     assert series.node_MPa.tolist() == [-0.3, 0.0]
     assert "changes from -0.3 to +0 MPa can be followed" in caplog.text
     contact = np.array([[3.0, 2.0, 0.5], [-5.0, 1.0, 1.5]])
@@ -62,7 +61,7 @@ def test_estimate_does_not_depend_on_the_film_that_is_solved_first(problem):
     """Touches at unknown places show the pretension, although the first solved film is far from the real film."""
     layout = problem.prior.layout
     tension, difference = layout.index("pretension"), layout.index("tension_difference")
-    earlier = replace(uneven_film(problem), covariance=0.01 * problem.prior.covariance(PLANNED))
+    earlier = replace(uneven_film(problem), covariance=0.01 * problem.film_before.covariance)
     later = earlier.film_values.copy()
     later[[tension, difference]] = 0.8, -0.25 * 1.2 / 0.8
     film = solve_even(problem, values=later)

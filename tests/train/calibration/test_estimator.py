@@ -131,7 +131,7 @@ def test_ellipses_of_contacts_contain_95_percent_on_films_of_all_hypotheses(prob
         unknowns = draw_unknowns(problem, hypothesis, rng)
         presses = presses_on(replace(problem, noise=hypothesis.errors.noise), synthetic, unknowns, 8, rng)
         film = film_estimate(problem, synthetic, presses).film
-        gain = ContactSensitivity.of(problem, synthetic, film.values).film_gain[:, :2]
+        gain = ContactSensitivity.of(film, synthetic, problem.domain).film_gain[:, :2]
         # The offset and the drift of the session are not errors of later contacts in this comparison.
         lasting = np.r_[problem.prior.layout.film, problem.prior.layout.coefficients]
         error = gain[:, :, lasting] @ (film.values - unknowns)[lasting]

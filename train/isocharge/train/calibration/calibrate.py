@@ -1,7 +1,6 @@
 """Calibration of a film: estimation of its properties from measured presses, by solving the film that is found."""
 
 from concurrent.futures import Executor
-from dataclasses import replace
 
 import numpy as np
 
@@ -120,8 +119,7 @@ def calibrate(
             reason = f"the charges of the best film differ from theirs by {residual:.2g} times the noise"
             raise unexplained_error(used_presses, estimation.charges, reason)
         _check_placement(estimation.film)
-        noisy_problem = replace(problem, noise=estimation.film.noise)
-        sensitivity = ContactSensitivity.of(noisy_problem, estimation.charges, estimation.film.values)
+        sensitivity = ContactSensitivity.of(estimation.film, estimation.charges, problem.domain)
     return CalibrationResult(
         problem=problem,
         presses=used_presses,
@@ -205,8 +203,9 @@ def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
     if solved.sensor.film.shear != described.sensor.film.shear:
         return False
     charge, jacobian = charges.linearised(values, contact)
-    missing = np.where(charges.prior.is_imperfection, values - charges.values, 0.0)
-    missing[[charges.prior.index(name) for name in ("d12", "crosstalk")]] = 0.0  # their effect is exact
+    # The effects of the imperfections that do not change the stress are exact.
+    is_missing = charges.prior.is_imperfection & charges.prior.changes_stress
+    missing = np.where(is_missing, values - charges.values, 0.0)
     return bool(np.linalg.norm(jacobian @ missing) < VISIBLE_ASYMMETRY * np.linalg.norm(charge))
 
 
@@ -231,16 +230,13 @@ def _check_placement(film: FilmEstimate) -> None:
     Raises:
         PressError: If one of them is at its bound. It is then probably larger, and its standard deviation is too small.
     """
-    prior = film.layout.prior
-    lowest, highest = prior.bounds
-    for name in PLACEMENT:
-        row = prior.index(name)
-        one = prior.properties[row]
-        if not lowest[row] < film.film_values[row] < highest[row]:
+    for one in film.layout.prior.properties:
+        lowest, highest = one.limits
+        if one.name in PLACEMENT and not lowest < film.value(one.name) < highest:
             raise PressError(
-                f"{one.meaning}: the presses agree best with {film.value(name):.3g} {one.unit} or more, the largest "
-                "value that is considered: is the origin of the stage the centre of the film, are its axes those of "
-                "the film, and are the electrodes where the sensor file describes them?"
+                f"{one.meaning}: the presses agree best with {film.value(one.name):.3g} {one.unit} or more, the "
+                "largest value that is considered: is the origin of the stage the centre of the film, are its axes "
+                "those of the film, and are the electrodes where the sensor file describes them?"
             )
 
 
@@ -268,14 +264,12 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
             "the load cell lag behind, or do the charges leak between the press and its reading?"
         )
     cautions.extend(film.session_cautions())
-    prior = film.layout.prior
-    for name in PLACEMENT:
-        one = prior.properties[prior.index(name)]
-        if abs(film.value(name)) > UNUSUAL_SHIFT * one.std:
-            cautions.append(
-                f"{one.meaning}: {film.value(name):.3g} {one.unit}, which is unusually far from the sensor file: is "
-                "the origin of the stage the centre of the film, and are its axes those of the film?"
-            )
+    cautions.extend(
+        f"{one.meaning}: {film.value(one.name):.3g} {one.unit}, which is unusually far from the sensor file: is the "
+        "origin of the stage the centre of the film, and are its axes those of the film?"
+        for one in film.layout.prior.properties
+        if one.name in PLACEMENT and abs(film.value(one.name)) > UNUSUAL_SHIFT * one.std
+    )
     if is_one_place(presses):
         cautions.append("all known positions are at one place, so they do not determine where the electrodes are")
     return cautions

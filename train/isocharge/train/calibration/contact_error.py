@@ -15,7 +15,7 @@ chosen before any charge is measured. Several presses are chosen one after the o
 Pukelsheim 1993).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,10 +25,9 @@ from isocharge.simulate import Domain, Sweep
 from isocharge.simulate.identifiability.cramer_rao import CramerRao
 from isocharge.simulate.numerics.disk import log_spaced_forces, sunflower
 from isocharge.simulate.solver.stress_limit import force_within_stress
-from isocharge.train.calibration.estimator import PLANNED
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import FilmEstimate
-from isocharge.train.calibration.press_data import PressData, linearise
+from isocharge.train.calibration.press_data import Linearised, PressData, linearise
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.data.contact_errors import rms
 
@@ -58,9 +57,8 @@ class ContactError:
     force_percent: float
 
     @classmethod
-    def of(cls, covariance: Array) -> "ContactError":
-        """Compute the errors from the covariances of estimated contacts (x, y, ln F), shape (n, 3, 3)."""
-        errors = CramerRao(covariance)
+    def of(cls, errors: CramerRao) -> "ContactError":
+        """Compute the errors from the covariances of several contacts (x, y, ln F)."""
         return cls(rms(errors.position), 100.0 * rms(errors.force))
 
 
@@ -77,17 +75,15 @@ class ContactSensitivity:
     noise_covariance: Array
 
     @classmethod
-    def of(cls, problem: CalibrationProblem, charges: FilmCharges, unknowns: Array) -> "ContactSensitivity":
-        """Compute the sensitivity of contacts in the whole working area.
+    def of(cls, film: FilmEstimate, charges: FilmCharges, domain: Domain) -> "ContactSensitivity":
+        """Compute the sensitivity of the contacts that `spread_contacts` returns.
 
         Args:
-            problem: The problem, with the working area and the noise.
+            film: The film and the noise of the charges.
             charges: Charges of a film and of similar films.
-            unknowns: Unknowns of the film, shape (n_unknown,).
+            domain: The working area.
         """
-        domain = problem.domain
-        data = _ideal_presses(problem, charges, unknowns, spread_contacts(domain))
-        linearised = linearise(charges, problem.prior.layout, data, unknowns, data.contact)
+        linearised = _linearise_at(film, charges, spread_contacts(domain))
         slopes = linearised.contact_jacobian[:, :-3]
         domain_precision = np.diag(3.0 / domain.scale**2)  # the variance of a uniform distribution from -1 to 1 is 1/3
         noise_covariance = np.linalg.inv(slopes.swapaxes(1, 2) @ slopes + domain_precision)
@@ -97,22 +93,15 @@ class ContactSensitivity:
     @property
     def noise_error(self) -> ContactError:
         """Errors that noise alone causes."""
-        return ContactError.of(self.noise_covariance)
+        return ContactError.of(CramerRao(self.noise_covariance))
 
     def film_error(self, covariance: Array) -> ContactError:
         """Return the errors that a covariance of the unknowns causes, shape (n_unknown, n_unknown)."""
-        return ContactError.of(self._contact_covariance(covariance))
+        return ContactError.of(self.film_limits(covariance))
 
-    def position_errors_mm(self, covariance: Array) -> Array:
-        """Return the position error that a covariance of the unknowns causes at each contact, shape (n,), mm.
-
-        The contacts are those of `spread_contacts`.
-        """
-        return CramerRao(self._contact_covariance(covariance)).position
-
-    def _contact_covariance(self, covariance: Array) -> Array:
-        """Return the covariances of contacts (x, y, ln F) that a covariance of the unknowns causes, shape (n, 3, 3)."""
-        return self.film_gain @ covariance @ self.film_gain.swapaxes(1, 2)
+    def film_limits(self, covariance: Array) -> CramerRao:
+        """Return the errors of each contact that a covariance of the unknowns causes, shape (n_unknown, n_unknown)."""
+        return CramerRao(self.film_gain @ covariance @ self.film_gain.swapaxes(1, 2))
 
 
 @dataclass(frozen=True)
@@ -158,16 +147,16 @@ def next_presses(
         position_std_mm: Standard deviation of the positions, mm.
         force_std: Relative standard deviation of the forces.
     """
-    unknowns = problem.prior.mean if film is None else film.values
-    covariance = problem.prior.covariance(PLANNED) if film is None else film.covariance
+    film = replace(film or problem.film_before, noise=problem.noise)
+    covariance = film.covariance
     candidates = _candidates(problem)
-    data = _ideal_presses(problem, charges, unknowns, candidates, position_std_mm, force_std)
-    _, information_root = linearise(charges, problem.prior.layout, data, unknowns, data.contact).eliminated()
-    sensitivity = ContactSensitivity.of(problem, charges, unknowns)
+    contact_std = (position_std_mm, position_std_mm, force_std)
+    _, information_root = _linearise_at(film, charges, candidates, contact_std).eliminated()
+    sensitivity = ContactSensitivity.of(film, charges, problem.domain)
 
     # The errors of position and force count relative to those of the noise.
     scale = np.sqrt(np.diagonal(sensitivity.noise_covariance, axis1=1, axis2=2).mean(axis=0))  # shape (3,)
-    gain = (sensitivity.film_gain / scale[:, None]).reshape(-1, len(unknowns))
+    gain = (sensitivity.film_gain / scale[:, None]).reshape(-1, len(covariance))
     proposed = []
     for _ in range(count):
         # A press with the rows H reduces the covariance C by C H' (1 + H C H')^-1 H C.
@@ -203,22 +192,25 @@ def _candidates(problem: CalibrationProblem) -> Array:
     return np.array([(x, y, force) for x, y in position for force in forces])
 
 
-def _ideal_presses(
-    problem: CalibrationProblem,
-    charges: FilmCharges,
-    unknowns: Array,
-    contact: Array,
-    position_std_mm: float = POSITION_STD_MM,
-    force_std: float = FORCE_STD,
-) -> PressData:
-    """Return presses with given contacts (x, y, F), shape (n, 3), whose charges are exactly those of a film."""
-    charge = charges.charges(unknowns[problem.prior.layout.film], contact)
-    count = len(contact)
-    return PressData(
+def _linearise_at(
+    film: FilmEstimate, charges: FilmCharges, contact: Array, contact_std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> Linearised:
+    """Compute the derivatives of the residuals of presses whose charges are exactly those of a film.
+
+    Args:
+        film: The film and the noise of the charges.
+        charges: Charges of a film and of similar films.
+        contact: Contacts (x, y, F) of the presses, shape (n, 3), mm and N.
+        contact_std: Standard deviations of x and y, mm, and of ln F.
+    """
+    charge = charges.charges(film.film_values, contact)
+    log_contact = np.column_stack([contact[:, :2], np.log(contact[:, 2])])
+    data = PressData(
         charge=charge,
-        charge_std=problem.noise.sigma(charge),
-        noise=problem.noise,
-        contact=np.column_stack([contact[:, :2], np.log(contact[:, 2])]),
-        contact_std=np.tile([position_std_mm, position_std_mm, force_std], (count, 1)),
-        time=np.linspace(-0.5, 0.5, count),
+        charge_std=film.noise.sigma(charge),
+        noise=film.noise,
+        contact=log_contact,
+        contact_std=np.broadcast_to(contact_std, contact.shape),
+        time=np.linspace(-0.5, 0.5, len(contact)),
     )
+    return linearise(charges, film.layout, data, film.values, log_contact)

@@ -19,13 +19,12 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.model.charge_series import CHUNK_SIZE, ChargeSeries, series_size
 from isocharge.serve.presses.measured_presses import CONTACT
-from isocharge.simulate import Domain, FilmSlopes, NoiseModel, Sweep
+from isocharge.simulate import Domain, FilmSlopes, Sweep
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.film_properties import PRETENSION, UNEVEN_TENSIONS
 from isocharge.simulate.solver.stress_limit import yield_force
 from isocharge.train.calibration.film_charges import FilmCharges, solve_even_map
 from isocharge.train.calibration.film_estimate import FilmEstimate, discrepancy_jacobian
-from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.data.charge_fit import fit_film_series, fit_series
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
 from isocharge.train.training.training_data import TrainingData
@@ -60,25 +59,25 @@ SEED = 3
 
 
 def compact_charges(
-    problem: CalibrationProblem, charges: FilmCharges, film: FilmEstimate, executor: Executor | None
+    domain: Domain, charges: FilmCharges, film: FilmEstimate, executor: Executor | None
 ) -> ChargeSeries:
     """Compute the compact charge map of an estimated film.
 
     Args:
-        problem: The calibration problem, with the contacts for which the map is needed, and with the noise of the
-            charges, which decides how many directions are needed.
+        domain: Contacts for which the map is needed.
         charges: Charges of the solved film and of similar films.
-        film: The estimate.
+        film: The estimate, with the noise of the charges, which decides how many directions are needed.
         executor: Executor that solves the films at the nodes; None for this process.
     """
-    domain, noise = problem.domain, problem.noise
     contact = draw_contacts(np.random.default_rng(SEED), domain, SERIES_CONTACTS)
     charge = _film_charges(charges, film, contact)
     names = charges.prior.sensor.electrode_names
     node_MPa = _nodes(film) if len(names) > len(CONTACT) else np.zeros(1)  # three charges only determine the contact
     factors = _tension_factors(charges, film, contact, node_MPa, executor)
-    series = fit_film_series(domain, names, contact, charge[:, None] * factors, node_MPa)
-    while series.charge_std > MAX_SERIES_ERROR and node_MPa.size > 1:
+    while True:
+        series = fit_film_series(domain, names, contact, charge[:, None] * factors, node_MPa)
+        if series.charge_std <= MAX_SERIES_ERROR or node_MPa.size == 1:
+            break
         # At a distant node, the imperfections may nearly cancel a charge. Their first-order effect is then not enough.
         is_near = np.abs(node_MPa) < np.abs(node_MPa).max()
         node_MPa, factors = node_MPa[is_near], factors[:, is_near]
@@ -88,10 +87,9 @@ def compact_charges(
             node_MPa[0],
             node_MPa[-1],
         )
-        series = fit_film_series(domain, names, contact, charge[:, None] * factors, node_MPa)
 
     contact, charge = contact[:DIRECTION_CONTACTS], charge[:DIRECTION_CONTACTS]
-    changes = _directions(charges, film, contact, charge, noise)  # shape (n, n_direction, n_electrode), pC
+    changes = _directions(charges, film, contact, charge)  # shape (n, n_direction, n_electrode), pC
     unit_contact = domain.to_unit(contact)
     size = charge if series.log_size is None else series_size(series.log_size, unit_contact[:, 2])[0]
     values = changes / size[:, None]  # a direction changes the value v of the series
@@ -103,7 +101,7 @@ def compact_charges(
         series,
         directions=directions,
         # A film is at most as well described as its charges can be measured.
-        charge_std=max(series.charge_std, noise.gain),
+        charge_std=max(series.charge_std, film.noise.gain),
         offset_pC=film.value("offset"),
         pretension_MPa=film.value(PRETENSION.name),
         tension_std_MPa=PRETENSION.drift,
@@ -174,7 +172,7 @@ def _tension_factors(
     return factors
 
 
-def _directions(charges: FilmCharges, film: FilmEstimate, contact: Array, charge: Array, noise: NoiseModel) -> Array:
+def _directions(charges: FilmCharges, film: FilmEstimate, contact: Array, charge: Array) -> Array:
     """Compute the directions in which the charges are uncertain, and omit effects below `MIN_DIRECTION`.
 
     Args:
@@ -182,7 +180,6 @@ def _directions(charges: FilmCharges, film: FilmEstimate, contact: Array, charge
         film: The estimate.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         charge: Their most probable charges, shape (n, n_electrode), pC.
-        noise: Noise of the charges.
 
     Returns:
         Changes by one standard deviation of each direction, shape (n, n_direction, n_electrode), pC.
@@ -197,7 +194,7 @@ def _directions(charges: FilmCharges, film: FilmEstimate, contact: Array, charge
     changes = jacobian @ (vectors * np.sqrt(np.maximum(eigenvalues, 0.0)))  # shape (n, n_electrode, n_unknown)
 
     # Rotate the directions so that their effects are uncorrelated in units of the noise, and keep the large ones.
-    weighted = (changes / noise.sigma(charge)[:, :, None]).reshape(-1, changes.shape[2])
+    weighted = (changes / film.noise.sigma(charge)[:, :, None]).reshape(-1, changes.shape[2])
     _, singular_values, rotation = np.linalg.svd(weighted, full_matrices=False)
     kept = rotation[singular_values > MIN_DIRECTION * np.sqrt(charge.size)]
     return np.asarray((changes @ kept.T).swapaxes(1, 2))

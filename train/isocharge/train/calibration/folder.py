@@ -140,12 +140,12 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
     unknowns = content.unknowns.values()
     values = np.array([one.value for one in unknowns])
     std = np.array([one.std for one in unknowns])
-    low, high = layout.prior.bounds
-    for index, name in enumerate(layout.prior.names):
-        if not low[index] <= values[index] <= high[index]:
+    for one in layout.prior.properties:
+        low, high = one.limits
+        value = content.unknowns[one.name].value
+        if not low <= value <= high:
             raise PressError(
-                f"{path}: unknowns.{name}.value: expected {low[index]:.6g} to {high[index]:.6g}, got "
-                f"{values[index]:g}; calibrate again"
+                f"{path}: unknowns.{one.name}.value: expected {low:.6g} to {high:.6g}, got {value:g}; calibrate again"
             )
     covariance = _correlations(path, content.correlations, len(values)) * np.outer(std, std)
     return FilmEstimate(layout, values, covariance, content.noise)
@@ -335,9 +335,8 @@ def write_calibration(
     problem, film = result.problem, result.film
     if held_out is not None:
         held_out = usable_held_out(held_out, result.presses, problem)
-    noisy_problem = replace(problem, noise=film.noise)
     with single_threaded_blas():
-        series = compact_charges(noisy_problem, result.charges, film, executor)
+        series = compact_charges(problem.domain, result.charges, film, executor)
     settings = config or FitConfig()
     settings = FitConfig(settings.network, replace_setting(settings.training, noise=film.noise))
     fitted = fit(training_data(result.charges, film, series, executor), settings)

@@ -25,7 +25,7 @@ def calibration_picture(result: CalibrationResult) -> Figure:
 
     # The position error at each contact, the electrodes and the presses
     x, y, _ = spread_contacts(result.problem.domain).T
-    error_mm = result.sensitivity.position_errors_mm(result.film.covariance)
+    error_mm = result.sensitivity.film_limits(result.film.covariance).position
     points = map_axes.scatter(x, y, c=error_mm, s=60)
     figure.colorbar(points, ax=map_axes, label="position error by the film, mm")
     error = result.film_error

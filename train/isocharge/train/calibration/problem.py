@@ -10,7 +10,7 @@ from isocharge.simulate.forward.charge_map import check_electrode_count
 from isocharge.simulate.forward.family import check_family
 from isocharge.simulate.noise import NOISE_LEVELS
 from isocharge.simulate.sensor.film_properties import PRETENSION
-from isocharge.train.calibration.estimator import Prior
+from isocharge.train.calibration.estimator import PLANNED, Prior
 from isocharge.train.calibration.film_charges import round_probe
 from isocharge.train.calibration.film_estimate import FilmEstimate, Layout
 
@@ -77,6 +77,11 @@ class CalibrationProblem:
     def prior(self) -> Prior:
         """Prior distribution of the unknowns."""
         return Prior(Layout(FilmPrior(self.sensor, self.probe)), self.earlier)
+
+    @property
+    def film_before(self) -> FilmEstimate:
+        """Distribution of the unknowns before the presses, with which the first presses are planned."""
+        return FilmEstimate(self.prior.layout, self.prior.mean, self.prior.covariance(PLANNED), self.noise)
 
     @property
     def domain(self) -> Domain:

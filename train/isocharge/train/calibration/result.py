@@ -9,7 +9,7 @@ import numpy as np
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.simulate import Probe, Sensor
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity
-from isocharge.train.calibration.estimator import PLANNED, Estimation
+from isocharge.train.calibration.estimator import Estimation
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.problem import CalibrationProblem
@@ -88,16 +88,16 @@ class CalibrationResult:
     @cached_property
     def film_error_before(self) -> ContactError:
         """Errors of contacts that the uncertainty of the film caused before the presses."""
-        return self.sensitivity.film_error(self.problem.prior.covariance(PLANNED))
+        return self.sensitivity.film_error(self.problem.film_before.covariance)
 
     @cached_property
     def properties(self) -> dict[str, PropertyEstimate]:
         """Properties of the film by name, with their standard deviations before and after the presses."""
-        before = np.sqrt(np.diag(self.problem.prior.covariance(PLANNED)))
+        before = self.problem.film_before
         estimates = {}
-        for index, one in enumerate(self.film.layout.prior.properties):
+        for one in self.film.layout.prior.properties:
             # The prior of imperfections for planning has half of their standard deviations.
-            before_std = one.std if self.problem.earlier is None else float(before[index])
+            before_std = one.std if self.problem.earlier is None else before.std(one.name)
             estimates[one.name] = PropertyEstimate(
                 one.meaning, one.unit, self.film.value(one.name), self.film.std(one.name), before_std
             )
