@@ -38,11 +38,7 @@ MIN_CHANGE = 1e-7
 def minimise(
     evaluate: ResidualFunction,
     start: Array,
-    max_steps: int = 60,
     min_change: float = MIN_CHANGE,
-    initial_damping: float = 1e-4,
-    damping_decrease: float = 0.2,
-    damping_increase: float = 8.0,
 ) -> tuple[Array, Array]:
     """Find a local minimum of each problem by damped Gauss-Newton steps, which begin at a given starting point.
 
@@ -55,11 +51,7 @@ def minimise(
         evaluate: Function that evaluates the residuals r and their derivatives dr/du for some of the problems. Its
             arguments are the indices of the problems, shape (m,), and a point of each problem, shape (m, 3).
         start: Starting points, shape (n, 3). Points outside D are replaced by the nearest point of D.
-        max_steps: Largest number of steps.
         min_change: Change of |r|^2 below which the iteration ends, relative to 1 + |r|^2.
-        initial_damping: Damping of the first step, relative to the mean of the diagonal of J'J.
-        damping_decrease: Factor of the damping after a step that lowers |r|^2, dimensionless.
-        damping_increase: Factor of the damping after a rejected step, dimensionless.
 
     Returns:
         Points in D, shape (n, 3), and the residuals at these points, shape (n, k).
@@ -68,8 +60,8 @@ def minimise(
     active = np.arange(len(start))  # indices of the problems whose iteration has not ended
     residual, slopes = (np.array(values) for values in evaluate(active, point))  # r and dr/du
     squared_norm = (residual**2).sum(axis=1)  # |r|^2, shape (n,)
-    damping = np.full(len(point), initial_damping)
-    for _ in range(max_steps):
+    damping = np.full(len(point), 1e-4)  # relative to the mean of the diagonal of J'J
+    for _ in range(60):
         if not active.size:
             break
         trial_point = bounded_step(point[active], residual[active], slopes[active], damping[active])
@@ -82,7 +74,7 @@ def minimise(
         residual[accepted] = trial_residual[is_accepted]
         slopes[accepted] = trial_slopes[is_accepted]
         squared_norm[accepted] = trial_squared_norm[is_accepted]
-        damping[active] *= np.where(is_accepted, damping_decrease, damping_increase)
+        damping[active] *= np.where(is_accepted, 0.2, 8.0)
         active = active[np.abs(change) >= min_change]
     return point, residual
 
@@ -105,20 +97,22 @@ def bounded_step(point: Array, residual: Array, slopes: Array, damping: Array) -
     trace = np.trace(matrix, axis1=1, axis2=2)[:, None, None] + 1e-12
     matrix = matrix + damping[:, None, None] * trace * np.eye(3) / 3.0
 
-    # The equations change only for points on an edge of D.
-    edge = np.flatnonzero(
-        (point[:, 0] ** 2 + point[:, 1] ** 2 > (1.0 - ROUNDING) ** 2) | (np.abs(point[:, 2]) > 1.0 - ROUNDING)
-    )
+    # The equations change only for points on an edge of D. The normals of the circle and of the end of the interval are
+    # (x, y, 0) and (0, 0, z), because the coordinates of a point on an edge have these lengths.
+    normals = point[:, None] * np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])  # shape (n, 2, 3)
+    normals[np.linalg.norm(normals, axis=2) <= 1.0 - ROUNDING] = 0.0
+    edge = np.flatnonzero(normals.any(axis=(1, 2)))
     if edge.size:
-        matrix[edge], gradient[edge] = _along_edges(point[edge], matrix[edge], gradient[edge], trace[edge])
+        matrix[edge], gradient[edge] = _along_edges(normals[edge], matrix[edge], gradient[edge], trace[edge])
     return into_domain(point - np.linalg.solve(matrix, gradient[..., None])[..., 0])
 
 
-def _along_edges(point: Array, matrix: Array, gradient: Array, trace: Array) -> tuple[Array, Array]:
+def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -> tuple[Array, Array]:
     """Modify the normal equations of points on an edge of the domain D such that each step does not leave D.
 
     Args:
-        point: Points on the circle, or at an end of the interval, or both, shape (n, 3).
+        normals: Normals of the circle and of the end of the interval at each point, shape (n, 2, 3); zeros for an edge
+            on which the point does not lie.
         matrix: Damped matrices J'J, shape (n, 3, 3).
         gradient: Gradients J'r, shape (n, 3).
         trace: Traces of the matrices J'J, shape (n, 1, 1).
@@ -126,11 +120,8 @@ def _along_edges(point: Array, matrix: Array, gradient: Array, trace: Array) -> 
     Returns:
         Modified matrices, shape (n, 3, 3), and modified gradients, shape (n, 3).
     """
-    # The normals of the circle and of the end of the interval are (x, y, 0) and (0, 0, z), because the coordinates of a
-    # point on an edge have these lengths. An edge is active if the negative gradient has an outward component.
-    normals = point[:, None] * np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])  # shape (n, 2, 3)
-    is_on_edge = np.linalg.norm(normals, axis=2) > 1.0 - ROUNDING
-    outward = -np.einsum("nbi,ni->nb", normals, gradient) * is_on_edge
+    # An edge is active if the negative gradient has an outward component.
+    outward = -np.einsum("nbi,ni->nb", normals, gradient)
     normals = normals * (outward > 0.0)[..., None]
 
     # The curvature of the circle adds a second derivative along the tangent, which is the outward component.

@@ -183,9 +183,8 @@ class AmbiguousPairs:
     @property
     def outer_radius(self) -> Array:
         """Distance between the centre of the film and the outer contact of each pair, shape (n,), mm."""
-        first_radius = np.hypot(*self.first[:, :2].T)
-        second_radius = np.hypot(*self.second[:, :2].T)
-        return np.asarray(np.maximum(first_radius, second_radius))
+        contacts = np.stack([self.first, self.second])
+        return np.asarray(np.linalg.norm(contacts[:, :, :2], axis=2).max(axis=0))
 
     @property
     def radius(self) -> float:
