@@ -273,7 +273,7 @@ class FilmPrior:
         return low, high
 
     @cached_property
-    def is_imperfection(self) -> Array:
+    def is_imperfection(self) -> Booleans:
         """Whether each property is an imperfection, shape (n_property,)."""
         return np.array([one.is_imperfection for one in self.properties])
 

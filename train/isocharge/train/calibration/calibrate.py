@@ -184,7 +184,7 @@ def _fit_uneven_film(
 def _solved_distance(estimation: Estimation) -> float:
     """Return the largest distance of the even properties from those of the solved film, in standard deviations."""
     film, charges = estimation.film, estimation.charges
-    is_even = charges.prior.changes_stress & np.logical_not(charges.prior.is_imperfection)
+    is_even = charges.prior.changes_stress & ~charges.prior.is_imperfection
     std = np.sqrt(np.diagonal(film.covariance)[film.layout.film])
     return float(np.abs((film.film_values - charges.values) / std)[is_even].max())
 

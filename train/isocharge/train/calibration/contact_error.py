@@ -27,7 +27,7 @@ from isocharge.simulate.numerics.disk import log_spaced_forces, sunflower
 from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import FilmEstimate
-from isocharge.train.calibration.press_data import Linearised, PressData, linearise
+from isocharge.train.calibration.press_data import Linearised, PressData, model_values
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.data.contact_errors import rms
 
@@ -213,4 +213,4 @@ def _linearise_at(
         contact_std=np.broadcast_to(contact_std, contact.shape),
         time=np.linspace(-0.5, 0.5, len(contact)),
     )
-    return linearise(charges, film.layout, data, film.values, log_contact)
+    return Linearised.of(model_values(charges, film.layout, data, film.values, log_contact), data, log_contact)

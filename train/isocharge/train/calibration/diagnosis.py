@@ -186,13 +186,10 @@ def expected_charges(charges: FilmCharges, contact: Array) -> Array:
         Charges, shape (n_pretension, n, n_electrode), pC.
     """
     prior = charges.prior
+    films = np.tile(prior.mean, (len(PRETENSIONS_MPa), 1))
+    films[:, prior.index("pretension")] = PRETENSIONS_MPa
     contact_in_domain = charges.into_domain(contact)
-    charges_by_film = []
-    for pretension in PRETENSIONS_MPa:
-        values = prior.mean.copy()
-        values[prior.index("pretension")] = pretension
-        charges_by_film.append(charges.charges(values, contact_in_domain))
-    return np.array(charges_by_film)
+    return np.array([charges.charges(values, contact_in_domain) for values in films])
 
 
 def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:

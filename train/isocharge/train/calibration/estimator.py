@@ -33,7 +33,6 @@ from isocharge.train.calibration.press_data import (
     PressData,
     PressErrors,
     in_domain,
-    linearise,
     model_values,
 )
 
@@ -321,8 +320,8 @@ def _estimate_with_errors(
 
     best = int(weight.argmax())
     log_contact[is_used] = used_contact
-    final = linearise(charges, layout, data, unknowns, log_contact)
-    final_residual, _ = final.eliminated()
+    final_model = model_values(charges, layout, data, unknowns, log_contact)
+    final_residual, _ = Linearised.of(final_model, data, log_contact).eliminated()
     final_chi2 = (final_residual**2).sum(axis=1)
     gain_variance = np.average([one.errors.noise.gain**2 for one in probable], weights=weight)
     noise = NoiseModel("presses", stated.noise.white, float(np.sqrt(gain_variance)))

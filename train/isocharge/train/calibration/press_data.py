@@ -169,11 +169,6 @@ def model_values(charges: FilmCharges, layout: Layout, data: PressData, unknowns
     )
 
 
-def linearise(charges: FilmCharges, layout: Layout, data: PressData, unknowns: Array, contact: Array) -> Linearised:
-    """Compute the residuals of presses and their derivatives; see `model_values`."""
-    return Linearised.of(model_values(charges, layout, data, unknowns, contact), data, contact)
-
-
 def in_domain(contact: Array, charges: FilmCharges) -> Array:
     """Convert contacts (x, y, ln F) to (x, y, F), and move contacts outside the domain to its nearest contact."""
     log_force = np.clip(contact[:, 2], *np.log(charges.domain.force_range))  # no number overflows
