@@ -293,29 +293,26 @@ def package_version() -> str:
     return version("isocharge")
 
 
-def lazy_names(package: str, *extras: str) -> Callable[[str], Any]:
-    """Return a function that imports a public name of a package when the name is used for the first time.
+def lazy_names(package: str, *extras: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """Return the attributes `__getattr__`, `__dir__` and `__all__` of a package with public names.
 
-    The package assigns the function to the name `__getattr__`. Python calls a function of this name for each attribute
-    that the package does not contain. The modules of the names are stated once, as imports that only type checkers
-    execute:
+    A public name is imported when it is used for the first time. Python calls `__getattr__` for each attribute that the
+    package does not contain. The public names and their modules are stated once, as imports that only type checkers
+    execute. Their repetition after `as` shows type checkers that the names are public:
 
         if TYPE_CHECKING:
-            from isocharge.simulate.solver.press import press
+            from isocharge.simulate.solver.press import press as press
         else:
-            __getattr__ = lazy_names(__name__, "simulate")
+            __getattr__, __dir__, __all__ = lazy_names(__name__, "simulate")
 
     Args:
         package: Name of the package.
         *extras: Extras of pyproject.toml that the package needs.
     """
-
-    @cache
-    def modules() -> dict[str, str]:
-        """Return the module of each public name, from the imports in the source of the package."""
-        source = pkgutil.get_data(package, "__init__.py") or b""
-        imports = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ImportFrom)]
-        return {alias.name: node.module or "" for node in imports for alias in node.names}
+    source = pkgutil.get_data(package, "__init__.py") or b""
+    imports = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ImportFrom)]
+    modules = {alias.name: node.module or "" for node in imports for alias in node.names if alias.asname}
+    public_names = sorted(modules)
 
     def look_up(name: str) -> Any:
         """Import a public name, and store it in the package, so that Python no longer calls this function for it.
@@ -326,12 +323,12 @@ def lazy_names(package: str, *extras: str) -> Callable[[str], Any]:
         """
         if name == "__version__":
             return package_version()
-        namespace = sys.modules[package]
-        if name not in namespace.__all__:
+        if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         with require(*extras):
-            value = getattr(import_module(modules()[name]), name)
-        setattr(namespace, name, value)
+            value = getattr(import_module(modules[name]), name)
+        setattr(sys.modules[package], name, value)
         return value
 
-    return look_up
+    # Tab completion suggests only the public names.
+    return look_up, public_names.copy, public_names
