@@ -46,7 +46,7 @@ def check_command(
     check = check_presses(predictor, presses)
     result = check.to_dict()
     if not json:
-        del result["each"]
+        each_press = result.pop("each")
         summaries = {name: result.pop(name) for name in ("position_mm", "force_percent")}
         errors = {name: summary for name, summary in summaries.items() if summary is not None}
         # The table contains the presses with the largest errors, in the order of the file. The squared errors of x, y
@@ -55,7 +55,7 @@ def check_command(
         worst_indices = np.argsort(-chi_squared, kind="stable")[:MAX_ROWS]
         if check.presses > MAX_ROWS:
             say(f"the table has the {MAX_ROWS} worst of {check.presses} presses; --json has all")
-        rows = map(check.errors.row, sorted(worst_indices.tolist()))
+        rows = [each_press[index] for index in sorted(worst_indices)]
         worst_presses = [{check.errors.row_noun: row["line"]} | {name: row[name] for name in SHOWN} for row in rows]
         result = {"each": worst_presses, "errors": errors} | result
         if check.std_factor is not None:

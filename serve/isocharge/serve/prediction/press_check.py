@@ -141,7 +141,7 @@ class PressCheck:
         degrees = agreement.degrees
         common = agreement.common
         values: dict[str, Any] = {
-            "each": [self.errors.row(press) for press in range(self.presses)],
+            "each": self.errors.rows(),
             "model": self.model,
             "presses": self.presses,
             "counted": self.compared,

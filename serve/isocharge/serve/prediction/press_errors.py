@@ -78,32 +78,27 @@ class PressErrors:
         """Distances between predicted and measured positions, shape (n,), mm; NaN if a position is unknown."""
         return np.asarray(np.linalg.norm(self.error[:, :FORCE], axis=1))
 
-    def row(self, press_index: int) -> dict[str, Any]:
-        """Return the contact, the errors and the flags of one press as a dictionary whose keys contain the units.
+    def rows(self) -> list[dict[str, Any]]:
+        """Return the contact, the errors and the flags of each press as a dictionary whose keys contain the units.
 
         The correlations of the contact are not included.
-
-        Args:
-            press_index: Index of the press; the first press has the index 0.
         """
-        x_error_mm, y_error_mm, force_error = self.error[press_index]  # the force is relative to the measured force
-        noise_std = self.noise_std[press_index]
-        rig_std = self.rig_std[press_index]
+        x_error_mm, y_error_mm, force_error = self.error.T  # the force is relative to the measured force
         contact_names = Contacts._fields[:N_WITHOUT_CORRELATION]
-        contact_values = self.predicted[press_index, :N_WITHOUT_CORRELATION].tolist()
-        return {
-            "line": self.lines[press_index],
-            **dict(zip(contact_names, contact_values, strict=True)),
+        columns: dict[str, Any] = {
+            "line": self.lines,
+            **dict(zip(contact_names, self.predicted.T, strict=False)),  # the last columns are the correlations
             "x_error_mm": x_error_mm,
             "y_error_mm": y_error_mm,
-            "position_error_mm": self.position_error_mm[press_index],
+            "position_error_mm": self.position_error_mm,
             "force_error_percent": 100.0 * force_error,
-            "noise_std_percent": 100.0 * noise_std[FORCE],
-            "position_std_mm": rig_std[0],
-            "force_std_percent": 100.0 * rig_std[FORCE],
-            "flags": list(self.flags[press_index]),
-            "left_out": self.exclusion_reasons[press_index] or None,  # None if the press is compared
+            "noise_std_percent": 100.0 * self.noise_std[:, FORCE],
+            "position_std_mm": self.rig_std[:, 0],
+            "force_std_percent": 100.0 * self.rig_std[:, FORCE],
+            "flags": self.flags,
+            "left_out": [reason or None for reason in self.exclusion_reasons],  # None if the press is compared
         }
+        return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
 
 def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
