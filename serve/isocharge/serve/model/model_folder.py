@@ -252,11 +252,9 @@ def check_golden(model: Model) -> None:
         expected = np.array(golden.outputs[name])
         # Below its floor, a value has a constant tolerance, because a relative tolerance would approach 0.
         tolerance = golden.tolerance.relative * np.maximum(np.abs(expected), golden.tolerance.floor[name])
-        with np.errstate(invalid="ignore"):
-            excess = np.abs(rows - expected) - tolerance
-        excess[np.isnan(excess)] = np.inf  # a value that is not a number counts as an infinite difference
-        row, column = np.unravel_index(np.argmax(excess), excess.shape)  # the largest difference of this output
-        if excess[row, column] > 0.0:
+        is_close = np.abs(rows - expected) <= tolerance  # False also for a value that is not a number
+        if not is_close.all():
+            row, column = np.argwhere(~is_close)[0]
             raise ModelError(
                 f"{where}: {name}[{row}, {column}]: expected {expected[row, column]:.9g} +- "
                 f"{tolerance[row, column]:.1g} (golden.json), got {rows[row, column]:.9g}; copy or export the model "
