@@ -21,7 +21,6 @@ Error messages have one of the following forms:
 """
 
 import difflib
-import math
 import re
 import sys
 import tomllib
@@ -183,13 +182,6 @@ def convert(value: object, target_type: type[T], where: str, error_class: type[I
         except (LookupError, ValueError, StopIteration):  # a key of the file imitates the keys in a message of msgspec
             mistake = cut(str(cause))
         raise error_class(_prefix(where) + mistake) from cause
-
-
-def finite_or_none(value: float | None) -> float | None:
-    """Convert a number to a float, or to None if the number is NaN, infinite or None."""
-    if value is None or not math.isfinite(value):
-        return None
-    return float(value)
 
 
 def plain_values(value: object) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import SceneError, SolveError
-from isocharge.common.structs import finite_or_none
+from isocharge.common.structs import plain_values
 from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.simulate.forward.forward_map import ForwardMap
@@ -164,8 +164,8 @@ class Identification:
             "working_area": {
                 "radius_mm": area.radius,
                 "why": area.bound,
-                "fold_radius_mm": finite_or_none(area.fold_radius),
-                "twin_radius_mm": finite_or_none(area.pairs.radius),
+                "fold_radius_mm": plain_values(area.fold_radius),
+                "twin_radius_mm": plain_values(area.pairs.radius),
                 "error_radius_mm": area.error_radius,
                 "unfolded_radius_mm": area.unambiguous_radius,
                 "error_mm": area.error,

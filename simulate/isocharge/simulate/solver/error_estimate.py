@@ -17,7 +17,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
-from isocharge.common.structs import finite_or_none
+from isocharge.common.structs import plain_values
 from isocharge.simulate.mechanics.theory import Theory, bending_length, slenderness
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.numerics.interpolation import gauss_reference_square, modal_matrix
@@ -277,7 +277,7 @@ def summary(equilibrium: Equilibrium) -> dict[str, Any]:
         "iterations": equilibrium.iterations,
         "residual": equilibrium.residual,
         "seconds": equilibrium.seconds,
-        "estimated_error": finite_or_none(estimated_error(equilibrium)),
+        "estimated_error": plain_values(estimated_error(equilibrium)),
         "groups": {
             **{name: getattr(equilibrium.groups, name) for name in REPORTED_GROUPS},
             "bending_length": bending_length(equilibrium.film, equilibrium.force),
