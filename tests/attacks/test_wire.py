@@ -16,7 +16,7 @@ from attacks.faults import mutated, with_junk
 from infer_requests import infer_request
 from isocharge.serve.network.grpc.service import METHODS, SERVICE
 from isocharge.serve.network.model_store import open_model_store
-from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.protocol.handler import Handler
 
 NAME = "three-25um-biaxial"
 MODELS = Path(__file__).parents[2] / "models"

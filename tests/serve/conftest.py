@@ -23,9 +23,9 @@ from boards import TcpBoard, taps
 from isocharge.serve import ModelMetadata, PredictionRecord, Predictor, write_model
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.network.address import Address
-from isocharge.serve.network.http import HttpServer
+from isocharge.serve.network.http.server import HttpServer
 from isocharge.serve.network.model_store import open_model_store
-from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.protocol.handler import Handler
 from isocharge.serve.record.record import selected_fields
 
 NAMES = ("A", "B", "C", "D")

@@ -22,7 +22,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from isocharge.serve import find_model
 from isocharge.serve.network.model_store import open_model_store
-from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.protocol.handler import Handler
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "serve/deploy"

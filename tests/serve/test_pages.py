@@ -18,7 +18,7 @@ from isocharge.serve import Frame, device_from_table, encode_frame, flags
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.live.device import STAGES
 from isocharge.serve.network.model_store import open_model_store
-from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.protocol.handler import Handler
 from isocharge.serve.signal_chain.touch import TouchRule
 from layout_encoder import encode_layout
 

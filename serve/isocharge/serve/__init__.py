@@ -53,6 +53,6 @@ if TYPE_CHECKING:  # each `as` marks a public name (PEP 484); isort would split 
     from isocharge.serve.virtual_sensor.script import Faults as Faults, Script as Script, wander as wander
     from isocharge.serve.virtual_sensor.sensor import VirtualSensor as VirtualSensor
 else:  # hidden from type checkers, which would otherwise accept every misspelt name
-    __getattr__, __dir__, __all__ = lazy_names(__name__)
+    __getattr__, __dir__, __all__ = lazy_names(__name__, "http")  # only `asgi_app` needs an extra
 
 __version__: str

@@ -7,7 +7,7 @@ from threading import Thread
 import pytest
 import uvloop
 
-from isocharge.serve.network.grpc import grpc_server
+from isocharge.serve.network.grpc.server import grpc_server
 
 
 @pytest.fixture(scope="session")

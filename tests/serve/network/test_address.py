@@ -10,7 +10,7 @@ import pytest
 from isocharge.common.errors import InputError, ListenError, TokenError
 from isocharge.serve.network.address import Address, Tls, check_exposure
 from isocharge.serve.network.browser_check import AccessCheck
-from isocharge.serve.network.http import HttpServer
+from isocharge.serve.network.http.server import HttpServer
 
 
 @pytest.mark.parametrize("token", ["", " a", "a\n", "a\r\nb: c", "schlüssel", "100%"])

@@ -11,7 +11,7 @@ from headless_chromium import start_chromium
 from infer_requests import INFER, infer_request
 from isocharge.common.errors import InputError, OriginError
 from isocharge.serve.network.browser_check import AccessCheck, host_name
-from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.protocol.handler import Handler
 
 CHROMIUM_ARGUMENTS = (
     "--host-resolver-rules=MAP evil.example 127.0.0.1",

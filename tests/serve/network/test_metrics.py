@@ -8,7 +8,7 @@ from infer_requests import BODY, INFER, infer_request
 from isocharge.serve.flags import MISFIT
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.model_store import open_model_store
-from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.protocol.handler import Handler
 
 
 def scrape(handler):

@@ -23,7 +23,7 @@ from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.grpc.service import SERVICE
 from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.model_store import open_model_store
-from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.protocol.handler import Handler
 from isocharge.serve.network.protocol.routes import ROUTES
 from model_files import put_graph
 from serve.network.http.test_server import exchange

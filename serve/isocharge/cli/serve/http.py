@@ -22,10 +22,10 @@ from isocharge.cli.shared.terminal import announce, on_signal, unless_hung_up, w
 from isocharge.common.errors import IsochargeError, require
 from isocharge.serve.network.address import Address, Tls, check_exposure
 from isocharge.serve.network.browser_check import AccessCheck
-from isocharge.serve.network.http import HttpServer
+from isocharge.serve.network.http.server import HttpServer
 from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.model_store import ModelStore, open_model_store
-from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.protocol.handler import Handler
 from isocharge.serve.outputs.output import WriterQueue
 
 log = logging.getLogger("isocharge.serve.http")
@@ -155,7 +155,7 @@ async def _announced(
     # The core of gRPC reads this variable when it is imported. It would print errors that are reported anyway.
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")
     with require("grpc"):
-        from isocharge.serve.network.grpc import grpc_server
+        from isocharge.serve.network.grpc.server import grpc_server
     async with grpc_server(handler, host, grpc_port, tls) as grpc_url:
         announce(server.url)
         announce(grpc_url)

@@ -26,7 +26,7 @@ from isocharge.common.structs import Finite, WrongKey, parse_json
 from isocharge.serve.flags import MEANINGS
 from isocharge.serve.network.address import Address, ServerLimits, Tls
 from isocharge.serve.network.browser_check import AccessCheck
-from isocharge.serve.network.http import HttpServer
+from isocharge.serve.network.http.server import HttpServer
 from isocharge.serve.network.metrics import Traffic
 from isocharge.serve.network.protocol.handler import Application
 from isocharge.serve.network.protocol.response import Response, json_response, response_of

@@ -25,7 +25,7 @@ from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.grpc import server
 from isocharge.serve.network.grpc.service import METHODS, SERVICE, Service
 from isocharge.serve.network.metrics import RequestLog, Traffic
-from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.protocol.handler import Handler
 
 PROTO = Path(__file__).parents[4] / "serve/isocharge/serve/network/grpc/inference.proto"
 

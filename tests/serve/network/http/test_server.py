@@ -19,7 +19,7 @@ from infer_requests import BODY, INFER, infer_request
 from isocharge.serve.network.address import ServerLimits, Tls
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.http.server import Connection
-from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.protocol.handler import Handler
 
 LOAD = b"POST /v2/repository/models/linear/load HTTP/1.1\r\nHost: localhost\r\nContent-Length: 0\r\n\r\n"
 LAST = b"Connection: close\r\n"

@@ -2,10 +2,3 @@
 
 May import: network.protocol, network.
 """
-
-from isocharge.common.errors import require
-
-with require("grpc"):
-    from isocharge.serve.network.grpc.server import grpc_server
-
-__all__ = ["grpc_server"]

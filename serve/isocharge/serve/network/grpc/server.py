@@ -12,7 +12,7 @@ import grpc.aio
 from isocharge.common.errors import ListenError
 from isocharge.serve.network.address import ServerLimits, Tls, url_host
 from isocharge.serve.network.grpc.service import Service
-from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.protocol.handler import Handler
 
 MAX_CALLS_PER_CONNECTION = 100
 """Largest number of open calls on one connection. HTTP/2 recommends at least this number.

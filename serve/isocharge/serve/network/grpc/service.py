@@ -29,7 +29,7 @@ from google.protobuf.message_factory import GetMessageClass
 from isocharge.common.errors import ModelError, RequestError, TooMany
 from isocharge.common.structs import convert
 from isocharge.serve.network.metrics import Exchange
-from isocharge.serve.network.protocol import Handler
+from isocharge.serve.network.protocol.handler import Handler
 from isocharge.serve.network.protocol.inference import DATATYPES, InferBody, infer
 from isocharge.serve.network.protocol.response import client_message, statuses
 from isocharge.serve.network.protocol.routes import ROUTES, Request
