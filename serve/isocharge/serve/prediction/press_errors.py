@@ -115,18 +115,16 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
     model_presses = presses.of_electrodes(metadata.electrodes, metadata.label)  # charges in the order of the model
     measured = model_presses.contact  # x, y and force, shape (n, 3)
 
-    # If a charge of a press is unknown, the press has no contact and no flags.
-    n_press = len(model_presses)
-    is_complete = ~np.isnan(model_presses.charge_pC).any(axis=1)
-    contacts = predictor.predict_batch(model_presses.charge_pC[is_complete])
-    predicted = np.full((n_press, len(Contacts._fields)), np.nan)
-    predicted[is_complete] = contacts
-    flags: list[tuple[str, ...]] = [()] * n_press
-    for press, words in zip(np.flatnonzero(is_complete), predictor.validity.batch_flags(contacts), strict=True):
-        flags[press] = words
+    # A press with an unknown charge is predicted with the charge 0. The result is discarded.
+    charge_pC = model_presses.charge_pC
+    is_unknown_charge = np.isnan(charge_pC)
+    is_complete = np.asarray(~is_unknown_charge.any(axis=1))
+    contacts = predictor.predict_batch(np.where(is_unknown_charge, 0.0, charge_pC))
+    predicted = np.where(is_complete[:, np.newaxis], contacts, np.nan)
+    flags_of_presses = predictor.validity.batch_flags(contacts)
 
     # Differences of x and y are errors in mm. Differences of the force are divided by the measured force.
-    divisor = np.ones((n_press, 3))
+    divisor = np.ones_like(measured)
     divisor[:, FORCE] = measured[:, FORCE]
 
     # Standard deviations of the measured values. The standard deviation of the force is already relative.
@@ -140,7 +138,7 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
         error=(predicted[:, COLUMNS["contact"]] - measured) / divisor,
         noise_std=np.where(is_unknown, np.nan, predicted[:, COLUMNS["contact_std"]] / divisor),
         rig_std=np.where(is_unknown, np.nan, rig_std),
-        flags=tuple(flags),
+        flags=tuple(flags if known else () for flags, known in zip(flags_of_presses, is_complete, strict=True)),
         has_misfit=predicted[:, Contacts._fields.index("misfit")] > misfit_limit(metadata),
         exclusion_reasons=_exclusion_reasons(predictor.validity, model_presses),
     )
