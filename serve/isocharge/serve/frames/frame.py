@@ -290,13 +290,9 @@ class Parser(ABC):
 
         No frame is counted as lost before the first frame of the next connection.
         """
-        self._drop_tail()
-        self._previous_seq = None
-
-    def _drop_tail(self) -> None:
-        """Drop the stored bytes of an unfinished frame."""
         self.counts.bytes_dropped += len(self._tail)
         self._tail = b""
+        self._previous_seq = None
 
     def sequence_flags(self, seq: int | None, *, is_clock_reset: bool = False) -> tuple[str, ...]:
         """Find lost and repeated frames and restarts by the frame counter, add them to `counts`, and return the flags.
@@ -377,37 +373,26 @@ class DelimitedParser(Parser):
         super().__init__(*parser_arguments)
         self._delimiter = delimiter
         self._max_length = max_length
-        self._beginning_was_dropped = False  # whether the unfinished piece is too long, so that its bytes are dropped
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that end within `data`.
 
         The bytes are divided into pieces at the delimiters. Pieces that are longer than `max_length` are dropped.
 
-        The bytes after the last delimiter are an unfinished piece, the tail, which is stored for the next call. If the
-        tail is longer than `max_length`, it is dropped instead, and so is the rest of the same piece when it arrives.
+        The bytes after the last delimiter are an unfinished piece, the tail, which is stored for the next call. Of a
+        tail that is longer than `max_length`, only `max_length + 1` bytes are stored, so that the piece is too long
+        also when its end arrives. The other bytes are dropped.
         """
         *pieces, tail = (self._tail + data).split(self._delimiter)
         frames = []
         for piece in pieces:
-            # If an earlier call has dropped the beginning of a long piece, the first piece is the rest of it.
-            if self._beginning_was_dropped or len(piece) > self._max_length:
-                self._beginning_was_dropped = False  # the following pieces are complete
+            if len(piece) > self._max_length:
                 self.counts.count_rejected(len(piece) + 1)  # with the delimiter
             else:
                 frames += self._parse_piece(piece)
-
-        # Store the tail, or drop it if it is too long or belongs to a piece whose beginning was dropped.
-        self._tail = tail
-        if self._beginning_was_dropped or len(tail) > self._max_length:
-            self._beginning_was_dropped = True
-            self._drop_tail()
+        self._tail = tail[: self._max_length + 1]
+        self.counts.bytes_dropped += len(tail) - len(self._tail)
         return frames
-
-    def reset(self) -> None:
-        """Drop the bytes of an unfinished piece, because the next bytes come from another connection."""
-        super().reset()
-        self._beginning_was_dropped = False
 
     @abstractmethod
     def _parse_piece(self, piece: bytes) -> list[Frame]:

@@ -362,25 +362,21 @@ class SyncParser(Parser):
         sync = self.layout.sync
         length = self.layout.length
         unparsed = self._tail + data
-        last_complete_start = len(unparsed) - length  # a frame that begins after this position is unfinished
         frames = []
         parsed_end = 0  # all bytes before this position have been parsed
-        start = unparsed.find(sync, parsed_end)  # -1 if the pattern does not occur
-        while 0 <= start <= last_complete_start:
-            self.counts.bytes_dropped += start - parsed_end  # bytes between the previous frame and the pattern
-            # If the bytes are not a frame, one byte is dropped, because a frame may begin at the next byte.
-            decoded = self._try_decode(self.layout.decode, unparsed[start : start + length], dropped_size=1)
-            frames += decoded
-            parsed_size = length if decoded else 1
-            parsed_end = start + parsed_size
+        while True:
             start = unparsed.find(sync, parsed_end)
-
-        tail_start = start  # the beginning of an unfinished frame
-        if start < 0:  # no sync pattern was found, but the end of the data may contain the beginning of the pattern
-            tail_start = max(parsed_end, len(unparsed) - len(sync) + 1)
-        self.counts.bytes_dropped += tail_start - parsed_end
-        self._tail = unparsed[tail_start:]
-        return frames
+            if start < 0:  # no sync pattern was found, but the end of the data may contain the beginning of the pattern
+                start = max(parsed_end, len(unparsed) - len(sync) + 1)
+            self.counts.bytes_dropped += start - parsed_end  # bytes between the previous frame and the pattern
+            candidate = unparsed[start : start + length]
+            if len(candidate) < length:  # an unfinished frame
+                self._tail = candidate
+                return frames
+            # If the bytes are not a frame, one byte is dropped, because a frame may begin at the next byte.
+            decoded = self._try_decode(self.layout.decode, candidate, dropped_size=1)
+            frames += decoded
+            parsed_end = start + (length if decoded else 1)
 
 
 class DatagramParser(SyncParser):
