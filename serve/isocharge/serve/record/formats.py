@@ -56,13 +56,13 @@ def _columns(electrodes: Sequence[str], *, with_tracking: bool, with_film: bool)
     with one column.
     """
     for field in selected_fields(with_tracking=with_tracking, with_film=with_film):
-        parts: Iterable[str | None] = [None]
-        if field.kind == "charges":
-            parts = electrodes
-        elif field.kind == "object":
-            parts = [part.name for part in field.parts]
-        for part in parts:
+        for part in _part_names(field, electrodes) or [None]:
             yield field.name, part
+
+
+def _part_names(field: Field, electrodes: Sequence[str]) -> Sequence[str]:
+    """Return the names of the numbers in a field: the electrodes for charges, and the parts of an object."""
+    return electrodes if field.kind == "charges" else [part.name for part in field.parts]
 
 
 def _line(cells: Iterable[str]) -> str:
@@ -153,10 +153,7 @@ def _property(field: Field, electrodes: Sequence[str], *, allows_null: bool) -> 
         schema["type"] = [json_type, "null"]
     if field.kind == "words":  # a list of texts
         schema["items"] = {"type": "string"}
-    if field.kind == "charges":  # an object with a number for each electrode
-        schema["properties"] = dict.fromkeys(electrodes, number_in_object)
-    if field.kind == "object":  # an object whose parts are all numbers
-        part_names = [part.name for part in field.parts]
-        schema["properties"] = dict.fromkeys(part_names, number_in_object)
+    if json_type == "object":  # its parts are all numbers
+        schema["properties"] = dict.fromkeys(_part_names(field, electrodes), number_in_object)
     schema["description"] = field.meaning.text
     return schema
