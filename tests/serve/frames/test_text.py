@@ -68,7 +68,7 @@ def test_damaged_line_of_text_is_refused_with_the_reason(text, reason):
 
 @pytest.mark.parametrize("text", ["booting v1.2 on ESP32-S3", "{", "ch3,A0", "10.0.0.1", "1_0", ">A", "ch-1,ch-2"])
 def test_digits_in_words_are_no_numbers(text):
-    assert parse_line(text).numbers == ()
+    assert parse_line(text).names == ()
 
 
 @pytest.mark.parametrize(

@@ -133,8 +133,7 @@ class DeviceClock:
             modulus: Time at which the clock wraps to 0, us.
             arrival_s: Arrival of the chunk that contains the reading, unix seconds.
         """
-        frame.is_clock_reset = self._is_reset(t_us, modulus)
-        step_us = self._unwrap(t_us, modulus)  # time since the previous reading
+        step_us = self._unwrap(frame, t_us, modulus)  # time since the previous reading
         predicted_s = self._predict(self._device_us)
 
         # No reading can be taken long after its arrival, so a clock was set. All chunks of a file have the same arrival
@@ -219,21 +218,7 @@ class DeviceClock:
         fitted_us = self._fitted_us or 0  # None without a fit
         return self._fitted_host_s + self.rate * (device_us - fitted_us) * 1e-6
 
-    def _is_reset(self, t_us: int, modulus: int) -> bool:
-        """Return whether the clock has jumped back by more than `MAX_DELAY_s` since the previous reading.
-
-        A clock that was not reset may jump back by less, for example if datagrams arrive in another order.
-
-        Args:
-            t_us: Clock of the reading as the device sent it, us.
-            modulus: Time at which the clock wraps to 0, us.
-        """
-        if self._sent_us is None:  # this is the first reading
-            return False
-        decrease_us = (self._sent_us - t_us) % modulus  # more than half of the range if the clock has advanced
-        return MAX_DELAY_s * 1e6 < decrease_us <= modulus // 2
-
-    def _unwrap(self, t_us: int, modulus: int) -> int:
+    def _unwrap(self, frame: Frame, t_us: int, modulus: int) -> int:
         """Remove the wraps from the clock value of the next reading, and store the resulting value in `_device_us`.
 
         If the clock went back by at most `MAX_DELAY_s`, the reading arrived late: for example, another datagram has
@@ -241,6 +226,7 @@ class DeviceClock:
         The fit is then discarded.
 
         Args:
+            frame: Frame of the reading, which stores whether the clock was reset.
             t_us: Clock of the reading as the device sent it, us.
             modulus: Time at which the clock wraps to 0, us.
 
@@ -254,6 +240,7 @@ class DeviceClock:
             # The modulo makes the step correct even if the clock has wrapped between the readings.
             half_range_us = modulus // 2
             step_us = (t_us - previous_us + half_range_us) % modulus - half_range_us
+            frame.is_clock_reset = step_us < -MAX_DELAY_s * 1e6
             if step_us >= -min(MAX_DELAY_s * 1e6, self._device_us):
                 self._device_us += step_us
                 return max(0, step_us)

@@ -194,7 +194,7 @@ class TextParser(DelimitedParser):
             line = line_below_header
         layout = self.layout
         self.unread_line = text
-        if line.numbers:
+        if line.names:  # the line contains numbers
             return self._recognise_layout(line, size) if layout is None else self._reject(size)
         if layout is None:
             self._headers.append(text)

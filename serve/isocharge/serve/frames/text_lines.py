@@ -131,14 +131,13 @@ class _Token(NamedTuple):
 
 
 class Line(NamedTuple):
-    """Numbers and skeleton of a line of text.
+    """Places and names of the numbers in a line of text, and the skeleton of the line.
 
     Attributes:
         text: The line.
         skeleton: The parts of the line that are the same in each line of a layout, with one control character for each
             number, each other part that may change, and optional blanks.
         names: Name of each number; empty for a number without a name.
-        numbers: The numbers as texts.
         starts: Position in the line at which each number begins.
         is_prose: Whether the line resembles a message. Either it has at least as many words as numbers, as in `Channel
             3 is ready`; keys, and words after a comma or another mark, do not count. Or it has a decimal number after a
@@ -149,7 +148,6 @@ class Line(NamedTuple):
     text: str
     skeleton: str
     names: tuple[str, ...]
-    numbers: tuple[str, ...]
     starts: tuple[int, ...]
     is_prose: bool
     words: tuple[str, ...]
@@ -257,11 +255,10 @@ def parse_line(text: str, *, has_header: bool = False, counters: Collection[str]
             skeleton += token.content
         else:
             skeleton += _CODES[number_kind if token.kind == "number" else token.kind]
-    numbers = tuple(token.content for token in number_tokens)
     starts = tuple(token.start for token in number_tokens)
-    is_prose = begins_with_address or word_count >= len(numbers)
+    is_prose = begins_with_address or word_count >= len(starts)
     words = tuple(token.name for token in tokens if token.kind not in ("mark", *_NUMBER_KINDS))
-    return Line(text, skeleton + _CODES["end"], tuple(names_with_units), numbers, starts, is_prose, words)
+    return Line(text, skeleton + _CODES["end"], tuple(names_with_units), starts, is_prose, words)
 
 
 def _has_decimal_commas(text: str) -> bool:

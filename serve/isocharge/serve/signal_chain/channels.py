@@ -2,9 +2,9 @@
 
 import re
 from collections.abc import Sequence
-from itertools import takewhile
 from json import dumps
 from operator import itemgetter
+from os.path import commonprefix
 
 import numpy as np
 
@@ -204,8 +204,7 @@ def _distinctive_parts(names: list[str]) -> list[str]:
 
 def _reversed_without_common_start(texts: list[str]) -> list[str]:
     """Remove the characters at the beginning that all texts have in common, and return the texts backwards."""
-    common = takewhile(lambda characters: len(set(characters)) == 1, zip(*texts, strict=False))
-    n_common = len(list(common))
+    n_common = len(commonprefix(texts))  # noqa: RUF071  # the texts are no paths
     return [text[n_common:][::-1] for text in texts]
 
 
