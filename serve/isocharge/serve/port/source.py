@@ -21,7 +21,6 @@ after an outage contains the length of the outage. If a board sends frames only 
 import contextlib
 import logging
 import os
-import stat
 import sys
 import time
 from collections.abc import Iterator
@@ -436,21 +435,11 @@ def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> context
 
     # Wait until the path exists, because the type of a missing path (a file or a port) is unknown.
     is_path = "://" not in url
+    path = Path(url)
     deadline_s = time.monotonic() + wait
-    while is_path and not Path(url).exists() and time.monotonic() < deadline_s:
+    while is_path and not path.exists() and time.monotonic() < deadline_s:
         time.sleep(RETRY_PAUSE_s)
-    if is_path and _is_file_or_pipe(Path(url)):
-        return open_file(Path(url))
+    if is_path and (path.is_file() or path.is_fifo()):  # false for a device, and if the path does not exist
+        return open_file(path)
     remaining_s = max(0.0, deadline_s - time.monotonic())
     return Port(url, wait=remaining_s, **port_settings)
-
-
-def _is_file_or_pipe(path: Path) -> bool:
-    """Return whether a path is a file or a named pipe.
-
-    The result is False for a device, and for a path that does not exist.
-    """
-    with contextlib.suppress(OSError):
-        mode = path.stat().st_mode
-        return stat.S_ISREG(mode) or stat.S_ISFIFO(mode)
-    return False

@@ -155,5 +155,5 @@ def _property(field: Field, electrodes: Sequence[str], *, allows_null: bool) -> 
         schema["items"] = {"type": "string"}
     if json_type == "object":  # its parts are all numbers
         schema["properties"] = dict.fromkeys(_part_names(field, electrodes), number_in_object)
-    schema["description"] = field.meaning.text
+    schema["description"] = field.meaning
     return schema

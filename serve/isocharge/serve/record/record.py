@@ -1,9 +1,8 @@
 """The prediction record, which contains a reading of a sensor and the contact that a model computed from the reading.
 
-The fields are declared only here. The layouts of JSON and CSV, the JSON Schema, the samples of the live page and the
-table in the documentation are derived from the declaration. An unknown value is None in Python and `null` in JSON. For
-example, the position is unknown while nothing touches the film. The device clock is unknown if the charges come from a
-CSV file.
+The fields are declared only here. The layouts of JSON and CSV, the JSON Schema and the table in the documentation are
+derived from the declaration. An unknown value is None in Python and `null` in JSON. For example, the position is
+unknown while nothing touches the film. The device clock is unknown if the charges come from a CSV file.
 """
 
 import json
@@ -32,20 +31,8 @@ KINDS: dict[Any, Kind] = {
 """Kind of the values of each type. Any other type is a struct."""
 
 
-class Meaning(NamedTuple):
-    """Annotation that describes the value of a field.
-
-    Attributes:
-        text: Description of the value, a sentence.
-        unit: Unit of the value; empty if it has none.
-        is_shown_live: Whether the samples of the live page contain the value.
-        is_flattened: Whether the fields of a nested struct are fields of the record instead of fields of an object.
-    """
-
-    text: str
-    unit: str = ""
-    is_shown_live: bool = False
-    is_flattened: bool = False
+FLATTENED = ""
+"""Description of a nested struct whose fields are fields of the record instead of fields of an object."""
 
 
 class Field(NamedTuple):
@@ -54,7 +41,7 @@ class Field(NamedTuple):
     Attributes:
         name: Key in JSON.
         kind: Kind of the value.
-        meaning: Meaning of the value.
+        meaning: Description of the value, a sentence.
         may_be_null: Whether the value may be null, because it is unknown.
         parts: Fields of the value, if its kind is `object`.
         group: Name of the attribute with the nested struct to which the field belongs. A record has the field only if
@@ -63,7 +50,7 @@ class Field(NamedTuple):
 
     name: str
     kind: Kind
-    meaning: Meaning
+    meaning: str
     may_be_null: bool
     parts: tuple["Field", ...] = ()
     group: str = ""
@@ -72,22 +59,23 @@ class Field(NamedTuple):
 def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
     """Return the fields of a struct in the order of their declaration.
 
-    If a field is marked as `is_flattened`, the fields of its nested struct are returned in its place. The group of a
-    field of a nested struct, and of a field of the kind `object`, is the name of the field that contains the struct.
+    The annotation of each field contains a sentence that describes the value. If it is `FLATTENED`, the fields of the
+    nested struct are returned instead. The group of a field of a nested struct, and of a field of the kind `object`, is
+    the name of the field that contains the struct.
 
     Raises:
-        TypeError: If a field has no `Meaning`.
+        TypeError: If the annotation of a field contains no sentence.
     """
     fields: list[Field] = []
     annotations = get_type_hints(struct, include_extras=True)  # with the metadata of `Annotated`
     for name in struct.__struct_fields__:
         annotation = annotations[name]
         if get_origin(annotation) is not Annotated:
-            raise TypeError(f"{struct.__name__}.{name}: expected Annotated[type, Meaning(...)]")
+            raise TypeError(f"{struct.__name__}.{name}: expected Annotated[type, description]")
         declared_type, meaning = get_args(annotation)
         may_be_null = isinstance(declared_type, UnionType)  # the other alternative is None
         value_type = get_args(declared_type)[0] if may_be_null else declared_type
-        if meaning.is_flattened:
+        if meaning == FLATTENED:
             fields += [nested_field._replace(group=name) for nested_field in fields_of(value_type)]
         elif value_type in KINDS:
             fields.append(Field(name, KINDS[value_type], meaning, may_be_null))
@@ -106,15 +94,15 @@ class TrackedContact(Struct, frozen=True):
     The tracked contact has no correlations. The correlations in the record belong to the contact of the latest frame.
     """
 
-    x_mm: Annotated[float, Meaning("Position x.", "mm")]
-    y_mm: Annotated[float, Meaning("Position y.", "mm")]
-    force_N: Annotated[float, Meaning("Force.", "N")]
-    x_std_mm: Annotated[float, Meaning("Standard deviation of x.", "mm")]
-    y_std_mm: Annotated[float, Meaning("Standard deviation of y.", "mm")]
-    force_std_N: Annotated[float, Meaning("Standard deviation of the force.", "N")]
-    vx_mm_s: Annotated[float, Meaning("Velocity along x; 0 while the contact is held.", "mm/s")]
-    vy_mm_s: Annotated[float, Meaning("Velocity along y; 0 while the contact is held.", "mm/s")]
-    moving: Annotated[float, Meaning("Probability that the contact moves, 0 to 1.")]
+    x_mm: Annotated[float, "Position x."]
+    y_mm: Annotated[float, "Position y."]
+    force_N: Annotated[float, "Force."]
+    x_std_mm: Annotated[float, "Standard deviation of x."]
+    y_std_mm: Annotated[float, "Standard deviation of y."]
+    force_std_N: Annotated[float, "Standard deviation of the force."]
+    vx_mm_s: Annotated[float, "Velocity along x; 0 while the contact is held."]
+    vy_mm_s: Annotated[float, "Velocity along y; 0 while the contact is held."]
+    moving: Annotated[float, "Probability that the contact moves, 0 to 1."]
 
 
 class OtherContact(Struct, frozen=True):
@@ -123,99 +111,68 @@ class OtherContact(Struct, frozen=True):
     The charges alone do not show which of the two contacts is real.
     """
 
-    x_mm: Annotated[float, Meaning("Position x.", "mm", is_shown_live=True)]
-    y_mm: Annotated[float, Meaning("Position y.", "mm", is_shown_live=True)]
-    force_N: Annotated[float, Meaning("Force.", "N")]
-    probability: Annotated[float, Meaning("Probability that this contact is the one that touches.")]
+    x_mm: Annotated[float, "Position x."]
+    y_mm: Annotated[float, "Position y."]
+    force_N: Annotated[float, "Force."]
+    probability: Annotated[float, "Probability that this contact is the one that touches."]
 
 
 class FollowedFilm(Struct, frozen=True):
     """Parameters of the film that are estimated from all touches so far."""
 
-    pretension_MPa: Annotated[float, Meaning("Pretension for which the model answered.", "MPa")]
-    pretension_std_MPa: Annotated[float, Meaning("Standard deviation of its change since the calibration.", "MPa")]
-    touches: Annotated[int, Meaning("Number of touches from which the pretension was estimated.")]
+    pretension_MPa: Annotated[float, "Pretension for which the model answered."]
+    pretension_std_MPa: Annotated[float, "Standard deviation of its change since the calibration."]
+    touches: Annotated[int, "Number of touches from which the pretension was estimated."]
 
 
 class Tracking(Struct, frozen=True):
     """Fields that the tracking of contacts adds to a record."""
 
     tracked: Annotated[
-        TrackedContact | None,
-        Meaning("Contact that was estimated from all frames of the touch up to now; null out of contact."),
+        TrackedContact | None, "Contact that was estimated from all frames of the touch up to now; null out of contact."
     ] = None
     event: Annotated[
-        str | None,
-        Meaning("Event that begins with this record: press, hold, slide, tap or release; null if none begins."),
+        str | None, "Event that begins with this record: press, hold, slide, tap or release; null if none begins."
     ] = None
     other: Annotated[
         OtherContact | None,
-        Meaning("Second possible contact with the same charges, on a film with folds; null if there is none."),
+        "Second possible contact with the same charges, on a film with folds; null if there is none.",
     ] = None
 
 
 class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     """One reading of a sensor and the contact that a model computed from the reading.
 
-    The annotations of the fields state their meanings and units. The page `serve/docs/record.md` contains a table of
-    all fields.
+    The annotations of the fields describe the values. The page `serve/docs/record.md` contains a table of all fields.
     """
 
-    timestamp: Annotated[
-        float | None,
-        Meaning("Time of the reading, unix seconds.", "s", is_shown_live=True),
-    ]
-    t_device_us: Annotated[int | None, Meaning("Clock of the device, us, without its wraps.", "us")]
-    seq: Annotated[int | None, Meaning("Sequence number, as the device sent it.")]
-    x_mm: Annotated[
-        float | None,
-        Meaning("Position x in the frame frame_id, mm; null out of contact.", "mm", is_shown_live=True),
-    ]
-    y_mm: Annotated[float | None, Meaning("Position y, mm; null out of contact.", "mm", is_shown_live=True)]
-    force_N: Annotated[float | None, Meaning("Force, N; 0 out of contact.", "N", is_shown_live=True)]
-    x_std_mm: Annotated[float | None, Meaning("Standard deviation of x, mm.", "mm", is_shown_live=True)]
-    y_std_mm: Annotated[float | None, Meaning("Standard deviation of y, mm.", "mm", is_shown_live=True)]
-    force_std_N: Annotated[float | None, Meaning("Standard deviation of the force, N.", "N", is_shown_live=True)]
+    timestamp: Annotated[float | None, "Time of the reading, unix seconds."]
+    t_device_us: Annotated[int | None, "Clock of the device, us, without its wraps."]
+    seq: Annotated[int | None, "Sequence number, as the device sent it."]
+    x_mm: Annotated[float | None, "Position x in the frame frame_id, mm; null out of contact."]
+    y_mm: Annotated[float | None, "Position y, mm; null out of contact."]
+    force_N: Annotated[float | None, "Force, N; 0 out of contact."]
+    x_std_mm: Annotated[float | None, "Standard deviation of x, mm."]
+    y_std_mm: Annotated[float | None, "Standard deviation of y, mm."]
+    force_std_N: Annotated[float | None, "Standard deviation of the force, N."]
     misfit: Annotated[
-        float | None,
-        Meaning(
-            "Distance of the charges from the nearest single contact, in standard deviations of the noise.",
-            is_shown_live=True,
-        ),
+        float | None, "Distance of the charges from the nearest single contact, in standard deviations of the noise."
     ]
-    xy_correlation: Annotated[
-        float | None,
-        Meaning("Correlation of the errors of x and y, -1 to 1.", is_shown_live=True),
-    ]
-    xF_correlation: Annotated[float | None, Meaning("Correlation of the errors of x and the force.")]
-    yF_correlation: Annotated[float | None, Meaning("Correlation of the errors of y and the force.")]
-    contact: Annotated[bool, Meaning("Whether something touches.")]
-    charge_pC: Annotated[
-        Charges | None,
-        Meaning("Touch charges by electrode, the model's input, pC.", "pC", is_shown_live=True),
-    ]
+    xy_correlation: Annotated[float | None, "Correlation of the errors of x and y, -1 to 1."]
+    xF_correlation: Annotated[float | None, "Correlation of the errors of x and the force."]
+    yF_correlation: Annotated[float | None, "Correlation of the errors of y and the force."]
+    contact: Annotated[bool, "Whether something touches."]
+    charge_pC: Annotated[Charges | None, "Touch charges by electrode, the model's input, pC."]
     charge_raw_pC: Annotated[
-        Charges | None,
-        Meaning("Readings of the board by electrode, converted to pC by `[gain]` and not processed further.", "pC"),
+        Charges | None, "Readings of the board by electrode, converted to pC by `[gain]` and not processed further."
     ]
-    tare_pC: Annotated[
-        Charges | None,
-        Meaning("Charges at rest that were subtracted, by electrode, pC.", "pC"),
-    ]
-    flags: Annotated[
-        tuple[str, ...], Meaning("Words that name events or reasons not to trust the contact; see the page Flags.")
-    ]
-    latency_us: Annotated[
-        float | None,
-        Meaning("Time since the program read the last byte of the frame, us.", "us", is_shown_live=True),
-    ]
-    model: Annotated[str, Meaning("The model, name/version.")]
-    frame_id: Annotated[str, Meaning("Name of the sensor, the frame of x and y.")]
-    tracking: Annotated[Tracking | None, Meaning("", is_flattened=True)] = None
-    film: Annotated[
-        FollowedFilm | None,
-        Meaning("Estimated film for which the model answered."),
-    ] = None
+    tare_pC: Annotated[Charges | None, "Charges at rest that were subtracted, by electrode, pC."]
+    flags: Annotated[tuple[str, ...], "Words that name events or reasons not to trust the contact; see the page Flags."]
+    latency_us: Annotated[float | None, "Time since the program read the last byte of the frame, us."]
+    model: Annotated[str, "The model, name/version."]
+    frame_id: Annotated[str, "Name of the sensor, the frame of x and y."]
+    tracking: Annotated[Tracking | None, FLATTENED] = None
+    film: Annotated[FollowedFilm | None, "Estimated film for which the model answered."] = None
 
     @property
     def tracked(self) -> TrackedContact | None:

@@ -1,10 +1,10 @@
 """Samples of a stream, from which the live page draws, and the tape that stores them under consecutive numbers.
 
 A sample contains the numbers of a prediction record that the page shows. All of them are stored as 64-bit floating
-point numbers: the timestamp, the numbers that are marked for the live page in the declaration of the record, the
-position of the other contact, the flags as a sum of bits, whether there is a contact, the number of coalesced records,
-and the touch charge of each electrode. An unknown number is NaN. If contacts are tracked, a sample contains the tracked
-contact instead of the contact of the frame.
+point numbers: the numbers of the record with the names `RECORD_NUMBERS`, the position of the other contact, the flags
+as a sum of bits, whether there is a contact, the number of coalesced records, and the touch charge of each electrode.
+An unknown number is NaN. If contacts are tracked, a sample contains the tracked contact instead of the contact of the
+frame.
 """
 
 import tempfile
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from isocharge.serve.flags import MEANINGS
-from isocharge.serve.record.record import RECORD_FIELDS, PredictionRecord
+from isocharge.serve.record.record import PredictionRecord
 
 FLAG_BITS = {word: 1 << position for position, word in enumerate(MEANINGS)}
 """Bit that represents each flag in a sample."""
@@ -22,12 +22,21 @@ FLAG_BITS = {word: 1 << position for position, word in enumerate(MEANINGS)}
 Samples = np.ndarray[Any, np.dtype[np.void]]
 """Samples in the order of their times, shape (n,), with the named fields of `sample_type`."""
 
-RECORD_NUMBERS = tuple(field.name for field in RECORD_FIELDS if field.meaning.is_shown_live and field.kind == "number")
+RECORD_NUMBERS = (
+    "timestamp",
+    "x_mm",
+    "y_mm",
+    "force_N",
+    "x_std_mm",
+    "y_std_mm",
+    "force_std_N",
+    "misfit",
+    "xy_correlation",
+    "latency_us",
+)
 """Names of the numbers of the record in a sample."""
 
-OTHER_NUMBERS = tuple(
-    part.name for field in RECORD_FIELDS if field.name == "other" for part in field.parts if part.meaning.is_shown_live
-)
+OTHER_NUMBERS = ("x_mm", "y_mm")
 """Names of the numbers of the other contact in a sample, where they have the prefix `other_`."""
 
 
