@@ -27,6 +27,7 @@ from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import find_model
 from isocharge.serve.record.formats import csv_header
+from isocharge.serve.record.record import RECORD_FIELDS
 
 HARMFUL_CATEGORIES = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
 
@@ -169,7 +170,7 @@ def read_metadata(names):
     props = GOOD_PROPS | {key: json.dumps(content.get(key, names[0]))}
     metadata = ModelMetadata.from_props(props, names[2])
     show(metadata.label)
-    print(csv_header(metadata.electrodes))
+    print(csv_header(metadata.electrodes, RECORD_FIELDS))
     print(metadata.frame_id)
 
 

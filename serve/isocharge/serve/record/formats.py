@@ -12,21 +12,19 @@ import io
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from isocharge.serve.record.record import DECIMALS, RECORD_FIELDS, Field, Kind, PredictionRecord, selected_fields
+from isocharge.serve.record.record import DECIMALS, RECORD_FIELDS, Field, Kind, PredictionRecord
 
 
-def csv_header(electrodes: Sequence[str], *, with_tracking: bool = False, with_film: bool = False) -> str:
+def csv_header(electrodes: Sequence[str], fields: Sequence[Field]) -> str:
     """Return the header of a CSV file of records, which contains the names of the columns, without the line end.
 
     A field with several numbers has one column for each number, such as `charge_pC.A` for the electrode A.
 
     Args:
         electrodes: Names of the electrodes.
-        with_tracking: Whether the records have the fields of the tracking.
-        with_film: Whether the records have the fields of the film follower.
+        fields: Fields of the records.
     """
-    columns = _columns(electrodes, with_tracking=with_tracking, with_film=with_film)
-    return _line(name if part is None else f"{name}.{part}" for name, part in columns)
+    return _line(name if part is None else f"{name}.{part}" for name, part in _columns(electrodes, fields))
 
 
 def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
@@ -38,10 +36,8 @@ def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
         record: Record to convert.
         electrodes: Names of the electrodes, in the order of the header.
     """
-    has_tracking = record.tracking is not None
-    has_film = record.film is not None
     cells: list[str] = []
-    for name, part in _columns(electrodes, with_tracking=has_tracking, with_film=has_film):
+    for name, part in _columns(electrodes, record.fields):
         value = getattr(record, name)
         if part is not None and value is not None:
             value = value[part] if isinstance(value, dict) else getattr(value, part)
@@ -49,13 +45,13 @@ def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
     return _line(cells)
 
 
-def _columns(electrodes: Sequence[str], *, with_tracking: bool, with_film: bool) -> Iterator[tuple[str, str | None]]:
+def _columns(electrodes: Sequence[str], fields: Sequence[Field]) -> Iterator[tuple[str, str | None]]:
     """Yield the name of the field and the name of its part for each column.
 
     The parts of charges are the electrodes, and the parts of an object are its fields. The part is None for a field
     with one column.
     """
-    for field in selected_fields(with_tracking=with_tracking, with_film=with_film):
+    for field in fields:
         for part in _part_names(field, electrodes) or [None]:
             yield field.name, part
 

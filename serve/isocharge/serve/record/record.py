@@ -190,14 +190,16 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
         return None if self.tracking is None else self.tracking.other
 
     @property
+    def fields(self) -> tuple[Field, ...]:
+        """The fields that this record has, in their order."""
+        return selected_fields(with_tracking=self.tracking is not None, with_film=self.film is not None)
+
+    @property
     def json_values(self) -> dict[str, Any]:
         """Values of the fields by name, as JSON contains them. Numbers are rounded to six decimals."""
-        values = structs.asdict(self)
-        if self.tracking is not None:
-            values |= structs.asdict(self.tracking)
         json_values: dict[str, Any] = {}
-        for field in selected_fields(with_tracking=self.tracking is not None, with_film=self.film is not None):
-            value = values[field.name]
+        for field in self.fields:
+            value = getattr(self, field.name)
             value_class = value.__class__  # comparing the class is faster than a call of `isinstance`
             if value_class is float:
                 value = round(value, DECIMALS)
