@@ -362,7 +362,7 @@ class SyncParser(Parser):
         sync = self.layout.sync
         length = self.layout.length
         unparsed = self._tail + data
-        frames = []
+        frames: list[Frame] = []
         parsed_end = 0  # all bytes before this position have been parsed
         while True:
             start = unparsed.find(sync, parsed_end)

@@ -52,7 +52,8 @@ def _columns(electrodes: Sequence[str], fields: Sequence[Field]) -> Iterator[tup
     with one column.
     """
     for field in fields:
-        for part in _part_names(field, electrodes) or [None]:
+        parts: Sequence[str | None] = _part_names(field, electrodes)
+        for part in parts or [None]:
             yield field.name, part
 
 
