@@ -14,6 +14,7 @@ from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import T_US_MODULUS, Frame
 from isocharge.serve.port.file_source import Chunk
 from isocharge.serve.signal_chain.gain import Gain
+from isocharge.serve.signal_chain.hum import Hum
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.signal_chain.thermal import ThermalRule
 from isocharge.serve.signal_chain.touch import TouchRule
@@ -240,6 +241,13 @@ def test_failed_first_tare_is_reported_after_the_patience_of_the_board(build, re
 def test_tare_that_is_too_long_for_c_is_refused():
     with pytest.raises(DeviceError, match=r"board: tare.frames: expected a whole number from 1 to 10000.*got 50000"):
         device_header(device_from_table({"tare": {"frames": 50_000, "patience": 0}}, "board"), ("A", "B", "C"))
+
+
+def test_stage_without_code_in_c_is_refused_by_its_name(monkeypatch):
+    monkeypatch.setattr(Hum, "c_prefix", "")
+    board = device_from_table({"hum": {}}, "board")
+    with pytest.raises(DeviceError, match="board: hum: this stage does not exist"):
+        device_header(board, ("A", "B", "C"))
 
 
 def test_sections_that_only_the_host_executes_are_named_in_a_warning(caplog):

@@ -136,6 +136,7 @@ class Leak(OffsetStage):
 
     section = "leak"
     rule_class = LeakRule
+    c_prefix = "LEAK"
 
     def __init__(self, setup: Setup) -> None:
         """Store the settings. The state begins at the first frame after the tare."""
@@ -270,6 +271,7 @@ class Integrator(Leak):
     """
 
     section = ""
+    c_prefix = ""
 
     @classmethod
     def is_used(cls, setup: Setup) -> bool:

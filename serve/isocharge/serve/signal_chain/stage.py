@@ -186,6 +186,7 @@ class Stage(ABC):
         is_default: Whether the stage is switched on, with default settings, if the device file has no such section.
         needs_contact: Whether the stage processes the contact of a record. Such a stage skips frames without a record,
             and is not part of an export to C.
+        c_prefix: Prefix of the settings in the export to C; empty if the stage does not exist in C.
     """
 
     section: ClassVar[str] = ""
@@ -194,6 +195,7 @@ class Stage(ABC):
     needs_model: ClassVar[bool] = False
     is_default: ClassVar[bool] = False
     needs_contact: ClassVar[bool] = False
+    c_prefix: ClassVar[str] = ""
 
     def __init__(self, setup: Setup) -> None:  # noqa: B027  # some stages have no settings
         """Begin without any frame.

@@ -64,6 +64,7 @@ class Tare(OffsetStage):
     is_required = True
     rule_class = TareRule
     is_default = True
+    c_prefix = "TARE"
 
     def __init__(self, setup: Setup) -> None:
         """Begin without a tare."""

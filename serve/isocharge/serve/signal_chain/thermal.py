@@ -75,6 +75,7 @@ class Warming(Stage):
     section = "common_mode"
     rule_class = ThermalRule
     needs_model = True
+    c_prefix = "THERMAL"
 
     def __init__(self, setup: Setup) -> None:
         """Begin with an estimated warming of zero."""

@@ -25,8 +25,8 @@ log = logging.getLogger(__name__)
 def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: bool = False) -> str:
     """Return the text of `isocharge_device.h`.
 
-    Each stage of the signal chain states its settings for C. The macro `ISOCHARGE_<SECTION>_ON` is 1 if the stage with
-    this section of the device file is switched on. The other macros have the names of the settings in capital letters.
+    Each stage of the signal chain states its settings for C. The macro `ISOCHARGE_<STAGE>_ON` is 1 if the stage is
+    switched on. The other macros have the names of the settings in capital letters.
 
     Args:
         device: The board.
@@ -44,12 +44,13 @@ def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: 
     sections_of_host = []
     for stage in STAGES:
         is_on = stage.rule_class in device.rules
-        if not stage.needs_contact and stage.section:
+        if stage.c_prefix:
             settings = {"on": is_on, **stage.c_settings(setup)}
             for name, value in settings.items():
-                macro = f"ISOCHARGE_{stage.section}_{name}".upper()
-                lines.append(f"#define {macro} {_c_literal(value)}")
-        elif stage.needs_contact and is_on:
+                lines.append(f"#define ISOCHARGE_{stage.c_prefix}_{name.upper()} {_c_literal(value)}")
+        elif stage.section and is_on:
+            if not stage.needs_contact:
+                raise DeviceError(f"{device.where}: {stage.section}: {NOT_IN_C}")
             sections_of_host.append(stage.section)
     if sections_of_host:
         log.warning(
