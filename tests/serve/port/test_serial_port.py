@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from isocharge.common.errors import InputError, PortError, PortLost
 from isocharge.serve import Chunk, Port, Recorder, Recording, open_source
+from isocharge.serve.port import serial_line
 from isocharge.serve.port.serial_line import QUIET_TIME_s, REPEAT_TIME_s, Request, Requester
 from isocharge.serve.virtual_sensor.sensor import PseudoPort
 
@@ -311,9 +312,10 @@ def test_udp_address_in_use_is_refused(address):
     ],
     ids=["the answer and the rate", "no answer"],
 )
-def test_the_next_request_waits(answers, waits_s):
+def test_the_next_request_waits(answers, waits_s, monkeypatch):
     clock = SimpleNamespace(now_s=100.0)
-    requester = Requester(Request(b"?\n"), lambda: clock.now_s)
+    monkeypatch.setattr(serial_line, "time", SimpleNamespace(monotonic=lambda: clock.now_s))
+    requester = Requester(Request(b"?\n"))
     assert requester.wait_s() == 0.0
     assert requester.next_request() == b"?\n"
     waited_s = [requester.wait_s()]

@@ -22,7 +22,6 @@ import select
 import socket
 import termios
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -53,15 +52,9 @@ class Request:
 class Requester:
     """Scheduler of the requests to a board, which also removes the echoes of the requests from received bytes."""
 
-    def __init__(self, request: Request, now_s: Callable[[], float] = time.monotonic) -> None:
-        """Store the settings, and make the first request due at once.
-
-        Args:
-            request: The request that the board needs for each frame.
-            now_s: Function that returns the present time on a clock that does not jump, s.
-        """
+    def __init__(self, request: Request) -> None:
+        """Store the request that the board needs for each frame, and make the first request due at once."""
         self._request = request
-        self._now_s = now_s
         self.reset()
 
     def reset(self) -> None:
@@ -77,7 +70,7 @@ class Requester:
         At least 1 / `rate_Hz` must pass between two requests. After a request without an answer, also at least
         `REPEAT_TIME_s` must pass. After the latest received byte, also at least `QUIET_TIME_s` must pass.
         """
-        now_s = self._now_s()
+        now_s = time.monotonic()
         due_s = self._requested_s + 1.0 / self._request.rate_Hz
         is_unanswered = self._received_s < self._requested_s
         if is_unanswered:
@@ -87,7 +80,7 @@ class Requester:
 
     def next_request(self) -> bytes:
         """Return the bytes of the next request, which the caller must send now."""
-        self._requested_s = self._now_s()
+        self._requested_s = time.monotonic()
         self._expects_echo = True
         self._kept_bytes = b""
         return self._request.data
@@ -102,7 +95,7 @@ class Requester:
             received: Bytes that arrived after the latest request; may be empty.
         """
         if received:
-            self._received_s = self._now_s()
+            self._received_s = time.monotonic()
         if not self._expects_echo:
             return received
         self._kept_bytes += received

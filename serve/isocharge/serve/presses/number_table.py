@@ -10,7 +10,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NoReturn
+from typing import NoReturn
 
 import numpy as np
 
@@ -135,10 +135,7 @@ class NumberTable(ABC):
     Attributes:
         header: Names of the columns in the file.
         source: The file.
-        row_noun: What the row numbers of the format count, for error messages: "line" or "row".
     """
-
-    row_noun: ClassVar[str]
 
     def __init__(self, header: Sequence[str], source: TableSource) -> None:
         """Check the number of columns, and store the names of the columns without blanks at their ends.

@@ -65,8 +65,6 @@ _THOUSANDS = re.compile(r"[-+]?[1-9][0-9]{0,2}[.,][0-9]{3}")
 class CsvTable(NumberTable):
     """Table of numbers that is read from a CSV text."""
 
-    row_noun = "line"
-
     def __init__(self, lines: Iterable[str], source: TableSource) -> None:
         """Find and read the header.
 
@@ -108,9 +106,9 @@ class CsvTable(NumberTable):
             self._check_cell_count(line_number, cells)
             line_numbers.append(line_number)
             for name, column_index in column_indices.items():
-                number = self._number(cells[column_index].strip())
+                cell = cells[column_index].strip()
+                number = self._number(cell)
                 if number is None:
-                    cell = cells[column_index].strip()
                     has_other_mark = self._mark != "" and any(mark in cell for mark in ",." if mark != self._mark)
                     advice = f"; the decimal mark is {self._mark!r}" if has_other_mark else ""
                     raise self.source.error(
@@ -118,12 +116,10 @@ class CsvTable(NumberTable):
                         f"{shown(cell)}{advice}"
                     )
                 numbers.append(number)
-            if not self._is_mark_certain:
-                is_point_between_commas = (self._separator, self._mark) == (",", ".")
-                read_cells = [cells[column_index] for column_index in column_indices.values()]
-                fractions = [cell for cell in cells if cell.strip().startswith(f"0{self._mark}")]  # these are no dates
-                has_evidence = any(_has_decimal_mark(cell.strip(), self._mark) for cell in read_cells + fractions)
-                self._is_mark_certain = is_point_between_commas or has_evidence
+            if self._mark and not self._is_mark_certain:  # a fraction in another column, such as 0.5, is no date
+                texts = [cell.strip() for cell in cells]
+                fractions = [text for text in texts if text.startswith(f"0{self._mark}")]
+                self._is_mark_certain = any(map(_NUMBER.fullmatch, fractions))
         if self._mark and not self._is_mark_certain:
             raise self.source.error(
                 f": every number with the mark {self._mark!r} may have a decimal mark or a separator of thousands; "
@@ -131,12 +127,13 @@ class CsvTable(NumberTable):
             )
         rows = np.asarray(numbers, dtype=np.float64).reshape(len(line_numbers), len(column_indices))
         values = dict(zip(column_indices, rows.T, strict=True))
-        return NumberColumns(values, np.array(line_numbers, dtype=np.intp), self.row_noun)
+        return NumberColumns(values, np.array(line_numbers, dtype=np.intp), "line")
 
     def _number(self, text: str) -> float | None:
         """Return the number in a cell: NaN for an empty cell, and None for a cell without a finite number.
 
-        The first number with a decimal mark determines the decimal mark of the file.
+        The first number with a decimal mark determines the decimal mark of the file. The mark is certain as soon as it
+        cannot be a separator of thousands.
 
         Args:
             text: The cell, without blanks at its ends.
@@ -151,6 +148,9 @@ class CsvTable(NumberTable):
             if self._mark:
                 return None
             self._mark = mark
+        if mark and not self._is_mark_certain:
+            is_point_between_commas = (self._separator, mark) == (",", ".")
+            self._is_mark_certain = is_point_between_commas or _THOUSANDS.fullmatch(text) is None
         number = float(text.replace(",", "."))
         return number if math.isfinite(number) else None
 
@@ -191,12 +191,6 @@ def _is_row_of_units(cells: list[str]) -> bool:
     """Return whether cells are the units of charges and other known columns, with or without brackets."""
     units = {cell.strip().strip("[]()") for cell in cells}
     return "pC" in units and units <= _UNITS
-
-
-def _has_decimal_mark(text: str, mark: str) -> bool:
-    """Return whether a text is a number with the given mark, which cannot be a separator of thousands."""
-    is_number_with_mark = mark != "" and mark in text and _NUMBER.fullmatch(text) is not None
-    return is_number_with_mark and _THOUSANDS.fullmatch(text) is None
 
 
 def _checked_lines(lines: Iterable[str], source: TableSource) -> Iterator[str]:
@@ -290,8 +284,6 @@ def _find_header(lines: list[str], names: Collection[str]) -> tuple[int, str]:
 class ParquetTable(NumberTable):
     """Table of numbers that is read from a Parquet file."""
 
-    row_noun = "row"
-
     def __init__(self, file: BinaryIO, source: TableSource) -> None:
         """Read the metadata of the file, which must remain open until the columns have been read.
 
@@ -337,7 +329,7 @@ class ParquetTable(NumberTable):
             }
             if any(len(column) != row_count for column in values.values()):
                 raise ValueError(f"the columns do not have {row_count:,} rows as stated in the metadata")
-        return NumberColumns(values, np.arange(1, row_count + 1, dtype=np.intp), self.row_noun)
+        return NumberColumns(values, np.arange(1, row_count + 1, dtype=np.intp), "row")
 
 
 def parquet_bytes(columns: Mapping[str, Array]) -> bytes:
