@@ -1,5 +1,6 @@
 """What serve/deploy ships: units, images, manifests and hosts, each tried as far as this machine allows."""
 
+import configparser
 import json
 import os
 import re
@@ -273,6 +274,12 @@ def test_dashboard_and_alerts_ask_for_metrics_that_there_are(start_http):
         families = text_string_to_metric_families(answer.read().decode())
     served = {sample.name for family in families for sample in family.samples}
     assert set(re.findall(r"\b(?:isocharge|process)_\w+", queries)) <= served
+
+
+def test_the_node_is_installed_where_ros2_run_looks_for_it():
+    settings = configparser.ConfigParser()
+    settings.read(DEPLOY / "ros2/isocharge_ros/setup.cfg")
+    assert settings["install"]["install_scripts"] == settings["develop"]["script_dir"] == "$base/lib/isocharge_ros"
 
 
 def test_the_ros2_package_has_the_version_of_isocharge():
