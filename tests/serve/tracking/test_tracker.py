@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from isocharge.serve import Contact, Predictor
+from isocharge.serve import Chunk, Contact, Frame, Predictor, TouchStream, device_from_table, encode_frame
 from isocharge.serve.flags import INVALID
 from isocharge.serve.model.model_folder import find_model, load_model
 from isocharge.serve.record.record import TrackedContact
@@ -216,6 +216,24 @@ def test_touch_continues_if_the_clock_is_set_back():
     ((hold_frame, event),) = events_of(after)
     assert (event, hold_frame) == ("hold", pytest.approx(100, abs=30))
     assert track(tracker, None, 50.2) == (None, "release")
+
+
+@pytest.mark.parametrize("change", ["a tare", "another model"])
+def test_touch_during_a_tare_or_a_change_of_the_model_has_one_press_and_one_end(change, film, predictor):
+    touch = TouchStream(predictor, device_from_table({"track": {}}, "b"))
+    rest = np.zeros((150, 3))
+    charge = np.concatenate([rest, np.tile(film.charges(np.array([[2.0, -3.0, 0.5]])), (200, 1)), rest])
+    noisy_charge = charge + np.random.default_rng(0).standard_normal(charge.shape)
+    records = []
+    for number, row in enumerate(noisy_charge.tolist()):
+        if number == 300 and change == "a tare":
+            touch.tare()
+        elif number == 300:
+            touch.use(predictor)
+        frame = encode_frame(Frame(number, 5000 * number, tuple(row)))
+        records += touch.feed(Chunk(frame, 5.0 + 5e-3 * number, 0))
+    events = [record.event for record in records if record.event in ("press", "tap", "release")]
+    assert events == ["press", "release"]
 
 
 @pytest.mark.parametrize("frames_per_time", [2, 10])

@@ -224,12 +224,16 @@ class TouchStream(ReadingStream):
         """
         present_predictor = self._setup.model
         charge_stages = [stage for stage in self._stages if not stage.needs_contact]
+        previous_stages = {type(stage): stage for stage in self._stages}
         self._setup.use(predictor)
         try:
-            self._stages = charge_stages + create_stages(self._setup, needs_contact=True)
+            contact_stages = create_stages(self._setup, needs_contact=True)
         except ModelError:
             self._setup.use(present_predictor)
             raise
+        for stage in contact_stages:
+            stage.continue_touch(previous_stages.get(type(stage), stage))
+        self._stages = charge_stages + contact_stages
         self.predictor = predictor
         self._label = predictor.metadata.label
         self.frame_id = self._given_name or predictor.metadata.frame_id
@@ -237,8 +241,8 @@ class TouchStream(ReadingStream):
     def use(self, predictor: Predictor) -> None:
         """Use another model with the same electrodes from the next frame on.
 
-        The tare and the state of the signal chain are not changed. The estimates of the contact stages, for example of
-        the tracked contact and of the pretension of the film, begin again.
+        The tare, the state of the signal chain and the present touch are not changed. The estimates of the contact
+        stages, for example of the tracked contact and of the pretension of the film, begin again.
 
         Raises:
             ModelError: If the model has other electrodes or another order of the electrodes, or if a stage cannot use

@@ -133,16 +133,26 @@ class Tracker(Stage):
                 self._mixture_validity = replace(predictor.validity, corners_mm=charges.corners_mm)
         self._time_s = 0.0  # time of the latest frame on a clock that is never set back
         self._latest_clock_s = math.inf
+        self._events: TouchEvents | None = None  # None without a touch
         self.reset()
 
     def reset(self) -> None:
-        """Discard the touch, for example after an outage or a new tare."""
-        self._events: TouchEvents | None = None  # None without a touch
+        """Discard the tracked contact, for example after an outage or a new tare.
+
+        A touch that has begun ends with the next valid frame without a contact.
+        """
         self._tracked: TrackedContact | None = None
         self._other: OtherContact | None = None  # another contact that also explains the charges
         self._filter.reset()
         if self._mixture is not None:
             self._mixture.reset()
+
+    def continue_touch(self, previous: Stage) -> None:
+        """Continue the touch of the tracker of another model, so that its end is an event."""
+        assert isinstance(previous, Tracker)
+        self._time_s = previous._time_s
+        self._latest_clock_s = previous._latest_clock_s
+        self._events = previous._events
 
     def step(self, frame: Frame) -> None:
         """Update the tracked contact with a frame, and add the tracked contact and its event to the frame.
@@ -160,6 +170,7 @@ class Tracker(Stage):
         elif frame.is_valid:  # an invalid frame does not show whether the touch has ended
             if self._events is not None:
                 event = self._events.end(self._time_s)
+                self._events = None
             self.reset()
         frame.tracking = Tracking(self._tracked, event, self._other)
 
