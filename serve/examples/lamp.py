@@ -8,6 +8,7 @@ example uses a simulated sensor.
 """
 
 import sys
+from contextlib import nullcontext
 
 import matplotlib.pyplot as plt
 
@@ -28,26 +29,27 @@ def simulated_chunks():
         yield Chunk(data, number / RATE_HZ, 0)
 
 
-chunks = Port(sys.argv[1], wait=60.0) if len(sys.argv) > 1 else simulated_chunks()
+port = Port(sys.argv[1], wait=60.0) if len(sys.argv) > 1 else nullcontext(simulated_chunks())
 times_s = []
 forces_N = []
 lamp_states = []
 is_on = False
 has_switched = False  # whether the present touch has already switched the lamp
-for record in stream(chunks, Predictor("three-25um-biaxial")):  # the tare is measured in the first half second
-    # The flag `stress` means that the press leaves a dent in the film. The contact itself is correct.
-    is_reliable = record.contact and not set(record.flags) - {"stress"}
-    is_hard_press = is_reliable and record.force_N > HARD_PRESS_N
-    if is_hard_press and not has_switched:
-        is_on = not is_on  # a real program would switch its lamp here
-        state = "on" if is_on else "off"
-        print(f"{state} by {record.force_N:.2f} N at ({record.x_mm:.1f}, {record.y_mm:.1f}) mm")
-    has_switched = record.contact and (has_switched or is_hard_press)
-    times_s.append(record.timestamp)
-    forces_N.append(record.force_N or 0.0)
-    lamp_states.append(is_on)
-    if times_s[-1] - times_s[0] > SECONDS:
-        break
+with port as chunks:
+    for record in stream(chunks, Predictor("three-25um-biaxial")):  # the tare is measured in the first half second
+        # The flag `stress` means that the press leaves a dent in the film. The contact itself is correct.
+        is_reliable = record.contact and not set(record.flags) - {"stress"}
+        is_hard_press = is_reliable and record.force_N > HARD_PRESS_N
+        if is_hard_press and not has_switched:
+            is_on = not is_on  # a real program would switch its lamp here
+            state = "on" if is_on else "off"
+            print(f"{state} by {record.force_N:.2f} N at ({record.x_mm:.1f}, {record.y_mm:.1f}) mm")
+        has_switched = record.contact and (has_switched or is_hard_press)
+        times_s.append(record.timestamp)
+        forces_N.append(record.force_N or 0.0)
+        lamp_states.append(is_on)
+        if times_s[-1] - times_s[0] > SECONDS:
+            break
 
 figure, axes = plt.subplots(figsize=(9.0, 3.6), layout="constrained")
 lamp_heights = [2.0 * is_on for is_on in lamp_states]
