@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
 from isocharge.common.errors import DeviceError, TareError
 from isocharge.serve import BinaryParser, Predictor, device_from_table, encode_frame
@@ -202,6 +203,23 @@ def test_single_precision_does_not_add_up_its_errors_in_a_held_press(tau_s, lear
     charge, _, contact, _ = exported.chain(*frames)
     np.testing.assert_array_equal(contact, expected_contact)
     np.testing.assert_allclose(charge, expected_charge, rtol=0, atol=0.2)
+
+
+@pytest.mark.parametrize("rate_Hz", [100.0, 200.0])
+def test_single_precision_learns_the_leak_from_the_same_frames_after_a_release(rate_Hz, build):
+    """Many sampling intervals add up to the hold-off after a touch, from which the inflow is learned again."""
+    board = device_from_table({"leak": {"tau_s": 10.0, "settle_s": 2.5}}, "board")
+    t_s = np.arange(0.0, 40.0, 1.0 / rate_Hz)
+    pressed_pC = np.where((t_s > 2.0) & (t_s % 3.7 < 2.0), 850.0, 0.0)
+    decay = np.exp(-1.0 / (rate_Hz * 10.0))
+    leaking_pC = lfilter([1.0, -1.0], [1.0, -decay], pressed_pC)  # output of an amplifier that leaks
+    values = leaking_pC[:, None] + np.random.default_rng(1).standard_normal((len(t_s), 4))
+    frames = regular_frames(values)._replace(t_s=t_s, dt_s=np.full(len(t_s), 1.0 / rate_Hz))
+    expected_charge, _, expected_contact, _ = python_chain(board, frames, None)
+    exported = build("four-25um-biaxial", board, options=("-DISOCHARGE_CHAIN_FLOAT", "-Wdouble-promotion"))
+    charge, _, contact, _ = exported.chain(*frames)
+    np.testing.assert_array_equal(contact, expected_contact)
+    np.testing.assert_allclose(charge, expected_charge, rtol=0, atol=0.1)
 
 
 def test_contact_that_a_drift_begins_has_the_flag_drift_in_c_as_in_python(build):

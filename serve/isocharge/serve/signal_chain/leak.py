@@ -194,7 +194,7 @@ class Leak(OffsetStage):
         else:
             self._is_falsified = False
             self._charge_pC = self._charge_pC * math.exp(-dt_s / self._rule.relax_s)
-            if self._inflow.hold_s > 0.0 or not self._rule.learn:
+            if self._inflow.hold_s > SUM_TOLERANCE_s or not self._rule.learn:
                 self._inflow.hold_s -= dt_s
             else:
                 self._inflow.learn(surplus_pC, frame.noise_pC, dt_s)

@@ -16,7 +16,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import DRIFT, NEGATIVE
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.stage import Rule, Setting, Setup, Stage
+from isocharge.serve.signal_chain.stage import Rule, Setting, Setup, Stage, SUM_TOLERANCE_s
 
 
 class TouchRule(Rule, frozen=True, kw_only=True):
@@ -198,7 +198,7 @@ class Touch(Stage):
         if size > 1.0 and float(charge @ direction) < 0.0:
             frame.flags.append(NEGATIVE)
         self._rest_s = 0.0 if size > 1.0 else self._rest_s + frame.dt_s
-        if self._rest_s >= RISE_S:
+        if self._rest_s >= RISE_S - SUM_TOLERANCE_s:
             self._touch_direction = None
 
     @classmethod

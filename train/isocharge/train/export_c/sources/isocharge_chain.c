@@ -259,7 +259,7 @@ static void undo_leak(isocharge_chain *chain, const real output_pC[N], real dt_s
         chain->hold_s = (real)ISOCHARGE_LEAK_HOLD_OFF_S;
         return;
     }
-    if (chain->hold_s > 0 || !ISOCHARGE_LEAK_LEARN)
+    if (chain->hold_s > (real)ISOCHARGE_SUM_TOLERANCE_S || !ISOCHARGE_LEAK_LEARN)
         chain->hold_s -= dt_s;
     else
         learn_inflow(chain, surplus_pC, dt_s);
@@ -357,7 +357,7 @@ static void update_contact(isocharge_chain *chain, const real charge_pC[N], real
     EACH(k) chain->mean[k] = charge[k] + rising * (chain->mean[k] - charge[k]);
     chain->below = size > 1 && dot(charge, chain->direction) < 0;
     chain->rest_s = size > 1 ? 0 : chain->rest_s + dt_s;
-    if (chain->rest_s >= (real)ISOCHARGE_TOUCH_RISE_S)
+    if (chain->rest_s >= (real)(ISOCHARGE_TOUCH_RISE_S - ISOCHARGE_SUM_TOLERANCE_S))
         EACH(k) chain->direction[k] = ISOCHARGE_TOUCH_ANY_SIGN ? 0 : 1;
 #else
     (void)charge_pC;
