@@ -249,10 +249,10 @@ def stream_command(
             allow_host=allow_host,
         ) as page,
         stop_timer(seconds, has_expired),
-        open_source(port, baud=baud, reconnect=True, request=board.request, wait=wait) as source,
         # The handlers of the signals only request changes, which the stream carries out later.
         on_signal(signal.SIGUSR1, stream.request_tare),
         on_signal(signal.SIGHUP, unless_hung_up(partial(stream.request_model, load_latest))),
+        open_source(port, baud=baud, reconnect=True, request=board.request, wait=wait) as source,
         recorder or nullcontext(),
         command_outputs(output, touch, is_live=source.is_live) as open_outputs,
         closing(stream.follow(source)) as records,  # closed before the recorder
