@@ -299,6 +299,17 @@ def test_empty_datagram_is_no_chunk(address):
         assert port.read(0.01) is None
 
 
+def test_udp_url_without_a_host_receives_on_every_address(address):
+    with Port(f"udp://:{address[1]}") as port, socket.socket(type=socket.SOCK_DGRAM) as board:
+        board.sendto(b"1,2\n", address)
+        assert port.read(1.0).data == b"1,2\n"
+
+
+def test_udp_port_of_a_board_that_needs_requests_is_refused(address):
+    with pytest.raises(InputError, match=r"request.* use tcp://"):
+        Port(f"udp://127.0.0.1:{address[1]}", request=Request(b"?"))
+
+
 def test_udp_address_in_use_is_refused(address):
     with Port(f"udp://127.0.0.1:{address[1]}"), pytest.raises(PortError, match="in use"):
         Port(f"udp://127.0.0.1:{address[1]}").__enter__()

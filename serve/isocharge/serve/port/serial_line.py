@@ -267,9 +267,7 @@ class UdpSocket:
         parts = urlsplit(url)
         if parts.port is None or parts.path or parts.query:
             raise ValueError(f"expected {UDP_SCHEME}HOST:PORT, got {url!r}")
-        addresses = socket.getaddrinfo(
-            parts.hostname or "", parts.port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE
-        )
+        addresses = socket.getaddrinfo(parts.hostname, parts.port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)
         family, socket_type, protocol, _canonical_name, address = addresses[0]  # the address that the system prefers
         self._socket = socket.socket(family, socket_type, protocol)
         try:

@@ -91,7 +91,16 @@ class Port:
         request: Request | None = None,
         wait: float = 0.0,
     ) -> None:
-        """Store the settings. The docstring of the class describes the arguments."""
+        """Store the settings. The docstring of the class describes the arguments.
+
+        Raises:
+            InputError: If requests would have to be sent to a UDP port.
+        """
+        if request is not None and url.startswith(UDP_SCHEME):
+            raise InputError(
+                f"{url}: expected a board that sends by itself, got a request in its settings; this port does not know "
+                "the address of the board before its first datagram, so use tcp:// or a serial port"
+            )
         self.url = url
         self._baud = baud
         self._silence_s = silence_s
