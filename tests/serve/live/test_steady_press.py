@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from isocharge.serve import Frame
-from isocharge.serve.flags import RECONNECTED, SATURATED, TARE
+from isocharge.serve.flags import RECONNECTED, RESTART, SATURATED, TARE
 from isocharge.serve.live.steady_press import Phase, PressWatch
 
 RATE_HZ = 200.0
@@ -180,6 +180,17 @@ def test_press_is_refused_with_a_reason_and_the_other_press_is_not(parts, flags,
     assert phases_of(results) == phases
     (refusal,) = [result.reason for result in results if result.phase is Phase.refused]
     assert re.match(reason, refusal), refusal
+
+
+def test_press_after_a_restart_of_the_board_is_taken():
+    """The clock of the board begins again at 0, far before the latest touch."""
+    watch = PressWatch(NAMES)
+    charge_pC = np.concatenate([rest(1), held(2), rest(1), rest(1), held(2)])
+    results = []
+    for number, reading in enumerate(readings(charge_pC, {800: (RESTART, TARE)})):
+        reading.clock_s += 100.0 if number < 800 else -4.0
+        results.append(watch.feed(reading))
+    assert len(taken_presses(results)) == 2
 
 
 def test_an_armed_watch_takes_no_press_that_has_begun():

@@ -180,8 +180,9 @@ class PressWatch:
             only for the reading with which the press was accepted.
         """
         if RECONNECTED in frame.flags or RESTART in frame.flags:
-            # The charges before the interruption cannot be compared with later charges.
+            # The charges and times before the interruption cannot be compared with later ones.
             self._rest_frames.clear()
+            self._end_s = -math.inf
             self._phase = Phase.taring
             return WatchResult(Phase.refused, PORT_LOST)
         if frame.charge_pC is None:  # there is no tare yet, or the frame is invalid
