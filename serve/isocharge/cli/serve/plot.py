@@ -71,7 +71,7 @@ def recording_picture(samples: Samples, title: str) -> Figure:
     flags = {flag: time_s[is_set] for flag, is_set in is_flagged.items() if is_set.any()}
     flag_height = 0.1 * (1 + len(flags))  # grows with the number of rows of flags
     figure = new_figure(12.0, 8.6)
-    figure.suptitle(f"{title}: {len(time_s)} records; faint points: ± 2 standard deviations")
+    figure.suptitle(f"{title}: {len(time_s)} records; faint points: ± 2 standard deviations", parse_math=False)
     heights = (1.0, 1.0, 0.8, flag_height)
     charge_axes, position_axes, force_axes, flag_axes = figure.subplots(4, 1, sharex=True, height_ratios=heights)
 
