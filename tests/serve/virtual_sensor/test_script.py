@@ -68,6 +68,7 @@ def test_load_script_reads_a_toml_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("presses = [[0, 0, 0, 0], [1e9, 0, 0, 0]]", r"presses\[1\]\[0\]: expected a number from -86400 to 86400, got"),
         ("presses = [[0, 1, 2]]", r"presses\[0\]: expected \[seconds, x_mm, y_mm, force_N\] with a force from 0, got"),
         ("presses = [[0, 1, 2, 1], [1, 1, 2, -1]]", r"presses\[1\]\[3\]: expected a number from 0, got -1"),
         ("presses = [[0, 1, 2, 1]]", "presses: expected two rows or more with growing seconds, got"),

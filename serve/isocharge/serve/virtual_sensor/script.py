@@ -31,6 +31,8 @@ RAMP_S = 0.15
 
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 
+Seconds = Annotated[float, Meta(ge=-86_400.0, le=86_400.0)]
+
 ROW_DESCRIPTION = "[seconds, x_mm, y_mm, force_N] with a force from 0"
 """Description of a row of presses in a script file, for error messages."""
 
@@ -96,7 +98,7 @@ class VirtualScript(Settings, frozen=True):
         faults: Faults between the board and the reader.
     """
 
-    presses: tuple[Annotated[tuple[Finite, Finite, Finite, NotNegative], Meta(description=ROW_DESCRIPTION)], ...] = ()
+    presses: tuple[Annotated[tuple[Seconds, Finite, Finite, NotNegative], Meta(description=ROW_DESCRIPTION)], ...] = ()
     faults: Faults = Faults()
 
     def __post_init__(self) -> None:
