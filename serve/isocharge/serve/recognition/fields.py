@@ -59,9 +59,8 @@ def identify_clock(steps: Array, frame_rate_Hz: float, tolerance: float = 0.06) 
     """
     ticks_per_frame = steady_step(steps)
     tick_rate_Hz = ticks_per_frame * frame_rate_Hz
-    deviations = {usual_tick_rate_Hz: abs(tick_rate_Hz / usual_tick_rate_Hz - 1.0) for usual_tick_rate_Hz in CLOCKS}
-    nearest_tick_rate_Hz = min(deviations, key=deviations.__getitem__)
-    return CLOCKS[nearest_tick_rate_Hz] if deviations[nearest_tick_rate_Hz] < tolerance else None
+    deviation, nearest_tick_rate_Hz = min((abs(tick_rate_Hz / usual_Hz - 1.0), usual_Hz) for usual_Hz in CLOCKS)
+    return CLOCKS[nearest_tick_rate_Hz] if deviation < tolerance else None
 
 
 def is_counter(steps: Array, clock: tuple[str, float] | None) -> bool:
@@ -299,8 +298,8 @@ def split_frame(
                 best_parts = (part, *rest_parts)
         return best_score, best_parts
 
-    scores = {sync_length: best_division(sync_length, "")[0] for sync_length in sync_lengths}
-    best_sync_length = min(scores, key=scores.__getitem__)  # of equal scores, the one with the shortest pattern
+    # Of equal scores, `min` returns the one with the shortest pattern, which comes first.
+    best_sync_length = min(sync_lengths, key=lambda sync_length: best_division(sync_length, "")[0])
     lowest_score, best_parts = best_division(best_sync_length, "")
     return lowest_score, best_sync_length, best_parts
 

@@ -161,10 +161,9 @@ def _fields(parts: Sequence[Part]) -> tuple[Field, ...]:
             roles.add(part.role)
             field = Field(name=part.name, type_name=part.type_name)
             fields.append(field if part.scale == 1.0 else structs.replace(field, scale=part.scale))
-        elif fields and fields[-1].type_name == PADDING:
-            fields[-1] = structs.replace(fields[-1], count=fields[-1].count + part.size)
         else:
-            fields.append(Field(type_name=PADDING, count=part.size))
+            adjacent_padding = fields.pop().count if fields and fields[-1].type_name == PADDING else 0
+            fields.append(Field(type_name=PADDING, count=adjacent_padding + part.size))
     return tuple(fields)
 
 
