@@ -37,7 +37,8 @@ from scipy.special import chdtri
 from shared import arguments, print_results, report_progress, whitened_errors
 from solved_films import FILMS, SolvedFilm, solved_film
 
-from isocharge.serve import Contact, Predictor
+from isocharge.serve import Contact, Frame, Predictor
+from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.simulate import Circle, NoiseModel, load_sensor, local_workers
 from isocharge.train import CalibrationProblem, calibrate, write_calibration
@@ -124,13 +125,14 @@ class Bench:
 
 def follower_after(predictor: Predictor, touches: np.ndarray) -> FilmFollower:
     """Return a follower that has observed touches frame by frame, 100 frames per second, a second between touches."""
-    follower = FilmFollower(predictor)
+    follower = FilmFollower(Setup(predictor.metadata.electrodes, predictor=predictor))
     clock_s = 0.0
-    for frames in touches:
-        for frame in frames:
-            follower.observe_frame(frame, predictor.predict(frame), (), clock_s)
+    for charges in touches:
+        for charge_pC in charges:
+            contact = predictor.predict(charge_pC)
+            follower.step(Frame(None, None, (), clock_s=clock_s, charge_pC=charge_pC, contact=contact))
             clock_s += 0.01
-        follower.observe_frame(None, None, (), clock_s)
+        follower.step(Frame(None, None, (), clock_s=clock_s))
         clock_s += 1.0
     return follower
 

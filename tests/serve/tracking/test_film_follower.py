@@ -12,7 +12,6 @@ from drawn_contacts import draw_contacts
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError
 from isocharge.serve import Contact, Frame
-from isocharge.serve.live.device import FollowFilm
 from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.signal_chain.stage import Device, Setup
@@ -78,7 +77,11 @@ def model_in(folder, series, noise=NOISE):
         return Contact(float(contact[0]), float(contact[1]), force, std[0], std[1], std[2] * force, 0.0)
 
     return SimpleNamespace(
-        folder=folder, metadata=SimpleNamespace(electrodes=series.electrodes, noise=NOISE), noise=noise, predict=predict
+        folder=folder,
+        metadata=SimpleNamespace(electrodes=series.electrodes, noise=NOISE),
+        noise=noise,
+        predict=predict,
+        validity=SimpleNamespace(flags=lambda _: ()),
     )
 
 
@@ -94,6 +97,11 @@ def touches(series, state, rng, count):
     return contact, series.changes(contact, np.array(state)).charge_pC
 
 
+def new_follower(model):
+    """Return a follower of the film of a model."""
+    return FilmFollower(Setup(model.metadata.electrodes, Device(), model))
+
+
 def followed(model, charge, rng, frames=2, noise=NOISE):
     """Return a follower that has observed touches, and whether the film was lost after each of them.
 
@@ -101,12 +109,13 @@ def followed(model, charge, rng, frames=2, noise=NOISE):
         frames: Number of frames of a touch.
         noise: Noise of the frames.
     """
-    follower = FilmFollower(model)
+    follower = new_follower(model)
     was_lost = []
     for number, row in enumerate(charge):
-        for frame in noise.add(np.repeat(row[None], frames, axis=0), rng):
-            follower.observe_frame(frame, model.predict(frame), (), float(number))
-        follower.observe_frame(None, None, (), number + 0.04)
+        for frame_charge in noise.add(np.repeat(row[None], frames, axis=0), rng):
+            contact = model.predict(frame_charge)
+            follower.step(Frame(None, None, (), clock_s=float(number), charge_pC=frame_charge, contact=contact))
+        follower.step(Frame(None, None, (), clock_s=number + 0.04))
         was_lost.append(follower.is_lost)
     return follower, was_lost
 
@@ -204,11 +213,10 @@ def test_stage_corrects_and_flags_contacts_and_counts_a_touch_with_invalid_frame
     rng = np.random.default_rng(1)
     _, charge = touches(series, [0.3, 0.0, 0.0], rng, 21)
     raw = model.predict(charge[20])
+    stage, _ = followed(model, charge[:20], rng)
     model.validity = SimpleNamespace(flags=lambda contact: () if contact == raw else ("misfit",))
-    stage = FollowFilm(Setup(ELECTRODES, Device(), model))
-    stage._follower, _ = followed(model, charge[:20], rng)
     for is_lost in (False, True):
-        stage._follower.is_lost = is_lost
+        stage.is_lost = is_lost
         for number in range(52):
             frame = Frame(None, None, (), clock_s=100.0 + 0.01 * number, is_valid=number % 20 != 10)
             if frame.is_valid and number < 50:
@@ -218,7 +226,7 @@ def test_stage_corrects_and_flags_contacts_and_counts_a_touch_with_invalid_frame
             assert frame.contact_flags == (("misfit",) if frame.contact else ())
             assert frame.flags == (["film"] if frame.contact and is_lost else [])
             assert frame.film.touches == 20 + is_lost
-    assert stage._follower.film.touches == 22
+    assert stage.film.touches == 22
 
 
 def test_film_that_is_lost_again_keeps_the_state_of_the_latest_touches(series, model):
@@ -233,7 +241,7 @@ def test_film_that_is_lost_again_keeps_the_state_of_the_latest_touches(series, m
 def test_models_that_cannot_be_followed_are_refused(series, tmp_path):
     single = series.calibrated_series
     with pytest.raises(ModelError, match="calibrate"):
-        FilmFollower(model_in(tmp_path, single))
+        new_follower(model_in(tmp_path, single))
     three = replace(
         series,
         electrodes=ELECTRODES[:3],
@@ -241,13 +249,13 @@ def test_models_that_cannot_be_followed_are_refused(series, tmp_path):
         directions=series.directions[..., :3],
     )
     with pytest.raises(ModelError, match="four electrodes"):
-        FilmFollower(model_in(tmp_path, three))
+        new_follower(model_in(tmp_path, three))
 
 
 def test_contacts_are_corrected_from_the_first_touch(series, model):
     rng = np.random.default_rng(8)
     contact, charge = touches(series, [-0.4, 0.0, 0.0], rng, 31)
-    before, normalised_before = force_errors(FilmFollower(model), model, contact[1:], charge[1:])
+    before, normalised_before = force_errors(new_follower(model), model, contact[1:], charge[1:])
     follower, _ = followed(model, charge[:1], rng)
     after, normalised_after = force_errors(follower, model, contact[1:], charge[1:])
     assert np.mean(after**2) < np.mean(before**2)

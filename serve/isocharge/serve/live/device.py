@@ -35,7 +35,6 @@ from msgspec import defstruct, field, structs
 
 from isocharge.common.errors import DeviceError
 from isocharge.common.structs import Settings, convert, read_toml
-from isocharge.serve.flags import FILM
 from isocharge.serve.frames.formats import AutoFrames, Frames
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.predictor import Predictor
@@ -45,9 +44,9 @@ from isocharge.serve.signal_chain.hum import Hum
 from isocharge.serve.signal_chain.leak import Integrator, Leak
 from isocharge.serve.signal_chain.stage import Device, FrontEnd, Rule, Setting, Setup, Share, Stage
 from isocharge.serve.signal_chain.tare import Tare
-from isocharge.serve.signal_chain.thermal import Warming, warming_ratios
+from isocharge.serve.signal_chain.thermal import Warming
 from isocharge.serve.signal_chain.touch import Touch
-from isocharge.serve.tracking.film_follower import FilmFollower, FollowRule
+from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.serve.tracking.tracker import Tracker
 
 
@@ -95,48 +94,6 @@ class Prediction(Stage):
         frame.set_contact(predictor.predict(frame.charge_pC), self._validity)
 
 
-class FollowFilm(Stage):
-    """Estimates the pretension of the film, and corrects contacts for the estimated pretension."""
-
-    section = "follow"
-    rule_class = FollowRule
-    needs_contact = True
-
-    def __init__(self, setup: Setup) -> None:
-        """Begin with the pretension that the calibration of the film has found.
-
-        Raises:
-            ModelError: If the pretension of this film cannot be estimated with the model.
-        """
-        predictor = setup.model
-        self._validity = predictor.validity  # of the calibrated film
-        self._follower = FilmFollower(predictor, setup.device.rule(FollowRule), warming_ratios(setup))
-
-    def step(self, frame: Frame) -> None:
-        """Correct the contact for the estimated pretension of the film, and then update the estimate with the frame.
-
-        An invalid frame does not change the estimate, because it does not show whether the touch has ended. If the
-        pretension can no longer be estimated, every frame with a contact gets the flag `film`.
-        """
-        # Correct the contact with the estimate from the earlier frames. The frame reports this estimate.
-        follower = self._follower
-        if frame.contact is not None and frame.charge_pC is not None:
-            frame.set_contact(follower.follow_contact(frame.contact, frame.charge_pC), self._validity)
-        frame.film = follower.film
-        if not frame.is_valid:
-            return
-
-        # Update the estimate.
-        flags = (*frame.flags, *frame.contact_flags)
-        follower.observe_frame(frame.charge_pC, frame.contact, flags, frame.clock_s)
-        if frame.contact is not None and follower.is_lost:
-            frame.flags.append(FILM)
-
-    def reset(self) -> None:
-        """Discard the state of the present touch. The estimated pretension is not changed."""
-        self._follower.discard_touch()
-
-
 STAGES: tuple[type[Stage], ...] = (
     Channels,
     Gain,
@@ -148,7 +105,7 @@ STAGES: tuple[type[Stage], ...] = (
     Saturation,
     Warming,
     Prediction,
-    FollowFilm,
+    FilmFollower,
     Tracker,
 )
 """All stages in the order in which they process a frame. The device file and the export to C follow from the stages."""

@@ -35,13 +35,14 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError
-from isocharge.serve.flags import BEYOND, GAP, MISFIT, OUTSIDE, REPEAT, STRESS
+from isocharge.serve.flags import BEYOND, FILM, GAP, MISFIT, OUTSIDE, REPEAT, STRESS
+from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.charge_file import FILE, read_charge_map
 from isocharge.serve.model.contact import Contact, is_close
-from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.robust_estimate import ModelValues, Prior, robust_estimate
 from isocharge.serve.record.record import FollowedFilm
-from isocharge.serve.signal_chain.stage import Rule, Setting
+from isocharge.serve.signal_chain.stage import Rule, Setting, Setup, Stage
+from isocharge.serve.signal_chain.thermal import warming_ratios
 from isocharge.serve.tracking.contact_mixture import GAIN_STD, contacts_of
 
 UNUSED_FRAME_FLAGS = frozenset({OUTSIDE, BEYOND, STRESS, GAP, REPEAT})
@@ -169,29 +170,26 @@ class _Conversion(NamedTuple):
     covariance: Array
 
 
-class FilmFollower:
-    """Estimator of the changes of one film, which corrects contacts for the estimated changes.
-
-    The methods must be called from one thread. The same sequence of frames always gives bitwise equal contacts.
+class FilmFollower(Stage):
+    """Estimates the changes of one film, and corrects contacts for the estimated changes.
 
     Attributes:
         predictor: Model of the calibrated film.
         is_lost: Whether the film is lost.
     """
 
-    def __init__(self, predictor: Predictor, rule: FollowRule | None = None, offset_ratio: Array | float = 1.0) -> None:
-        """Start with the assumption that the film has not changed since the calibration.
+    section = "follow"
+    rule_class = FollowRule
+    needs_contact = True
 
-        Args:
-            predictor: Model of the calibrated film.
-            rule: Settings; None for the default value of every setting.
-            offset_ratio: Charge that warmth adds to each electrode, relative to the common offset, shape
-                (n_electrode,), or one number for all electrodes.
+    def __init__(self, setup: Setup) -> None:
+        """Start with the assumption that the film has not changed since the calibration.
 
         Raises:
             ModelError: If the model has fewer than four electrodes, or has no charge map with several pretensions, or
                 the file of the charge map belongs to another model.
         """
+        predictor = setup.model
         electrodes = predictor.metadata.electrodes
         if len(electrodes) < 4:
             raise ModelError(
@@ -207,9 +205,10 @@ class FilmFollower:
                 "or again with this version"
             )
         self.predictor = predictor
-        self._rule = rule or FollowRule()
+        self._rule = setup.device.rule(FollowRule) or FollowRule()
         self._series = series
-        self._offset_ratio = np.broadcast_to(np.asarray(offset_ratio, dtype=float), (len(electrodes),))
+        # Charge that warmth adds to each electrode, relative to the common offset, shape (n_electrode,)
+        self._offset_ratio = np.broadcast_to(np.asarray(warming_ratios(setup), dtype=float), (len(electrodes),))
         self._offset_std_pC = RELATIVE_OFFSET_STD * self._rule.largest_offset_pC
 
         # The state consists of the state of the charge map, the logarithms of the gains and the common offset.
@@ -242,15 +241,15 @@ class FilmFollower:
         self._applied_covariance = self._covariance
         self._conversion: _Conversion | None = None  # latest conversion of charges, and its contact
         self._conversion_contact: Contact | None = None
-        self.discard_touch()
+        self.reset()
 
     def _start_estimate(self) -> None:
         """Set the state to that of the calibrated film, with the standard deviations before the first touch."""
         self._state = np.zeros(self._initial_std.size)
         self._covariance = np.diag(self._initial_std**2)
 
-    def discard_touch(self) -> None:
-        """Discard the frames of the present touch, for example after an outage or a new tare."""
+    def reset(self) -> None:
+        """Discard the frames of the present touch, for example after an outage or a new tare. The estimate remains."""
         self._peak = TouchPeak()
 
     @property
@@ -260,25 +259,24 @@ class FilmFollower:
         std_MPa = math.sqrt(self._applied_covariance[0, 0])
         return FollowedFilm(self._series.pretension_MPa + change_MPa, std_MPa, self._touch_count)
 
-    def observe_frame(
-        self, charge_pC: Array | None, contact: Contact | None, flags: tuple[str, ...], clock_s: float
-    ) -> None:
-        """Process the next frame, and update the estimate of the film when a touch ends.
+    def step(self, frame: Frame) -> None:
+        """Correct the contact with the estimate from the earlier touches, and update the estimate when a touch ends.
 
-        Args:
-            charge_pC: Touch charges, shape (n_electrode,), pC; None if nothing touches the film.
-            contact: Contact after the correction; None if nothing touches the film.
-            flags: Flags of the frame.
-            clock_s: Time of the frame on a clock that does not jump, s.
+        An invalid frame does not change the estimate, because it does not show whether the touch has ended. If the film
+        is lost, every frame with a contact gets the flag `film`.
         """
-        if contact is not None:
-            assert charge_pC is not None  # a frame with a contact has charges
-            self._peak.add_frame(contact, charge_pC, flags)
-            return
-        mean_charge_pC = self._peak.mean_charge_pC
-        self.discard_touch()
-        if mean_charge_pC is not None:
-            self._observe_touch(mean_charge_pC, clock_s)
+        frame.film = self.film
+        if frame.contact is not None and frame.charge_pC is not None:
+            # A corrected contact is valid within the limits of the calibrated film.
+            frame.set_contact(self.follow_contact(frame.contact, frame.charge_pC), self.predictor.validity)
+            self._peak.add_frame(frame.contact, frame.charge_pC, (*frame.flags, *frame.contact_flags))
+            if self.is_lost:
+                frame.flags.append(FILM)
+        elif frame.is_valid:
+            mean_charge_pC = self._peak.mean_charge_pC
+            self.reset()
+            if mean_charge_pC is not None:
+                self._observe_touch(mean_charge_pC, frame.clock_s)
 
     def _observe_touch(self, charge_pC: Array, clock_s: float) -> None:
         """Update the estimate of the film with a touch, and decide whether the film is lost.
