@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from shared import model_film, options, print_results
 
+from isocharge.common.contact_domain import into_unit_domain
 from isocharge.serve import Contact, Predictor
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.charge_file import read_charge_map
@@ -28,7 +29,6 @@ from isocharge.serve.tracking.tracker import Tracker, TrackRule
 from isocharge.simulate import noise_model
 from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
-from isocharge.simulate.identifiability.nearest_contact import into_domain
 
 RISE_TIME_s = 0.03
 """Time in which the force rises, s."""
@@ -125,7 +125,7 @@ def examine_frame(
     """
     contacts = [contact for contact in (tracked, other) if contact is not None]
     reported = np.array([(contact.x_mm, contact.y_mm, contact.force_N) for contact in contacts])
-    in_map = film.domain.to_contact(into_domain(film.domain.to_unit(reported)))
+    in_map = film.domain.to_contact(into_unit_domain(film.domain.to_unit(reported)))
     is_right_side = sides(film, in_map) == side
     error_mm = float(np.hypot(*(reported[0] - truth)[:2]))
     return other is None, bool(is_right_side[0]), bool(is_right_side.any()), error_mm

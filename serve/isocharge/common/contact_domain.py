@@ -68,8 +68,7 @@ class Domain:
         Returns:
             Scaled coordinates, shape (n, 3), dimensionless.
         """
-        log_contact = np.stack([contact[:, 0], contact[:, 1], np.log(contact[:, 2])], axis=1)
-        return np.asarray((log_contact - self.centre) / self.scale)
+        return np.asarray((with_log_force(contact) - self.centre) / self.scale)
 
     def to_contact(self, unit: Array) -> Array:
         """Convert the scaled coordinates that `to_unit` returns back into contacts (x, y, F).
@@ -125,6 +124,24 @@ class Domain:
                 f"at most {self.radius:g} mm from the centre and {low:g} to {high:g} N"
             )
         return contact
+
+
+def with_log_force(contact: Array) -> Array:
+    """Convert contacts (x, y, F), shape (n, 3), mm and N, into (x, y, ln F)."""
+    return np.column_stack([contact[:, :2], np.log(contact[:, 2])])
+
+
+def into_unit_domain(unit: Array) -> Array:
+    """Replace each point outside the unit disk times [-1, 1] by the nearest point of this set.
+
+    Args:
+        unit: Scaled coordinates, as `Domain.to_unit` returns them, shape (n, 3). The first two belong to the disk.
+
+    Returns:
+        Points in the set, shape (n, 3).
+    """
+    distance = np.hypot(unit[:, 0], unit[:, 1])
+    return np.column_stack([unit[:, :2] / np.maximum(distance, 1.0)[:, None], np.clip(unit[:, 2], -1.0, 1.0)])
 
 
 def as_contacts(contact: Array, source: str) -> Array:

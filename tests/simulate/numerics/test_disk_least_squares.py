@@ -3,7 +3,8 @@
 import numpy as np
 from scipy.optimize import minimize
 
-from isocharge.simulate.identifiability.nearest_contact import into_domain, minimise
+from isocharge.common.contact_domain import into_unit_domain
+from isocharge.simulate.identifiability.nearest_contact import minimise
 
 RNG = np.random.default_rng(0)
 MATRIX = RNG.normal(size=(4, 3))
@@ -17,7 +18,7 @@ def sine_residuals(rows, unit):
 
 
 def test_minimise_is_not_worse_than_scipy_with_constraints():
-    starts = into_domain(RNG.uniform(-0.7, 0.7, (12, 3)))
+    starts = into_unit_domain(RNG.uniform(-0.7, 0.7, (12, 3)))
     unit, residual = minimise(sine_residuals, starts)
     inside = {"type": "ineq", "fun": lambda at: 1.0 - at[0] ** 2 - at[1] ** 2}
     for row, start in enumerate(unit):

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.polynomial import chebyshev, polynomial
 
 from isocharge.common.arrays import Array, Integers
-from isocharge.common.contact_domain import Domain
+from isocharge.common.contact_domain import Domain, into_unit_domain
 from isocharge.serve.model.contact import disk_corners
 from isocharge.serve.model.robust_estimate import ModelValues
 
@@ -310,9 +310,7 @@ class ChargeSeries:
             The differences of contacts in the domain are zero.
         """
         unit_contact = self.domain.to_unit(contact)
-        nearest = np.clip(unit_contact, -1.0, 1.0)
-        distance = np.hypot(unit_contact[:, 0], unit_contact[:, 1])
-        nearest[:, :2] = unit_contact[:, :2] / np.maximum(distance, 1.0)[:, None]
+        nearest = into_unit_domain(unit_contact)
         return nearest, unit_contact - nearest
 
     def _charges(self, value: Array, nearest: Array, excess: Array) -> tuple[Array, Array, Array]:

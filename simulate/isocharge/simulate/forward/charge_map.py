@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from isocharge.common.arrays import Array
-from isocharge.common.contact_domain import Domain
+from isocharge.common.contact_domain import Domain, with_log_force
 from isocharge.common.errors import SceneError
 
 STEPS = (0.05, 0.05, 1e-3)
@@ -134,7 +134,7 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: Array
     # Step each variable up and down, and evaluate the function once. The axes are direction, variable and contact.
     variable_steps = np.array(steps)
     changes = np.stack([np.diag(variable_steps), -np.diag(variable_steps)])[:, :, None]
-    stepped = np.column_stack([contact[:, :2], np.log(contact[:, 2])]) + changes
+    stepped = with_log_force(contact) + changes
     stepped[..., 2] = np.exp(stepped[..., 2])
     stepped_values = function(stepped.reshape(-1, 3))
     values_up, values_down = stepped_values.reshape(2, 3, len(contact), stepped_values.shape[1])

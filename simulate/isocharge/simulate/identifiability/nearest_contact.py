@@ -21,8 +21,9 @@ import numpy as np
 import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.common.contact_domain import into_unit_domain
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
-from isocharge.simulate.numerics.disk import INNER_RADIUS, ROUNDING, onto_disk
+from isocharge.simulate.numerics.disk import INNER_RADIUS, ROUNDING
 
 ResidualFunction = Callable[[Integers, Array], tuple[Array, Array]]
 """Function that evaluates the residuals of some of the problems.
@@ -56,7 +57,7 @@ def minimise(
     Returns:
         Points in D, shape (n, 3), and the residuals at these points, shape (n, k).
     """
-    point = into_domain(start)
+    point = into_unit_domain(start)
     active = np.arange(len(start))  # indices of the problems whose iteration has not ended
     residual, slopes = (np.array(values) for values in evaluate(active, point))  # r and dr/du
     squared_norm = (residual**2).sum(axis=1)  # |r|^2, shape (n,)
@@ -104,7 +105,7 @@ def bounded_step(point: Array, residual: Array, slopes: Array, damping: Array) -
     edge = np.flatnonzero(normals.any(axis=(1, 2)))
     if edge.size:
         matrix[edge], gradient[edge] = _along_edges(normals[edge], matrix[edge], gradient[edge], trace[edge])
-    return into_domain(point - np.linalg.solve(matrix, gradient[..., None])[..., 0])
+    return into_unit_domain(point - np.linalg.solve(matrix, gradient[..., None])[..., 0])
 
 
 def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -> tuple[Array, Array]:
@@ -132,18 +133,6 @@ def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -
     across: Array = np.einsum("nbi,nbj->nij", normals, normals)
     along = np.eye(3) - across
     return along @ matrix @ along + trace * across, (along @ gradient[..., None])[..., 0]
-
-
-def into_domain(point: Array) -> Array:
-    """Replace each point outside the domain D by the nearest point of D, which is the unit disk times [-1, 1].
-
-    Args:
-        point: Points, shape (n, 3). The first two coordinates belong to the disk, and the third to the interval.
-
-    Returns:
-        Points of D, shape (n, 3).
-    """
-    return np.column_stack([onto_disk(point[:, :2], 1.0), np.clip(point[:, 2], -1.0, 1.0)])
 
 
 CANDIDATES = 4096

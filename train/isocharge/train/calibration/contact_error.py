@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.common.contact_domain import with_log_force
 from isocharge.serve.presses.measured_presses import FORCE_STD, POSITION_STD_MM
 from isocharge.simulate import Domain, Sweep
 from isocharge.simulate.identifiability.cramer_rao import CramerRao
@@ -204,7 +205,7 @@ def _linearise_at(
         contact_std: Standard deviations of x and y, mm, and of ln F.
     """
     charge = charges.charges(film.film_values, contact)
-    log_contact = np.column_stack([contact[:, :2], np.log(contact[:, 2])])
+    log_contact = with_log_force(contact)
     data = PressData(
         charge=charge,
         charge_std=film.noise.sigma(charge),

@@ -22,6 +22,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import chdtrc, chdtri, softmax
 
 from isocharge.common.arrays import Array, Booleans
+from isocharge.common.contact_domain import with_log_force
 from isocharge.serve.model.robust_estimate import MeasuredContacts, ModelValues, robust_estimate
 from isocharge.serve.model.robust_estimate import Prior as StatePrior
 from isocharge.simulate import NoiseModel, noise_model
@@ -173,13 +174,14 @@ class Prior:
             fixed += self.earlier.covariance
             discrepancy *= REMAINING_DISCREPANCY**2
             return parts
-        variance = layout.prior.std**2
         is_imperfection = layout.prior.is_imperfection
         is_tension = np.isin(layout.prior.names, UNEVEN_TENSIONS)
-        fixed[layout.film, layout.film] = np.diag(np.where(is_imperfection, 0.0, variance))
-        uneven_tension[layout.film, layout.film] = np.diag(np.where(is_tension, variance, 0.0))
-        others[layout.film, layout.film] = np.diag(np.where(is_imperfection, variance, 0.0))
-        others -= uneven_tension
+        for part, is_part in (
+            (fixed, ~is_imperfection),
+            (uneven_tension, is_tension),
+            (others, is_imperfection & ~is_tension),
+        ):
+            part[layout.film, layout.film] = np.diag(is_part * layout.prior.std**2)
         return parts
 
     def covariance(self, hypothesis: Hypothesis) -> Array:
@@ -276,7 +278,7 @@ def _estimate_with_errors(
     log_contact = data.contact
     if previous is not None:
         unknowns = previous.film.values
-        log_contact = np.column_stack([previous.contact[:, :2], np.log(previous.contact[:, 2])])
+        log_contact = with_log_force(previous.contact)
     charge_variance = np.nan_to_num(data.charge_std**2)  # the largest number for a charge that was not measured
     found = robust_estimate(
         lambda contacts, state: model_values(charges, layout, data, state, contacts),
@@ -329,7 +331,7 @@ def _estimate_with_errors(
     return Estimation(
         charges=charges,
         film=film,
-        contact=in_domain(log_contact, charges),
+        contact=in_domain(log_contact, charges.domain),
         is_bad=is_bad,
         press_chi2=np.divide(final_chi2, redundancy, out=np.full(len(data), np.nan), where=redundancy > 0),
         chi2=fits[best].chi2,

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.common.contact_domain import into_unit_domain
 from isocharge.simulate import Circle, Domain, FilmPrior, FilmSlopes, ForwardMap, Probe, Sensor, SolveSettings
 from isocharge.simulate.forward.derivative_maps import few_nodes
 from isocharge.simulate.forward.family import nearest_to_clamp
-from isocharge.simulate.numerics.disk import onto_disk
 from isocharge.simulate.sensor.film_properties import PRETENSION, UNEVEN_TENSIONS, FilmProperty, changed_film
 from isocharge.simulate.solver.press import needed_resolution
 
@@ -81,8 +81,7 @@ class FilmCharges:
 
     def into_domain(self, contact: Array) -> Array:
         """Move each contact (x, y, F), shape (n, 3), that lies outside the domain to the nearest contact in it."""
-        position = onto_disk(contact[:, :2], self.domain.radius)
-        return np.column_stack([position, np.clip(contact[:, 2], *self.domain.force_range)])
+        return self.domain.to_contact(into_unit_domain(self.domain.to_unit(contact)))
 
     def charges(self, values: Array, contact: Array) -> Array:
         """Compute the charges of presses on a film with given properties, shape (n, n_electrode), pC."""

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
+from isocharge.common.contact_domain import into_unit_domain, with_log_force
 from isocharge.serve.model.robust_estimate import ModelValues
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.simulate import Domain, NoiseModel
@@ -61,8 +62,7 @@ class PressData:
         """
         is_charge_known = np.isfinite(presses.charge_pC)
         charge = np.where(is_charge_known, presses.charge_pC, 0.0)
-        log_contact = presses.contact.copy()
-        log_contact[:, 2] = np.log(log_contact[:, 2])
+        log_contact = with_log_force(presses.contact)
         is_contact_known = np.isfinite(log_contact)
         measured_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std])
         count = len(presses)
@@ -154,7 +154,7 @@ def model_values(charges: FilmCharges, layout: Layout, data: PressData, unknowns
         unknowns: Values of the unknowns, shape (n_unknown,).
         contact: Contacts (x, y, ln F), shape (n, 3).
     """
-    metric_contact = in_domain(contact, charges)
+    metric_contact = in_domain(contact, charges.domain)
     film_values = unknowns[layout.film]
     charge, film_jacobian = charges.linearised(film_values, metric_contact)
     session_jacobian = np.stack([one.effect(data.time, charge) for one in SESSION], axis=2)
@@ -169,7 +169,6 @@ def model_values(charges: FilmCharges, layout: Layout, data: PressData, unknowns
     )
 
 
-def in_domain(contact: Array, charges: FilmCharges) -> Array:
-    """Convert contacts (x, y, ln F) to (x, y, F), and move contacts outside the domain to its nearest contact."""
-    log_force = np.clip(contact[:, 2], *np.log(charges.domain.force_range))  # no number overflows
-    return charges.into_domain(np.column_stack([contact[:, :2], np.exp(log_force)]))
+def in_domain(contact: Array, domain: Domain) -> Array:
+    """Convert contacts (x, y, ln F) to (x, y, F), and move contacts outside a domain to its nearest contact."""
+    return domain.to_contact(into_unit_domain((contact - domain.centre) / domain.scale))
