@@ -209,7 +209,7 @@ def test_the_units_of_a_sharpened_layer_bend_among_the_inputs():
     torch.manual_seed(0)
     perceptron = TrainablePerceptron(3, (400, 8), 4)
     perceptron.sharpen_first_layer()
-    first, *_ = perceptron.linear_layers()
+    first, *_ = perceptron.linear_layers
     slope = first.weight.norm(dim=1)
     distance_of_bend = first.bias.detach() / slope.detach()
     smallest, largest = FIRST_LAYER_SLOPES

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import torch
 from threadpoolctl import threadpool_limits
-from torch import Tensor
 
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import FEW_ELECTRODES
@@ -205,9 +204,5 @@ def train_perceptron(stage: TrainingStage, config: FitConfig) -> None:
         return
 
     stage.network.round_hidden_matrices()
-
-    def last_loss(_: float, random: torch.Generator) -> Tensor:
-        """Return the loss at the end of the training."""
-        return stage.loss(1.0, random)
-
-    replace(stage, loss=last_loss, steps=round(ROUNDED_FRACTION * stage.steps)).run()
+    steps = round(ROUNDED_FRACTION * stage.steps)
+    replace(stage, loss=lambda _, random: stage.loss(1.0, random), steps=steps).run()

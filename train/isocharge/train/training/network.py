@@ -135,7 +135,8 @@ class TrainablePerceptron(nn.Module):
         super().__init__()
         self.activation = activation
         widths = (n_input, *hidden, n_output)
-        self.layers = nn.ModuleList([nn.Linear(n_in, n_out) for n_in, n_out in pairwise(widths)])
+        self.linear_layers = [nn.Linear(n_in, n_out) for n_in, n_out in pairwise(widths)]  # from first to last
+        self.layers = nn.ModuleList(self.linear_layers)  # makes the parameters of the layers those of the perceptron
         self.skip = nn.Linear(n_input, n_output, bias=False)
         nn.init.zeros_(self.skip.weight)
 
@@ -147,7 +148,7 @@ class TrainablePerceptron(nn.Module):
         random direction in the space of the inputs, a random slope along this direction, and a random centre. The
         centre is the point of this space at which the argument of the activation is zero.
         """
-        first, *_ = self.linear_layers()
+        first, *_ = self.linear_layers
         n_unit = first.out_features
         direction = nn.functional.normalize(torch.randn(n_unit, first.in_features), dim=1)
         smallest, largest = FIRST_LAYER_SLOPES
@@ -167,7 +168,7 @@ class TrainablePerceptron(nn.Module):
             Outputs, shape (n, n_output).
         """
         activation = getattr(nn.functional, self.activation.torch_name)
-        *hidden, last = self.linear_layers()
+        *hidden, last = self.linear_layers
         value = inputs
         for layer in hidden:
             value = activation(layer(value))
@@ -176,12 +177,8 @@ class TrainablePerceptron(nn.Module):
 
     def to_numpy(self) -> Perceptron:
         """Return a copy of the perceptron as NumPy arrays in double precision."""
-        *hidden, last = (Layer(_to_numpy(layer.weight.T), _to_numpy(layer.bias)) for layer in self.linear_layers())
+        *hidden, last = (Layer(_to_numpy(layer.weight.T), _to_numpy(layer.bias)) for layer in self.linear_layers)
         return Perceptron(tuple(hidden), last, _to_numpy(self.skip.weight.T), self.activation)
-
-    def linear_layers(self) -> list[nn.Linear]:
-        """Return the hidden layers and the output layer, from first to last."""
-        return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
     def round_hidden_matrices(self) -> None:
         """Round the weights between hidden layers to 8 bits, and exclude these weights from further training.
@@ -189,7 +186,7 @@ class TrainablePerceptron(nn.Module):
         Each rounded weight is the product of a scale and an integer from -127 to 127. All weights that lead to the same
         unit have the same scale.
         """
-        _, *between, _ = self.linear_layers()
+        _, *between, _ = self.linear_layers
         for matrix in (layer.weight for layer in between):
             weights = matrix.detach()  # shares its memory with the matrix, so that `copy_` below changes the matrix
             scale = weights.abs().amax(dim=1, keepdim=True) / LARGEST_INT8  # shape (n_output, 1)
