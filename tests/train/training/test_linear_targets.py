@@ -8,11 +8,7 @@ from scipy.optimize import least_squares
 from function_map import FunctionMap
 from isocharge.simulate import Domain, NoiseModel
 from isocharge.train import LabelledPresses
-from isocharge.train.training.contact_training import (
-    LARGEST_LINEAR_STD,
-    LinearTargets,
-    fresh_noise,
-)
+from isocharge.train.training.contact_training import LARGEST_LINEAR_STD, LinearTargets
 
 DOMAIN = Domain(10.0, (0.1, 2.0))
 ELECTRODE_PLACES = 8.0 * np.array([[1, 0], [0, 1], [-1, 0], [0, -1], [0.2, 0.1], [0.9, 0.9]])
@@ -35,9 +31,9 @@ def targets_of(noise, contact=CONTACT):
 
 def draw(targets, noise, rows, seed):
     """Return the enlarged noise of presses, pC, and the changes of their targets, in double precision."""
-    charge = torch.tensor(bell_charges(CONTACT)).float()[rows]
-    drawn = fresh_noise(charge, noise, torch.Generator().manual_seed(seed))
-    enlarged, change, _ = targets.enlarge(drawn, rows)
+    charge = bell_charges(CONTACT)[rows]
+    drawn = noise.sigma(charge) * np.random.default_rng(seed).standard_normal(charge.shape)
+    enlarged, change, _ = targets.enlarge(torch.tensor(drawn).float(), rows)
     return enlarged.double().numpy(), change.double().numpy()
 
 

@@ -49,23 +49,6 @@ MIN_SINE = 0.003
 """Smallest sine of an angle of the correlations in the loss. Smaller sines count as this value."""
 
 
-def fresh_noise(charge: Tensor, noise: Noise, random: torch.Generator) -> Tensor:
-    """Draw normally distributed noise for charges.
-
-    Args:
-        charge: Charges without noise, any shape, pC.
-        noise: White noise and noise of the gains.
-        random: Random number generator.
-
-    Returns:
-        The noise, same shape as the charges, pC.
-    """
-    white = torch.as_tensor(noise.white, dtype=torch.float32)
-    gain = torch.as_tensor(noise.gain, dtype=torch.float32)
-    sigma = torch.hypot(white, gain * charge)
-    return sigma * torch.randn(charge.shape, generator=random)
-
-
 def contact_loss(posterior: Posterior, target: Tensor, error: Tensor) -> Tensor:
     """Compute the loss of the contact perceptron, which is the sum of the losses of its mean and of its covariance.
 
@@ -242,6 +225,8 @@ def contact_stage(
     """
     domain = network.domain
     charge = as_tensor(train.charge)
+    white, gain = (torch.as_tensor(values, dtype=torch.float32) for values in (noise.white, noise.gain))
+    noise_std = torch.hypot(white, gain * charge)
     unit_contact = as_tensor(domain.to_unit(train.contact))
     batch = min(config.batch, len(charge))
 
@@ -253,7 +238,7 @@ def contact_stage(
             random: Random number generator of the batch and of its noise.
         """
         rows = torch.randint(len(charge), (batch,), generator=random)
-        added_noise = fresh_noise(charge[rows], noise, random)
+        added_noise = noise_std[rows] * torch.randn((batch, charge.shape[1]), generator=random)
         contact = unit_contact[rows]
         target = contact
         noise_factor = torch.ones(())
