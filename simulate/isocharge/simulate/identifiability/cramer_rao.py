@@ -31,14 +31,12 @@ class CramerRao:
     @property
     def position(self) -> Array:
         """Smallest root mean square distance between the estimated and the true position, shape (n,), mm."""
-        variance = np.diagonal(self.covariance, axis1=1, axis2=2)
-        return np.sqrt(variance[:, 0] + variance[:, 1])  # x and y
+        return np.sqrt(self.covariance[:, 0, 0] + self.covariance[:, 1, 1])  # x and y
 
     @property
     def force(self) -> Array:
         """Smallest standard deviation of the estimated force, relative to the force, shape (n,), dimensionless."""
-        variance = np.diagonal(self.covariance, axis1=1, axis2=2)
-        return np.sqrt(variance[:, 2])  # ln F
+        return np.sqrt(self.covariance[:, 2, 2])  # ln F
 
 
 def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel, nuisance: Array | None = None) -> CramerRao:

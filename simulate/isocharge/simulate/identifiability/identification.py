@@ -51,7 +51,7 @@ class LimitMap:
 
     Attributes:
         force: Force of all contacts, N.
-        rings: Positions of the contacts.
+        rings: Positions of the contacts, with equal distances between the rings (`Rings.spread`).
         position: Smallest root mean square error of the position, shape (n_ring, n_angle), mm.
         relative_force: Smallest standard deviation of the force divided by the force, shape (n_ring, n_angle),
             dimensionless.
@@ -80,15 +80,17 @@ class LimitMap:
 
         The weight of a position is the area that it represents. Errors of the force are in percent of the force.
         """
-        # The area that a position represents is proportional to its distance from the centre.
-        n_angle = self.position.shape[1]
-        area = np.repeat(self.rings.distance, n_angle)
+        # The area that a position represents is proportional to its distance from the centre, and therefore to the
+        # number of its ring. Each position counts as often in the median.
+        n_ring, n_angle = self.position.shape
+        area = np.repeat(np.arange(1, n_ring + 1), n_angle)
         statistics = {"force_N": self.force}
         for name, errors in (
             ("position_{}_mm", self.position.ravel()),
             ("force_{}_percent", 100.0 * self.relative_force.ravel()),
         ):
-            statistics[name.format("median")] = _median(errors, area)
+            median = np.quantile(np.repeat(errors, area), 0.5, method="inverted_cdf")
+            statistics[name.format("median")] = float(median)
             statistics[name.format("rms")] = float(np.sqrt(np.average(errors**2, weights=area)))
             statistics[name.format("worst")] = float(errors.max())
         return statistics
@@ -310,18 +312,3 @@ def map_to_search(
         except SolveError as error:
             last_error = error
     raise last_error
-
-
-def _median(values: Array, weights: Array) -> float:
-    """Compute the weighted median of values.
-
-    The values up to the weighted median have half of the total weight.
-
-    Args:
-        values: Values, shape (n,).
-        weights: Positive weights of the values, shape (n,).
-    """
-    order = np.argsort(values)
-    cumulative_weight = np.cumsum(weights[order])
-    middle = np.searchsorted(cumulative_weight, 0.5 * cumulative_weight[-1])
-    return float(values[order][middle])
