@@ -98,13 +98,13 @@ def bounded_step(point: Array, residual: Array, slopes: Array, damping: Array) -
     trace = np.trace(matrix, axis1=1, axis2=2)[:, None, None] + 1e-12
     matrix = matrix + damping[:, None, None] * trace * np.eye(3) / 3.0
 
-    # The equations change only for points on an edge of D. The normals of the circle and of the end of the interval are
-    # (x, y, 0) and (0, 0, z), because the coordinates of a point on an edge have these lengths.
-    normals = point[:, None] * np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])  # shape (n, 2, 3)
-    normals[np.linalg.norm(normals, axis=2) <= 1.0 - ROUNDING] = 0.0
-    edge = np.flatnonzero(normals.any(axis=(1, 2)))
-    if edge.size:
-        matrix[edge], gradient[edge] = _along_edges(normals[edge], matrix[edge], gradient[edge], trace[edge])
+    # The equations change only for points on the circle or at an end of the interval, which are the edges of D.
+    is_on_edge = np.column_stack([np.hypot(point[:, 0], point[:, 1]), np.abs(point[:, 2])]) > 1.0 - ROUNDING
+    rows = np.flatnonzero(is_on_edge.any(axis=1))
+    if rows.size:
+        # The normals are (x, y, 0) and (0, 0, z), because the coordinates of a point on an edge have these lengths.
+        normals = point[rows, None] * np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) * is_on_edge[rows, :, None]
+        matrix[rows], gradient[rows] = _along_edges(normals, matrix[rows], gradient[rows], trace[rows])
     return into_unit_domain(point - np.linalg.solve(matrix, gradient[..., None])[..., 0])
 
 
