@@ -145,8 +145,8 @@ def solve_even(
     even_values = prior.even(problem.prior.mean[layout.film] if values is None else values)
     film = solve_even_map(prior, even_values, problem.solved_domain, executor)
     larger_probe = None
-    if PROBE_RADIUS in prior.names:
-        is_radius = np.arange(len(even_values)) == prior.index(PROBE_RADIUS)
+    is_radius = np.array(prior.names) == PROBE_RADIUS
+    if is_radius.any():
         larger_values = even_values + STEP * prior.std * is_radius
         larger_probe = solve_even_map(prior, larger_values, problem.solved_domain, executor)
     return FilmCharges(prior, even_values, film, FilmSlopes.build(film, executor=executor), larger_probe)

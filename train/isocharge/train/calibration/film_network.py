@@ -9,7 +9,6 @@ follower know what is uncertain. The nodes of the map are films with other prete
 calibrated film, times the ratio of the charges of nearly axisymmetric films with both pretensions.
 """
 
-import hashlib
 import logging
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -17,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.common.files import sha256_of
 from isocharge.serve.model.charge_series import CHUNK_SIZE, ChargeSeries, series_size
 from isocharge.serve.presses.measured_presses import CONTACT
 from isocharge.simulate import Domain, FilmSlopes, Sweep
@@ -224,7 +224,7 @@ def training_data(
         probes=(charges.prior.probe.rotated_notation,),
         domain=domain,
         presses=LabelledPresses(contact, charge),
-        sha256=hashlib.sha256(charge.tobytes()).hexdigest(),
+        sha256=sha256_of(charge.tobytes()),
         outside=_outside_presses(charges, domain, executor),
         yield_force_N=yield_force(sensor.film, [probe], domain.force_range),
         field=series.calibrated_series,

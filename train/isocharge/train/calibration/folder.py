@@ -271,7 +271,7 @@ def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[No
 
 
 def _copy_last_version(folder: Path) -> None:
-    """Copy the readable files of the last version to the folder of the calibration, if the copies are not up to date.
+    """Copy the readable files of the last version to the folder of the calibration.
 
     Args:
         folder: Folder of the calibration, which contains the version folders.
@@ -281,11 +281,7 @@ def _copy_last_version(folder: Path) -> None:
         return
     last_version = calibrated_versions[-1]
     for name in (SENSOR, PICTURE, CARD, RESULT):
-        content = (last_version / name).read_bytes()
-        copy = folder / name
-        is_up_to_date = copy.is_file() and copy.read_bytes() == content
-        if not is_up_to_date:
-            write_whole(copy, content)
+        write_whole(folder / name, (last_version / name).read_bytes())
 
 
 def _calibrated_versions(folder: Path) -> list[Path]:
