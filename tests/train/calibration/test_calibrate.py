@@ -10,7 +10,7 @@ from tests.train.calibration.conftest import rig
 from tests.train.calibration.synthetic_film import SyntheticFilm
 
 from isocharge.common.errors import PressError, SceneError, SensorError
-from isocharge.simulate import Circle, load_sensor
+from isocharge.simulate import Circle, NoiseModel, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, next_presses
 from isocharge.train.calibration import calibrate as calibrate_module
 from solved_charges import with_film
@@ -182,6 +182,20 @@ def test_proposed_presses_reduce_the_errors_as_announced(problem, synthetic):
         _, _, presses = rig(problem, synthetic, 6, seed, values=problem.prior.layout.prior.mean)
         random_errors.append(fit(presses, problem, synthetic).film_error.position_mm)
     assert chosen < np.mean(random_errors)
+
+
+def test_errors_that_are_announced_after_noisy_presses_contain_the_noise(problem, synthetic):
+    """With the noise of a good amplifier, the announced errors would be a tenth too small."""
+    noisy = replace(problem, noise=NoiseModel("bench", 1.0, 0.016))
+    values, _, presses = rig(noisy, synthetic, 12, seed=22)
+    proposed = next_presses(problem, synthetic, 8, fit(presses, problem, synthetic).film)
+    further = np.array([press.contact for press in proposed])
+    charge = noisy.noise.add(synthetic.charges(values, further), np.random.default_rng(23))
+    all_presses = measured_presses(
+        problem, np.vstack([presses.contact, further]), np.vstack([presses.charge_pC, charge])
+    )
+    after = fit(all_presses, problem, synthetic).film_error
+    assert proposed[-1].position_mm == pytest.approx(after.position_mm, rel=0.05)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ chosen before any charge is measured. Several presses are chosen one after the o
 Pukelsheim 1993).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -144,11 +144,11 @@ def next_presses(
         problem: The calibration problem.
         charges: Charges of a film and of similar films.
         count: Number of presses.
-        film: Estimate of the film; None before the first press.
+        film: Estimate of the film and of the noise; None before the first press.
         position_std_mm: Standard deviation of the positions, mm.
         force_std: Relative standard deviation of the forces.
     """
-    film = replace(film or problem.film_before, noise=problem.noise)
+    film = film or problem.film_before
     covariance = film.covariance
     candidates = _candidates(problem)
     contact_std = (position_std_mm, position_std_mm, force_std)
