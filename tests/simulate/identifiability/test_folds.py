@@ -125,11 +125,7 @@ def test_find_folds_finds_a_fold_smaller_than_the_rings():
         return x - 2.0 * (x - at[0]) * bump
 
     model = shaped_charges(pocket, lambda _, y: y)
-    rings = Rings.spread(5.0, 25, 40)
-    scaled = rings.per_ring(scaled_derivatives(model, rings.contacts(1.0), REFERENCE))
-    assert not has_reversed_orientation(scaled[:-1], scaled[1:]).any()
-    assert not has_reversed_orientation(scaled, np.roll(scaled, -1, axis=1)).any()
-    points = folds_of(model, rings)
+    points = folds_of(model, Rings.spread(5.0, 25, 40))
     assert len(points)
     assert np.hypot(*(points - at).T).max() < 2.0 * width
 
@@ -157,8 +153,6 @@ def test_find_folds_finds_nothing_in_a_sharply_bent_map():
     """
     bend = 0.2
     model = shaped_charges(lambda x, _: bend * np.cos(x / bend), lambda x, _: bend * np.sin(x / bend), lambda _, y: y)
-    near, far = (scaled_derivatives(model, np.array([[x, 0.0, 1.0]]), REFERENCE) for x in (-0.2, 0.2))
-    assert has_reversed_orientation(near, far)
     for rings in (Rings.spread(0.5, 2, 8), Rings.spread(0.5, 20, 40)):
         assert len(folds_of(within(model, 0.5), rings)) == 0
 

@@ -18,7 +18,6 @@ from isocharge.serve.signal_chain.gain import Gain
 from isocharge.serve.signal_chain.hum import Hum
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.signal_chain.thermal import ThermalRule
-from isocharge.serve.signal_chain.touch import TouchRule
 from isocharge.train.export_c.folder import device_header
 from stage_runner import StageRunner
 
@@ -174,9 +173,6 @@ def test_c_and_python_give_the_same_charges_and_states_for_each_frame(board, bui
         assert np.mean(flags != expected_flags) <= max_share_of_other_flags
         np.testing.assert_allclose(charge, expected_charge, rtol=0, atol=tolerance_pC)
         np.testing.assert_allclose(tare, expected_tare, rtol=0, atol=tolerance_pC)
-        assert expected_contact.mean() > 0.05
-        release_count = np.count_nonzero(np.diff(expected_contact.astype(int)) < 0)
-        assert release_count >= 3 or device(board).rule(TouchRule) is None
 
 
 @pytest.mark.parametrize("board", ["any board", "hum"])

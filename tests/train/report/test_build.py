@@ -75,13 +75,16 @@ def test_presses_without_an_estimate_are_left_out_of_the_errors():
     assert contact_errors(np.full((10, 3), np.nan), truth) == (0.0, {})
 
 
-def test_picture_has_a_panel_for_each_dataset_with_the_evaluated_model_as_a_star():
-    def section(limits):
-        entries = [{"errors": {"position_rms_mm": error_mm}} for error_mm in (0.1, 0.2)] + [{"errors": {}}]
-        records = [evaluation.MethodRecord("method", "", 1.0, entry["errors"], 8.0) for entry in entries]
-        return evaluation.Section("film", False, [], 8.0, (0.05, 2.0), "", "", 1, 1, limits, records, [])
+def section_of(methods, *, is_measured=False, limits=()):
+    """Return the section of methods with given errors, each a dictionary, on a film of 48 presses."""
+    records = [evaluation.MethodRecord("method", "", 1.0, errors, 8.0) for errors in methods]
+    return evaluation.Section("film", is_measured, [], 8.0, (0.05, 2.0), "", "", 48, 12, dict(limits), records, [])
 
-    simulated, measured = page.draw_speed([section({"position_rms_mm": 0.05}), section({})]).axes
+
+def test_picture_has_a_panel_for_each_dataset_with_the_evaluated_model_as_a_star():
+    methods = [{"position_rms_mm": 0.1}, {"position_rms_mm": 0.2}, {}]
+    sections = [section_of(methods, limits={"position_rms_mm": 0.05}), section_of(methods)]
+    simulated, measured = page.draw_speed(sections).axes
     *points, limit = simulated.lines
     assert [point.get_marker() for point in points] == ["*", "o"]
     assert [point.get_ydata()[0] for point in points] == [0.1, 0.2]
@@ -90,11 +93,10 @@ def test_picture_has_a_panel_for_each_dataset_with_the_evaluated_model_as_a_star
 
 
 def test_page_does_not_describe_methods_that_are_left_out():
-    record = evaluation.MethodRecord("network", "", 1.0, {"position_rms_mm": 0.1}, 8.0)
-    section = evaluation.Section("film", True, [], 8.0, (0.05, 2.0), None, "", 48, 12, {}, [record], ["too few"])
-    assert "Triangulation" not in page.report_page([section], evaluation.QUICK, {}, "")
-    complete = replace(section, methods=[record, record])
-    assert "fitted to the other 48 presses" in page.report_page([complete], evaluation.QUICK, {}, "")
+    for count, is_described in ((1, False), (2, True)):
+        section = section_of(count * [{"position_rms_mm": 0.1}], is_measured=True)
+        text = page.report_page([section], evaluation.QUICK, {}, "")
+        assert ("Triangulation" in text) == ("fitted to the other 48 presses" in text) == is_described
 
 
 def with_one_position(dataset):

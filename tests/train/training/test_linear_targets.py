@@ -57,7 +57,6 @@ def test_targets_are_the_least_squares_estimates_of_the_charges_with_noise(gain)
     noisy = bell_charges(CONTACT) + 0.25 * enlarged
     estimates = [nonlinear_estimate(charge, std) for charge, std in zip(noisy, noise_std, strict=True)]
     change = np.array(estimates) - DOMAIN.to_unit(CONTACT)
-    assert np.abs(change).max() > 1e-3  # the noise changes the estimates clearly
     np.testing.assert_allclose(0.25 * target_change, change, rtol=0.05, atol=2e-5)
 
 
