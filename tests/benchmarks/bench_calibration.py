@@ -172,7 +172,6 @@ def film_results(bench: Bench, counts: list[int], *, has_all_cases: bool) -> dic
         result, predictor = bench.calibrated(bench.contact[:count], bench.charge[:count])
         answers = [predictor.predict(row) for row in charge]
         results[f"{count} presses"] = errors(answers, truth)
-        report_progress(f"{count} presses", results[f"{count} presses"])
     if not has_all_cases:
         return results
 

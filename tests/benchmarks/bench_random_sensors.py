@@ -1,7 +1,6 @@
 """Train a network for sensors drawn at random, and compare its errors with the Bayes limit of each sensor.
 
-    python tests/benchmarks/bench_random_sensors.py [--sensors 20] [--first 0] [--presses 600] [--samples 24000]
-        [--json]
+    python tests/benchmarks/bench_random_sensors.py [--sensors 20] [--json]
 
 A sensor has three to eight electrodes on one or two rings, a film of 5 to 200 um with a pretension of up to 2 MPa, and
 a round probe with a radius of 1 to 12 mm. Each network is trained with the default configuration on simulated presses
@@ -73,26 +72,24 @@ def describe(sensor: Sensor, probe: Circle) -> dict[str, Any]:
     }
 
 
-def measure(sensor: Sensor, probe: Circle, n_sample: int, n_press: int) -> dict[str, Any]:
+def measure(sensor: Sensor, probe: Circle) -> dict[str, Any]:
     """Train a network for a sensor, and return its errors over the limit.
 
     Args:
         sensor: The sensor.
         probe: The probe.
-        n_sample: Number of presses for training.
-        n_press: Number of presses on which the errors are measured.
 
     Raises:
         IsochargeError: If the sensor is refused.
     """
     charge_map = ForwardMap.build(sensor, probe, DEFAULT_RADIUS, DEFAULT_FORCE_RANGE)
-    data = training_data(charge_map, n_sample)
+    data = training_data(charge_map, 24_000)
     started = time.process_time()
     fitted = fit(data)
     seconds = time.process_time() - started
 
     radius = fitted.domain.radius
-    truth = Sweep(radius, DEFAULT_FORCE_RANGE, n_press, 1).contacts()
+    truth = Sweep(radius, DEFAULT_FORCE_RANGE, 600, 1).contacts()
     charge = NOISE.add(charge_map.charges(truth), np.random.default_rng(2))
     estimate, _, _ = fitted.predict(charge)
     limit_estimate, _ = Posterior(ChargeSpline.of(charge_map), NOISE, radius).mean_and_std(charge)
@@ -105,13 +102,13 @@ def measure(sensor: Sensor, probe: Circle, n_sample: int, n_press: int) -> dict[
 
 def main() -> None:
     """Train for all sensors and print a row for each."""
-    options = arguments(__doc__, sensors=20, first=0, presses=600, samples=24_000, json=False)
+    options = arguments(__doc__, sensors=20, json=False)
     rows: dict[str, dict[str, Any]] = {}
-    for number in range(options.first, options.first + options.sensors):
+    for number in range(options.sensors):
         sensor, probe = random_sensor(number)
         row = describe(sensor, probe)
         try:
-            row |= measure(sensor, probe, options.samples, options.presses)
+            row |= measure(sensor, probe)
         except IsochargeError as error:
             row["refused"] = str(error)
         rows[sensor.name] = row

@@ -1,6 +1,6 @@
 """100,000 labelled presses: wall time, memory, and the error of the charges against direct solves.
 
-    python tests/benchmarks/bench_sweep.py [--samples 100000] [--workers 2] [--checks 60] [--seed 0] [--json]
+    python tests/benchmarks/bench_sweep.py [--json]
 
 Three probes within 10 mm of the centre, 0.05 to 2 N, turned at random, as `isocharge simulate sweep` makes them, from
 the call to the finished dataset: start of the workers, solves, evaluation, checksums. Memory is the peak of the parent
@@ -34,6 +34,10 @@ from isocharge.simulate import (
 from isocharge.simulate.execution import in_order
 
 PROBES = ("circle:1.0", "rectangle:4.0x2.0", "triangle:4.0")
+SAMPLES = 100_000
+CHECKS = 20
+"""Number of presses of each probe that are compared with direct solves."""
+
 FINER = Resolution(order=7, around=8, rings=7, rim=2)
 
 
@@ -47,23 +51,23 @@ def relative_error(dataset: Dataset, row: int) -> np.ndarray:
 
 
 def main() -> None:
-    options = arguments(__doc__, sensor="four-25um-biaxial", samples=100_000, workers=2, checks=60, seed=0, json=False)
-    sensor, sweep = load_sensor(options.sensor), Sweep(10.0, (0.05, 2.0), options.samples, options.seed, "random")
+    options = arguments(__doc__, json=False)
+    sensor, sweep = load_sensor("four-25um-biaxial"), Sweep(10.0, (0.05, 2.0), SAMPLES, 0, "random")
     began, solved_at = time.perf_counter(), []
 
     def listener(title: str, *_) -> None:
         if title == "pressing":
             solved_at.append(time.perf_counter())
 
-    with tempfile.TemporaryDirectory() as folder, local_workers(options.workers) as executor:
+    with tempfile.TemporaryDirectory() as folder, local_workers(2) as executor:
         with listening(listener):
             run_sweep(Path(folder) / "presses", sensor, [*map(parse_probe, PROBES)], sweep, executor=executor)
         seconds, dataset = time.perf_counter() - began, read_dataset(Path(folder) / "presses")
     parent, worker = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     rng, errors = np.random.default_rng(1), {}
-    with local_workers(options.workers) as executor:
+    with local_workers(2) as executor:
         for name in PROBES:
-            rows = rng.permutation(np.flatnonzero(dataset.samples.probe == name))[: options.checks // len(PROBES)]
+            rows = rng.permutation(np.flatnonzero(dataset.samples.probe == name))[:CHECKS]
             errors[name] = np.max([*in_order(executor, partial(relative_error, dataset), rows.tolist())])
     result = {
         "seconds": seconds,

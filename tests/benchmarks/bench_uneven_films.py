@@ -5,7 +5,7 @@ and compares some of them with direct solves. The error of a charge is relative 
 tenth of the largest charge of the press if this is larger. A probe that is not round either keeps its orientation or
 has random orientations.
 
-    python tests/benchmarks/bench_uneven_films.py [--probe circle:1.0] [--presses 20] [--json]
+    python tests/benchmarks/bench_uneven_films.py [--presses 20] [--json]
 """
 
 import time
@@ -48,14 +48,12 @@ def direct_errors(forward_map: ForwardMap, sensor: Sensor, orientation: Orientat
 
 
 def main() -> None:
-    options = arguments(__doc__, probe="", presses=20, json=False)
-    probes = [options.probe] if options.probe else PROBES
-
+    options = arguments(__doc__, presses=20, json=False)
     built_in = load_sensor("four-25um-biaxial")
     sensor = replace(built_in, film=replace(built_in.film, oval=0.01, **TENSION, **MODULI))
     rows = {}
     with ProcessPoolExecutor(2) as executor:
-        for notation, orientation in product(probes, get_args(Orientation)):
+        for notation, orientation in product(PROBES, get_args(Orientation)):
             probe = parse_probe(notation)
             if probe.is_axisymmetric and orientation == "random":
                 continue

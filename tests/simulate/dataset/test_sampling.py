@@ -31,8 +31,7 @@ def test_presses_lie_within_the_ranges_and_have_the_requested_number(sweep, coun
     assert low <= force.min() <= force.max() <= high
     assert 0.0 <= presses.rotation.min() <= presses.rotation.max() < 2.0 * np.pi
     assert sweep.orientation == "random" or not presses.rotation.any()
-    assert len(presses) == len(presses.contact) == len(presses.rotation)
-    assert len(presses) == sweep.samples
+    assert len(presses) == len(presses.contact) == len(presses.rotation) == sweep.samples
     np.testing.assert_array_equal(presses.probe, np.arange(sweep.samples) % count)
 
 

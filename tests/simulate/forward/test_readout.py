@@ -122,20 +122,6 @@ def test_a_trace_collects_the_stress_under_it(film, at):
     assert charge[0] == pytest.approx(expected, rel=1e-4)
 
 
-def test_concave_electrode_equals_the_sum_of_two_rectangles(solved):
-    dented = Electrode("A", ((8.0, 0.0), (12.0, 0.0), (12.0, 1.0), (9.0, 1.0), (9.0, 4.0), (8.0, 4.0)))
-    lying = Electrode("A", ((8.0, 0.0), (12.0, 0.0), (12.0, 1.0), (8.0, 1.0)))
-    standing = Electrode("B", ((8.0, 1.0), (9.0, 1.0), (9.0, 4.0), (8.0, 4.0)))
-    union = replace(lying, more=(standing.corners,))
-    for charge, tolerance in (
-        (lambda sensor: touch_charge(sensor, solved), 1e-6),
-        (lambda sensor: charge_of(sensor, lambda x, y: (x**2 - y, x * y, 0 * x), 4), 1e-12),
-        (lambda sensor: contact_charge(sensor, Circle(1.5), (9.2, 1.1), 1.0), 1e-12),
-    ):
-        one, other, parts = (charge(with_d33(electrodes=e)) for e in ((dented,), (union,), (lying, standing)))
-        np.testing.assert_allclose([one[0], other[0]], parts.sum(), rtol=tolerance)
-
-
 def test_pressure_and_thermal_charge_only_where_front_and_back_overlap():
     """The back metal covers the square only, so the trace collects no charge."""
     square = Electrode.of_square("A", (10.0, 0.0), 3.0)

@@ -27,9 +27,7 @@ def test_parse_probe_reads_circles(text, radius):
     ("text", "outline"),
     [
         ("rectangle:4.0x2.0", [2 + 1j, -2 + 1j, -2 - 1j, 2 - 1j]),
-        ("rectangle:4x2@90", [-1 + 2j, -1 - 2j, 1 - 2j, 1 + 2j]),
         ("triangle:3", [np.sqrt(3) * 1j, -1.5 - np.sqrt(3) / 2 * 1j, 1.5 - np.sqrt(3) / 2 * 1j]),
-        ("triangle:3@-30", np.sqrt(3) * np.exp(2j * np.pi * np.array([1, 3, 5]) / 6)),
         ("polygon:0,0;3,0;0,3", [-1 - 1j, 2 - 1j, -1 + 2j]),
         ("polygon:-1,-1;1,-1;1,1;-1,1@45", np.sqrt(2) * np.array([-1j, 1, 1j, -1])),
     ],
