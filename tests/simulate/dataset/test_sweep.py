@@ -28,6 +28,7 @@ from isocharge.simulate.dataset.sweep import outside_map, solve_maps, write_swee
 from isocharge.simulate.forward.family import NodeCount
 from solved_charges import solved_charge
 
+PROBE = Circle(1.0)
 SENSOR = load_sensor("three-25um-biaxial")
 
 
@@ -69,7 +70,7 @@ def test_samples_contain_the_presses_and_their_charges(small_dataset):
         np.testing.assert_array_equal(column, expected)
     assert set(read.samples.probe) == {"circle:1.0"}
     for i in (0, 123, 499):
-        expected = solved_charge(read.sensor, Circle(1.0), (x[i], y[i]), force[i])
+        expected = solved_charge(read.sensor, PROBE, (x[i], y[i]), force[i])
         np.testing.assert_allclose(read.samples.charge_pC[i], expected, rtol=1e-3)
 
 
@@ -98,7 +99,7 @@ def test_presses_outside_the_radius_reach_up_to_the_clamp(small_dataset):
     assert np.mean(distance < 25.0) == pytest.approx((25.0**2 - 8.0**2) / (42.8**2 - 8.0**2), abs=1e-3)
     assert np.mean(outside.force_N < np.sqrt(0.05 * 2.0)) == pytest.approx(0.5, abs=1e-3)
     for i in np.flatnonzero(distance < 30.0)[:3]:
-        expected = solved_charge(read.sensor, Circle(1.0), (outside.x_mm[i], outside.y_mm[i]), outside.force_N[i])
+        expected = solved_charge(read.sensor, PROBE, (outside.x_mm[i], outside.y_mm[i]), outside.force_N[i])
         np.testing.assert_allclose(outside.charge_pC[i], expected, rtol=5e-3)
     about = read.manifest["outside"]
     assert (about["samples"], about["probe"], about["radius_mm"]) == (16_384, "circle:1.0", [8.0, 42.8])
@@ -109,17 +110,17 @@ def test_presses_outside_the_radius_reach_up_to_the_clamp(small_dataset):
 @pytest.mark.parametrize("changes", [{"outside": 0}, {"radius": 42.0}])
 def test_a_sweep_without_presses_outside(changes):
     """No presses are requested, or the ring between the radius and the clamp is narrower than a millimetre."""
-    assert outside_map(SENSOR, (Circle(1.0),), small(**changes)) is None
+    assert outside_map(SENSOR, (PROBE,), small(**changes)) is None
 
 
 def test_run_sweep_writes_the_same_bytes_as_write_sweep_and_reports_progress(tmp_path):
     """`run_sweep` stores its parts in a draft, and `write_sweep` does not. The datasets are equal."""
     reports: dict[str, list] = {}
     with listening(lambda title, done, total, _: reports.setdefault(title, []).append((done, total))):
-        drafted = run_sweep(tmp_path / "b" / "presses", SENSOR, (Circle(1.0),), small(), COARSE)
-    maps = [ForwardMap.build(SENSOR, Circle(1.0), 3.0, (1.0, 1.0), COARSE)]
+        drafted = run_sweep(tmp_path / "b" / "presses", SENSOR, (PROBE,), small(), COARSE)
+    maps = [ForwardMap.build(SENSOR, PROBE, 3.0, (1.0, 1.0), COARSE)]
     with pytest.raises(SceneError, match="one forward map of this sensor for each probe"):
-        run_sweep(tmp_path / "c", SENSOR, (Circle(1.0), Circle(2.0)), small(), maps=maps)
+        run_sweep(tmp_path / "c", SENSOR, (PROBE, Circle(2.0)), small(), maps=maps)
     assert len(read_dataset(drafted).outside) == 50
     assert files(drafted) == files(write_sweep(tmp_path / "a" / "presses", maps, small()))
     assert [path.name for path in drafted.parent.iterdir()] == ["presses"]
@@ -169,7 +170,7 @@ def test_maps_of_a_sweep_on_an_uneven_film_allow_its_orientations(monkeypatch, o
 def test_shards_of_a_probe_with_many_corners_fit_into_a_file():
     angle = 2.0 * np.pi * np.arange(60) / 60
     polygon = Polygon.of(np.stack([1.3 * np.cos(angle), np.sin(angle)], axis=1))
-    rows = sweep_module._shard_size([Circle(1.0), polygon], sweep_module.SHARD_SIZE)
+    rows = sweep_module._shard_size([PROBE, polygon], sweep_module.SHARD_SIZE)
     assert 1000 < rows < sweep_module.SHARD_SIZE
     assert np.full(rows, polygon.notation).nbytes < 2**26
-    assert sweep_module._shard_size([Circle(1.0)], sweep_module.SHARD_SIZE) == sweep_module.SHARD_SIZE
+    assert sweep_module._shard_size([PROBE], sweep_module.SHARD_SIZE) == sweep_module.SHARD_SIZE

@@ -30,6 +30,8 @@ from isocharge.simulate.forward.forward_map import INTERPOLATION_ERROR
 from kept import kept
 from solved_charges import relative_error, solved_charge, solved_charges, with_film, with_piezo
 
+BIAXIAL = load_sensor("four-25um-biaxial")
+PROBE = Circle(1.0)
 QUICK = {"radius": 4.0, "force_range": (0.7, 1.0), "settings": COARSE}
 """A small family without bending: few and cheap solves."""
 TRACED = Electrode.of_square("A", (5.0, 0.0), 3.0).with_trace(((5.0, 0.0), (-2.0, -1.0), (-9.0, -30.0)), 0.5)
@@ -103,8 +105,8 @@ def test_footprint_grows_with_the_cube_root_of_the_force(near_electrodes):
     "changes",
     [
         {"readout": "edge"},
-        {"piezo": load_sensor("four-25um-biaxial").piezo},
-        {"calibration": replace(load_sensor("four-25um-biaxial").calibration, shift=(0.5, -0.3), rotation=0.1)},
+        {"piezo": BIAXIAL.piezo},
+        {"calibration": replace(BIAXIAL.calibration, shift=(0.5, -0.3), rotation=0.1)},
         {"electrodes": (TRACED, Electrode.of_square("B", (0.0, 5.0), 3.0))},
     ],
     ids=["edge", "biaxial", "calibrated", "traces"],
@@ -135,7 +137,7 @@ FILMS = {
 def test_forward_map_of_other_films(near_electrodes, film, surface, theory):
     sensor = replace(with_film(near_electrodes, **film), surface=surface)
     settings = replace(COARSE, theory=theory)
-    forward_map = ForwardMap.build(sensor, Circle(1.0), 2.0, (0.8, 1.0), settings)
+    forward_map = ForwardMap.build(sensor, PROBE, 2.0, (0.8, 1.0), settings)
     assert forward_map.theory.bending == (film != {"pretension": 0.5})
     assert errors(forward_map, draw(forward_map, 4, seed=7)[0]).max() < 1e-3
 
@@ -157,7 +159,7 @@ def test_orientations_that_are_not_finite_are_refused(three_map):
 
 def test_derivatives_of_a_map_with_a_single_force_are_refused(near_electrodes):
     single = QUICK | {"force_range": (1.0, 1.0)}
-    forward_map = kept(ForwardMap.build, near_electrodes, Circle(1.0), **single)
+    forward_map = kept(ForwardMap.build, near_electrodes, PROBE, **single)
     with pytest.raises(SceneError, match=r"one of the force 1 N; build a map from 0\.9 to 1\.1 N"):
         forward_map.derivatives(np.array([[1.0, 0.0, 1.0]]))
 
@@ -166,7 +168,7 @@ def test_derivatives_of_a_map_with_a_single_force_are_refused(near_electrodes):
 def test_forward_map_reaches_40_mm_on_a_taut_film_of_45_mm():
     """Near the clamp the fields change over the distance from the press to the clamp."""
     sensor = load_sensor("eight-25um-biaxial-36mm")
-    forward_map = kept(ForwardMap.build, sensor, Circle(1.0), 40.0, (1.0, 1.0))
+    forward_map = kept(ForwardMap.build, sensor, PROBE, 40.0, (1.0, 1.0))
     assert forward_map.error <= INTERPOLATION_ERROR
     contact = np.array([[39.9, 0.9, 1.0], [-20.0, 34.2, 1.0], [0.7, -0.4, 1.0]])
     assert errors(forward_map, contact).max() < 1e-3
@@ -192,7 +194,7 @@ def test_charges_of_many_presses_equal_those_of_single_presses(three_map, orient
 )
 def test_invalid_domains_raise_error(arguments, message):
     with pytest.raises(SceneError, match=message):
-        ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1.0), **arguments)
+        ForwardMap.build(load_sensor("three-25um-biaxial"), PROBE, **arguments)
 
 
 def test_unreachable_interpolation_error_raises_solve_error(monkeypatch):
@@ -200,7 +202,7 @@ def test_unreachable_interpolation_error_raises_solve_error(monkeypatch):
     monkeypatch.setattr("isocharge.simulate.forward.family.NODE_COUNTS", NODE_COUNTS[:2])
     settings = replace(COARSE, resolution=Resolution(3, 8, 2))
     with pytest.raises(SolveError, match=r"up to 4 mm and 1 N interpolates to .* only, expected 1e-13"):
-        ForwardMap.build(load_sensor("three-25um-biaxial"), Circle(1.0), **{**QUICK, "settings": settings})
+        ForwardMap.build(load_sensor("three-25um-biaxial"), PROBE, **{**QUICK, "settings": settings})
 
 
 @pytest.mark.parametrize(("error", "tried"), [(0.5, [0, 2]), (1.5 * INTERPOLATION_ERROR, [0, 1])])
@@ -216,7 +218,7 @@ def test_next_number_of_nodes_is_skipped_if_the_error_is_very_large(near_map, mo
     monkeypatch.setattr(ForwardMap, "build_unchecked", build_unchecked)
     monkeypatch.setattr(forward_map_module, "node_counts", lambda _: counts)
     monkeypatch.setattr(forward_map_module, "relative_error", lambda *_: error if len(built) == 1 else 0.0)
-    ForwardMap.build(near_map.sensor, Circle(1.0), **QUICK)
+    ForwardMap.build(near_map.sensor, PROBE, **QUICK)
     assert built == tried
 
 
@@ -238,7 +240,7 @@ UNEVEN_FILMS = {
         ),
         pytest.param(UNEVEN_FILMS["moduli"], Polygon.triangle(2.5), "fixed", marks=pytest.mark.slow),
         pytest.param(UNEVEN_FILMS["moduli"], Polygon.triangle(2.5), "random", marks=pytest.mark.slow),
-        *(pytest.param(changes, Circle(1.0), "fixed", marks=pytest.mark.slow) for changes in UNEVEN_FILMS.values()),
+        *(pytest.param(changes, PROBE, "fixed", marks=pytest.mark.slow) for changes in UNEVEN_FILMS.values()),
     ],
 )
 def test_maps_of_films_that_are_not_axisymmetric_agree_with_direct_solves(near_electrodes, changes, probe, orientation):
@@ -250,7 +252,7 @@ def test_maps_of_films_that_are_not_axisymmetric_agree_with_direct_solves(near_e
     assert errors(forward_map, contact, rotation if orientation == "random" else 0.0).max() < 1e-3
 
 
-@pytest.mark.parametrize(("probe", "solves"), [(Circle(1.0), 7), (Ellipse(2.0, 1.4), 5), (Polygon.triangle(2.5), 9)])
+@pytest.mark.parametrize(("probe", "solves"), [(PROBE, 7), (Ellipse(2.0, 1.4), 5), (Polygon.triangle(2.5), 9)])
 def test_a_probe_that_keeps_its_orientation_needs_few_turns(near_electrodes, probe, solves):
     """Nine harmonics of the rotation: an ellipse and the film are the same after half a turn, a triangle is not."""
     film = with_film(near_electrodes, **UNEVEN_FILMS["tension"]).film
@@ -273,8 +275,8 @@ def test_rotation_of_a_probe_whose_map_has_its_own_orientation_is_refused(near_e
 @pytest.mark.slow
 def test_taut_film_with_a_ratio_of_three_between_its_pretensions_is_interpolated():
     """Under a small force, the pretension alone determines the charges, and they contain many harmonics."""
-    taut = with_film(load_sensor("four-25um-biaxial"), pretension=2.4, deviator=(1.2, 0.0))
-    assert ForwardMap.build(taut, Circle(1.0), 8.0, (0.05, 0.05)).error <= INTERPOLATION_ERROR
+    taut = with_film(BIAXIAL, pretension=2.4, deviator=(1.2, 0.0))
+    assert ForwardMap.build(taut, PROBE, 8.0, (0.05, 0.05)).error <= INTERPOLATION_ERROR
 
 
 def test_derivatives_of_a_small_sensor_are_those_of_a_large_one_in_other_units(near_map):
@@ -299,7 +301,7 @@ def test_derivatives_of_a_small_sensor_are_those_of_a_large_one_in_other_units(n
 @pytest.mark.slow
 def test_derivatives_under_a_narrow_probe_are_those_of_direct_solves():
     """The electrode has more integration points in a direct solve, so its differences allow short steps."""
-    sensor = replace(load_sensor("four-25um-biaxial"), electrodes=(Electrode.of_square("A", (0.0, 3.0), 2.0),))
+    sensor = replace(BIAXIAL, electrodes=(Electrode.of_square("A", (0.0, 3.0), 2.0),))
     narrow = kept(ForwardMap.build, sensor, Ellipse(2.0, 0.1), 3.5, (0.9, 1.1), COARSE)
     contact = np.array([[-0.11, 3.12, 1.0], [0.19, 3.29, 1.0], [0.55, 3.2, 1.0]])
     solved = partial(solved_charges, sensor, narrow.probe, settings=narrow.settings)

@@ -31,6 +31,7 @@ from isocharge.simulate.forward.readout import (
 from isocharge.simulate.numerics.polygon import to_corners
 from solved_charges import with_film
 
+PROBE = Circle(1.0)
 UNIAXIAL = load_sensor("four-25um-uniaxial")
 AREA = 9.0
 D31 = 20.0
@@ -42,7 +43,7 @@ def charge_of(sensor: Sensor, stress, per_side: int = 12) -> np.ndarray:
     """Charges under a made-up stress field, a function of x and y that returns (s11, s22, s12)."""
     pieces = ElectrodePieces.of(sensor)
     charge = np.zeros(len(sensor.electrodes))
-    for rule in pieces.rules(Circle(1.0), np.zeros(1), (per_side, per_side)):
+    for rule in pieces.rules(PROBE, np.zeros(1), (per_side, per_side)):
         values = np.broadcast_arrays(*stress(rule.points.real, rule.points.imag))
         np.add.at(charge, pieces.electrode[rule.piece], pieces.charge(rule, np.stack(values, axis=-1)))
     return charge
@@ -95,7 +96,7 @@ def test_edges_of_a_turned_pattern_are_those_of_the_same_squares(solved):
 
 @pytest.fixture(scope="module")
 def solved(film) -> Equilibrium:
-    return press(film, Circle(1.0), (4.0, 3.0), 1.0)
+    return press(film, PROBE, (4.0, 3.0), 1.0)
 
 
 # Traces, concave electrodes, and metal on the back
@@ -113,7 +114,7 @@ def test_a_trace_collects_the_stress_under_it(film, at):
     """The charge of a square with a bent trace equals the sum over small cells of its three rectangles."""
     path = ((10.0, 0.0), (18.0, 0.0), (18.0, 20.0))
     traced = Electrode.of_square("A", (10.0, 0.0), 3.0).with_trace(path, 0.5)
-    solved = press(film, Circle(1.0), at, 1.0)
+    solved = press(film, PROBE, at, 1.0)
     expected = 0.0
     for low, high in (((8.5, -1.5), (11.5, 1.5)), ((11.5, -0.25), (18.25, 0.25)), ((17.75, 0.25), (18.25, 20.0))):
         points, cell = midpoints(low, high)
@@ -128,7 +129,7 @@ def test_pressure_and_thermal_charge_only_where_front_and_back_overlap():
     traced = replace(square.with_trace(((10.0, 0.0), (20.0, 0.0)), 0.5), back=(square.corners,))
     for charge in (
         lambda sensor: charge_of(sensor, lambda x, y: (x**2, y, 0 * x)),
-        lambda sensor: contact_charge(sensor, Circle(1.0), (11.5, 0.0), 1.0),
+        lambda sensor: contact_charge(sensor, PROBE, (11.5, 0.0), 1.0),
         lambda sensor: thermal_charge(replace(sensor, piezo=Piezo(1.0, 1.0, 0.0, -30.0)), 0.1),
     ):
         there, alone = (charge(with_d33(electrodes=(electrode,))) for electrode in (traced, square))
@@ -182,7 +183,7 @@ def with_d33(d33: float = -30.0, **changes) -> Sensor:
     ("probe", "at", "covered"),
     [
         (Circle(5.0), (10.0, 0.0), 9.0),  # the whole electrode under it
-        (Circle(1.0), (8.5, 1.5), 0.25 * np.pi),  # about a corner
+        (PROBE, (8.5, 1.5), 0.25 * np.pi),  # about a corner
         (Polygon.rectangle(2.0, 1.0, np.pi / 2), (8.5, 1.5), 0.5),
         (Polygon.triangle(1.0), (10.0, 1.5), 5 / 9 * np.sqrt(3.0) / 4),  # all below the centroid
     ],
@@ -200,8 +201,8 @@ def test_contact_charge_is_proportional_to_the_covered_area(probe, at, covered):
 def test_contact_charge_follows_gain_and_place_of_the_electrodes():
     """The layout is shifted to the probe, and the gain is two."""
     calibration = Calibration(gain={"A": 2.0}, shift=(2.0, 0.0))
-    still = contact_charge(with_d33(), Circle(1.0), (8.5, 0.2), 1.0)
-    moved = contact_charge(with_d33(calibration=calibration), Circle(1.0), (10.5, 0.2), 1.0)
+    still = contact_charge(with_d33(), PROBE, (8.5, 0.2), 1.0)
+    moved = contact_charge(with_d33(calibration=calibration), PROBE, (10.5, 0.2), 1.0)
     np.testing.assert_allclose(moved, [2.0 * still[0], 0.0, 0.0, 0.0], rtol=1e-9, atol=1e-12)
 
 

@@ -14,6 +14,7 @@ from isocharge.simulate.solver.load_case import check_press
 from solved_charges import relative_error, solved_charge, with_film
 from whole_films import whole_film_map_solved_once
 
+PROBE = Circle(1.0)
 SENSOR = load_sensor("four-25um-biaxial")
 FINER = SolveSettings(resolution=Resolution(order=6, around=8, rings=6, rim=3))
 PRESSES = [
@@ -29,10 +30,10 @@ PRESSES = [
 @pytest.mark.parametrize("pretension", [0.0, pytest.param(0.8, marks=pytest.mark.slow)])
 def test_coarse_map_agrees_with_direct_solves_up_to_the_clamp(pretension):
     sensor = with_film(SENSOR, pretension=pretension)
-    coarse = whole_film_map_solved_once(sensor, Circle(1.0), (0.05, 2.0))
+    coarse = whole_film_map_solved_once(sensor, PROBE, (0.05, 2.0))
     for distance, force, error in PRESSES:
         at = (distance * np.cos(0.7), distance * np.sin(0.7))
-        direct = solved_charge(sensor, Circle(1.0), at, force, FINER)
+        direct = solved_charge(sensor, PROBE, at, force, FINER)
         np.testing.assert_allclose(coarse.charges(np.array([[*at, force]]))[0], direct, rtol=error)
 
 
@@ -44,9 +45,9 @@ def test_coarse_map_of_a_taut_film_is_accurate_over_a_wide_range_of_forces(monke
     monkeypatch.setattr(whole_film, "outermost_distance", lambda *_: 18.0)
     monkeypatch.setattr(whole_film, "COARSE_DISTANCES", 4)
     sensor = with_film(SENSOR, pretension=2.0)
-    coarse = whole_film_map(sensor, Circle(1.0), (0.005, 5.0))
+    coarse = whole_film_map(sensor, PROBE, (0.005, 5.0))
     for contact in ((9.0, -5.0, 0.026), (-14.0, 9.0, 0.015)):
-        direct = solved_charge(sensor, Circle(1.0), contact[:2], contact[2], FINER)
+        direct = solved_charge(sensor, PROBE, contact[:2], contact[2], FINER)
         assert relative_error(coarse.charges(np.array([contact]))[0], direct) < 0.02
 
 
@@ -64,10 +65,10 @@ def test_outermost_press_of_a_small_probe_can_be_meshed(probe_radius, film_radiu
 @pytest.mark.parametrize("changes", [{"oval": 0.05}, {"oval": 0.05, "oval_axis": 1.6}, {"oval": -0.05}])
 def test_presses_on_an_oval_film_stay_inside_the_shorter_axis(changes):
     film = replace(SENSOR.film, **changes)
-    outermost = outermost_distance(film, Circle(1.0))
+    outermost = outermost_distance(film, PROBE)
     assert outermost == pytest.approx(0.95 * 45.0 - 2.2)
-    check_family(film, Circle(1.0), Domain(outermost, (0.1, 1.0)))
+    check_family(film, PROBE, Domain(outermost, (0.1, 1.0)))
     for angle in np.linspace(0.0, np.pi, 9):
-        check_press(film, Circle(1.0), (outermost * np.cos(angle), outermost * np.sin(angle)), 1.0)
+        check_press(film, PROBE, (outermost * np.cos(angle), outermost * np.sin(angle)), 1.0)
     with pytest.raises(SceneError, match="probe off the film"):
-        check_family(film, Circle(1.0), Domain(43.0, (0.1, 1.0)))
+        check_family(film, PROBE, Domain(43.0, (0.1, 1.0)))

@@ -13,8 +13,11 @@ from isocharge.simulate.forward.charge_map import within
 from isocharge.simulate.identifiability.mirror_region import MirrorRegion, has_mirror, mirror_region
 from isocharge.simulate.identifiability.nearest_contact import search
 from kept import kept
+from solved_charges import with_film
 from whole_films import whole_film_map_solved_once
 
+SENSOR = load_sensor("four-25um-biaxial")
+PROBE = Circle(1.0)
 NOISE = noise_model("reference")
 FORCES = (0.05, 2.0)
 CIRCLE = 10.0 * np.exp(2j * np.pi * np.arange(4) / 4)
@@ -60,10 +63,9 @@ def test_an_electrode_at_another_radius_removes_the_mirror_region():
 
 def test_a_press_at_20_mm_on_the_film_has_the_charges_of_one_at_5_mm():
     """The mirror image in the circle of 10 mm is at R^2 / r = 5 mm. On the film, it is at 5.2 mm, with 0.24 N."""
-    sensor = load_sensor("four-25um-biaxial")
-    solved = kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0), 11.5, FORCES)  # of the same film
-    inside = within(replace(solved, sensor=sensor), 9.0)
-    coarse = whole_film_map_solved_once(sensor, Circle(1.0), FORCES)
+    solved = kept(ForwardMap.build, load_sensor("three-25um-biaxial"), PROBE, 11.5, FORCES)  # of the same film
+    inside = within(replace(solved, sensor=SENSOR), 9.0)
+    coarse = whole_film_map_solved_once(SENSOR, PROBE, FORCES)
     charge = coarse.charges(np.array([[20.0, 0.0, 0.5], [0.0, -20.0, 0.5], [10.2, 0.0, 0.5]]))
     contact, residual = search(inside, charge, NOISE.sigma(charge), candidates=512)
     np.testing.assert_allclose(contact[:2, :2], [[5.2, 0.0], [0.0, -5.2]], atol=0.15)
@@ -73,14 +75,12 @@ def test_a_press_at_20_mm_on_the_film_has_the_charges_of_one_at_5_mm():
 
 
 def test_a_film_without_a_working_area_has_no_mirror_region():
-    sensor = load_sensor("four-25um-biaxial")
     charges = inverse_distance_map(CIRCLE, 8.0)
-    assert mirror_region(sensor, Circle(1.0), charges, 0.0, NOISE) is None
-    assert mirror_region(sensor, Circle(1.0), charges, 43.5, NOISE) is None
+    assert mirror_region(SENSOR, PROBE, charges, 0.0, NOISE) is None
+    assert mirror_region(SENSOR, PROBE, charges, 43.5, NOISE) is None
 
 
 def test_a_slack_film_that_wrinkles_has_no_mirror_region_and_logs_a_warning(caplog):
-    sensor = load_sensor("four-25um-biaxial")
-    slack = replace(sensor, film=replace(sensor.film, pretension=-0.5))
-    assert mirror_region(slack, Circle(1.0), inverse_distance_map(CIRCLE, 8.0), 8.0, NOISE) is None
+    slack = with_film(SENSOR, pretension=-0.5)
+    assert mirror_region(slack, PROBE, inverse_distance_map(CIRCLE, 8.0), 8.0, NOISE) is None
     assert re.search("the mirror region outside 8 mm is not computed: no equilibrium at .* wrinkles", caplog.text)

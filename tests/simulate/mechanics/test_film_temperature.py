@@ -8,13 +8,14 @@ import pytest
 from isocharge.simulate import load_sensor
 from isocharge.simulate.mechanics.warming import tension_change, warmed
 
+SENSOR = load_sensor("four-25um-biaxial")
 YOUNG = 3000.0
 POISSON = 0.34
 
 
 def film_with(**changes):
     """Return the film of a built-in sensor with other attributes."""
-    return replace(load_sensor("four-25um-biaxial").film, pretension=0.8, **changes)
+    return replace(SENSOR.film, pretension=0.8, **changes)
 
 
 def test_tension_turns_with_the_axis_of_an_orthotropic_film():
@@ -34,9 +35,7 @@ def test_tension_turns_with_the_axis_of_an_orthotropic_film():
 
 
 def test_warmed_sensor_of_a_biaxial_film_stays_axisymmetric():
-    sensor = load_sensor("four-25um-biaxial")
-    sensor = replace(sensor, film=film_with(expansion=(1e-4, 1e-4)))
-    warm = warmed(sensor, 0.5)
+    warm = warmed(replace(SENSOR, film=film_with(expansion=(1e-4, 1e-4))), 0.5)
     assert warm.film.is_axisymmetric
     assert warm.film.pretension == pytest.approx(0.8 - 0.5e-4 * YOUNG / (1.0 - POISSON))
-    assert warmed(load_sensor("four-25um-biaxial"), 5.0) == load_sensor("four-25um-biaxial")
+    assert warmed(SENSOR, 5.0) == SENSOR

@@ -18,12 +18,14 @@ from isocharge.simulate.plots.film import (
     draw_section,
 )
 
+SENSOR = load_sensor("three-25um-biaxial")
+
 
 def test_draw_electrodes_draws_front_and_back_at_their_positions():
     pad = Electrode.of_square("A", (5.0, 0.0), 3.0)
     back = ((0.0, -9.0), (9.0, -9.0), (9.0, 9.0))
     electrode = replace(pad.with_trace(((5.0, 0.0), (9.0, 0.0)), 0.5), back=(back,))
-    sensor = replace(load_sensor("three-25um-biaxial"), electrodes=(electrode,))
+    sensor = replace(SENSOR, electrodes=(electrode,))
     axes = Figure().subplots()
     draw_electrodes(axes, replace(sensor, calibration=Calibration(shift=(1.0, 0.0))))
     corners = [patch.get_xy()[:-1] - [1.0, 0.0] for patch in axes.patches]
@@ -54,7 +56,7 @@ def test_draw_charge_map_covers_the_whole_disk():
 
 def test_pictures_of_an_oval_film_end_at_its_rim():
     """The semi-axes of the oval are 48.6 mm along y and 41.4 mm along x."""
-    film = replace(load_sensor("three-25um-biaxial").film, oval=0.08, oval_axis=np.pi / 2.0)
+    film = replace(SENSOR.film, oval=0.08, oval_axis=np.pi / 2.0)
     solved = press(film, Circle(1.0), (0.0, 5.0), 1.0)
     axes = Figure().subplots()
     draw_deflection(axes, solved)
@@ -72,7 +74,7 @@ def test_pictures_of_an_oval_film_end_at_its_rim():
 def test_draw_section_goes_through_the_probe(at, distance):
     """The section extends from rim to rim. The deflection is largest under the mark of the probe."""
     axes = Figure().subplots()
-    draw_section(axes, press(load_sensor("three-25um-biaxial").film, Circle(1.0), at, 1.0))
+    draw_section(axes, press(SENSOR.film, Circle(1.0), at, 1.0))
     film, mark = axes.lines
     along, height = film.get_data()
     assert [*mark.get_xdata(), *along[[0, -1]]] == pytest.approx(

@@ -15,8 +15,9 @@ from isocharge.simulate.sensor.film_properties import LARGEST_PRETENSION, change
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from solved_charges import with_film
 
+PROBE = Circle(1.0)
 SENSOR = with_film(load_sensor("four-25um-biaxial"), pretension=0.5)
-PRIOR = FilmPrior(SENSOR, Circle(1.0))
+PRIOR = FilmPrior(SENSOR, PROBE)
 
 
 def with_value(name, value):
@@ -71,13 +72,13 @@ def test_all_moduli_change_with_the_modulus_of_the_film():
     """The default of the shear modulus, stated explicitly, describes the same film."""
     shear = 0.5 * SENSOR.film.young / (1.0 + SENSOR.film.poisson)
     stated = with_film(SENSOR, shear=shear)
-    (changed, _), (default, _) = (changed_film(sensor, Circle(1.0), {"young": 0.2}) for sensor in (stated, SENSOR))
+    (changed, _), (default, _) = (changed_film(sensor, PROBE, {"young": 0.2}) for sensor in (stated, SENSOR))
     assert changed.film.shear == pytest.approx(0.5 * default.film.young / (1.0 + default.film.poisson))
 
 
 def test_even_film_keeps_the_axis_of_its_shear_modulus():
     orthotropic = with_film(SENSOR, young_ratio=1.5, axis=0.6, shear=700.0)
-    prior = FilmPrior(orthotropic, Circle(1.0))
+    prior = FilmPrior(orthotropic, PROBE)
     even = prior.film(prior.even(prior.described))[0].film
     assert (even.young_ratio, even.axis, even.shear) == (1.0, 0.6, 700.0)
 
@@ -87,7 +88,7 @@ def test_all_properties_are_tested():
 
 
 def test_described_film_is_that_of_the_sensor_file():
-    assert PRIOR.film(PRIOR.described) == (SENSOR, Circle(1.0))
+    assert PRIOR.film(PRIOR.described) == (SENSOR, PROBE)
 
 
 @given(st.integers(0, 10**6), st.booleans())
@@ -113,7 +114,7 @@ def test_draws_have_the_mean_and_the_spread_of_the_prior():
 @pytest.mark.parametrize("name", ["eight-25um-biaxial-36mm", "six-25um-biaxial-30mm", "four-25um-biaxial"])
 def test_electrodes_stay_on_every_film_within_the_bounds(name):
     """A search for the properties of a film may try each corner of the bounds. A sensor refuses electrodes off it."""
-    prior = FilmPrior(load_sensor(name), Circle(1.0))
+    prior = FilmPrior(load_sensor(name), PROBE)
     low, high = prior.bounds
     is_high = np.random.default_rng(0).random((100, low.size)) < 0.5
     for corner in np.where(is_high, high, np.maximum(low, [0.1, *low[1:]])):
@@ -124,4 +125,4 @@ def test_electrodes_stay_on_every_film_within_the_bounds(name):
 def test_electrode_near_the_rim_is_refused_with_the_largest_distance():
     sensor = sensor_from_dict(sensor_to_dict(SENSOR) | {"electrodes": {"side_mm": 3.0, "A": [43.3, 0.0]}})
     with pytest.raises(SensorError, match=r"within 44\.5 mm.*reaches 44\.83 mm; move it inwards"):
-        FilmPrior(sensor, Circle(1.0))
+        FilmPrior(sensor, PROBE)

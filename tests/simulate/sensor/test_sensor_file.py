@@ -23,6 +23,7 @@ from isocharge.simulate import (
 )
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 
+SENSOR = load_sensor("three-25um-biaxial")
 WHOLE = """
 name = "mine"
 readout = "edge"
@@ -193,7 +194,6 @@ def test_written_sensor_file_reads_as_the_built_in_sensor(name, tmp_path):
 
 
 def test_every_property_of_a_film_is_written_in_the_unit_of_its_key():
-    sensor = load_sensor("three-25um-biaxial")
     film = Film(
         *(45.0, 0.025, 3000.0, 0.34, 1.0, (0.33, 0.2)),
         young_ratio=1.44,
@@ -207,7 +207,7 @@ def test_every_property_of_a_film_is_written_in_the_unit_of_its_key():
         ring_expansion=0.0,
     )
     calibration = Calibration(crosstalk=0.01)
-    table = sensor_to_dict(replace(sensor, film=film, piezo=replace(sensor.piezo, d12=0.5), calibration=calibration))
+    table = sensor_to_dict(replace(SENSOR, film=film, piezo=replace(SENSOR.piezo, d12=0.5), calibration=calibration))
     assert table["film"] == {
         "radius_mm": 45.0,
         "thickness_um": 25.0,
@@ -227,23 +227,22 @@ def test_every_property_of_a_film_is_written_in_the_unit_of_its_key():
     again = sensor_from_dict(table)
     assert sensor_to_dict(again) == table
     np.testing.assert_allclose([*again.film.expansion, again.film.axis], [-5e-6, 1e-4, np.pi / 6.0])
-    assert list(sensor_to_dict(sensor)["film"]) == list(table["film"])[:5]  # optional keys are omitted
+    assert list(sensor_to_dict(SENSOR)["film"]) == list(table["film"])[:5]  # optional keys are omitted
 
 
 def test_squares_of_a_second_size_are_written_as_polygons():
     """The file has one side for all squares."""
-    base = load_sensor("three-25um-biaxial")
     squares = (Electrode.of_square("A", (0.0, 0.0), 3.0), Electrode.of_square("B", (6.0, 0.0), 2.0))
-    again = sensor_from_dict(sensor_to_dict(replace(base, electrodes=squares)))
+    again = sensor_from_dict(sensor_to_dict(replace(SENSOR, electrodes=squares)))
     assert [electrode.area for electrode in again.electrodes] == pytest.approx([9.0, 4.0])
     with pytest.raises(SensorError, match=r"all squares have one side: got \{'A': 3\.0, 'B': 2\.0\} mm"):
-        sensor_to_dict(replace(base, electrodes=squares, readout="edge"))
+        sensor_to_dict(replace(SENSOR, electrodes=squares, readout="edge"))
 
 
 @pytest.mark.parametrize(("name", "message"), [("", "name: expected a text"), ("\ud800", "cannot be encoded in UTF-8")])
 def test_sensor_that_cannot_be_written_raises_error(tmp_path, name, message):
     with pytest.raises(SensorError, match=message):
-        write_sensor(replace(load_sensor("three-25um-biaxial"), name=name), tmp_path / "mine.toml")
+        write_sensor(replace(SENSOR, name=name), tmp_path / "mine.toml")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -253,6 +252,6 @@ def test_write_and_load_round_trip(tmp_path):
     traced = replace(Electrode("a.b", pad).with_trace(((-10.0, 5.0), (-10.0, 20.0)), 0.5), back=(pad,))
     electrodes = (traced, Electrode.of_square('"#]', (6.0, 0.0), 3.0))
     calibration = Calibration({"a.b": 1.5}, (0.5, -0.25), float(np.deg2rad(5.0)))
-    sensor = replace(load_sensor("three-25um-biaxial"), electrodes=electrodes, calibration=calibration)
+    sensor = replace(SENSOR, electrodes=electrodes, calibration=calibration)
     write_sensor(sensor, tmp_path / "mine.toml")
     assert load_sensor(tmp_path / "mine.toml") == sensor

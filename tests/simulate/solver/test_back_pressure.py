@@ -25,6 +25,7 @@ from isocharge.simulate.solver.error_estimate import mesh_error
 from kept import ROOT
 from solved_charges import relative_error, solved_charge, with_film
 
+PROBE = Circle(1.0)
 ATMOSPHERE = 0.101325
 """Pressure of the atmosphere, MPa."""
 
@@ -63,7 +64,7 @@ def test_deflection_with_trapped_air_equals_that_of_a_taut_membrane(volume, at):
     z = points @ np.array([1.0, 1j])
     by_force = force / (2.0 * np.pi * tension) * np.log(np.abs((a**2 - np.conj(centre) * z) / (a * (z - centre))))
     expected = by_force - pressure * (a**2 - np.abs(z) ** 2) / (4.0 * tension)
-    solved = press(film, Circle(1.0), at, force, MEMBRANE)
+    solved = press(film, PROBE, at, force, MEMBRANE)
     assert relative_error(deflection(solved, points), expected) <= 1e-4
 
 
@@ -102,7 +103,7 @@ def axisymmetric_charges(sensor: Sensor, force: float) -> np.ndarray:
 )
 def test_charges_with_back_pressure_equal_those_of_a_collocation(back_volume, static_pressure, force):
     sensor = sensor_with(back_volume=back_volume, static_pressure=static_pressure)
-    charge = solved_charge(sensor, Circle(1.0), (0.0, 0.0), force, MEMBRANE)
+    charge = solved_charge(sensor, PROBE, (0.0, 0.0), force, MEMBRANE)
     expected = axisymmetric_charges(sensor, force)
     np.testing.assert_allclose(charge, expected, rtol=1e-3)
 
@@ -123,8 +124,8 @@ def test_charges_with_back_pressure_equal_those_of_scikit_fem(case):
 @pytest.mark.slow  # in `make test`, the presses of a closed back are compared, and maps of other films
 def test_forward_map_of_a_film_with_a_closed_back_equals_direct_solves():
     sensor = sensor_with(back_volume=CAVITY, static_pressure=1e-6)
-    forward_map = ForwardMap.build(sensor, Circle(1.0), 4.0, (0.3, 0.5))
-    charge = solved_charge(sensor, Circle(1.0), (-2.0, 3.2), 0.35)
+    forward_map = ForwardMap.build(sensor, PROBE, 4.0, (0.3, 0.5))
+    charge = solved_charge(sensor, PROBE, (-2.0, 3.2), 0.35)
     np.testing.assert_allclose(forward_map.charges(np.array([[-2.0, 3.2, 0.35]]))[0], charge, rtol=1e-3)
 
 
@@ -132,8 +133,8 @@ def test_forward_map_of_a_film_with_a_closed_back_equals_direct_solves():
 @pytest.mark.parametrize("at", [(12.0, -5.0), (20.0, 8.0)])
 def test_estimated_error_holds_for_a_closed_back_off_the_centre(at):
     sensor = sensor_with(back_volume=CAVITY)
-    solved = press(sensor.film, Circle(1.0), at, 1.0)
+    solved = press(sensor.film, PROBE, at, 1.0)
     resolution = solved.mesh.resolution
     fine = SolveSettings(theory=solved.theory, resolution=replace(resolution, order=resolution.order + 2))
-    fine_charge = solved_charge(sensor, Circle(1.0), at, 1.0, fine)
+    fine_charge = solved_charge(sensor, PROBE, at, 1.0, fine)
     assert relative_error(touch_charge(sensor, solved), fine_charge) <= mesh_error(solved) <= 1e-3

@@ -20,6 +20,7 @@ from isocharge.simulate import (
 from isocharge.simulate.solver.equilibrium import principal_stress
 from isocharge.simulate.solver.error_estimate import cautions, estimated_error, mesh_error
 
+PROBE = Circle(1.0)
 MEMBRANE = Theory(bending=False)
 
 
@@ -27,24 +28,24 @@ MEMBRANE = Theory(bending=False)
     ("probe", "at", "force", "message"),
     [
         (
-            Circle(1.0),
+            PROBE,
             (44.5, 0.0),
             1.0,
             r"probe off the film: centre \(44\.5, 0\) mm, farthest .* circle:1\.0 45\.5 mm",
         ),
         (Polygon.rectangle(10.0, 1.0), (39.9, 5.0), 1.0, r"off the film: centre \(39\.9, 5\) mm, .* rectangle"),
-        (Circle(1.0), (np.nan, 0.0), 1.0, r"probe off the film: centre \(nan, 0\) mm"),
+        (PROBE, (np.nan, 0.0), 1.0, r"probe off the film: centre \(nan, 0\) mm"),
         (GrowingFinger(1.0), (0.0, 0.0), 1e-6, r"growing-finger:1\.0 under 1e-06 N: expected a radius of at least"),
         (GrowingFinger(1.0), (0.0, 0.0), -1.0, r"growing-finger:1\.0 under -1 N: expected a radius .* press with more"),
         (
-            Circle(1.0),
+            PROBE,
             (0.0, 0.0),
             200.0,
             r"force 200 N stretches a film of 0\.025 mm beyond small strains: .* got 0\.152",
         ),
         (Circle(0.9999), (44.0, 0.0), 1.0, r"press at \(44, 0\) mm comes within 0\.0001 mm of the rim, too near for a"),
-        (Circle(1.0), (0.0, 0.0), 0.0, "force: expected at least 1e-12 N .* got 0 N"),
-        (Circle(1.0), (0.0, 0.0), np.inf, "force: expected at least 1e-12 N .* got inf N"),
+        (PROBE, (0.0, 0.0), 0.0, "force: expected at least 1e-12 N .* got 0 N"),
+        (PROBE, (0.0, 0.0), np.inf, "force: expected at least 1e-12 N .* got inf N"),
     ],
 )
 def test_invalid_press_raises_scene_error(film, probe, at, force, message):
@@ -60,7 +61,7 @@ def test_too_small_probe_raises_scene_error(film):
 
 @pytest.mark.parametrize("read", [deflection, touch_stress])
 def test_points_off_the_film_raise_scene_error(film, read):
-    solved = press(film, Circle(1.0), (0.0, 0.0), 1.0)
+    solved = press(film, PROBE, (0.0, 0.0), 1.0)
     for point in ((-40.0, 30.0), (np.nan, 0.0)):
         with pytest.raises(SceneError, match=rf"point \({point[0]:.4g}, .*\) mm is off the film of radius 45 mm"):
             read(solved, np.array([(0.0, 45.0), point]))
@@ -71,21 +72,21 @@ def test_compression_near_the_rim_gives_a_warning(film):
     """A press at half the radius gives no warning about wrinkles. A press at three quarters does."""
     for distance, taut in ((0.5, True), (0.75, False)):
         settings = SolveSettings(theory=MEMBRANE, resolution=Resolution(5, 8, 5))
-        solved = press(film, Circle(1.0), (distance * film.radius, 0.0), 1.0, settings)
+        solved = press(film, PROBE, (distance * film.radius, 0.0), 1.0, settings)
         wrinkles = [caution for caution in cautions(solved) if "may wrinkle" in caution]
         assert (principal_stress(solved)[0] > 0.0) == taut == (not wrinkles)
 
 
 def test_compression_without_a_press_gives_a_warning(film):
     compressed = replace(film, pretension=-0.1, deviator=(0.03, 0.04))
-    (sentence,) = cautions(press(compressed, Circle(1.0), (0.0, 0.0), 0.5))
+    (sentence,) = cautions(press(compressed, PROBE, (0.0, 0.0), 0.5))
     assert "without a press, the film is compressed to -0.15 MPa" in sentence
 
 
 def test_stress_above_the_yield_stress_of_pvdf_gives_a_warning(film):
     """The largest stress includes the pretension."""
-    light, heavy = (press(film, Circle(1.0), (2.0, 0.0), force) for force in (0.01, 5.0))
-    taut = press(replace(film, pretension=44.99), Circle(1.0), (2.0, 0.0), 0.01)
+    light, heavy = (press(film, PROBE, (2.0, 0.0), force) for force in (0.01, 5.0))
+    taut = press(replace(film, pretension=44.99), PROBE, (2.0, 0.0), 0.01)
     assert not cautions(light)
     largest = principal_stress(heavy)[1]
     assert cautions(heavy) == (f"the film is stressed to {largest:.3g} MPa; PVDF yields from 45 MPa on",)
@@ -95,7 +96,7 @@ def test_stress_above_the_yield_stress_of_pvdf_gives_a_warning(film):
 
 def test_principal_stress_is_that_of_the_points(film):
     """No point of the film exceeds the reported stresses, at either surface."""
-    solved = press(film, Circle(1.0), (6.0, 2.0), 1.0)
+    solved = press(film, PROBE, (6.0, 2.0), 1.0)
     z = film.radius * np.sqrt(np.linspace(0.0, 1.0, 4000)) * np.exp(2.4j * np.arange(4000))
     z = np.concatenate([z, complex(6.0, 2.0) + 0.05 * z])
     points = np.stack([z.real, z.imag], axis=1)
@@ -113,5 +114,5 @@ def test_error_estimates_of_singular_cases(film):
     taut = replace(film, pretension=10.0)
     settings = SolveSettings(theory=MEMBRANE, resolution=Resolution(12, 8, 3))
     assert 0.0 <= mesh_error(press(taut, Circle(0.9 * film.radius), (0.0, 0.0), 1e-3, settings)) < 1e-4
-    thick = press(replace(film, thickness=1.0), Circle(1.0), (0.0, 0.0), 1.0, SolveSettings(theory=MEMBRANE))
+    thick = press(replace(film, thickness=1.0), PROBE, (0.0, 0.0), 1.0, SolveSettings(theory=MEMBRANE))
     assert estimated_error(thick) == np.inf

@@ -23,8 +23,9 @@ from isocharge.simulate.solver.load_case import LoadCase, needs_second_mesh
 from isocharge.simulate.solver.press import needed_resolution
 from solved_charges import relative_error, solved_charge, with_film
 
+PROBE = Circle(1.0)
 FILM = Film(45.0, 0.025, 3000.0, 0.34)
-INNER = (Circle(1.0), (8.0, 2.0), 1.0)
+INNER = (PROBE, (8.0, 2.0), 1.0)
 NEAR_THE_RIM = (Circle(2.0), (28.0, 0.0), 0.1)
 
 
@@ -63,11 +64,11 @@ AT_THE_RIM = replace(with_film(FOUR, pretension=0.0), electrodes=(Electrode.of_s
 
 BENT_MESH = Resolution(order=7, around=8, rings=8, rim=4)
 CHOSEN = {
-    "very uneven pretension": (UNEVEN, Circle(1.0), (3.0, 2.0), 0.05, Resolution(5, 20, 7, 2), 3e-4),
+    "very uneven pretension": (UNEVEN, PROBE, (3.0, 2.0), 0.05, Resolution(5, 20, 7, 2), 3e-4),
     "small film": (square_pair(14.0, 0.104, 0.64), Circle(2.6), (2.8, 0.7), 1.0, BENT_MESH, 1e-4),
-    "thick film": (square_pair(30.0, 0.05, 0.0), Circle(1.0), (6.0, 1.5), 0.05, BENT_MESH, 1e-4),
-    "surface under the probe": (ON_TOP, Circle(1.0), (8.0, 3.0), 0.05, Resolution(7, 16, 8, 2), 2e-4),
-    "electrode at the rim": (AT_THE_RIM, Circle(1.0), (0.0, 8.0), 0.5, Resolution(8, 16, 8, 3), 1e-4),
+    "thick film": (square_pair(30.0, 0.05, 0.0), PROBE, (6.0, 1.5), 0.05, BENT_MESH, 1e-4),
+    "surface under the probe": (ON_TOP, PROBE, (8.0, 3.0), 0.05, Resolution(7, 16, 8, 2), 2e-4),
+    "electrode at the rim": (AT_THE_RIM, PROBE, (0.0, 8.0), 0.5, Resolution(8, 16, 8, 3), 1e-4),
     "slack film with a closed back": (CLOSED, Finger(5.0), (22.0, 5.0), 0.05, Resolution(7, 8, 12, 4), 1e-3),
 }
 """Sensor, probe, position, force, a mesh that is finer than the chosen one, and the largest error of a charge."""
@@ -136,7 +137,7 @@ def test_mesh_error_bounds_the_difference_from_a_finer_mesh(scene):
         (Polygon.rectangle(4.0, 2.0), 9.0, 1e-3, False),
         (Polygon.rectangle(8.0, 2.0), 9.0, 1e-3, True),  # a large polygon
         (Circle(4.2), 9.0, 1e-3, False),
-        (Circle(1.0), 9.0, 5e-4, True),  # more digits
+        (PROBE, 9.0, 5e-4, True),  # more digits
     ],
 )
 def test_needs_second_mesh_near_the_rim_and_for_large_probes(probe, distance, accuracy, needed):

@@ -54,6 +54,12 @@ def rig(problem, charges, count, seed, values=None):
     return values, contact, measured_presses(problem, with_rig_errors(contact, rng), charge)
 
 
+def rig_presses(*arguments, **options):
+    """Return the measured presses of `rig`."""
+    _, _, presses = rig(*arguments, **options)
+    return presses
+
+
 def uneven_film(problem):
     """Return the estimate of a film whose tension is uneven, without uncertainty."""
     layout = problem.prior.layout

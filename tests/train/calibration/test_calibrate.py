@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.benchmarks.measured_films import measured_presses
-from tests.train.calibration.conftest import rig
+from tests.train.calibration.conftest import rig, rig_presses
 from tests.train.calibration.synthetic_film import SyntheticFilm
 
 from isocharge.common.errors import PressError, SceneError, SensorError
@@ -67,7 +67,7 @@ def test_sensor_of_two_electrodes_is_refused(problem):
 
 @pytest.mark.parametrize("offset", [10.0, -12.0])
 def test_offset_of_all_charges_is_found_with_its_sign(problem, synthetic, offset):
-    _, _, presses = rig(problem, synthetic, 15, seed=12)
+    presses = rig_presses(problem, synthetic, 15, seed=12)
     result = fit(replace(presses, charge_pC=presses.charge_pC + offset), problem, synthetic)
     assert abs(result.film.value("offset") - offset) < 4.0 * result.film.std("offset") < 8.0
     (caution,) = result.cautions
@@ -76,7 +76,7 @@ def test_offset_of_all_charges_is_found_with_its_sign(problem, synthetic, offset
 
 
 def test_bad_press_and_press_outside_are_named_by_their_lines(problem, synthetic):
-    _, _, presses = rig(problem, synthetic, 12, seed=13)
+    presses = rig_presses(problem, synthetic, 12, seed=13)
     presses.contact[4, 1] -= 3.0
     presses.contact[8] = [9.5, 0.0, 1.0]
     result = fit(presses, problem, synthetic)
@@ -86,7 +86,7 @@ def test_bad_press_and_press_outside_are_named_by_their_lines(problem, synthetic
 
 
 def test_forces_that_scatter_more_than_stated_are_named(problem, synthetic):
-    _, _, presses = rig(problem, synthetic, 25, seed=14)
+    presses = rig_presses(problem, synthetic, 25, seed=14)
     scattered = presses.contact.copy()
     scattered[:, 2] *= np.exp(0.04 * np.random.default_rng(0).standard_normal(25))
     result = fit(replace(presses, contact=np.clip(scattered, [-9, -9, 0.05], [9, 9, 2.0])), problem, synthetic)
@@ -96,8 +96,7 @@ def test_forces_that_scatter_more_than_stated_are_named(problem, synthetic):
 def presses_on_shifted_electrodes(problem, synthetic, shift_mm):
     values = problem.prior.layout.prior.mean.copy()
     values[problem.prior.layout.index("shift_x")] = shift_mm
-    _, _, presses = rig(problem, synthetic, 20, seed=15, values=values)
-    return presses
+    return rig_presses(problem, synthetic, 20, seed=15, values=values)
 
 
 def test_electrodes_far_from_their_places_are_named(problem, synthetic):
@@ -123,7 +122,7 @@ def test_presses_at_one_place_are_named(problem, synthetic, scatter_mm):
 
 def test_presses_with_few_known_values_change_nothing(problem, synthetic):
     """Two known values do not determine a contact, and state nothing about the film."""
-    _, _, presses = rig(problem, synthetic, 12, seed=17)
+    presses = rig_presses(problem, synthetic, 12, seed=17)
     presses.charge_pC[11, :2] = np.nan
     presses.contact[11] = np.nan
     without = fit(presses[:11], problem, synthetic).film
@@ -133,7 +132,7 @@ def test_presses_with_few_known_values_change_nothing(problem, synthetic):
 
 
 def test_one_press_states_nothing_about_the_noise(problem, synthetic):
-    _, _, presses = rig(problem, synthetic, 1, seed=18)
+    presses = rig_presses(problem, synthetic, 1, seed=18)
     (caution,) = fit(presses, problem, synthetic).cautions
     assert caution.startswith("all known positions are at one place")
 
@@ -142,7 +141,7 @@ def test_one_press_states_nothing_about_the_noise(problem, synthetic):
 def test_uneven_film_whose_solution_changes_the_estimate_again_is_a_caution(problem, synthetic, monkeypatch, is_exact):
     monkeypatch.setattr(calibrate_module, "_fit_uneven_film", lambda _problem, _data, estimation, _executor: estimation)
     monkeypatch.setattr(calibrate_module, "_is_exact", lambda *_: is_exact)
-    _, _, presses = rig(problem, synthetic, 12, seed=11)
+    presses = rig_presses(problem, synthetic, 12, seed=11)
     cautions = calibrate(presses, problem, start=synthetic).cautions
     assert cautions == (() if is_exact else (calibrate_module.NOT_CONVERGED,))
 
@@ -150,7 +149,7 @@ def test_uneven_film_whose_solution_changes_the_estimate_again_is_a_caution(prob
 def test_three_charges_need_a_known_contact_inside():
     three = CalibrationProblem(load_sensor("three-25um-biaxial"), Circle(1.0))
     film = SyntheticFilm(three.prior.layout.prior, three.solved_domain)
-    _, _, presses = rig(three, film, 4, seed=3)
+    presses = rig_presses(three, film, 4, seed=3)
     presses.contact[:2, 0] = 9.5
     presses.contact[2:] = np.nan
     with pytest.raises(PressError, match=r"^lines 2, 3: a calibration takes presses within 8\.5 mm"):
@@ -161,7 +160,7 @@ def test_continued_calibration_needs_fewer_presses(problem, synthetic):
     values, _, presses = rig(problem, synthetic, 20, seed=19)
     earlier = fit(presses, problem, synthetic).film.drifted()
     values[0] += 0.2 if values[0] < 2.0 else -0.2
-    _, _, three = rig(problem, synthetic, 3, seed=20, values=values)
+    three = rig_presses(problem, synthetic, 3, seed=20, values=values)
     continued = fit(three, replace(problem, earlier=earlier), synthetic)
     fresh = fit(three, problem, synthetic)
     assert continued.film_error.position_mm < 0.5 * fresh.film_error.position_mm
@@ -179,7 +178,7 @@ def test_proposed_presses_reduce_the_errors_as_announced(problem, synthetic):
     assert chosen == pytest.approx(errors[-1], rel=0.6)
     random_errors = []
     for seed in range(3):
-        _, _, presses = rig(problem, synthetic, 6, seed, values=problem.prior.layout.prior.mean)
+        presses = rig_presses(problem, synthetic, 6, seed, values=problem.prior.layout.prior.mean)
         random_errors.append(fit(presses, problem, synthetic).film_error.position_mm)
     assert chosen < np.mean(random_errors)
 
@@ -208,7 +207,7 @@ def test_errors_that_are_announced_after_noisy_presses_contain_the_noise(problem
     ids=["unknown", "outside", "mixed up"],
 )
 def test_presses_that_no_film_explains_are_refused(problem, synthetic, change, message):
-    _, _, presses = rig(problem, synthetic, 12, seed=21)
+    presses = rig_presses(problem, synthetic, 12, seed=21)
     changed = change(presses)
     if message is None:  # four charges of unknown contacts are accepted
         assert len(fit(changed, problem, synthetic).presses) == 3

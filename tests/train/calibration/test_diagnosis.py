@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.benchmarks.measured_films import measured_presses
-from tests.train.calibration.conftest import rig
+from tests.train.calibration.conftest import rig_presses
 
 from isocharge.common.errors import PressError
 from isocharge.train import calibrate
@@ -49,7 +49,7 @@ IMPOSSIBLE = {
 
 def with_mistake(problem, synthetic, make_mistake):
     """Return twelve presses of a rig, after a function has changed their contacts and charges."""
-    _, _, presses = rig(problem, synthetic, 12, seed=7)
+    presses = rig_presses(problem, synthetic, 12, seed=7)
     return measured_presses(problem, *make_mistake(presses.contact, presses.charge_pC))
 
 
@@ -64,7 +64,7 @@ def test_mistake_in_the_presses_is_found(problem, synthetic, name):
 
 def test_places_near_the_rim_of_an_oval_film(problem, synthetic):
     """The half axes are 45.9 and 44.1 mm."""
-    _, _, presses = rig(problem, synthetic, 12, seed=7)
+    presses = rig_presses(problem, synthetic, 12, seed=7)
     oval_film = replace(problem.sensor.film, oval=0.02)
     contact = presses.contact.copy()
     contact[3, :2] = (45.5, 0.0)

@@ -24,6 +24,8 @@ from isocharge.train.data.presses import (
 )
 from isocharge.train.training.training_data import TrainingData
 
+PROBE = Circle(1.0)
+
 
 def positions_of(contact):
     """Return the set of the positions (x, y) of contacts, mm."""
@@ -108,7 +110,7 @@ def test_positions_of_an_encoder_with_noise_are_merged_to_places_but_not_scatter
     contact = np.column_stack([reported, np.ones(len(reported))])
     merged = merged_places(contact)
     assert place_count(merged) == len(places)
-    samples = dataset_of(measured_presses(contact, np.ones((len(contact), 3))), sensor, Circle(1.0)).samples
+    samples = dataset_of(measured_presses(contact, np.ones((len(contact), 3))), sensor, PROBE).samples
     assert np.array_equal(samples.x_mm, merged[:, 0])
     np.testing.assert_allclose(merged[::60, :2], places, atol=0.003)
     scattered = draw_contacts(3, 5000, 8.0, (0.05, 2.0))
@@ -131,7 +133,7 @@ def test_presses_with_unknown_places_forces_or_charges_are_left_out(sensor):
     charge = np.ones((55, 3))
     contact[0, 2] = np.nan
     charge[1, 0] = np.nan
-    assert len(dataset_of(measured_presses(contact, charge), sensor, Circle(1.0)).samples) == 53
+    assert len(dataset_of(measured_presses(contact, charge), sensor, PROBE).samples) == 53
     contact[2:7, :2] = np.nan
     with pytest.raises(PressError, match=r"at least 50 presses .* got 48 of 55.*train calibrate"):
-        dataset_of(measured_presses(contact, charge), sensor, Circle(1.0))
+        dataset_of(measured_presses(contact, charge), sensor, PROBE)

@@ -30,6 +30,7 @@ from isocharge.train.model_release import release as release_module
 from isocharge.train.model_release.evaluate import simulated_errors
 from kept import ROOT, kept
 
+PROBE = Circle(1.0)
 REFERENCE = noise_model("reference")
 MODELS = ROOT / "models"
 FORCE_RANGE_N = (0.05, 2.0)
@@ -108,10 +109,8 @@ def forward_map(predictor, film):
     radius = np.cos(np.pi / len(area)) * np.hypot(*area[0])
     sensor = sensor_from_dict(dict(predictor.metadata.sensor))
     if sensor.film != film.sensor.film:
-        return ForwardMap.build(sensor, Circle(1.0), radius), radius
-    film_map = (
-        film if radius <= RADIUS_mm else kept(ForwardMap.build, film.sensor, Circle(1.0), radius=LARGEST_RADIUS_mm)
-    )
+        return ForwardMap.build(sensor, PROBE, radius), radius
+    film_map = film if radius <= RADIUS_mm else kept(ForwardMap.build, film.sensor, PROBE, radius=LARGEST_RADIUS_mm)
     return replace(film_map, sensor=sensor), radius
 
 
@@ -146,7 +145,7 @@ def test_the_folder_is_complete_and_its_card_and_metadata_agree(released, datase
     assert metadata == released.metadata
     assert (metadata.electrodes, metadata.probes) == (("A", "B", "C"), ("circle:1.0",))
     assert (metadata.dataset_sha256, metadata.force_range_N) == (dataset.sha256, FORCE_RANGE_N)
-    press_at_yield = press(sensor.film, Circle(1.0), (0.0, 0.0), metadata.yield_force_N)
+    press_at_yield = press(sensor.film, PROBE, (0.0, 0.0), metadata.yield_force_N)
     assert principal_stress(press_at_yield)[1] == pytest.approx(45.0, rel=0.01)
     assert metadata.noise == ModelNoise(name="reference", white_pC=1.0, gain=0.002)
     assert sensor_from_dict(json.loads(json.dumps(metadata.sensor))) == sensor
