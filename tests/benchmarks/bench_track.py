@@ -146,8 +146,9 @@ def draw_paths(speed: float, count: int, dt_s: float, rng: np.random.Generator) 
     """
     duration_s = min(MAX_MOVEMENT_s, MAX_MOVEMENT_mm / speed) if speed else MAX_MOVEMENT_s
     t_s = np.arange(0.0, 2.0 * REST_s + duration_s, dt_s)
-    centre = 2.0 * np.sqrt(rng.random(count)) * np.exp(2j * np.pi * rng.random(count))
-    direction = np.exp(2j * np.pi * rng.random(count))
+    distance_from_centre = 2.0 * np.sqrt(rng.random(count))
+    bearing, direction = np.exp(2j * np.pi * rng.random((2, count)))
+    centre = distance_from_centre * bearing
     distance = speed * (np.clip(t_s - REST_s, 0.0, duration_s) - 0.5 * duration_s)
     is_moving = (t_s > REST_s) & (t_s < REST_s + duration_s)
     return Paths(centre[:, None] + direction[:, None] * distance, is_moving)

@@ -5,7 +5,7 @@ import pytest
 
 from isocharge.common.errors import SceneError
 from isocharge.simulate import ChargeMap, Domain
-from isocharge.simulate.forward.charge_map import within
+from isocharge.simulate.forward.charge_map import differences, within
 from isocharge.simulate.numerics.disk import sunflower
 from solved_charges import relative_error
 
@@ -42,13 +42,9 @@ def test_maps_implement_the_charge_map_protocol(charge_map):
     charge = charge_map.charges(contact)
     slope = charge_map.derivatives(contact)
     assert slope.shape == (*charge.shape, 3) == (60, len(charge_map.electrodes), 3)
-    for axis, step in enumerate((0.02, 0.02, 1e-3)):
-        ahead = contact.copy()
-        behind = contact.copy()
-        ahead[:, axis] = contact[:, axis] + step if axis < 2 else contact[:, 2] * np.exp(step)
-        behind[:, axis] = contact[:, axis] - step if axis < 2 else contact[:, 2] * np.exp(-step)
-        expected = (charge_map.charges(ahead) - charge_map.charges(behind)) / (2.0 * step)
-        assert relative_error(slope[..., axis], expected) <= 5e-4
+    expected = differences(charge_map.charges, contact, (0.02, 0.02, 1e-3))
+    for axis in range(3):
+        assert relative_error(slope[..., axis], expected[..., axis]) <= 5e-4
 
 
 @pytest.mark.parametrize("charge_map", CHECKED, indirect=True)

@@ -36,6 +36,7 @@ UNIAXIAL = load_sensor("four-25um-uniaxial")
 AREA = 9.0
 D31 = 20.0
 D32 = 2.0
+SQUARE = Electrode.of_square("A", (10.0, 0.0), 3.0)
 TRIANGLE = Electrode("T", ((-12.0, 4.0), (-8.0, 4.0), (-10.0, 8.0)))
 
 
@@ -55,14 +56,11 @@ def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force:
     return charge
 
 
-@pytest.fixture(params=["area", "edge"])
-def sensor(request) -> Sensor:
-    return replace(UNIAXIAL, readout=request.param)
-
-
+@pytest.mark.parametrize("readout", ["area", "edge"])
 @pytest.mark.parametrize("per_side", [1, 3, 12])
-def test_linear_stress_is_read_at_the_centre(sensor, per_side):
+def test_linear_stress_is_read_at_the_centre(readout, per_side):
     """The mean of a linear function over a square or two opposite edges is its value at the centre."""
+    sensor = replace(UNIAXIAL, readout=readout)
     charge = charge_of(sensor, lambda x, y: (1.0 + 3.0 * x - 2.0 * y, -4.0 * x + y, x), per_side)
     x, y = np.array([electrode.centre for electrode in sensor.electrodes]).T
     expected = AREA * (D31 * (1.0 + 3.0 * x - 2.0 * y) + D32 * (-4.0 * x + y))
@@ -113,7 +111,7 @@ def midpoints(low, high, step=0.02):
 def test_a_trace_collects_the_stress_under_it(film, at):
     """The charge of a square with a bent trace equals the sum over small cells of its three rectangles."""
     path = ((10.0, 0.0), (18.0, 0.0), (18.0, 20.0))
-    traced = Electrode.of_square("A", (10.0, 0.0), 3.0).with_trace(path, 0.5)
+    traced = SQUARE.with_trace(path, 0.5)
     solved = press(film, PROBE, at, 1.0)
     expected = 0.0
     for low, high in (((8.5, -1.5), (11.5, 1.5)), ((11.5, -0.25), (18.25, 0.25)), ((17.75, 0.25), (18.25, 20.0))):
@@ -125,22 +123,20 @@ def test_a_trace_collects_the_stress_under_it(film, at):
 
 def test_pressure_and_thermal_charge_only_where_front_and_back_overlap():
     """The back metal covers the square only, so the trace collects no charge."""
-    square = Electrode.of_square("A", (10.0, 0.0), 3.0)
-    traced = replace(square.with_trace(((10.0, 0.0), (20.0, 0.0)), 0.5), back=(square.corners,))
+    traced = replace(SQUARE.with_trace(((10.0, 0.0), (20.0, 0.0)), 0.5), back=(SQUARE.corners,))
     for charge in (
         lambda sensor: charge_of(sensor, lambda x, y: (x**2, y, 0 * x)),
         lambda sensor: contact_charge(sensor, PROBE, (11.5, 0.0), 1.0),
         lambda sensor: thermal_charge(replace(sensor, piezo=Piezo(1.0, 1.0, 0.0, -30.0)), 0.1),
     ):
-        there, alone = (charge(with_d33(electrodes=(electrode,))) for electrode in (traced, square))
+        there, alone = (charge(with_d33(electrodes=(electrode,))) for electrode in (traced, SQUARE))
         np.testing.assert_allclose(there, alone, rtol=1e-12)
 
 
 @pytest.mark.parametrize("readout", ["area", "edge"])
 def test_each_rule_is_accurate_from_its_smallest_distance_on(film, readout):
     """The electrode lies at the smallest distance at which the forward map uses the rule."""
-    electrode = Electrode.of_square("A", (10.0, 0.0), 3.0)
-    sensor = replace(UNIAXIAL, electrodes=(electrode,), readout=readout)
+    sensor = replace(UNIAXIAL, electrodes=(SQUARE,), readout=readout)
     reach = 1.0
     unit = 1.5 * np.sqrt(2.0) + reach
     for smallest_distance, tolerance in ((0.0, 2e-4), (NEAR_DISTANCE, 1e-4)):

@@ -34,6 +34,9 @@ negative."""
 NOISE_pC = np.array([0.3, 0.2, 0.3, 0.4])
 """Standard deviation of the white noise of each channel, pC."""
 
+REAL_PAD = ROOT / "tests" / "data" / "tactile_fsi.csv"
+"""Presses on a real pad of TactileFSI."""
+
 CHANNELS = ("Q1", "Q2", "Q3", "Q4")
 
 FORCES_N = (0.2, 5.0)
@@ -324,7 +327,7 @@ def test_unknown_forces_that_vary_are_not_taken_for_noise():
 
 def test_intact_presses_are_accepted_without_a_warning(caplog):
     """Charges in other units, channels that are mostly zero, similar channels, and presses on a real pad."""
-    usable_presses(read_presses(ROOT / "tests" / "data" / "tactile_fsi.csv"))
+    usable_presses(read_presses(REAL_PAD))
     presses = presses_on_l()
     for unit in (1e-12, 1e12):
         usable_presses(measured_presses(presses.contact, unit * presses.charge_pC, CHANNELS))
@@ -351,7 +354,7 @@ def test_a_real_pad_is_learned_better_than_by_boosted_trees():
 
     Boosted trees have errors of 6.93 mm and 27.0 % on the held-out presses.
     """
-    presses = read_presses(ROOT / "tests" / "data" / "tactile_fsi.csv")
+    presses = read_presses(REAL_PAD)
     is_held_out = position_ranks(presses.contact) < 0.2
     fitted = fit_presses(presses[~is_held_out], "pad")
     held_out_presses = presses[is_held_out]
