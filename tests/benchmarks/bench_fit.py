@@ -12,8 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from unittest.mock import patch
 
 import numpy as np
@@ -32,7 +31,6 @@ from sklearn.preprocessing import FunctionTransformer
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, FEW_ELECTRODES
 from isocharge.simulate import (
-    ChargeMap,
     ChargeSpline,
     Circle,
     Domain,
@@ -56,46 +54,32 @@ Predict = Callable[[Array], Array]
 """Function from charges, shape (n, n_electrode), pC, to contacts, shape (n, 3), mm and N."""
 
 
-@dataclass(frozen=True)
 class Case:
     """Presses for training and presses for measuring errors.
 
     Attributes:
         domain: Contacts of both.
+        noise: Noise of the charges.
+        charge_map: Map from contacts to charges.
         train: Presses for training without noise.
+        noisy_train: Copies of these presses with noise.
         truth: Contacts on which errors are measured, shape (n, 3), mm and N.
         charge: Their charges with noise, shape (n, n_electrode), pC.
         estimate: Posterior means of the contacts from these charges, shape (n, 3).
-        charge_map: Map from contacts to charges.
-        noise: Noise of the charges.
     """
 
-    domain: Domain
-    train: LabelledPresses
-    truth: Array
-    charge: Array
-    estimate: Array
-    charge_map: ChargeMap
-    noise: NoiseModel
-
-    @classmethod
-    def simulate(cls, sensor_name: str, radius: float, n_sample: int, n_press: int, noise: NoiseModel) -> "Case":
+    def __init__(self, sensor_name: str, radius: float, n_sample: int, n_press: int, noise: NoiseModel) -> None:
         """Simulate the presses and compute the limit."""
-        domain = Domain(radius, DEFAULT_FORCE_RANGE)
-        charge_map = ForwardMap.build(load_sensor(sensor_name), Circle(1.0), radius, domain.force_range)
-        contact = Sweep(radius, domain.force_range, n_sample, 0).contacts()
-        truth = Sweep(radius, domain.force_range, n_press, 1).contacts()
-        charge = noise.add(charge_map.charges(truth), np.random.default_rng(2))
-        estimate, _ = Posterior(ChargeSpline.of(charge_map), noise, radius).mean_and_std(charge)
-        return cls(
-            domain=domain,
-            train=LabelledPresses(contact, charge_map.charges(contact)),
-            truth=truth,
-            charge=charge,
-            estimate=estimate,
-            charge_map=charge_map,
-            noise=noise,
-        )
+        self.domain = Domain(radius, DEFAULT_FORCE_RANGE)
+        self.noise = noise
+        self.charge_map = ForwardMap.build(load_sensor(sensor_name), Circle(1.0), radius, DEFAULT_FORCE_RANGE)
+        contact = Sweep(radius, DEFAULT_FORCE_RANGE, n_sample, 0).contacts()
+        self.train = LabelledPresses(contact, self.charge_map.charges(contact))
+        noisy_charges = [self.train.noisy(noise, seed) for seed in range(N_COPIES)]
+        self.noisy_train = LabelledPresses(np.tile(contact, (N_COPIES, 1)), np.concatenate(noisy_charges))
+        self.truth = Sweep(radius, DEFAULT_FORCE_RANGE, n_press, 1).contacts()
+        self.charge = noise.add(self.charge_map.charges(self.truth), np.random.default_rng(2))
+        self.estimate, _ = Posterior(ChargeSpline.of(self.charge_map), noise, radius).mean_and_std(self.charge)
 
     def measure(self, fit: Callable[[], Predict]) -> dict[str, float]:
         """Return the CPU time of a fit, its position error, and the errors over the limit.
@@ -118,12 +102,6 @@ class Case:
             "position_over_limit": round(float(np.hypot(1.0, position_mm / limit["position_rms_mm"])), 4),
             "force_over_limit": round(float(np.hypot(1.0, force_percent / limit["force_rms_percent"])), 4),
         }
-
-    @cached_property
-    def noisy_train(self) -> LabelledPresses:
-        """Copies of the presses for training with noise."""
-        charges = [self.train.noisy(self.noise, seed) for seed in range(N_COPIES)]
-        return LabelledPresses(np.tile(self.train.contact, (N_COPIES, 1)), np.concatenate(charges))
 
     def network(self) -> InverseNetwork:
         """Return an untrained network of the default size."""
@@ -204,7 +182,7 @@ def main() -> None:
         noise="reference",
         json=False,
     )
-    case = Case.simulate(asked.sensor, asked.radius, asked.samples, asked.presses, noise_model(asked.noise))
+    case = Case(asked.sensor, asked.radius, asked.samples, asked.presses, noise_model(asked.noise))
     fits: dict[str, Callable[[], Predict]] = {}
     for steps in map(int, asked.steps.split(",")):
         fits[f"training, {steps} steps"] = partial(train, case, steps)
@@ -212,7 +190,6 @@ def main() -> None:
         if name == "linear targets" and case.charge_map.charges(case.truth[:1]).shape[1] <= FEW_ELECTRODES:
             continue  # they are not used
         fits[f"without {name}"] = partial(train, case, None, change)
-    _ = case.noisy_train  # computed now, so that the time of the first regressor does not include it
     for name in REGRESSORS:
         fits[name] = partial(regressor, case, name)
 
