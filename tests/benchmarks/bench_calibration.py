@@ -207,7 +207,6 @@ def main() -> None:
         changes="0,0.3,-0.4",
         cases="all",
         gain_noise=0.002,
-        json=False,
     )
     problem = CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))
     noise = NoiseModel("bench", problem.noise.white, asked.gain_noise)

@@ -47,7 +47,7 @@ def errors(fitted: Fitted, contact: Array, charge: Array) -> dict[str, float]:
 
 
 def main() -> None:
-    asked = arguments(__doc__, sensor="four-25um-biaxial", presses=1000, json=False)
+    asked = arguments(__doc__, sensor="four-25um-biaxial", presses=1000)
     sensor = load_sensor(asked.sensor)
     sensor = replace(sensor, film=replace(sensor.film, pretension=PRETENSION_MPa))
     contact = Sweep(0.999 * RADIUS_mm, FORCE_RANGE_N, asked.presses, 1).contacts()

@@ -69,7 +69,7 @@ def _sizes(program: Path) -> tuple[int, int, int]:
 
 
 def main() -> None:
-    asked = arguments(__doc__, export=Path("c"), json=False)
+    asked = arguments(__doc__, export=Path("c"))
     with tempfile.TemporaryDirectory() as folder:
         print_results("cortex_m", asked, {board: measure(asked.export, board, Path(folder)) for board in BOARDS})
 

@@ -180,7 +180,6 @@ def main() -> None:
         presses=1_500,
         steps="250,600,1500,2000",
         noise="reference",
-        json=False,
     )
     case = Case(asked.sensor, asked.radius, asked.samples, asked.presses, noise_model(asked.noise))
     fits: dict[str, Callable[[], Predict]] = {}

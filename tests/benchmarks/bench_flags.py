@@ -20,7 +20,7 @@ RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial"
 
 
 def main() -> None:
-    requested = arguments(__doc__, models=RELEASED, presses=4000, seed=1, json=False)
+    requested = arguments(__doc__, models=RELEASED, presses=4000, seed=1)
     models = requested.models.split(",")
     nominal = film_map()
     variants = film_variants()

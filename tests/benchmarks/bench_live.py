@@ -77,7 +77,7 @@ def following(port, folder):
 
 
 def main():
-    options, results = arguments(__doc__, rounds=4, seconds=10.0, rate_Hz=1000.0, json=False), {}
+    options, results = arguments(__doc__, rounds=4, seconds=10.0, rate_Hz=1000.0), {}
     pipe, far = multiprocessing.Pipe()
     board = multiprocessing.get_context("spawn").Process(
         target=bench_stream.board, args=(far, 3, presses(options.rate_Hz), 0), daemon=True

@@ -90,7 +90,7 @@ def coverage(case: ModelCase, count: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    asked = arguments(__doc__, models=RELEASED, presses=6000, draws=MAX_PRESSES, seed=1, json=False)
+    asked = arguments(__doc__, models=RELEASED, presses=6000, draws=MAX_PRESSES, seed=1)
     results = {}
     for model in asked.models.split(","):
         case = ModelCase(model, asked.seed)

@@ -27,7 +27,7 @@ NOISE = noise_model("reference")
 
 
 def main() -> None:
-    options = arguments(__doc__, json=False)
+    options = arguments(__doc__)
     first_sensor, _ = CASES[0]
     largest_radius = max(radius for _, radius in CASES)
     forward_map = ForwardMap.build(load_sensor(first_sensor), Circle(1.0), largest_radius, (FORCES[0], FORCES[-1]))

@@ -102,7 +102,7 @@ def measure(sensor: Sensor, probe: Circle) -> dict[str, Any]:
 
 def main() -> None:
     """Train for all sensors and print a row for each."""
-    options = arguments(__doc__, sensors=20, json=False)
+    options = arguments(__doc__, sensors=20)
     rows: dict[str, dict[str, Any]] = {}
     for number in range(options.sensors):
         sensor, probe = random_sensor(number)

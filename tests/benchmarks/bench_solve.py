@@ -203,7 +203,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
 
 
 def main() -> None:
-    asked = arguments(__doc__, positions=20, seed=1, plot=None, json=False)
+    asked = arguments(__doc__, positions=20, seed=1, plot=None)
     result = measure_all(asked.positions, asked.seed)
     if asked.plot:
         plot(result, asked.plot)

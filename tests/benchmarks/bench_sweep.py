@@ -51,7 +51,7 @@ def relative_error(dataset: Dataset, row: int) -> np.ndarray:
 
 
 def main() -> None:
-    options = arguments(__doc__, json=False)
+    options = arguments(__doc__)
     sensor, sweep = load_sensor("four-25um-biaxial"), Sweep(10.0, (0.05, 2.0), SAMPLES, 0, "random")
     began, solved_at = time.perf_counter(), []
 

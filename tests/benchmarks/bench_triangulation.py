@@ -17,7 +17,7 @@ RADIUS, FORCES = 8.0, (0.05, 2.0)
 
 def main() -> None:
     """Three and four electrodes, clean and noisy, unknown force."""
-    options = arguments(__doc__, presses=2000, json=False)
+    options = arguments(__doc__, presses=2000)
     contact = Sweep(RADIUS, FORCES, options.presses).contacts()
     solved = ForwardMap.build(load_sensor("three-25um-biaxial"), Polygon.triangle(4.0), 10.0, FORCES)
     results = {}

@@ -48,7 +48,7 @@ def direct_errors(forward_map: ForwardMap, sensor: Sensor, orientation: Orientat
 
 
 def main() -> None:
-    options = arguments(__doc__, presses=20, json=False)
+    options = arguments(__doc__, presses=20)
     built_in = load_sensor("four-25um-biaxial")
     sensor = replace(built_in, film=replace(built_in.film, oval=0.01, **TENSION, **MODULI))
     rows = {}

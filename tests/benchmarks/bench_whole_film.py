@@ -26,7 +26,7 @@ RING_EDGES_mm = (8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 43.0)
 
 
 def main() -> None:
-    requested = arguments(__doc__, models=RELEASED, presses=2000, seed=1, json=False)
+    requested = arguments(__doc__, models=RELEASED, presses=2000, seed=1)
     models = requested.models.split(",")
     results = {model: WholeFilmStudy(model, requested.presses, requested.seed).rings(RING_EDGES_mm) for model in models}
     print_shares("whole film", requested, "distance", results, empty="-")

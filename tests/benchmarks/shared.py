@@ -27,11 +27,11 @@ def options(page: str, model: str = "three-25um-biaxial", **more: Any) -> argpar
         model: Default of the option `--model`.
         more: Defaults of further options; see `arguments`.
     """
-    return arguments(page, model=model, seed=0, json=False, **more)
+    return arguments(page, model=model, seed=0, **more)
 
 
 def arguments(page: str, **defaults: Any) -> argparse.Namespace:
-    """Parse the options of a benchmark.
+    """Parse the options of a benchmark, one of which is the switch `--json`.
 
     Args:
         page: Description of the benchmark for `--help`.
@@ -39,7 +39,7 @@ def arguments(page: str, **defaults: Any) -> argparse.Namespace:
             default False is a switch, and an option with the default None is a path.
     """
     parser = argparse.ArgumentParser(description=page, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name, default in defaults.items():
+    for name, default in {**defaults, "json": False}.items():
         option = "--" + name.replace("_", "-").lower()
         if default is False:
             parser.add_argument(option, dest=name, action="store_true")
