@@ -70,3 +70,15 @@ def test_svg_is_to_scale(sensor, drawing, tmp_path):
         left, low, right, high = box(electrode.corners)
         expected = [middle[0] + left, middle[1] - high, middle[0] + right, middle[1] - low]
         assert np.abs(boxes - expected).max(axis=1).min() < MICROMETRE
+
+
+def test_electrode_without_metal_on_the_back_has_its_area_there_beside_pads_of_others():
+    """Without such pads, the metal covers the whole back and is not drawn."""
+    whole = load_sensor("three-25um-biaxial")
+    first, second, third = whole.electrodes
+    pad = Electrode.of_square("", first.centre, 2.0).corners
+    padded = replace(whole, electrodes=(replace(first, back=(pad,)), second, third))
+    backs = [draw_layout(sensor).modelspace().query('LWPOLYLINE[layer=="BACK"]') for sensor in (whole, padded)]
+    drawn = [[np.array(line.get_points("xy")) for line in back] for back in backs]
+    assert drawn[0] == []
+    np.testing.assert_allclose(drawn[1], [pad, second.corners, third.corners])

@@ -61,6 +61,12 @@ def test_impossible_design_case_raises_input_error(sensor, changes, message):
         )
 
 
+def test_new_squares_have_the_side_of_pads_with_traces(sensor):
+    pad = Electrode.of_square("A", (10.0, 0.0), 5.0).with_trace(((10.0, 0.0), (30.0, 0.0)), 0.5)
+    traced = replace(sensor, electrodes=(pad, *sensor.electrodes[1:]))
+    assert DesignCase(traced, 5, 8.0, keep=("A",)).square_side == pytest.approx(5.0)
+
+
 def test_negative_nuisance_raises_input_error():
     with pytest.raises(InputError, match="pretension: expected at least 0, got -1"):
         Nuisances(pretension=-1.0)
@@ -69,5 +75,5 @@ def test_negative_nuisance_raises_input_error():
 def test_squares_that_do_not_fit_raise_input_error_before_the_film_is_solved(sensor):
     wall = replace(sensor, electrodes=(Electrode.of_square("A", (0.0, 0.0), 60.0),))
     for case in (DesignCase(sensor, 8, 8.0, side=30.0), DesignCase(wall, 4, 8.0, keep=("A",), side=20.0)):
-        with pytest.raises(InputError, match="do not fit"):
+        with pytest.raises(InputError, match="found no layout"):
             design(case)

@@ -98,6 +98,12 @@ def test_goal_rms_reduces_the_root_mean_square(centres, sensor, fields):
     assert search.case.all_clearances(found.positions).min() > -1e-3
 
 
+@pytest.mark.parametrize(("count", "side"), [(8, 13.0), (4, 20.0)])
+def test_large_squares_are_placed_farther_from_the_centre(count, side, sensor):
+    case = DesignCase(sensor, count, 8.0, side=side)
+    assert min(case.all_clearances(positions).min() for positions in random_layouts(case)) >= 0.0
+
+
 @pytest.fixture
 def _random_layouts(monkeypatch):
     """Do not improve the random layouts."""

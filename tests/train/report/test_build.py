@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ from tests.train.measured import measured_presses, with_samples
 from isocharge.cli.train import report as report_module
 from isocharge.common.errors import DatasetError, ModelError, OutputExists, PressError
 from isocharge.serve import benchmark, find_model
+from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.model.model_folder import load_model
-from isocharge.simulate import Circle, Sweep, load_sensor
+from isocharge.simulate import Circle, NoiseModel, Sweep, load_sensor
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train.data.contact_errors import contact_error_statistics
 from isocharge.train.data.presses import dataset_of
@@ -63,6 +65,22 @@ def test_every_method_is_in_the_table_with_its_error_near_the_cramer_rao_limit(r
         )
         assert 0.5 < errors["position_rms_mm"] / limit["position_rms_mm"] < 1.5
         assert entry["single_press_us"] > 0.0
+
+
+def test_model_is_tested_on_positions_and_with_the_noise_of_its_own_training(dataset, monkeypatch):
+    metadata = load_model(find_model(NAME)).metadata
+    for sha256, hold_out, share in (("other", 0.02, 0.1), (dataset.sha256, 0.02, 0.02), (dataset.sha256, 0.5, 0.1)):
+        trained = structs.replace(
+            metadata,
+            dataset_sha256=sha256,
+            made_with={"config": {"training": {"hold_out": hold_out}}},
+            noise=ModelNoise(name="bench", white_pC=3.0, gain=0.01),
+        )
+        monkeypatch.setattr(evaluation, "Predictor", lambda _, trained=trained: SimpleNamespace(metadata=trained))
+        prepared = evaluation.DatasetEvaluation.prepare(dataset, find_model(NAME), SMALL)
+        held_out_count = len(prepared.held_out_presses)
+        assert held_out_count / (held_out_count + len(prepared.presses)) == pytest.approx(share, abs=0.005)
+        assert prepared.noise == NoiseModel("bench", 3.0, 0.01)
 
 
 def test_presses_without_an_estimate_are_left_out_of_the_errors():

@@ -12,7 +12,7 @@ import typer
 from isocharge.cli.shared.terminal import say
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT, FEW_ELECTRODES
 from isocharge.common.errors import InputError, IsochargeError
-from isocharge.simulate import Dataset, Film, Probe, Sensor, read_dataset
+from isocharge.simulate import Dataset, Film, NoiseModel, Probe, Sensor, read_dataset
 from isocharge.simulate.execution import cores, dask_workers, local_workers
 from isocharge.simulate.sensor.probe import PROBE_HELP
 
@@ -55,7 +55,14 @@ def solving_executor(film: Film) -> AbstractContextManager[Executor | None]:
     return executor_for(1 if film.is_axisymmetric else None)
 
 
-def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tuple[float, float]) -> float:
+def sweep_radius(
+    text: str,
+    sensor: Sensor,
+    probes: Sequence[Probe],
+    force: tuple[float, float],
+    executor: Executor | None,
+    noise: NoiseModel | None = None,
+) -> float:
     """Return the radius of a sweep, mm.
 
     Args:
@@ -63,9 +70,11 @@ def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tupl
         sensor: The sensor.
         probes: The probes.
         force: Smallest and largest force, N.
+        executor: Executor that runs the solves; None for this process.
+        noise: Noise with which the working area is determined; None for `reference`.
 
     Raises:
-        InputError: If the text is neither a number nor `auto`, or there is no working area with `reference` noise.
+        InputError: If the text is neither a number nor `auto`, or there is no working area with this noise.
     """
     if text != "auto":
         try:
@@ -77,12 +86,11 @@ def sweep_radius(text: str, sensor: Sensor, probes: Sequence[Probe], force: tupl
     from isocharge.simulate.identifiability.identification import map_to_search
 
     radii = []
-    with solving_executor(sensor.film) as executor:
-        for probe in probes:
-            forward_map = map_to_search(sensor, probe, force, executor)  # covers the largest possible working area
-            area = working_area(forward_map, noise_model("reference"))
-            say(f"{probe.notation}: {area.summary}")
-            radii.append(area.radius)
+    for probe in probes:
+        forward_map = map_to_search(sensor, probe, force, executor)  # covers the largest possible working area
+        area = working_area(forward_map, noise or noise_model("reference"))
+        say(f"{probe.notation}: {area.summary}")
+        radii.append(area.radius)
     smallest_radius = min(radii)
     if smallest_radius == 0.0:
         raise InputError(

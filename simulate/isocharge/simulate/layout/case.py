@@ -170,7 +170,8 @@ class DesignCase:
         """
         if self.side is not None:
             return float(self.side)
-        sides = (electrode.side for electrode in self.sensor.electrodes)
+        pads = (replace(electrode, more=(), back=()) for electrode in self.sensor.electrodes)  # without traces
+        sides = (pad.side for pad in pads)
         return next((side for side in sides if side is not None), DEFAULT_SIDE)
 
     @property

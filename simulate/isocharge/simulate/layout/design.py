@@ -86,10 +86,22 @@ def random_layouts(case: DesignCase) -> list[Array]:
     """
     useful_radius = case.radius + EXTENT * case.sensor.film.radius
     allowed_radius = case.sensor.film.inner_radius - RIM_DISTANCE - 0.5 * case.square_side
-    radius = min(useful_radius, allowed_radius)
+    layouts = _layouts_within(min(useful_radius, allowed_radius), case) or _layouts_within(allowed_radius, case)
+    if not layouts:
+        raise InputError(
+            f"found no layout of {case.new_count} new squares of {case.square_side:g} mm within "
+            f"{allowed_radius:.3g} mm of the centre, with gaps of {GAP:g} mm; ask for fewer or smaller electrodes"
+        )
+    return layouts
+
+
+def _layouts_within(radius: float, case: DesignCase) -> list[Array]:
+    """Choose random layouts of which all centres are within a radius, mm; an empty list if a layout is not complete.
+
+    Each layout is filled with random points, as long as the next point satisfies the distance rules.
+    """
     grid = radius * sunflower(1000)
     grid = grid[case.clearance(grid) >= 0.0]
-
     rng = np.random.default_rng(case.seed)
     layouts = []
     for _ in range(STARTS):
@@ -98,10 +110,7 @@ def random_layouts(case: DesignCase) -> list[Array]:
             if len(positions) < case.new_count and (case.pair_clearance(positions, candidate[None]) >= 0.0).all():
                 positions = np.vstack([positions, candidate])
         if len(positions) < case.new_count:
-            raise InputError(
-                f"{case.new_count} new squares of {case.square_side:g} mm do not fit within {radius:.3g} mm of the "
-                f"centre, with gaps of {GAP:g} mm; ask for fewer, smaller or nearer electrodes"
-            )
+            return []
         layouts.append(positions)
     return layouts
 

@@ -13,6 +13,7 @@ from isocharge.cli.shared.forward_maps import (
     DEFAULT_PROBE,
     ProbesOption,
     simulated_presses,
+    solving_executor,
     sweep_radius,
     warn_of_stress,
 )
@@ -30,6 +31,7 @@ from isocharge.simulate import (
     read_dataset,
 )
 from isocharge.train import FitConfig, Fitted, TrainingConfig, TrainingData, fit, fit_presses, load_config, release
+from isocharge.train.data.channel_noise import misfit_noise
 from isocharge.train.data.presses import is_measured, measured_presses_of
 from isocharge.train.model_release.release import Release
 
@@ -212,7 +214,9 @@ def _fit_simulated_presses(sensor_name: str, notations: Sequence[str], radius: s
     sensor = load_sensor(sensor_name)
     probes = [parse_probe(notation) for notation in notations]
     warn_of_stress(sensor.film, probes, DEFAULT_FORCE_RANGE[1])
-    radius_mm = sweep_radius(radius, sensor, probes, DEFAULT_FORCE_RANGE)
+    noise = misfit_noise(config.training.noise_model)
+    with solving_executor(sensor.film) as executor:
+        radius_mm = sweep_radius(radius, sensor, probes, DEFAULT_FORCE_RANGE, executor, noise)
     return fit(TrainingData.of(simulated_presses(sensor, probes, radius_mm, DEFAULT_FORCE_RANGE)), config)
 
 

@@ -10,6 +10,7 @@ from itertools import cycle
 from pathlib import Path
 
 import numpy as np
+from msgspec import structs
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DatasetError, ModelError, PressError, TrainingError
@@ -24,6 +25,7 @@ from isocharge.simulate import ChargeMap, Dataset, NoiseModel, Triangulation, li
 from isocharge.simulate.identifiability.nearest_contact import search
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from isocharge.train.calibration.folder import PRESSES
+from isocharge.train.data.channel_noise import misfit_noise
 from isocharge.train.data.charge_fit import fit_charge_series
 from isocharge.train.data.contact_errors import contact_error_statistics, rms, rounded
 from isocharge.train.data.presses import (
@@ -132,10 +134,6 @@ def model_method(folder: Path) -> Method:
     return Method(f"network `{predictor.metadata.label}`", "Predictor", estimate, single_call)
 
 
-NOISE = noise_model("reference")
-"""Noise of simulated test presses, which also weights the charges of measured presses."""
-
-
 SEED = 0
 """Seed of all random numbers."""
 
@@ -225,6 +223,7 @@ class DatasetEvaluation:
         model_folder: Version folder of the evaluated model.
         presses: The presses to which the methods are fitted.
         held_out_presses: The presses at other positions, on which the methods are tested.
+        noise: Noise of simulated test presses, which also weights the charges of measured presses.
         settings: Settings of the report.
     """
 
@@ -232,6 +231,7 @@ class DatasetEvaluation:
     model_folder: Path
     presses: LabelledPresses
     held_out_presses: LabelledPresses
+    noise: NoiseModel
     settings: Settings
 
     @classmethod
@@ -239,6 +239,7 @@ class DatasetEvaluation:
         """Select the presses that the model covers, and hold out a part of them for the test.
 
         Of simulated presses, a tenth of the positions is held out, which a training on the same dataset also holds out.
+        If the model was trained on this dataset and held fewer positions out, only these are held out.
         Of measured presses, which are fewer, a fifth is held out. A held-out press is
         left out if a calibration of the model has used it.
 
@@ -281,8 +282,11 @@ class DatasetEvaluation:
                 )
             held_out = held_out[~is_learned]
         else:
-            presses, held_out = split_by_position(presses_of(covered), TrainingConfig().hold_out)
-        return cls(covered, model_folder, presses, held_out, settings)
+            hold_out = TrainingConfig().hold_out
+            if model.dataset_sha256 == dataset.sha256:
+                hold_out = min(hold_out, model.made_with["config"]["training"]["hold_out"])
+            presses, held_out = split_by_position(presses_of(covered), hold_out)
+        return cls(covered, model_folder, presses, held_out, _noise_of(model), settings)
 
     def measure(self) -> Section:
         """Fit all methods, and measure their errors and their speed."""
@@ -291,7 +295,7 @@ class DatasetEvaluation:
         measured = is_measured(self.dataset)
         if not measured:
             test = test.repeated(self.settings.presses)
-            test = replace(test, charge=test.noisy(NOISE, SEED))
+            test = replace(test, charge=test.noisy(self.noise, SEED))
 
         methods = [model_method(self.model_folder)]
         limits: dict[str, float] = {}
@@ -299,16 +303,16 @@ class DatasetEvaluation:
         try:
             train, validation = split_by_position(self.presses, TrainingConfig().hold_out)
             charge_map = fit_charge_series(domain, self.dataset.sensor.electrode_names, train, validation)
-            task = FittingTask(self.presses, charge_map, NOISE)
+            task = FittingTask(self.presses, charge_map, self.noise)
             methods += [build_method(task) for build_method in METHOD_BUILDERS]
             # The limit follows from the derivatives of the series, and the noise of measured presses is unknown.
-            if not measured and charge_map.charge_std >= NOISE.gain:
+            if not measured and charge_map.charge_std >= self.noise.gain:
                 failure_reasons.append(
                     f"Cramér-Rao limit: a series that is fitted to {len(train)} presses has an error of "
                     f"{100.0 * charge_map.charge_std:.2g} % of a charge, more than the noise; simulate more presses"
                 )
             elif not measured:
-                cramer_rao = limits_at(charge_map, test.contact, NOISE)
+                cramer_rao = limits_at(charge_map, test.contact, self.noise)
                 limits = {
                     "position_rms_mm": rounded(rms(cramer_rao.position)),
                     "force_rms_percent": rounded(100.0 * rms(cramer_rao.force)),
@@ -321,7 +325,7 @@ class DatasetEvaluation:
             probes=list(self.dataset.samples.probes),
             radius_mm=domain.radius,
             force_N=domain.force_range,
-            noise=None if measured else NOISE.name,
+            noise=None if measured else self.noise.name,
             dataset_sha256=self.dataset.sha256,
             fitted_presses=len(self.presses),
             test_presses=len(test),
@@ -329,6 +333,17 @@ class DatasetEvaluation:
             methods=measure_methods(methods, test, self.settings.seconds),
             left_out=failure_reasons,
         )
+
+
+def _noise_of(model: ModelMetadata) -> NoiseModel:
+    """Return the noise for which a model was trained; `reference` for a training without noise or with measured noise.
+
+    Measured noise has other parameters for each electrode.
+    """
+    name, white_pC, gain = structs.astuple(model.noise)
+    if isinstance(white_pC, tuple) or isinstance(gain, tuple):
+        return noise_model("reference")
+    return misfit_noise(NoiseModel(name, white_pC, gain))
 
 
 def _calibration_charges(model_folder: Path, model: ModelMetadata) -> Array:
