@@ -65,16 +65,18 @@ def test_plot_draws_a_recording(command, recorded, tmp_path, figures):
 
     records = [json.loads(line) for line in path.read_text().splitlines() if line.startswith('{"timestamp"')]
     lines = {line.get_label(): line.get_ydata() for axes in figures[0].axes for line in axes.lines}
-    keys = ("x_mm", "x_std_mm", "force_N")
-    x_mm, x_std_mm, force_N = np.array([[record[key] for key in keys] for record in records], dtype=float).T
-    charge_C_pC = np.array([(record["charge_pC"] or {"C": None})["C"] for record in records], dtype=float)
+    x_mm, x_std_mm, force_N, charge_C_pC = np.array(
+        [
+            (record["x_mm"], record["x_std_mm"], record["force_N"], (record["charge_pC"] or {"C": None})["C"])
+            for record in records
+        ],
+        dtype=float,
+    ).T
     for name, values in {"x": x_mm, "force": force_N, "C": charge_C_pC}.items():
         np.testing.assert_array_equal(lines[name], values)
-    position_lines = next(axes for axes in figures[0].axes if axes.get_ylabel().startswith("position")).lines
-    for line, limit_mm in zip(position_lines[1:3], (x_mm - 2.0 * x_std_mm, x_mm + 2.0 * x_std_mm), strict=True):
-        np.testing.assert_allclose(line.get_ydata(), limit_mm)
-
-    flag_axes = next(axes for axes in figures[0].axes if axes.get_xlabel().startswith("time since"))
+    _, position_axes, _, flag_axes = figures[0].axes
+    for line, stds in zip(position_axes.lines[1:3], (-2.0, 2.0), strict=True):
+        np.testing.assert_allclose(line.get_ydata(), x_mm + stds * x_std_mm)
     words = [label.get_text() for label in flag_axes.get_yticklabels()]
     for flag, marks in zip(words, flag_axes.lines, strict=True):
         times_s = [record["timestamp"] - records[0]["timestamp"] for record in records if flag in record["flags"]]

@@ -47,32 +47,10 @@ def test_charges_are_the_same_from_the_exports_of_other_programs(export):
     np.testing.assert_array_equal(read(EXPORTS[export]), [[502.3, 244.8, 215.8], [423.2, 695.6, 507.8]])
 
 
-def test_header_is_above_the_first_numbers():
-    with pytest.raises(ChargeError, match="rename 'c' to 'C'"):
-        read("A,B,c\n1,2,3\nA,B,C\n4,5,6\n")
-    with pytest.raises(ChargeError, match=r"got the header \['time', 'channel', 'value'\]"):
-        read("time,channel,value\n0,A,1\n0,B,2\n")
-
-
 def test_further_columns_are_ignored_with_a_message(caplog):
     text = io.StringIO("x_mm,A,B,,C,x_mm\nhere,1,2,?,3,\n")
     np.testing.assert_array_equal(read_charges(text, NAMES, "presses.csv"), [[1, 2, 3]])
     assert caplog.messages == ["presses.csv: ignored columns: ['x_mm', '', 'x_mm']"]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (",".join(f"column {i}" for i in range(2000)), "expected at most 1,000 columns, got 2,000"),
-        ("A" * 200_000, "line 1: not CSV text .field larger"),
-        ("A,B," + "x" * 90_000, r"missing: \['C'\]"),
-        ("A,B,C\n" + ",".join("1" * 20_000), "line 2: expected 3 cells"),
-    ],
-)
-def test_message_about_a_wrong_table_is_short(text, message):
-    with pytest.raises(ChargeError, match=message) as caught:
-        read(text)
-    assert len(str(caught.value)) < 600
 
 
 @pytest.mark.parametrize(
@@ -91,11 +69,18 @@ def test_message_about_a_wrong_table_is_short(text, message):
         ("A;B;C\npC;nC;pC\n1;2;3\n", "line 2, column 'A': expected a charge in pC, got 'pC'"),
         ("A,B,C\n1,2,3\n\n4,,6\n", "presses.csv, line 4, column 'B': expected a charge in pC.*got an empty cell"),
         ("A,B,C\n1,1_0,3\n", "line 2, column 'B': .* got '1_0'"),
+        ("A,B,c\n1,2,3\nA,B,C\n4,5,6\n", "rename 'c' to 'C'"),
+        ("time,channel,value\n0,A,1\n0,B,2\n", r"got the header \['time', 'channel', 'value'\]"),
+        (",".join(f"column {i}" for i in range(2000)), "expected at most 1,000 columns, got 2,000"),
+        ("A" * 200_000, "line 1: not CSV text .field larger"),
+        ("A,B," + "x" * 90_000, r"missing: \['C'\]"),
+        ("A,B,C\n" + ",".join("1" * 20_000), "line 2: expected 3 cells"),
     ],
 )
-def test_wrong_charge_tables_are_refused(text, message):
-    with pytest.raises(ChargeError, match=message):
+def test_wrong_charge_tables_are_refused_with_a_short_message(text, message):
+    with pytest.raises(ChargeError, match=message) as caught:
         read(text)
+    assert len(str(caught.value)) < 600
 
 
 def test_rows_of_a_table_become_csv_and_records(film, predictor):
@@ -104,15 +89,16 @@ def test_rows_of_a_table_become_csv_and_records(film, predictor):
     expected = np.column_stack(predictor.predict_batch(charge_pC)).tolist()
     out = io.StringIO()
     write_contacts(charge_pC, predictor, out)
-    header, *rows = (line.split(",") for line in out.getvalue().splitlines())
-    assert header == [*Contacts._fields[:7], "flags"]
-    assert [row[-1] for row in rows] == ["", "outside", "outside beyond", ""]
-    assert [row[:-1] for row in rows[:3]] == [[f"{value:.6f}" for value in row[:7]] for row in expected[:3]]
-    assert rows[3] == ["", "", "0.000000", "", "", "", "", ""]
+    header, *rows, untouched = out.getvalue().splitlines()
+    assert header == ",".join(Contacts._fields[:7]) + ",flags"
+    flags = ["", "outside", "outside beyond", ""]
+    for row, values, words in zip(rows, expected, flags, strict=False):
+        assert row.split(",") == [*(f"{value:.6f}" for value in values[:7]), words]
+    assert untouched == ",,0.000000,,,,,"
 
     records = [json.loads(record.to_json()) for record in table_records(charge_pC, predictor)]
     assert [record["contact"] for record in records] == [True, True, True, False]
-    assert [" ".join(record["flags"]) for record in records] == [row[-1] for row in rows]
+    assert [" ".join(record["flags"]) for record in records] == flags
     assert records[1]["charge_pC"] == pytest.approx(dict(zip("ABC", charge_pC[1], strict=True)), abs=1e-6)
     assert [records[1][name] for name in Contacts._fields] == pytest.approx(expected[1], abs=1e-6)
     absent = {"timestamp", "t_device_us", "seq", "charge_raw_pC", "tare_pC", "latency_us"}
