@@ -152,27 +152,21 @@ class FaultStudy:
 
     def average(self, faulty_charges: list[Array]) -> Shares:
         """Return the mean over several forms of a fault, for example over the electrode that has it."""
-        every = [self.shares(self.contact, charge) for charge in faulty_charges]
-        flagged = float(np.mean([shares.flagged for shares in every]))
-        unnoticed = float(np.mean([shares.unnoticed for shares in every]))
-        return Shares(flagged, unnoticed)
+        contact = np.tile(self.contact, (len(faulty_charges), 1))
+        return self.shares(contact, np.concatenate(faulty_charges))
 
     def with_gain(self, *gains: float) -> list[Array]:
         """Return the charges with one electrode's gain changed, for every gain and every electrode."""
         count = self.clean_charge.shape[1]
-        return [
-            self.clean_charge * np.where(np.arange(count) == electrode, gain, 1.0)
-            for gain in gains
-            for electrode in range(count)
-        ]
+        return [self.clean_charge * (1.0 + (gain - 1.0) * unit) for gain in gains for unit in np.eye(count)]
 
     def swapped(self) -> Iterator[tuple[str, Array]]:
         """Yield a name and the charges for every pair of electrodes that is swapped."""
         names = self.predictor.metadata.electrodes
         for first, second in combinations(range(len(names)), 2):
-            order = np.arange(len(names))
-            order[[first, second]] = order[[second, first]]
-            yield f"{names[first]} and {names[second]} swapped", self.clean_charge[:, order]
+            charge = self.clean_charge.copy()
+            charge[:, [first, second]] = charge[:, [second, first]]
+            yield f"{names[first]} and {names[second]} swapped", charge
 
     def of_two_fingers(self) -> tuple[Array, Array]:
         """Return contacts of the first finger and the charges of both.
@@ -180,7 +174,7 @@ class FaultStudy:
         The charges of two presses are added, which is exact for a taut film and approximate for a slack one.
         """
         second = draw_contacts(self.rng, len(self.contact), self.radius_mm, SECOND_FINGER_FORCE_N)
-        distance = np.hypot(second[:, 0] - self.contact[:, 0], second[:, 1] - self.contact[:, 1])
+        distance = np.linalg.norm((second - self.contact)[:, :2], axis=1)
         apart = distance > SECOND_FINGER_DISTANCE_mm
         charge = self.clean_charge[apart] + self.nominal.charges(second[apart])
         return self.contact[apart], charge

@@ -75,5 +75,4 @@ def test_the_command_prints_a_table_and_json(command):
     code, out, _ = command("serve", "bench", "four-25um-biaxial", "--seconds", "0.2", "--json")
     report = json.loads(out)
     assert report["model"] == "four-25um-biaxial/1"
-    assert [timing["presses"] for timing in report["timings"]] == [1, 1, 16, 256, 4096]
     assert all(0 < timing["p50_us"] <= timing["p99_us"] for timing in report["timings"])

@@ -39,17 +39,6 @@ def test_sighup_loads_all_models_again(start, film, tmp_path):
     assert process.wait(timeout=30) == 0
 
 
-def test_stderr_of_log_json_has_only_lines_of_json(start, film, tmp_path):
-    film.write(tmp_path)
-    (film.write(tmp_path, version=2) / "golden.json").unlink()
-    process = start("--port", 0, "--log", "json", folder=tmp_path)
-    process.stdout.readline()
-    process.terminate()
-    refused, serving = map(json.loads, process.communicate(timeout=30)[1].splitlines())
-    assert (refused["level"], refused["message"][:9]) == ("warning", "refused: ")
-    assert (serving["level"], serving["message"]) == ("info", "serving linear/1; Ctrl-C stops")
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_server_answers_until_sigterm(start, number):
     process = start("--port", 0, "--grpc-port", 0)
@@ -109,9 +98,11 @@ def test_http_command_refuses_wrong_options_and_models(command, models, tmp_path
             assert any(line.startswith(message) for line in error.splitlines())
 
 
-def test_full_log_pipe_delays_no_request(start):
-    """The pipe of stderr takes some 64 KiB; then lines wait, and are not waited for."""
-    process = start("--port", 0, "--log", "json")
+def test_full_log_pipe_delays_no_request(start, film, tmp_path):
+    """The pipe of stderr takes some 64 KiB; then lines wait, and are not waited for. Each line is JSON."""
+    film.write(tmp_path)
+    (film.write(tmp_path, version=2) / "golden.json").unlink()
+    process = start("--port", 0, "--log", "json", folder=tmp_path)
     address = process.stdout.readline().strip().removeprefix("http://")
     client = http.client.HTTPConnection(address, timeout=20)
     for _ in range(500):
@@ -123,4 +114,7 @@ def test_full_log_pipe_delays_no_request(start):
     assert b"isocharge_log_lines_lost 0.0" in client.getresponse().read()  # 10,000 may wait
     client.close()
     process.terminate()
-    assert process.wait(timeout=20) == 0
+    refused, serving, *requests = map(json.loads, process.communicate(timeout=20)[1].splitlines())
+    assert (refused["level"], refused["message"][:9]) == ("warning", "refused: ")
+    assert (serving["level"], serving["message"]) == ("info", "serving linear/1; Ctrl-C stops")
+    assert (process.returncode, len(requests)) == (0, 501)

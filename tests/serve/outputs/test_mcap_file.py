@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.exceptions import EndOfFile
-from mcap.reader import NonSeekingReader, SeekingReader, make_reader
+from mcap.reader import SeekingReader, make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
@@ -194,8 +194,6 @@ def test_mcap_reader_finds_schemas_index_and_checksums(tmp_path, press):
         assert json.loads(schema.data) == record_schema(ELECTRODES)
         pose = next(reader.iter_decoded_messages("/isocharge/pose")).decoded_message
         assert (pose.pose.pose.position.x, pose.header.frame_id) == (3e-3, "linear-film")
-        file.seek(0)
-        assert sum(1 for _ in NonSeekingReader(file, validate_crcs=True).iter_messages()) == 15000
 
 
 SCHEMA = jsonschema_rs.Draft7Validator(record_schema(ELECTRODES))

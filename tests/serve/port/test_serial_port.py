@@ -294,11 +294,6 @@ def test_datagrams_are_chunks(address, sent, chunks):
             assert port.read(10.0).data == chunk
 
 
-def test_empty_datagram_is_no_chunk(address):
-    with udp_port(address, b"") as port:
-        assert port.read(0.01) is None
-
-
 def test_udp_url_without_a_host_receives_on_every_address(address):
     with Port(f"udp://:{address[1]}") as port, socket.socket(type=socket.SOCK_DGRAM) as board:
         board.sendto(b"1,2\n", address)

@@ -175,15 +175,21 @@ def test_noise_and_constant_bytes_are_not_recognised(data):
     assert recognise([data], 2.0) is None
 
 
-@pytest.mark.parametrize("tick_rate_Hz", [31250.0, 32768.0])
-def test_clock_has_the_nearest_usual_tick_rate(tick_rate_Hz):
-    clock, *_ = recognised_fields("<I4h", np.arange(FRAMES) * tick_rate_Hz / RATE_HZ, VALUES)
-    assert (clock["name"], clock["scale"]) == ("t_us", pytest.approx(1e6 / tick_rate_Hz))
+NUMBERS = np.arange(FRAMES)
 
 
-def test_counter_of_one_byte_that_restarts_is_recognised():
-    counter, *_ = recognised_fields("<B4h", np.arange(FRAMES) % 256, VALUES)
-    assert (counter["name"], counter["type"]) == ("seq", "u8")
+@pytest.mark.parametrize(
+    ("number_format", "numbers", "rate_Hz", "field"),
+    [
+        ("B", NUMBERS % 256, RATE_HZ, {"name": "seq", "type": "u8"}),
+        ("I", NUMBERS + (NUMBERS % 10 == 3), 1000.0, {"name": "t_ms", "type": "u32"}),
+        ("I", 31250.0 / RATE_HZ * NUMBERS, RATE_HZ, {"name": "t_us", "type": "u32", "scale": 32.0}),
+        ("I", 32768.0 / RATE_HZ * NUMBERS, RATE_HZ, {"name": "t_us", "type": "u32", "scale": 1e6 / 32768.0}),
+    ],
+    ids=["counter that wraps", "clock that repeats milliseconds", "clock of 31250 Hz", "clock of 32768 Hz"],
+)
+def test_number_before_the_channels_is_a_counter_or_a_clock_with_a_usual_rate(number_format, numbers, rate_Hz, field):
+    assert recognised_fields(f"<{number_format}4h", numbers, VALUES, rate_Hz)[0] == pytest.approx(field)
 
 
 @pytest.mark.parametrize(("size", "start", "step"), [(1, 0, 1), (2, 0x9000, 1), (4, 0x03F0_0000, 5000)])
@@ -235,11 +241,6 @@ def test_clock_that_counts_about_one_millisecond_per_frame_is_no_frame_counter(n
     times = (5000 + 1e3 / rate_Hz * np.arange(2000) + spread * rng.random(2000)).astype(int)
     lines = [f"{name}:{t},A:{q:.3f}\n" for t, q in zip(times, rng.normal(5.0, 0.3, 2000), strict=True)]
     assert recognise([b"\n", "".join(lines).encode()], 2000 / rate_Hz) == {"format": "text"} | expected
-
-
-def test_binary_clock_that_repeats_milliseconds_is_no_frame_counter():
-    times_ms = np.arange(FRAMES) + (np.random.default_rng(0).random(FRAMES) < 0.1)
-    assert recognised_fields("<I4h", times_ms, VALUES, 1000.0)[0] == {"name": "t_ms", "type": "u32"}
 
 
 def test_header_of_a_csv_stream_becomes_part_of_the_device_file():

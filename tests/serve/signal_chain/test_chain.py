@@ -48,13 +48,6 @@ def test_tare_gives_up_with_the_reason(charges_pC, message):
         run(charges_pC, tare={"patience": 250})
 
 
-def test_tare_takes_the_first_hundred_frames():
-    readings = run(rest(150))
-    assert all(reading.tare_pC is None and reading.flags == ("tare",) for reading in readings[:100])
-    np.testing.assert_allclose(readings[100].tare_pC, rest(150)[:100].mean(axis=0), atol=0.01)
-    np.testing.assert_allclose(np.mean([reading.charge_pC for reading in readings[100:]], axis=0), 0.0, atol=0.5)
-
-
 def test_second_tare_never_gives_up():
     """A finger that rests on the film does not stop a live stream."""
     chain = StageRunner(tare={"frames": 20, "patience": 50})

@@ -1,6 +1,5 @@
 """`serve stream --live` and `serve replay --live` as a person starts them."""
 
-import os
 import re
 import signal
 import time
@@ -28,13 +27,13 @@ def start(models, start_command):
     return start
 
 
-def follow(client, until, **read):
+def follow(client, until):
     """Read samples and the state until there are enough. Return the samples by column."""
     columns = client.session()["columns"]
     rows, state, answer = [], {}, {"first": None}
     end_s = time.monotonic() + 60.0
     while True:
-        answer = client.ask("read", first=answer["first"], **read)
+        answer = client.ask("read", first=answer["first"])
         state |= answer.get("state", {})
         rows += answer["samples"]
         samples = dict(zip(columns, np.array(rows, float).reshape(-1, len(columns)).T, strict=True))
@@ -55,7 +54,6 @@ def test_live_page_shows_a_press_and_carries_out_requests(board, start, tmp_path
     is_contact = samples["contact"] == 1.0
     assert [np.median(samples[name][is_contact]) for name in ("x_mm", "force_N")] == pytest.approx([3.0, 1.0], abs=0.01)
     assert state["counters"]["lost"] == 0
-    assert 1000.0 < state["rate_Hz"] < 3000.0 or os.getloadavg()[0] > 2.0
     assert client.session()["film"]["model"] == "linear/1"
 
     client.ask("record", on=True)
@@ -75,7 +73,7 @@ def test_live_page_shows_a_press_and_carries_out_requests(board, start, tmp_path
     assert (process.returncode, "Traceback" in err) == (0, False)
 
 
-def test_replay_page_shows_any_position_of_the_recording(film, models, start, command, tmp_path):
+def test_replay_page_shows_the_whole_recording(film, models, start, command, tmp_path):
     """Ctrl-C is the only end of such a replay: its MCAP file is whole before."""
     path, mcap = tmp_path / "touch.rec", tmp_path / "touch.mcap"
     (tmp_path / "frames").write_bytes(b"".join(encoded_frames(islice(taps(film), 600))))
@@ -86,8 +84,6 @@ def test_replay_page_shows_any_position_of_the_recording(film, models, start, co
     assert state["counters"]["frames"] == 600  # also if the recording is read faster than counters are shown
     assert samples["records"].sum() == 600
     assert max(state["overview"]) == pytest.approx(1.0, abs=0.05)
-    samples, _ = follow(client, lambda samples, _: len(samples["records"]) > 0, until_s=2.5)
-    assert 480 < samples["records"].sum() < 520
     process.send_signal(signal.SIGINT)
     assert process.wait(60) == 0
     with mcap.open("rb") as file:
