@@ -37,9 +37,8 @@ COMMANDS_OF_EXTRAS = {
 
 def check_prediction(bin_folder, folder):
     """Check the contact that the installed command computes."""
-    table = "A,B,C\n942.9,910.4,690.8\n"
     words = [bin_folder / "isocharge", "serve", "predict", "three-25um-biaxial", "-", "--json"]
-    done = subprocess.run(words, input=table, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    done = finished(words, input="A,B,C\n942.9,910.4,690.8\n", cwd=folder, timeout=120)
     assert done.returncode == 0, done.stderr
     record = json.loads(done.stdout)
     assert [record["x_mm"], record["y_mm"], record["force_N"]] == pytest.approx([3.0, -2.0, 1.0], abs=0.06)

@@ -1,7 +1,6 @@
 """Options of `isocharge` itself: its version, and completion by the shell."""
 
 import os
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -9,15 +8,11 @@ from pathlib import Path
 import pytest
 
 from isocharge import serve, simulate, train
+from processes import finished
 
 ROOT = Path(__file__).parents[2]
 ISOCHARGE = Path(sys.executable).parent / "isocharge"
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
-
-
-def run(*words, **variables):
-    environment = os.environ | variables
-    return subprocess.run(words, env=environment, capture_output=True, text=True, timeout=60, check=True).stdout
 
 
 def test_version(command):
@@ -35,4 +30,5 @@ def test_version(command):
 )
 def test_the_shell_completes_what_is_typed(typed, proposed):
     words = {"COMP_WORDS": typed, "COMP_CWORD": str(len(typed.split()) - 1), "_ISOCHARGE_COMPLETE": "complete_bash"}
-    assert set(run(ISOCHARGE, **words).split()) == proposed
+    done = finished([ISOCHARGE], env=os.environ | words, timeout=60)
+    assert set(done.stdout.split()) == proposed

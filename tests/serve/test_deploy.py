@@ -24,6 +24,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from isocharge.serve import find_model
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol.handler import Handler
+from processes import finished
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "serve/deploy"
@@ -132,7 +133,7 @@ def installed_unit(folder, names):
 
 def analyze(*words):
     """Exit code and messages of `systemd-analyze`."""
-    done = subprocess.run(["systemd-analyze", *words], capture_output=True, text=True, timeout=60, check=False)
+    done = finished(["systemd-analyze", *words], timeout=60)
     return done.returncode, done.stdout + done.stderr
 
 

@@ -1,12 +1,12 @@
 """A missing extra says how to get it; any other failed import is not dressed up as one; serving needs none."""
 
 import json
-import subprocess
 import sys
 
 import pytest
 
 from isocharge.common.errors import MissingExtra, require
+from processes import finished
 
 
 @pytest.mark.parametrize(
@@ -34,8 +34,7 @@ def test_missing_module_of_isocharge_itself_passes():
 
 def test_serving_loads_nothing_heavy():
     code = "import json, sys; import isocharge.serve; isocharge.serve.Predictor; print(json.dumps([*sys.modules]))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    loaded = set(json.loads(done.stdout))
+    loaded = set(json.loads(finished([sys.executable, "-c", code]).stdout))
     assert "onnxruntime" in loaded
     assert not loaded & {"torch", "scipy", "sklearn", "onnx", "matplotlib", "typer", "rich"}
     assert not loaded & {"isocharge.simulate", "isocharge.train", "isocharge.cli"}

@@ -231,7 +231,10 @@ def test_doctor_lists_the_ports_and_what_they_send(resting, run, monkeypatch):
 
 
 def test_doctor_refuses_a_file_in_a_folder_that_does_not_exist(resting, run):
-    with resting() as sensor, pytest.raises(OutputError, match=r"/proc/none/board\.toml cannot be written: No such file"):
+    with (
+        resting() as sensor,
+        pytest.raises(OutputError, match=r"/proc/none/board\.toml cannot be written: No such file"),
+    ):
         run("doctor", "--port", sensor.url, "--seconds", 0.5, "--write", "/proc/none/board.toml")
 
 

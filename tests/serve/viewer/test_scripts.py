@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import subprocess
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -15,6 +14,7 @@ from isocharge.serve.viewer.film_description import describe_film
 from isocharge.serve.viewer.tape import sample_type, sample_values
 from isocharge.simulate import Circle, Film, deflection, press
 from isocharge.simulate.sensor.sensor_file import film_to_dict
+from processes import finished
 
 VIEWER = Path(str(files("isocharge.serve.viewer")))
 FILM = Film(radius=45.0, thickness=0.025, young=3000.0, poisson=0.34)
@@ -42,10 +42,9 @@ def node(script):
     """Run a script by Node.js, and return the JSON value that it prints."""
     if shutil.which("node") is None:
         pytest.skip("needs Node.js, which reads the page's modules as a browser does")
-    command = ["node", "--input-type=module", "-e", script]
-    finished = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert finished.returncode == 0, finished.stderr
-    return json.loads(finished.stdout)
+    done = finished(["node", "--input-type=module", "-e", script])
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
 
 
 @pytest.mark.parametrize(("radius_mm", "middle"), [(None, [30.0, 0.0]), (45.0, [0.0, 0.0])])
