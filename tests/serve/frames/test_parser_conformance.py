@@ -67,7 +67,6 @@ def test_bytes_between_two_frames_damage_no_frame(name, data):
             (2 + 4, 1, 1),
             ["", "gap", "gap", "repeat", "", "restart", ""],
         ),
-        ((254, 255, 0, 3), 256, (2, 0, 0), ["", "", "", "gap"]),
         ((None, 5, None, 8), 65536, (2, 0, 0), ["", "", "", "gap"]),
         ((60_000, 60_001, 0, 1, 30_000), 65536, (29_998, 0, 1), ["", "", "restart", "", "gap"]),
         ((65_500, 60), 65536, (95, 0, 0), ["", "gap"]),
@@ -78,7 +77,6 @@ def test_bytes_between_two_frames_damage_no_frame(name, data):
     ids=[
         "wrap",
         "gaps, a repeat and a restart",
-        "one byte",
         "some without a number",
         "a restart in the upper half",
         "a gap at the end of the range",

@@ -23,10 +23,9 @@ def random_series(*, is_signed=False):
     """Return a series with three nodes, two directions of other degrees, and random coefficients."""
     rng = np.random.default_rng(0)
     coefficients = 0.1 * rng.normal(size=(3, 4, 4, 3, 4))
-    coefficients[:, 0, 0, 0] += 5.0 * (not is_signed)
-    coefficients[:, 0, 0, 1] += 1.2 * (not is_signed)
-    degrees = np.arange(4)
-    coefficients[:, degrees[:, None] + degrees > 3] = 0.0
+    if not is_signed:
+        coefficients[:, 0, 0, :2] += np.array([[5.0], [1.2]])
+    coefficients[:, np.add.outer(range(4), range(4)) > 3] = 0.0
     directions = 0.05 * rng.normal(size=(2, 2, 1, 2, 4))
     directions[1, 1] = 0.0
     return ChargeSeries(

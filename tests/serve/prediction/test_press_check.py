@@ -29,16 +29,14 @@ def measure(film):
 
     def measure(n, *, seed=0, force_scale=1.0, shift_mm=(0.0, 0.0), known=(True, True), noise=1.0):
         rng = np.random.default_rng(seed)
-        contact = np.column_stack([rng.uniform(-5.0, 5.0, (2, n)).T, rng.uniform(0.1, 1.8, n)])
-        contact[:, :2] /= np.sqrt(2.0)
+        contact = rng.uniform([-3.5, -3.5, 0.1], [3.5, 3.5, 1.8], (n, 3))
         std = 50.0 / (2400.0 * contact[:, 2])  # of the model, from the sum of the charges
         moved = contact + noise * rng.normal(size=(n, 3)) * np.column_stack([std, std, np.full(n, 7e-4)])
         moved += [*shift_mm, 0.0]
         moved[:, 2] *= force_scale
         contact[:, :2] += RIG_STD_MM * rng.normal(size=(n, 2))
         contact[:, 2] /= 1.0 + RIG_FORCE_STD * rng.normal(size=n)
-        contact[:, :2] *= 1.0 if known[0] else np.nan
-        contact[:, 2] *= 1.0 if known[1] else np.nan
+        contact[:, [not known[0], not known[0], not known[1]]] = np.nan
         stds = np.full(n, RIG_STD_MM), np.full(n, RIG_FORCE_STD)
         return MeasuredPresses(contact, film.charge_pC(*moved.T), *stds, film.electrodes, tuple(range(2, n + 2)))
 

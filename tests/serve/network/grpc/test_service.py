@@ -79,7 +79,6 @@ def test_charges_as_fp32_contents(serve, film, predictor, datatype):
 @pytest.mark.parametrize(
     ("fields", "status", "message"),
     [
-        ({"inputs": []}, "INVALID_ARGUMENT", "expected a list with one tensor"),
         *(
             ({"inputs": [tensor([[1.0] * 3], contents=contents)]}, "INVALID_ARGUMENT", message)
             for contents, message in [
