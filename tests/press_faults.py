@@ -89,17 +89,6 @@ class Shares:
     unnoticed: float
 
 
-def contacts_between(
-    rng: np.random.Generator, inner_mm: float, outer_mm: float, count: int, force_range_N: tuple[float, float]
-) -> Array:
-    """Draw contacts uniform over a ring with log-uniform forces, shape (count, 3), mm and N."""
-    radius = np.sqrt(rng.uniform(inner_mm**2, outer_mm**2, count))
-    angle = rng.uniform(0.0, 2.0 * np.pi, count)
-    low, high = np.log(force_range_N)
-    force = np.exp(rng.uniform(low, high, count))
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), force])
-
-
 def answer_shares(predictor: Predictor, contact: Array, charge: Array, rng: np.random.Generator) -> Shares:
     """Add `reference` noise to charges, predict, and count flags and wrong answers.
 
@@ -239,7 +228,7 @@ class WholeFilmStudy:
     def ring(self, inner_mm: float, outer_mm: float) -> RingShares:
         """Press a ring, and count what the model answers."""
         reachable_mm = min(outer_mm, self.film_map.domain.radius)
-        contact = contacts_between(self.rng, inner_mm, reachable_mm, self.presses, WHOLE_FILM_FORCES_N)
+        contact = draw_contacts(self.rng, self.presses, reachable_mm, WHOLE_FILM_FORCES_N, inner_mm)
         is_inside = np.hypot(contact[:, 0], contact[:, 1]) <= self.inner_map.domain.radius
         clean_charge = self.film_map.charges(contact)
         clean_charge[is_inside] = self.inner_map.charges(contact[is_inside])

@@ -48,12 +48,11 @@ def measured(tmp_path, film):
     """Write presses of the linear film, their forces read on a scale with an error of its own."""
 
     def write(*, scale=1.0, count=6, known="x_mm,y_mm,force_N"):
-        rng = np.random.default_rng(1)
-        x, y, force = rng.uniform(-4, 4, count), rng.uniform(-4, 4, count), rng.uniform(0.2, 1.5, count)
-        values = dict(zip(("x_mm", "y_mm", "force_N"), (x, y, scale * force), strict=True))
-        contact = [values[name] for name in known.split(",")]
-        table = np.column_stack([*contact, film.charge_pC(x, y, force), np.ones(count)])
+        contact = np.random.default_rng(1).uniform([-4.0, -4.0, 0.2], [4.0, 4.0, 1.5], (count, 3))
+        first_known = 2 if known == "force_N" else 0
+        read_contact = contact[:, first_known:] * [1.0, 1.0, scale][first_known:]
         path = tmp_path / "measured.csv"
+        table = np.column_stack([read_contact, film.charges(contact), np.ones(count)])
         np.savetxt(path, table, delimiter=",", header=f"{known},A,B,C,day", comments="")
         return path
 
