@@ -1,7 +1,7 @@
 """Tests of the estimator of a film on films whose charges are a closed formula."""
 
 from dataclasses import replace
-from functools import partial
+from functools import partial, partialmethod
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from tests.benchmarks.measured_films import measured_presses, with_rig_errors
 from tests.train.calibration.conftest import rig, uneven_film
 
-from isocharge.serve.model.robust_estimate import robust_estimate
+from isocharge.serve.model.robust_estimate import RobustProblem
 from isocharge.simulate import NoiseModel, noise_model
 from isocharge.simulate.mechanics.warming import warmed
 from isocharge.train.calibration import estimator
@@ -35,7 +35,8 @@ def _one_hypothesis(monkeypatch):
     """Estimate a film under one hypothesis, with nearly normal weights of the presses."""
     monkeypatch.setattr(estimator, "hypotheses", lambda *_: [ONE])
     monkeypatch.setattr(estimator, "TYPICAL", ONE)
-    monkeypatch.setattr(estimator, "robust_estimate", partial(robust_estimate, freedom=1e9, tolerance=1e-4))
+    monkeypatch.setattr(RobustProblem, "estimate", partialmethod(RobustProblem.estimate, tolerance=1e-4))
+    monkeypatch.setattr(estimator, "RobustProblem", partial(RobustProblem, freedom=1e9))
 
 
 def draw_unknowns(problem, hypothesis, rng):

@@ -67,103 +67,8 @@ class Prior(NamedTuple):
     covariance: Array
 
 
-class MeasuredContacts(NamedTuple):
-    """Measured coordinates of the contacts.
-
-    Attributes:
-        coordinates: Measured coordinates, shape (n, 3). Those that are not measured are ignored.
-        std: Standard deviations, shape (n, 3); NaN or infinity for a coordinate that is not measured.
-    """
-
-    coordinates: Array
-    std: Array
-
-
-class RobustEstimate(NamedTuple):
-    """Result of `robust_estimate`.
-
-    Attributes:
-        state: Most probable state, shape (p,).
-        covariance: Covariance of the state in the linearised problem, shape (p, p).
-        contacts: Most probable coordinates of the contacts, shape (n, 3).
-        chi2: Squared residual chi2_i of each press, shape (n,).
-        cost: Minimised function without constants.
-    """
-
-    state: Array
-    covariance: Array
-    contacts: Array
-    chi2: Array
-    cost: float
-
-
-def robust_estimate(
-    model: Callable[[Array, Array], ModelValues],
-    charge_pC: Array,
-    covariance_pC2: Array,
-    prior: Prior,
-    start_state: Array,
-    start_contacts: Array,
-    *,
-    measured: MeasuredContacts | None = None,
-    contact_bounds: tuple[Array, Array] | tuple[float, float] = (-np.inf, np.inf),
-    state_bounds: tuple[Array, Array] | tuple[float, float] = (-np.inf, np.inf),
-    freedom: float = 4.0,
-    max_steps: int = 20,
-    tolerance: float = 1e-3,
-) -> RobustEstimate:
-    """Estimate the state that many presses share, and the contact of each press.
-
-    Args:
-        model: Function that predicts the charges from contacts, shape (n, 3), and a state, shape (p,). The coordinates
-            of a contact may have any meaning, for example x, y and the logarithm of the force.
-        charge_pC: Measured charges of the presses, shape (n, e), pC.
-        covariance_pC2: Covariances of the charges of each press, shape (n, e, e), pC^2.
-        prior: Prior of the state.
-        start_state: State at which the search starts, shape (p,).
-        start_contacts: Contacts at which the search starts, shape (n, 3).
-        measured: Measured coordinates of the contacts; None if all contacts are unknown.
-        contact_bounds: Smallest and largest coordinates of contacts, each of shape (3,). The contacts are clipped.
-        state_bounds: Smallest and largest values of the state, each of shape (p,). The state is clipped.
-        freedom: Degrees of freedom nu of the distribution of the residuals. A large number stands for a Gaussian
-            distribution.
-        max_steps: Largest number of steps.
-        tolerance: The search ends when a step reduces the minimised function by less than this value. A step of one
-            standard deviation of the state reduces it by about 0.5.
-    """
-    problem = _Problem(model, charge_pC, covariance_pC2, prior, measured, freedom)
-    point = problem.evaluate(start_state, start_contacts)
-    damping = FIRST_DAMPING
-    rejected = 0
-    for _ in range(max_steps):
-        state_step, contact_step = problem.step(point, damping)
-        state = np.clip(point.state + state_step, *state_bounds)
-        contacts = np.clip(point.contacts + contact_step, *contact_bounds)
-        trial = problem.evaluate(state, contacts)
-        if not trial.cost <= point.cost:  # also if the cost is not a number
-            damping *= DAMPING_FACTOR
-            rejected += 1
-            if rejected > MAX_REJECTED_STEPS:
-                break
-            continue
-        rejected = 0
-        damping /= DAMPING_FACTOR
-        improvement = point.cost - trial.cost
-        point = trial
-        if improvement < tolerance:
-            break
-    normal_matrix, *_ = problem.normal_equations(point, damping=0.0)
-    return RobustEstimate(
-        state=point.state,
-        covariance=np.asarray(np.linalg.inv(normal_matrix)),
-        contacts=point.contacts,
-        chi2=point.chi2,
-        cost=point.cost,
-    )
-
-
-class _Point(NamedTuple):
-    """State and contacts during the search, with the whitened residuals and derivatives.
+class RobustPoint(NamedTuple):
+    """State and contacts of a `RobustProblem`, with the whitened residuals and derivatives at this point.
 
     Attributes:
         state: State, shape (p,).
@@ -188,8 +93,8 @@ class _Point(NamedTuple):
     cost: float
 
 
-class _Problem:
-    """The least squares problem of `robust_estimate`."""
+class RobustProblem:
+    """Least squares problem for the state that many presses share, and for the contact of each press."""
 
     def __init__(
         self,
@@ -197,13 +102,28 @@ class _Problem:
         charge_pC: Array,
         covariance_pC2: Array,
         prior: Prior,
-        measured: MeasuredContacts | None,
-        freedom: float,
+        *,
+        measured_contacts: Array | float = 0.0,
+        contact_std: Array | float = np.inf,
+        freedom: float = 4.0,
     ) -> None:
         """Compute the quantities that do not depend on the unknowns: whitening, precision and weights.
 
         A residual of the charges is whitened: it is multiplied by a matrix that makes its errors independent, with the
-        standard deviation 1. The arguments are those of `robust_estimate`.
+        standard deviation 1.
+
+        Args:
+            model: Function that predicts the charges from contacts, shape (n, 3), and a state, shape (p,). The
+                coordinates of a contact may have any meaning, for example x, y and the logarithm of the force.
+            charge_pC: Measured charges of the presses, shape (n, e), pC.
+            covariance_pC2: Covariances of the charges of each press, shape (n, e, e), pC^2.
+            prior: Prior of the state.
+            measured_contacts: Measured coordinates of the contacts, shape (n, 3). Those without a finite standard
+                deviation are ignored.
+            contact_std: Standard deviations of the measured coordinates, shape (n, 3); NaN or infinity for a coordinate
+                that is not measured. By default, no coordinate is measured.
+            freedom: Degrees of freedom nu of the distribution of the residuals. A large number stands for a Gaussian
+                distribution.
         """
         self._model = model
         self._charge_pC = charge_pC
@@ -212,16 +132,61 @@ class _Problem:
         self._precision = np.linalg.inv(prior.covariance)
         self._freedom = freedom
         n_press, n_electrode = charge_pC.shape
-        self._measured = np.zeros((n_press, 3))
+        self._measured = np.nan_to_num(measured_contacts)
         # One over the standard deviations of the measured coordinates; 0 where a coordinate was not measured
-        self._contact_weight = np.zeros((n_press, 3))
-        if measured is not None:
-            self._measured = np.nan_to_num(measured.coordinates)
-            self._contact_weight = np.nan_to_num(1.0 / measured.std)
+        self._contact_weight = np.broadcast_to(np.nan_to_num(1.0 / np.asarray(contact_std)), (n_press, 3))
         measured_count = np.count_nonzero(self._contact_weight, axis=1)
         self._degrees = n_electrode + measured_count - 3.0
 
-    def evaluate(self, state: Array, contacts: Array) -> _Point:
+    def estimate(
+        self,
+        start_state: Array,
+        start_contacts: Array,
+        *,
+        contact_bounds: tuple[Array, Array] | tuple[float, float] = (-np.inf, np.inf),
+        state_bounds: tuple[Array, Array] | tuple[float, float] = (-np.inf, np.inf),
+        max_steps: int = 20,
+        tolerance: float = 1e-3,
+    ) -> RobustPoint:
+        """Return the point with the most probable state and contacts.
+
+        Args:
+            start_state: State at which the search starts, shape (p,).
+            start_contacts: Contacts at which the search starts, shape (n, 3).
+            contact_bounds: Smallest and largest coordinates of contacts, each of shape (3,). The contacts are clipped.
+            state_bounds: Smallest and largest values of the state, each of shape (p,). The state is clipped.
+            max_steps: Largest number of steps.
+            tolerance: The search ends when a step reduces the minimised function by less than this value. A step of one
+                standard deviation of the state reduces it by about 0.5.
+        """
+        point = self.evaluate(start_state, start_contacts)
+        damping = FIRST_DAMPING
+        rejected = 0
+        for _ in range(max_steps):
+            state_step, contact_step = self.step(point, damping)
+            state = np.clip(point.state + state_step, *state_bounds)
+            contacts = np.clip(point.contacts + contact_step, *contact_bounds)
+            trial = self.evaluate(state, contacts)
+            if not trial.cost <= point.cost:  # also if the cost is not a number
+                damping *= DAMPING_FACTOR
+                rejected += 1
+                if rejected > MAX_REJECTED_STEPS:
+                    break
+                continue
+            rejected = 0
+            damping /= DAMPING_FACTOR
+            improvement = point.cost - trial.cost
+            point = trial
+            if improvement < tolerance:
+                break
+        return point
+
+    def state_covariance(self, point: RobustPoint) -> Array:
+        """Compute the covariance of the state in the problem that is linearised at a point, shape (p, p)."""
+        normal_matrix, *_ = self.normal_equations(point, damping=0.0)
+        return np.asarray(np.linalg.inv(normal_matrix))
+
+    def evaluate(self, state: Array, contacts: Array) -> RobustPoint:
         """Evaluate the model, the residuals and the cost at a state and contacts."""
         values = self._model(contacts, state)
         residual = (self._whitening @ (self._charge_pC - values.charge_pC)[:, :, None])[:, :, 0]
@@ -230,7 +195,7 @@ class _Problem:
         weights = (self._freedom + self._degrees) / (self._freedom + chi2)
         press_cost = 0.5 * (self._freedom + self._degrees) * np.log1p(chi2 / self._freedom)
         deviation = state - self._prior.mean
-        return _Point(
+        return RobustPoint(
             state=state,
             contacts=contacts,
             residual=residual,
@@ -242,7 +207,7 @@ class _Problem:
             cost=float(press_cost.sum() + 0.5 * deviation @ self._precision @ deviation),
         )
 
-    def normal_equations(self, point: _Point, damping: float) -> tuple[Array, Array, Array, Array]:
+    def normal_equations(self, point: RobustPoint, damping: float) -> tuple[Array, Array, Array, Array]:
         """Compute the normal equations of a step of the state, from which the contacts are eliminated.
 
         With the whitened derivatives C_i with respect to the contact and S_i with respect to the state, the contact of
@@ -281,7 +246,7 @@ class _Problem:
         symmetric = 0.5 * (normal_matrix + normal_matrix.T)
         return symmetric, gradient, contact_shift, contact_by_state
 
-    def step(self, point: _Point, damping: float) -> tuple[Array, Array]:
+    def step(self, point: RobustPoint, damping: float) -> tuple[Array, Array]:
         """Compute a damped Gauss-Newton step of the state, shape (p,), and of the contacts, shape (n, 3)."""
         normal_matrix, gradient, contact_shift, contact_by_state = self.normal_equations(point, damping)
         damped = normal_matrix + damping * np.diag(np.diag(normal_matrix))

@@ -39,7 +39,7 @@ from isocharge.serve.flags import BEYOND, FILM, GAP, MISFIT, OUTSIDE, REPEAT, ST
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.charge_file import FILE, read_charge_map
 from isocharge.serve.model.contact import Contact, is_close
-from isocharge.serve.model.robust_estimate import ModelValues, Prior, robust_estimate
+from isocharge.serve.model.robust_estimate import ModelValues, Prior, RobustProblem
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.stage import Rule, Setting, Setup, Stage
 from isocharge.serve.signal_chain.thermal import warming_ratios
@@ -300,23 +300,17 @@ class FilmFollower(Stage):
         scale = self._error_scale
         covariance_pC2 = scale * (np.diag(variance_pC2) + np.outer(touch_offset_pC, touch_offset_pC))
         start = self._log_contact(self.follow_contact(self.predictor.predict(charge_pC), charge_pC))
-        estimate = robust_estimate(
-            self._values,
-            charge_pC[np.newaxis],
-            covariance_pC2[np.newaxis],
-            Prior(self._state, self._covariance),
-            self._state,
-            start,
-            contact_bounds=self._contact_bounds,
-            state_bounds=(self._lowest, self._highest),
-        )
+        prior = Prior(self._state, self._covariance)
+        problem = RobustProblem(self._values, charge_pC[np.newaxis], covariance_pC2[np.newaxis], prior)
+        state_bounds = (self._lowest, self._highest)
+        estimate = problem.estimate(self._state, start, contact_bounds=self._contact_bounds, state_bounds=state_bounds)
         self._state = estimate.state
-        self._covariance = estimate.covariance
+        self._covariance = problem.state_covariance(estimate)
         self._touch_count += 1
 
         # Twice the cost is the squared distance, in which large residuals have little weight.
         self._mean_square += (2.0 * scale * estimate.cost - self._mean_square) / MEMORY_TOUCHES
-        is_changed = np.abs(estimate.state) > CLEAR_CHANGE * np.sqrt(estimate.covariance.diagonal())
+        is_changed = np.abs(estimate.state) > CLEAR_CHANGE * np.sqrt(self._covariance.diagonal())
         at_end = is_changed & ((estimate.state <= self._lowest) | (estimate.state >= self._highest))
         was_lost = self.is_lost
         self.is_lost = self._mean_square > MAX_MEAN_SQUARE or bool(at_end[0] or at_end[self._offset])

@@ -23,7 +23,7 @@ from scipy.special import chdtrc, chdtri, softmax
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.contact_domain import with_log_force
-from isocharge.serve.model.robust_estimate import MeasuredContacts, ModelValues, robust_estimate
+from isocharge.serve.model.robust_estimate import ModelValues, RobustProblem
 from isocharge.serve.model.robust_estimate import Prior as StatePrior
 from isocharge.simulate import NoiseModel, noise_model
 from isocharge.simulate.sensor.film_properties import UNEVEN_TENSIONS
@@ -280,16 +280,15 @@ def _estimate_with_errors(
         unknowns = previous.film.values
         log_contact = with_log_force(previous.contact)
     charge_variance = np.nan_to_num(data.charge_std**2)  # the largest number for a charge that was not measured
-    found = robust_estimate(
+    robust_problem = RobustProblem(
         lambda contacts, state: model_values(charges, layout, data, state, contacts),
         data.charge,
         charge_variance[:, :, None] * np.eye(charge_variance.shape[1]),
         StatePrior(prior.mean, prior.covariance(TYPICAL)),
-        unknowns,
-        log_contact,
-        measured=MeasuredContacts(data.contact, data.contact_std),
-        state_bounds=prior.bounds,
+        measured_contacts=data.contact,
+        contact_std=data.contact_std,
     )
+    found = robust_problem.estimate(unknowns, log_contact, state_bounds=prior.bounds)
     unknowns, log_contact = found.state, found.contacts.copy()
     redundancy = _redundancy(data)
     is_bad = (redundancy > 0) & (chdtrc(np.maximum(redundancy, 1), found.chi2) < BAD_PROBABILITY)
