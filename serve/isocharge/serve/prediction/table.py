@@ -21,6 +21,7 @@ from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.session import N_WITHOUT_CORRELATION
 from isocharge.serve.presses.number_table import CHARGE_RULE, NumberTable, TableSource
 from isocharge.serve.presses.table_file import CsvTable, open_table
+from isocharge.serve.record.formats import cell_text
 from isocharge.serve.record.record import NO_CONTACT, PredictionRecord
 
 MAX_CHARGE_ROWS = 10_000_000
@@ -106,14 +107,11 @@ def write_contacts(charge_pC: Array, predictor: Predictor, out: TextIO) -> None:
     Raises:
         ChargeError: If the charges do not fit the model.
     """
-    names = Contact._fields[:N_WITHOUT_CORRELATION]
+    names = (*Contact._fields[:N_WITHOUT_CORRELATION], "flags")
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow((*names, "flags"))
-    for _, values, flags in _predicted_rows(charge_pC, predictor):
-        if values is None:
-            writer.writerow("0.000000" if name == "force_N" else "" for name in (*names, "flags"))
-        else:
-            writer.writerow((*[f"{value:.6f}" for value in values[: len(names)]], " ".join(flags)))
+    writer.writerow(names)
+    for record in table_records(charge_pC, predictor):
+        writer.writerow(cell_text(getattr(record, name)) for name in names)
 
 
 def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[PredictionRecord]:
@@ -131,44 +129,26 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
         ChargeError: If the charges do not fit the model.
     """
     metadata = predictor.metadata
-    for charges, values, flags in _predicted_rows(charge_pC, predictor):
-        yield PredictionRecord(
-            timestamp=None,
-            t_device_us=None,
-            seq=None,
-            **(NO_CONTACT if values is None else dict(zip(Contact._fields, values, strict=True))),
-            contact=values is not None,
-            charge_pC=dict(zip(metadata.electrodes, charges, strict=True)),
-            charge_raw_pC=None,
-            tare_pC=None,
-            flags=flags,
-            latency_us=None,
-            model=metadata.label,
-            frame_id=metadata.frame_id,
-        )
-
-
-def _predicted_rows(
-    charge_pC: Array, predictor: Predictor
-) -> Iterator[tuple[list[float], list[float] | None, tuple[str, ...]]]:
-    """Yield the charges, the values of the contact in the order of `Contact`, and the flags of each row of a table.
-
-    The contact is None, without flags, if the charges of the row do not exceed the noise. At most `MAX_BATCH`
-    rows are processed at a time, because the model and Python numbers need a hundred times as much memory as the array.
-
-    Args:
-        charge_pC: Charges, shape (n, electrodes), pC.
-        predictor: The model.
-
-    Raises:
-        ChargeError: If the charges do not fit the model.
-    """
-    for start in range(0, max(len(charge_pC), 1), MAX_BATCH):  # an array without rows is one empty block
+    # Few rows are predicted at a time, because the model and Python numbers need a hundred times as much memory as the
+    # array. An array without rows is one empty block.
+    for start in range(0, max(len(charge_pC), 1), MAX_BATCH):
         block = charge_pC[start : start + MAX_BATCH]
         contacts = predictor.predict_batch(block)
         flags_of_rows = predictor.validity.batch_flags(contacts)
         is_touch_of_rows = predictor.validity.is_touch(block).tolist()
-        values_of_rows = np.asarray(contacts).tolist()
-        rows = zip(block.tolist(), values_of_rows, flags_of_rows, is_touch_of_rows, strict=True)
+        rows = zip(block.tolist(), np.asarray(contacts).tolist(), flags_of_rows, is_touch_of_rows, strict=True)
         for charges, values, flags, is_touch in rows:
-            yield (charges, values, flags) if is_touch else (charges, None, ())
+            yield PredictionRecord(
+                timestamp=None,
+                t_device_us=None,
+                seq=None,
+                **(dict(zip(Contact._fields, values, strict=True)) if is_touch else NO_CONTACT),
+                contact=is_touch,
+                charge_pC=dict(zip(metadata.electrodes, charges, strict=True)),
+                charge_raw_pC=None,
+                tare_pC=None,
+                flags=flags if is_touch else (),
+                latency_us=None,
+                model=metadata.label,
+                frame_id=metadata.frame_id,
+            )

@@ -41,7 +41,7 @@ def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
         value = getattr(record, name)
         if part is not None and value is not None:
             value = value[part] if isinstance(value, dict) else getattr(value, part)
-        cells.append(_cell(value))
+        cells.append(cell_text(value))
     return _line(cells)
 
 
@@ -69,7 +69,7 @@ def _line(cells: Iterable[str]) -> str:
     return line.getvalue().removesuffix("\r\n")
 
 
-def _cell(value: Any) -> str:
+def cell_text(value: Any) -> str:
     """Convert a value to the text of a cell.
 
     The value None becomes an empty text. The words of a tuple are joined with blanks. A floating-point number gets six
