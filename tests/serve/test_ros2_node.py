@@ -17,7 +17,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from isocharge.serve.flags import MEANINGS
-from isocharge.serve.outputs.ros_messages import pose_stamped, ros_time_ns, wrench_stamped
+from isocharge.serve.outputs.ros_messages import pose_stamped, ros_time_ns, with_tracked_contact, wrench_stamped
 from isocharge.serve.record.record import TrackedContact, Tracking
 
 NODE = Path(__file__).parents[2] / "serve/deploy/ros2/isocharge_ros/isocharge_ros/node.py"
@@ -149,7 +149,7 @@ def test_the_node_publishes_what_an_mcap_file_holds(run_node, record):
     sent = [one for one in run_node(records) if one[0] in ("/isocharge/wrench", "/isocharge/pose")]
     expected = []
     for one in records[:2]:
-        fields = one.json_values
+        fields = with_tracked_contact(one.json_values)
         expected.append(("/isocharge/wrench", wrench_stamped(fields, ros_time_ns(fields))))
         if one.contact:
             expected.append(("/isocharge/pose", pose_stamped(fields, ros_time_ns(fields))))

@@ -26,6 +26,7 @@ from isocharge.serve.outputs.ros_messages import (
     pose_stamped,
     ros_time_ns,
     string_message,
+    with_tracked_contact,
     wrench_stamped,
 )
 from isocharge.serve.record.formats import SCHEMA_NAME, record_schema
@@ -68,35 +69,20 @@ class McapFile(FileOutput):
         self._is_ros2 = is_ros2
         self._flush_time_s = time.monotonic()
         self._writer = Writer(self._file)  # type: ignore[arg-type]  # uses only write, tell and flush
+        # Topic, encoding of the messages, name of the schema, notation of the schema, and the schema of each channel
+        channels = [
+            (RECORD_TOPIC, "json", SCHEMA_NAME, "jsonschema", json.dumps(record_schema(electrodes))),
+            (WRENCH_TOPIC, "cdr", WRENCH, "ros2msg", DEFINITIONS[WRENCH]),
+            (POSE_TOPIC, "cdr", POSE, "ros2msg", DEFINITIONS[POSE]),
+        ]
+        if is_ros2:
+            channels[0] = (RECORD_TOPIC, "cdr", STRING, "ros2msg", DEFINITIONS[STRING])
+        self._channels: dict[str, int] = {}  # identifier of the channel of each topic
         with as_output_errors(path):
             self._writer.start(profile="ros2", library="isocharge")
-            if is_ros2:
-                record_channel = self._add_ros_channel(RECORD_TOPIC, STRING)
-            else:
-                schema_text = json.dumps(record_schema(electrodes))
-                record_channel = self._add_channel(RECORD_TOPIC, "json", SCHEMA_NAME, "jsonschema", schema_text)
-            self._channels = {
-                RECORD_TOPIC: record_channel,
-                WRENCH_TOPIC: self._add_ros_channel(WRENCH_TOPIC, WRENCH),
-                POSE_TOPIC: self._add_ros_channel(POSE_TOPIC, POSE),
-            }
-
-    def _add_ros_channel(self, topic: str, name: str) -> int:
-        """Register a channel of ROS 2 messages of a type, such as "std_msgs/msg/String", and return its identifier."""
-        return self._add_channel(topic, "cdr", name, "ros2msg", DEFINITIONS[name])
-
-    def _add_channel(self, topic: str, encoding: str, schema_name: str, schema_encoding: str, schema: str) -> int:
-        """Register a channel and the schema of its messages in the file, and return the identifier of the channel.
-
-        Args:
-            topic: Topic of the messages.
-            encoding: Encoding of the messages: `json`, or `cdr` for ROS 2 messages.
-            schema_name: Name of the schema, such as "std_msgs/msg/String".
-            schema_encoding: Notation of the schema: `jsonschema`, or `ros2msg` for ROS 2 messages.
-            schema: Text of the schema.
-        """
-        schema_id = self._writer.register_schema(schema_name, schema_encoding, schema.encode())
-        return self._writer.register_channel(topic, encoding, schema_id)
+            for topic, encoding, schema_name, schema_encoding, schema in channels:
+                schema_id = self._writer.register_schema(schema_name, schema_encoding, schema.encode())
+                self._channels[topic] = self._writer.register_channel(topic, encoding, schema_id)
 
     def write(self, record: PredictionRecord) -> None:
         """Write a record, its wrench if the force is known, and its pose if something touches the film.
@@ -105,7 +91,7 @@ class McapFile(FileOutput):
             InputError: If a time stamp of ROS 2 cannot represent the time of the record.
             OutputError: If the disk is full or was removed.
         """
-        values = record.json_values
+        values = with_tracked_contact(record.json_values)
         time_ns = ros_time_ns(values)
         json_text = record.to_json()
         messages = {

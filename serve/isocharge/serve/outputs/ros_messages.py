@@ -116,20 +116,19 @@ def with_tracked_contact(record: Mapping[str, Any]) -> Mapping[str, Any]:
     return {**record, **tracked_contact}
 
 
-def wrench_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
+def wrench_stamped(values: Mapping[str, Any], time_ns: int) -> bytes | None:
     """Return the load of the probe on the film as a ROS 2 message WrenchStamped, in N and N m.
 
     If a probe presses with the force F at (x, y), the message has the force (0, 0, -F) and the torque (-y F, x F, 0)
     about the origin.
 
     Args:
-        record: Values of the prediction record by name.
+        values: Values of the record by name, in which a tracked contact replaces the contact of the frame.
         time_ns: Time of the record, ns.
 
     Returns:
         The message, whose numbers are zero if nothing touches the film; None if the force is unknown.
     """
-    values = with_tracked_contact(record)  # a tracked contact replaces the contact of the frame
     force_N = values["force_N"]
     if force_N is None:
         return None
@@ -142,30 +141,24 @@ def wrench_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
     return _stamped(values["frame_id"], time_ns, (*force, *torque))
 
 
-def pose_stamped(record: Mapping[str, Any], time_ns: int) -> bytes | None:
+def pose_stamped(values: Mapping[str, Any], time_ns: int) -> bytes | None:
     """Return the position of a record as a ROS 2 message PoseWithCovarianceStamped, in m, m^2 and rad^2.
 
     Args:
-        record: Values of the prediction record by name.
+        values: Values of the record by name, in which a tracked contact replaces the contact of the frame.
         time_ns: Time of the record, ns.
 
     Returns:
         The message; None if nothing touches the film.
     """
-    values = with_tracked_contact(record)  # a tracked contact replaces the contact of the frame
-    x_mm = values["x_mm"]
-    y_mm = values["y_mm"]
-    x_std_mm = values["x_std_mm"]
-    y_std_mm = values["y_std_mm"]
-    if None in (x_mm, y_mm, x_std_mm, y_std_mm):
+    if None in (values["x_mm"], values["x_std_mm"]):
         return None
-    xy_correlation = values.get("xy_correlation") or 0.0  # a record of an earlier version has none
-    position = (1e-3 * x_mm, 1e-3 * y_mm, 0.0)
+    position = (1e-3 * values["x_mm"], 1e-3 * values["y_mm"], 0.0)
     no_rotation = (0.0, 0.0, 0.0, 1.0)  # a quaternion (x, y, z, w)
     # The covariance has 6 rows and columns: x, y, z and the rotations about x, y and z. Only x and y are correlated.
-    std_m = [1e-3 * x_std_mm, 1e-3 * y_std_mm, DEFLECTION_STD_m]
+    std_m = [1e-3 * values["x_std_mm"], 1e-3 * values["y_std_mm"], DEFLECTION_STD_m]
     covariance = np.diag(np.append(np.square(std_m), [ROTATION_VARIANCE_rad2] * 3))
-    covariance[[0, 1], [1, 0]] = std_m[0] * std_m[1] * xy_correlation
+    covariance[[0, 1], [1, 0]] = std_m[0] * std_m[1] * (values["xy_correlation"] or 0.0)
     return _stamped(values["frame_id"], time_ns, (*position, *no_rotation, *covariance.ravel().tolist()))
 
 
