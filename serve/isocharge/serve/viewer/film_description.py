@@ -4,8 +4,9 @@ import math
 from typing import Any
 
 import numpy as np
-from msgspec import to_builtins
 
+from isocharge.common.arrays import Array
+from isocharge.common.structs import plain_values
 from isocharge.serve.model.metadata import ModelMetadata
 
 
@@ -20,28 +21,24 @@ def describe_film(name: str, metadata: ModelMetadata) -> dict[str, Any]:
     """
     film = metadata.sensor.get("film")
     polygons_mm = _electrode_polygons(metadata.sensor, metadata.electrodes)  # for each electrode, the pad is the first
-    leads_mm = {electrode: leads for electrode, (_, *leads) in polygons_mm.items()}
-    return {
+    description = {
         "name": name,
         "model": metadata.label,
         "sensor": metadata.frame_id,
-        "electrodes": list(metadata.electrodes),
+        "electrodes": metadata.electrodes,
         "outlines_mm": {electrode: pad for electrode, (pad, *_) in polygons_mm.items()},
-        "more_mm": {electrode: leads for electrode, leads in leads_mm.items() if leads},
+        "more_mm": {electrode: leads for electrode, (_, *leads) in polygons_mm.items() if leads},
         "film": film,
         "radius_mm": film.get("radius_mm") if isinstance(film, dict) else None,
-        "working_area_mm": [[float(x), float(y)] for x, y in metadata.working_area_mm],
-        "force_range_N": list(metadata.force_range_N),
-        "probes": list(metadata.probes),
-        "unnoticed": to_builtins(metadata.unnoticed),
+        "working_area_mm": metadata.working_area_mm,
+        "force_range_N": metadata.force_range_N,
+        "probes": metadata.probes,
+        "unnoticed": metadata.unnoticed,
     }
+    return dict(plain_values(description))
 
 
-Polygon = list[list[float]]
-"""Corners (x, y) of a polygon, mm."""
-
-
-def _electrode_polygons(sensor: dict[str, Any], electrodes: tuple[str, ...]) -> dict[str, list[Polygon]]:
+def _electrode_polygons(sensor: dict[str, Any], electrodes: tuple[str, ...]) -> dict[str, list[Array]]:
     """Return the polygons of each electrode at the place that a calibration has determined, if there is one.
 
     The first polygon of an electrode is its pad. All further polygons describe additional metal that belongs to the
@@ -52,7 +49,8 @@ def _electrode_polygons(sensor: dict[str, Any], electrodes: tuple[str, ...]) -> 
         electrodes: Names of the electrodes.
 
     Returns:
-        List of polygons by electrode name. It is empty if the description of the sensor has an unknown form.
+        Corners (x, y) of the polygons, each of shape (n, 2), mm, by electrode name. The dictionary is empty if the
+        description of the sensor has an unknown form.
     """
     try:
         calibration = sensor.get("calibration") or {}
@@ -61,7 +59,7 @@ def _electrode_polygons(sensor: dict[str, Any], electrodes: tuple[str, ...]) -> 
         rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
         return {
             name: [
-                (np.array(corners, float) @ rotation.T + shift_mm).tolist()  # corners of shape (n, 2)
+                np.array(corners, float) @ rotation.T + shift_mm  # corners of shape (n, 2)
                 for corners in _designed_polygons(sensor["electrodes"], name)
             ]
             for name in electrodes
@@ -70,10 +68,12 @@ def _electrode_polygons(sensor: dict[str, Any], electrodes: tuple[str, ...]) -> 
         return {}
 
 
-def _designed_polygons(parts: dict[str, Any], name: str) -> list[Polygon]:
+def _designed_polygons(parts: dict[str, Any], name: str) -> list[Any]:
     """Return the polygons of an electrode according to its design, before a calibration has corrected them.
 
     If the design contains only a point for the electrode, the electrode is a square around this point.
+
+    The polygons are lists or arrays of corners (x, y), mm.
 
     Args:
         parts: Section `electrodes` of a sensor file: a point (x, y) or polygons for each electrode name, and the side
@@ -85,4 +85,4 @@ def _designed_polygons(parts: dict[str, Any], name: str) -> list[Polygon]:
         return [part["polygon_mm"], *part.get("more_mm", [])]
     half_side_mm = 0.5 * parts["side_mm"]
     corners_mm = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * half_side_mm + part
-    return [corners_mm.tolist()]
+    return [corners_mm]

@@ -210,7 +210,7 @@ class LivePage(Application):
             "first": stop,
             "missed": max(tape.oldest - first, 0),
             "sent_s": time.time(),
-            "samples": [list(sample) for sample in samples.tolist()],
+            "samples": samples.tolist(),
         }
         if version != request.version:
             extent: dict[str, Any] = {}
