@@ -10,7 +10,6 @@ sharp bends and crossings.
 """
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -179,13 +178,17 @@ def is_simple(corners: Array) -> bool:
     return signed_area > 0.0 and bool(abs(difference) < MERGE_DISTANCE * perimeter)
 
 
-def union_triangles(front: Sequence[ArrayLike], back: Sequence[ArrayLike] = ()) -> list[Array]:
+def union_triangles(
+    front: Sequence[ArrayLike], back: Sequence[ArrayLike] = (), max_side: float = np.inf
+) -> list[Array]:
     """Divide the union of simple polygons into triangles that do not overlap.
 
     Args:
         front: Simple polygons, each of shape (n, 2), mm.
         back: Further simple polygons, each of shape (n, 2), mm. If there are any, the function divides the intersection
             of the union of `front` and the union of `back`.
+        max_side: Largest length of the sides that lie on the outline of the divided region, mm. Longer sides of the
+            outline are divided first.
 
     Returns:
         Triangles with anticlockwise corners, each of shape (3, 2), mm.
@@ -196,7 +199,8 @@ def union_triangles(front: Sequence[ArrayLike], back: Sequence[ArrayLike] = ()) 
     # The polygons of the region, without points and lines at which polygons only touch
     parts = shapely.get_parts(region)
     polygons = shapely.multipolygons(parts[shapely.get_dimensions(parts) == 2])
-    triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(polygons))
+    divided_outlines = shapely.segmentize(polygons, max_side)
+    triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(divided_outlines))
     return [shapely.get_coordinates(triangle)[:3] for triangle in shapely.orient_polygons(triangles)]
 
 
@@ -207,30 +211,6 @@ def region_of(polygons: Sequence[ArrayLike]) -> shapely.Geometry:
     """
     valid_regions = shapely.make_valid([shapely.Polygon(corners) for corners in polygons])
     return shapely.union_all(valid_regions)
-
-
-def subdivide(triangle: Array, max_side: float) -> list[Array]:
-    """Cut a triangle into quadrilaterals and triangles whose sides do not exceed a given length.
-
-    Args:
-        triangle: Corners (x, y), anticlockwise, shape (3, 2), mm.
-        max_side: Largest length of a side of the returned polygons, mm.
-
-    Returns:
-        Corners of each polygon, anticlockwise, shape (4, 2) for a quadrilateral or (3, 2) for a triangle, mm. The
-        triangles share the corner that lies opposite the shortest side of the given triangle.
-    """
-    sides = np.linalg.norm(np.roll(triangle, -1, axis=0) - triangle, axis=1)
-    first, second, apex = np.roll(triangle, -int(sides.argmin()), axis=0)
-    base = np.linspace(first, second, int(np.ceil(sides.min() / max_side)) + 1)
-    heights = np.linspace(0.0, 1.0, int(np.ceil(sides.max() / max_side)) + 1)[:-1, None, None]
-    grid = base + heights * (apex - base)  # points on lines from the base to the apex, shape (n_height, n_base, 2)
-    quadrilaterals = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=2)
-    last = grid[-1]
-    return [
-        *quadrilaterals.reshape(-1, 4, 2),
-        *(np.array([left, right, apex]) for left, right in pairwise(last)),
-    ]
 
 
 def trace_outline(path: Complexes, width: float) -> Complexes:

@@ -23,7 +23,6 @@ from isocharge.simulate.numerics.polygon import (
     is_convex,
     is_simple,
     region_of,
-    subdivide,
     to_complex,
     to_corners,
     trace_outline,
@@ -50,7 +49,7 @@ A smaller value was probably given in metres.
 """
 
 MAX_PART_SIDE = 3.0
-"""Largest side of the quadrilaterals and triangles into which an electrode that is not convex is divided, mm."""
+"""Largest side, along the outline of an electrode that is not convex, of the triangles into which it is divided, mm."""
 
 MAX_CROSSTALK = 0.2
 """Largest accepted magnitude of the crosstalk, dimensionless."""
@@ -196,12 +195,12 @@ class Electrode:
     def parts(self) -> tuple[Array, ...]:
         """Convex parts that do not overlap and together form the collecting area of the electrode.
 
-        A convex electrode has one part. All other electrodes are divided into quadrilaterals and triangles with sides
-        of at most `MAX_PART_SIDE`. The corners (x, y) of a part are an array of shape (n, 2), mm.
+        A convex electrode has one part. All other electrodes are divided into triangles, whose sides along the outline
+        are at most `MAX_PART_SIDE` long. The corners (x, y) of a part are an array of shape (n, 2), mm.
         """
         if self._is_convex:
             return self.collecting_polygons
-        return tuple(piece for polygon in self.collecting_polygons for piece in subdivide(polygon, MAX_PART_SIDE))
+        return tuple(union_triangles(self.front, self.back, MAX_PART_SIDE))
 
     @property
     def _is_convex(self) -> bool:
