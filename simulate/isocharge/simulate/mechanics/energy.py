@@ -18,9 +18,8 @@ scaled strain E'. The scaled strain is of order one for every force.
 
 The stress follows from Saint-Venant-Kirchhoff elasticity in plane stress as S = E_young A^2 (C : E' + tau I). Here, C
 is the elasticity matrix divided by Young's modulus, tau is the scaled pretension, and I is the unit tensor. Energies
-are in units of E_young h a^2 A^4, where h is the thickness of the film. For an anisotropic film, a matrix is added to
-C, and a deviator is added to tau I (`theory.DimensionlessGroups`). The bending stiffness is always computed for an
-isotropic film.
+are in units of E_young h a^2 A^4, where h is the thickness of the film. For an uneven pretension, a deviator is added
+to tau I (`theory.DimensionlessGroups`). The bending stiffness is always computed for an isotropic film.
 """
 
 from itertools import combinations_with_replacement
@@ -29,7 +28,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.mechanics.back_pressure import BackPressure
-from isocharge.simulate.mechanics.theory import DimensionlessGroups, scaled_stress, strain
+from isocharge.simulate.mechanics.theory import DimensionlessGroups, strain
 from isocharge.simulate.mesh.placed_mesh import Geometry
 
 
@@ -207,7 +206,7 @@ class Membrane:
         # The last two axes are the coordinate and the displacement component, shape (n_element, n_point, 2, 3).
         slopes = self._slopes(field)
         scaled_strain = strain(slopes, self.groups.squared_amplitude)
-        energy_density = 0.5 * np.sum(scaled_strain * scaled_stress(scaled_strain, self.groups), axis=-1)
+        energy_density = 0.5 * np.sum(scaled_strain * (scaled_strain @ self.groups.elasticity), axis=-1)
 
         # The difference tr E' - div U is half of the weighted sum of the squared slopes. The weights are A^2 for the
         # slopes of U1 and U2, and 1 for the slopes of W, where A is the amplitude.
@@ -227,7 +226,7 @@ class Membrane:
         geometry = self.geometry
         slopes = self._slopes(field)
         scaled_strain = strain(slopes, self.groups.squared_amplitude)
-        elastic_stress = scaled_stress(scaled_strain, self.groups)
+        elastic_stress = scaled_strain @ self.groups.elasticity
 
         # The traction is the derivative of the energy density with respect to the slopes, shape (n_element, n_point, 2,
         # 3). Its terms belong to the elastic stress and to the pretension.
@@ -259,7 +258,7 @@ class Membrane:
 
         # The total stress (S11, S22, S12) is the sum of the elastic stress and the pretension. It is multiplied by the
         # integration weights.
-        elastic_stress = scaled_stress(strain(slopes, self.groups.squared_amplitude), self.groups)
+        elastic_stress = strain(slopes, self.groups.squared_amplitude) @ self.groups.elasticity
         total_stress = elastic_stress + self._pretension + added_tension * EQUAL_TENSION
         weighted_stress = _symmetric_matrix(total_stress * geometry.weights[..., None])
         weighted_stiffness = self._material_stiffness(deformation) * geometry.weights[..., None, None, None, None]
@@ -305,7 +304,7 @@ class Membrane:
 
         n_element, n_point, _, _ = deformation.shape
         derivatives = strain_derivative.reshape(n_element, n_point, 6, 3)  # one row for each slope
-        stiffness = scaled_stress(derivatives, self.groups) @ derivatives.swapaxes(-1, -2)
+        stiffness = derivatives @ self.groups.elasticity @ derivatives.swapaxes(-1, -2)
         return stiffness.reshape(n_element, n_point, 2, 3, 2, 3)
 
 

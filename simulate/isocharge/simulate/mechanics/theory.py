@@ -78,27 +78,6 @@ def strain(slopes: Array, squared_amplitude: float) -> Array:
     return np.stack([strain_11, strain_22, double_strain_12], axis=-1)
 
 
-def stress(strain: Array, poisson: float, moduli: Array | float = 0.0) -> Array:
-    """Compute the plane stress that a strain causes according to Hooke's law, without the pretension.
-
-    Args:
-        strain: Strain (E11, E22, 2 E12), shape (..., 3).
-        poisson: Poisson's ratio.
-        moduli: Symmetric matrix that is added to the elasticity matrix C / E_young of an isotropic material, shape
-            (3, 3). It is zero for an isotropic material.
-
-    Returns:
-        Stress (S11, S22, S12), shape (..., 3), in units of E_young times the unit of the strain.
-    """
-    plane_modulus = 1.0 / (1.0 - poisson**2)
-    shear_modulus = 0.5 / (1.0 + poisson)
-    coupling = plane_modulus * poisson
-    isotropic_moduli = np.array(
-        [[plane_modulus, coupling, 0.0], [coupling, plane_modulus, 0.0], [0.0, 0.0, shear_modulus]]
-    )
-    return strain @ (isotropic_moduli + moduli)
-
-
 def rotate_stress(rotated_frame_stress: Array, angle: float | Array) -> Array:
     """Transform stresses from a rotated frame to the unrotated frame.
 
@@ -122,29 +101,38 @@ def rotate_stress(rotated_frame_stress: Array, angle: float | Array) -> Array:
     return np.stack([mean + new_half_difference, mean - new_half_difference, new_s12], axis=-1)
 
 
-def orthotropic_moduli(film: Film) -> Array:
-    """Compute the difference between the elasticity matrix of a film and that of an isotropic film.
+def elasticity(film: Film, angle: float) -> Array:
+    """Compute the plane-stress elasticity matrix of a film (Hooke's law), divided by Young's modulus E.
 
-    Both matrices are divided by Young's modulus E, and refer to the axes of the film. The moduli along the two axes are
-    E1 = E r and E2 = E / r, where r is the square root of E1 / E2.
+    The product of a strain (E11, E22, 2 E12) and the matrix is the stress (S11, S22, S12) in units of E, without the
+    pretension. The moduli along the two axes of the film are E1 = E r and E2 = E / r, where r is the square root of
+    E1 / E2.
 
     Args:
         film: The film.
+        angle: Angle of axis 1 of the strain and of the stress from the x axis, anticlockwise, rad.
 
     Returns:
-        Difference for the strain components (E11, E22, 2 E12), shape (3, 3), dimensionless.
+        Symmetric matrix, shape (3, 3), dimensionless.
     """
     plane_modulus = 1.0 / (1.0 - film.poisson**2)
+    shear_modulus = 0.5 / (1.0 + film.poisson)
+    coupling = plane_modulus * film.poisson
+    isotropic_elasticity = np.array(
+        [[plane_modulus, coupling, 0.0], [coupling, plane_modulus, 0.0], [0.0, 0.0, shear_modulus]]
+    )
+
+    # Difference from an isotropic film in the axes of the film. If no shear modulus is given, the film has the shear
+    # modulus of an isotropic film.
     root_of_ratio = np.sqrt(film.young_ratio)  # r
     difference_11 = plane_modulus * (root_of_ratio - 1.0)
     difference_22 = plane_modulus * (1.0 / root_of_ratio - 1.0)
+    difference_12 = 0.0 if film.shear is None else film.shear / film.young - shear_modulus
+    difference = np.diag([difference_11, difference_22, difference_12])
 
-    # If no shear modulus is given, the film has the shear modulus of an isotropic film.
-    difference_12 = 0.0
-    if film.shear is not None:
-        isotropic_shear = 0.5 / (1.0 + film.poisson)
-        difference_12 = film.shear / film.young - isotropic_shear
-    return np.diag([difference_11, difference_22, difference_12])
+    # Only the difference is rotated, so that the matrix of an isotropic film has no rounding errors.
+    rotation = rotate_stress(np.eye(3), film.axis - angle).T  # matrix for the stress components (s11, s22, s12)
+    return isotropic_elasticity + rotation @ difference @ rotation.T
 
 
 MEMBRANE_STIFFNESS = 1.6
@@ -200,9 +188,9 @@ class DimensionlessGroups:
         load: Force divided by E h a A^3.
         tension: Mean pretension divided by E A^2.
         bending: Bending stiffness divided by E h a^2 A^2. Zero if the theory omits bending.
-        poisson: Poisson's ratio.
-        moduli: Elasticity matrix of the film minus the elasticity matrix of an isotropic film, divided by Young's
-            modulus E, in the axes of the press, shape (3, 3); see `stress`.
+        elasticity: Elasticity matrix of the film in the axes of the press, divided by E, shape (3, 3). The product of a
+            scaled strain (E11, E22, 2 E12) and the matrix is the scaled stress (S11, S22, S12) without the pretension,
+            in units of E A^2.
         uneven_tension: Pretension (T11, T22, T12) minus its mean, divided by E A^2, in the axes of the press, shape
             (3,).
         side_load: Side force (Fx, Fy) divided by E h a A^2, in the axes of the press.
@@ -216,8 +204,7 @@ class DimensionlessGroups:
     load: float
     tension: float
     bending: float
-    poisson: float
-    moduli: Array = field(default_factory=partial(np.zeros, (3, 3)))
+    elasticity: Array
     uneven_tension: Array = field(default_factory=partial(np.zeros, 3))
     side_load: tuple[float, float] = (0.0, 0.0)
     static_pressure: float = 0.0
@@ -269,8 +256,7 @@ class DimensionlessGroups:
             load=force / force_unit,
             tension=film.pretension / tension_unit,
             bending=slenderness(film) / squared_amplitude if bending else 0.0,
-            poisson=film.poisson,
-            moduli=press_frame_moduli(film, angle),
+            elasticity=elasticity(film, angle),
             uneven_tension=rotate_stress(deviator, -angle) / tension_unit,
             side_load=(side_load.real, side_load.imag),
             static_pressure=film.static_pressure / pressure_unit,
@@ -313,38 +299,6 @@ class DimensionlessGroups:
         cubic_factor = 1.0 / 0.662**3
         height = float(_root(linear_factor / cubic_factor, abs(self.static_pressure) / cubic_factor))
         return float(np.copysign(height, self.static_pressure))
-
-
-def scaled_stress(scaled_strain: Array, groups: DimensionlessGroups) -> Array:
-    """Compute the scaled stress that belongs to a scaled strain, with the elasticity of the film.
-
-    Args:
-        scaled_strain: Scaled strain (E11, E22, 2 E12), shape (..., 3), in units of A^2.
-        groups: Dimensionless groups of the press.
-
-    Returns:
-        Scaled stress (S11, S22, S12) without the pretension, shape (..., 3), in units of E_young A^2.
-    """
-    return stress(scaled_strain, groups.poisson, groups.moduli)
-
-
-def press_frame_moduli(film: Film, angle: float) -> Array:
-    """Compute the elasticity matrix of a film minus that of an isotropic film, in the axes of a press.
-
-    The first axis of the press points from the centre of the film to the press.
-
-    Args:
-        film: The film.
-        angle: Direction of the press from the centre of the film, rad.
-
-    Returns:
-        Difference, divided by Young's modulus, shape (3, 3); see `orthotropic_moduli`.
-    """
-    # The moduli refer to the axes of the material. The angle from the direction of the press to axis 1 of the material
-    # is `material_angle`.
-    material_angle = film.axis - angle
-    rotation = rotate_stress(np.eye(3), material_angle).T  # matrix for the stress components (s11, s22, s12)
-    return rotation @ orthotropic_moduli(film) @ rotation.T
 
 
 def side_force_unit(film: Film, squared_amplitude: Array | float) -> Any:

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.mechanics.theory import orthotropic_moduli, rotate_stress, stress
+from isocharge.simulate.mechanics.theory import elasticity, rotate_stress
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.sensor import Sensor
 
@@ -39,7 +39,7 @@ def tension_change(film: Film, film_warming_K: float, ring_warming_K: float) -> 
         return np.zeros(3)
     free_strain = np.array(film.expansion) * film_warming_K  # along the axes 1 and 2 of the film
     elastic_strain = np.append(film.ring_expansion * ring_warming_K - free_strain, 0.0)
-    change_in_film_axes = film.young * stress(elastic_strain, film.poisson, orthotropic_moduli(film))
+    change_in_film_axes = film.young * (elastic_strain @ elasticity(film, film.axis))
     return rotate_stress(change_in_film_axes, film.axis)
 
 

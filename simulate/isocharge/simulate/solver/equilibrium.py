@@ -21,7 +21,6 @@ from isocharge.simulate.mechanics.theory import (
     Theory,
     principal_stresses,
     rotate_stress,
-    scaled_stress,
     strain,
 )
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
@@ -195,7 +194,7 @@ def _induced_stress(equilibrium: Equilibrium, surface: Surface, derivatives_of: 
     if surface != "middle":
         second_derivatives = derivatives_of(_continuous_slope(equilibrium))  # of the deflection W
         total_strain += _bending_strain(equilibrium, surface, second_derivatives)
-    return scaled_stress(total_strain, equilibrium.groups)
+    return total_strain @ equilibrium.groups.elasticity
 
 
 def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:

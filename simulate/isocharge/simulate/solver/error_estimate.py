@@ -256,7 +256,7 @@ def cautions(equilibrium: Equilibrium) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-REPORTED_GROUPS = ("squared_amplitude", "load", "tension", "bending", "poisson")
+REPORTED_GROUPS = ("squared_amplitude", "load", "tension", "bending")
 """Attributes of `DimensionlessGroups` that the JSON output contains."""
 
 
@@ -280,6 +280,7 @@ def summary(equilibrium: Equilibrium) -> dict[str, Any]:
         "estimated_error": plain_values(estimated_error(equilibrium)),
         "groups": {
             **{name: getattr(equilibrium.groups, name) for name in REPORTED_GROUPS},
+            "poisson": equilibrium.film.poisson,
             "bending_length": bending_length(equilibrium.film, equilibrium.force),
         },
         "warnings": list(cautions(equilibrium)),

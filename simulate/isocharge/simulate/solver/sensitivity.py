@@ -44,7 +44,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.energy import ElasticFilm
-from isocharge.simulate.mechanics.theory import press_frame_moduli, side_force_unit
+from isocharge.simulate.mechanics.theory import elasticity, side_force_unit
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, from_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Surface, increased
@@ -107,8 +107,8 @@ def _add_stiffness(solved: Equilibrium, log_ratio: float, angle: float) -> Equil
     addition = cmath.rect(log_ratio, 2.0 * (solved.direction + angle))
     new_log_ratio, axis = increased(math.log(film.young_ratio), film.axis, addition)
     changed_film = replace(film, young_ratio=math.exp(new_log_ratio), axis=axis)
-    moduli = press_frame_moduli(changed_film, solved.direction)
-    return replace(solved, groups=replace(solved.groups, moduli=moduli))
+    groups = replace(solved.groups, elasticity=elasticity(changed_film, solved.direction))
+    return replace(solved, groups=groups)
 
 
 def _add_oval(solved: Equilibrium, value: float, direction: complex) -> Equilibrium:
