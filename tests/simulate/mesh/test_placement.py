@@ -67,7 +67,7 @@ def exact_points(placement: Placement, mesh: Template, xi: np.ndarray, eta: np.n
 
 def found_again(placement: Placement, mesh: Template, film: np.ndarray) -> np.ndarray:
     """Return the points of the local coordinates that `locate` finds. These coordinates must lie in [-1, 1]."""
-    element, xi, eta = (found[0] for found in locate_points(placement[None], mesh, film[None]))
+    element, xi, eta, _ = (found[0] for found in locate_points(placement[None], mesh, film[None]))
     assert np.abs(np.concatenate([xi, eta])).max() <= 1.0 + 1e-7
     return exact_points(placement, mesh, xi, eta)[element, np.arange(film.size)]
 

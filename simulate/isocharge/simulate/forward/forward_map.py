@@ -45,7 +45,7 @@ from isocharge.simulate.forward.readout import (
 )
 from isocharge.simulate.mechanics.theory import Theory, amplitude_squared
 from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.mesh.placed_mesh import distance_on_circular_film, film_oval
+from isocharge.simulate.mesh.oval import film_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import template_for
 from isocharge.simulate.numerics.disk import contacts_at
@@ -487,6 +487,6 @@ class ForwardMap:
         film = self.sensor.film
         direction = np.angle(position)
         template = template_for(self.resolution, self.probe.topology, not film.is_axisymmetric)
-        circular_distance = distance_on_circular_film(film, np.abs(position), direction)
-        placement = Placement.of(template, self.probe, circular_distance, film.radius, self.layer, rotation)
-        return PressMeshes(template, placement, direction, film_oval(film, direction))
+        oval = film_oval(film, direction)
+        placement = Placement.of(template, self.probe, np.abs(position), film.radius, self.layer, rotation, oval)
+        return PressMeshes(template, placement, direction)

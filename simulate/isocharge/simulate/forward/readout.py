@@ -22,7 +22,6 @@ from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.common.errors import SensorError
 from isocharge.simulate.mechanics.theory import rotate_stress
 from isocharge.simulate.mechanics.warming import tension_change
-from isocharge.simulate.mesh.placed_mesh import from_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template, locate_points
 from isocharge.simulate.numerics.interpolation import tensor_values
@@ -336,14 +335,11 @@ class PressMeshes:
         template: Template of the meshes.
         placement: Position of the template under each press, after the press has been rotated onto the x axis.
         direction: Direction from the centre of the film to each press, shape (n,), rad.
-        oval: Shape of an oval clamp, rotated with each press, shape (n,); see `mesh.placed_mesh.PlacedMesh`. Zero for a
-            circular clamp.
     """
 
     template: Template
     placement: Placement
     direction: Array
-    oval: Complexes
 
     def locate(self, press_index: Integers, points: Complexes) -> tuple[Integers, Array, Booleans]:
         """Find the elements that contain integration points, and evaluate the basis functions at the points.
@@ -358,12 +354,9 @@ class PressMeshes:
             Index of the element, shape (n_pair, n_point). Values of the basis functions, shape (n_pair, n_point,
             n_local). Whether each point was reflected, shape (n_pair, n_point).
         """
-        # Rotate film and points so that the press lies on the positive x axis, and make the clamp circular.
         mesh = self.template
-        rotated_points = points * np.exp(-1j * self.direction[press_index])[:, None]
-        circular_points = from_oval(rotated_points, self.oval[press_index, None])
-        position, is_mirrored = mesh.into_meshed_half(circular_points)
-        element, xi, eta = locate_points(self.placement[press_index], mesh, position)
+        rotated_points = points * np.exp(-1j * self.direction[press_index])[:, None]  # the press is on the x axis
+        element, xi, eta, is_mirrored = locate_points(self.placement[press_index], mesh, rotated_points)
         basis_values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel())
         return element, basis_values.reshape(*points.shape, mesh.xi.size), is_mirrored
 

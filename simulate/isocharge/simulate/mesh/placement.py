@@ -8,8 +8,9 @@ the element. The sides of the elements lie on the core polygon, on the boundary 
 circle. The edges of a polygonal footprint remain straight, so the load is integrated exactly over the footprint. The
 values of fields at the nodes are smooth functions of the position of the probe.
 
-The class `Placement` combines these steps for one or several presses. The function
-`template.locate_points` finds the element that contains a film point.
+The class `Placement` combines these steps for one or several presses on a circular film. If the clamp is oval, the
+module `oval` finally displaces the points. The function `template.locate_points` finds the element that contains a film
+point.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -27,6 +28,7 @@ from isocharge.simulate.mesh.conformal_map import (
     sector_angles,
     stretch_on_circle,
 )
+from isocharge.simulate.mesh.oval import from_oval, to_oval
 from isocharge.simulate.sensor.footprint import CurvedProbe, Probe
 
 
@@ -47,6 +49,7 @@ class Placement:
         rotation_and_scale: Complex factor for points of the footprint relative to its centroid, shape (...). The factor
             rotates the points by the additional rotation of the footprint, and converts them from mm to film radii.
         probe: The probe.
+        oval: Shape of the clamp in the frame of the press, shape (...); see the module `oval`.
     """
 
     map_parameter: Array
@@ -57,6 +60,7 @@ class Placement:
     ring_depths: Array
     rotation_and_scale: Complexes
     probe: Probe
+    oval: Complexes
 
     @classmethod
     def of(
@@ -67,6 +71,7 @@ class Placement:
         film_radius: float,
         thin_ring_width: float,
         rotation: Array | float = 0.0,
+        oval: complex | Complexes = 0.0,
     ) -> Self:
         """Place a template under a press on the positive x axis.
 
@@ -76,14 +81,15 @@ class Placement:
         Args:
             blocks: The elements. Their topology must be the topology of the probe.
             probe: The probe in the frame in which the press lies on the positive x axis.
-            distance: Distance of the centroid of the footprint from the centre of the film, any shape, mm.
+            distance: Distance of the centroid of the footprint from the centre of the real film, any shape, mm.
             film_radius: Radius of the film, mm.
             thin_ring_width: Total width of the thin rings at the rim, in film radii.
             rotation: Additional rotation of the footprint, a number or of the shape of `distance`, rad.
+            oval: Shape of the clamp in the frame of the press, a number or of the shape of `distance`.
         """
-        # Corners of the core polygon on the film, followed by the centroid of the footprint. The centroid is a real
-        # number, because the press lies on the x axis.
-        centroid = np.asarray(distance, dtype=float) / film_radius
+        # Corners of the core polygon on the circular film, followed by the centroid of the footprint. The centroid is a
+        # real number, because the press lies on the x axis.
+        centroid = from_oval(np.asarray(distance / film_radius, dtype=complex), oval).real
         if probe.is_axisymmetric:
             rotation = 0.0
         rotation_factor: Complexes = np.exp(1j * np.broadcast_to(rotation, centroid.shape))
@@ -124,6 +130,7 @@ class Placement:
             ring_depths=ring_edges(blocks.resolution, template_radius, template_thin_ring_width),
             rotation_and_scale=np.asarray(rotation_factor / film_radius),
             probe=probe,
+            oval=np.asarray(oval),
         )
 
     def __getitem__(self, indices: Integers | None) -> "Placement":
@@ -186,7 +193,7 @@ class Placement:
         """
         inner_points = self._inner_element_points(blocks)
         ring_points = self._ring_element_points(blocks)
-        return np.concatenate([inner_points, ring_points])
+        return to_oval(np.concatenate([inner_points, ring_points]), self.oval)
 
     def _inner_element_points(self, blocks: Blocks) -> Complexes:
         """Compute the film points of the nodes of the elements inside the innermost circle.

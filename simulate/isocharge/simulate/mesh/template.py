@@ -13,8 +13,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Complexes, Integers
+from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.simulate.mesh.blocks import Blocks, Resolution
+from isocharge.simulate.mesh.oval import from_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.footprint import FootprintTopology
 from isocharge.simulate.sensor.probe import RoundProbe
@@ -94,20 +95,24 @@ template_for = lru_cache(maxsize=16)(Template)
 """Function that returns the template for a given resolution and topology. Templates are cached."""
 
 
-def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array]:
+def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tuple[Integers, Array, Array, Booleans]:
     """Find the elements that contain film points, and the local coordinates of the points in their elements.
 
     Args:
         placement: k placements, one for each row of points.
         blocks: The elements.
-        points: Film points x + iy, shape (k, n), in film radii. If only the upper half of the film is meshed, all
-            points must lie in the upper half.
+        points: Film points x + iy, shape (k, n), in film radii. If only the upper half of the film is meshed, points in
+            the lower half are reflected.
 
     Returns:
-        Index of the element and local coordinates xi and eta from -1 to 1, each of shape (k, n).
+        Index of the element, local coordinates xi and eta from -1 to 1, and whether the point was reflected, each of
+        shape (k, n).
     """
+    # Convert the points into points of the meshed part of a circular film.
+    circular_points, is_reflected = blocks.into_meshed_half(from_oval(points, placement.oval[:, None]))
+
     # First locate all points as if they were in the rings. Then locate the points inside the innermost circle again.
-    template_points = placement.to_template(points)
+    template_points = placement.to_template(circular_points)
     element, radial, angular = _locate_in_rings(placement, blocks, template_points)
     is_inside = np.abs(template_points) <= placement.template_radius[:, None]
     if np.any(is_inside):
@@ -116,13 +121,13 @@ def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tu
         corners = _inner_corners(placement[used_index], blocks)[point_index]
         placement_of_point = placement[placement_index]  # one placement for each point inside the circle
         element[is_inside], radial[is_inside], angular[is_inside] = _locate_inside(
-            placement_of_point, blocks, points[is_inside], corners
+            placement_of_point, blocks, circular_points[is_inside], corners
         )
 
     # Convert the coordinates from the range from 0 to 1 to the range from -1 to 1.
     xi = 2.0 * radial - 1.0
     eta = 2.0 * angular - 1.0
-    return element, xi, eta
+    return element, xi, eta, is_reflected
 
 
 def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Complexes) -> tuple[Integers, Array, Array]:

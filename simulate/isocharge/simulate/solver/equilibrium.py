@@ -24,6 +24,7 @@ from isocharge.simulate.mechanics.theory import (
     strain,
 )
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
+from isocharge.simulate.mesh.template import locate_points
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.numerics.polygon import to_complex
 from isocharge.simulate.sensor.film import Film, Surface
@@ -314,4 +315,11 @@ def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, A
         raise SceneError(f"point ({x:.4g}, {y:.4g}) mm is off the film of radius {film.radius:.4g} mm")
 
     # Rotate the points, x + iy in film radii, into the frame in which the press lies on the positive x axis.
-    return equilibrium.mesh.locate(to_complex(points) / film.radius * np.exp(-1j * equilibrium.direction))
+    rotated_points = to_complex(points) / film.radius * np.exp(-1j * equilibrium.direction)
+
+    # `locate_points` expects one row of points for each placement. Here, there is a single placement.
+    mesh = equilibrium.mesh
+    (element,), (xi,), (eta,), (is_reflected,) = locate_points(
+        mesh.placement[None], mesh.template, rotated_points[None]
+    )
+    return element, xi, eta, is_reflected

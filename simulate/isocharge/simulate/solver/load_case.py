@@ -12,7 +12,8 @@ from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.theory import ACCURACY, WITH_BENDING, Theory, amplitude_squared, bending_length
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import CLEARANCE
-from isocharge.simulate.mesh.placed_mesh import PlacedMesh, distance_on_circular_film, place
+from isocharge.simulate.mesh.oval import film_oval, from_oval
+from isocharge.simulate.mesh.placed_mesh import PlacedMesh, place
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.footprint import Probe
@@ -179,13 +180,10 @@ def farthest_distance(film: Film, probe: Probe, at: tuple[float, float]) -> floa
         probe: The probe.
         at: Centroid (x, y) of the footprint, mm.
     """
-    x, y = at
-    distance = np.hypot(x, y)
-    if not film.oval or distance == 0.0:
+    if not film.oval:
         return probe.farthest_distance(at)
-    circular_distance = distance_on_circular_film(film, distance, float(np.arctan2(y, x)))
-    ratio = float(circular_distance / distance)
-    return probe.farthest_distance((ratio * x, ratio * y))
+    centroid = film.radius * from_oval(np.array(complex(*at) / film.radius), film_oval(film, direction=0.0))
+    return probe.farthest_distance((float(centroid.real), float(centroid.imag)))
 
 
 def check_side_force(side_force: tuple[float, float], force: float) -> None:

@@ -19,7 +19,8 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.theory import DimensionlessGroups
-from isocharge.simulate.mesh.placed_mesh import PlacedMesh, from_oval
+from isocharge.simulate.mesh.oval import from_oval
+from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.solver.assembly import Assembly, SolveTangent, factor_tangent
 
 STABILISING_TENSION = 0.4
@@ -83,7 +84,7 @@ def first_iterate(mesh: PlacedMesh, groups: DimensionlessGroups) -> Array:
     Returns:
         Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
     """
-    circular_points = from_oval(mesh.node_points, mesh.oval)
+    circular_points = from_oval(mesh.node_points, mesh.placement.oval)
     template_distance = np.abs(mesh.placement.to_template(circular_points))
     # The square of the radius of the innermost circle is added, which rounds the tip of the deflection under the probe.
     rounding = float(mesh.placement.template_radius) ** 2

@@ -45,7 +45,7 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.theory import elasticity, side_force_unit
-from isocharge.simulate.mesh.placed_mesh import PlacedMesh, from_oval
+from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Surface, increased
 from isocharge.simulate.solver.assembly import SolveTangent, assembly, factor_tangent, single_threaded_blas
@@ -116,17 +116,19 @@ def _add_oval(solved: Equilibrium, value: float, direction: complex) -> Equilibr
 
     Args:
         solved: The press.
-        value: Parameter e of the oval clamp; see `PlacedMesh.oval`.
+        value: Parameter e of the oval clamp; see `mesh.oval`.
         direction: exp(2 i alpha), where alpha is the angle from the direction of the press to the longer axis.
     """
-    # The position of the probe does not change, so its position on the circular film does.
     mesh = solved.mesh
-    radius = solved.film.radius
-    oval = mesh.oval + value * direction
-    relative_position = np.array(np.hypot(*solved.at) / radius, dtype=complex)
-    circular_distance = radius * from_oval(relative_position, oval).real
-    placement = Placement.of(mesh.template, mesh.placement.probe, circular_distance, radius, mesh.layer)
-    return replace(solved, mesh=replace(mesh, oval=oval, placement=placement))
+    placement = Placement.of(
+        mesh.template,
+        mesh.placement.probe,
+        np.array(np.hypot(*solved.at)),
+        solved.film.radius,
+        mesh.layer,
+        oval=mesh.placement.oval + value * direction,
+    )
+    return replace(solved, mesh=replace(mesh, placement=placement))
 
 
 FILM_FIELDS = (
@@ -224,7 +226,7 @@ def _change_by_imperfection(
 
     # The nodes of an oval film move with the rim. Subtract the change of the stress that the movement of the nodes
     # causes, so that the result holds for fixed points of the film.
-    if positive_press.mesh.oval != negative_press.mesh.oval:
+    if positive_press.mesh is not negative_press.mesh:
         node_shift = (positive_press.mesh.points - negative_press.mesh.points) / (2.0 * STEP)
         change -= change_by_node_shift(solved.mesh, nodal_stress(solved, surface), node_shift)
     return change
