@@ -24,7 +24,7 @@ from typing import Any, get_args
 import numpy as np
 import scipy  # loads each of its subpackages on first use
 
-from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.common.arrays import Array, Integers
 from isocharge.common.contact_domain import Domain
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SceneError, SolveError
@@ -40,6 +40,7 @@ from isocharge.simulate.forward.family import Orientation, check_domain
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.numerics.disk import log_spaced_forces
+from isocharge.simulate.sensor.film import tidy
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Sensor
@@ -76,11 +77,6 @@ class SweepPresses:
 
     def __len__(self) -> int:
         return self.probe.size
-
-    @property
-    def is_outside(self) -> Booleans:
-        """Whether each press lies outside the disk of the sweep, shape (n,)."""
-        return np.asarray(self.probe == OUTSIDE_PROBE)
 
     def __getitem__(self, part: slice | Integers) -> "SweepPresses":
         """Return the presses that a slice or an array of indices selects."""
@@ -348,7 +344,7 @@ def _manifest_entries(maps: Sequence[ForwardMap], whole_film: ForwardMap | None,
         outside = {
             "samples": sweep.outside,
             "probe": whole_film.probe.notation,
-            "radius_mm": [float(f"{radius:.12g}") for radius in (sweep.radius, whole_film.domain.radius)],
+            "radius_mm": [tidy(sweep.radius), tidy(whole_film.domain.radius)],
             "force_N": list(sweep.force_range),
             "solves": whole_film.solves,
             "interpolation_error": whole_film.error,
@@ -356,7 +352,7 @@ def _manifest_entries(maps: Sequence[ForwardMap], whole_film: ForwardMap | None,
     return {
         "probes": list(dict.fromkeys(forward_map.probe.notation for forward_map in maps)),
         "ranges": {
-            "radius_mm": float(f"{sweep.radius:.12g}"),
+            "radius_mm": tidy(sweep.radius),
             "force_N": list(sweep.force_range),
             "orientation": sweep.orientation,
         },
@@ -424,15 +420,14 @@ def _samples(
     n_press = sum(map(len, shards))
     finished_presses = 0
     report("pressing", finished_presses, n_press)
-    charges = in_order(executor, partial(_charges, all_maps), shards)
-    for presses, charge in zip(shards, charges, strict=True):
-        finished_presses += len(presses)
+    for samples in in_order(executor, partial(_samples_of_shard, all_maps), shards):
+        finished_presses += len(samples)
         report("pressing", finished_presses, n_press)
-        yield _samples_of_shard(all_maps, presses, charge)
+        yield samples
 
 
-def _charges(maps: Sequence[ForwardMap], presses: SweepPresses) -> Array:
-    """Compute the touch charges of the presses of a shard, shape (n, n_electrode), pC.
+def _samples_of_shard(maps: Sequence[ForwardMap], presses: SweepPresses) -> Samples:
+    """Compute the charges of the presses of a shard, and return the columns of the shard.
 
     Args:
         maps: Forward map of each probe, and of the whole film if presses lie outside the radius of the sweep.
@@ -442,20 +437,10 @@ def _charges(maps: Sequence[ForwardMap], presses: SweepPresses) -> Array:
     for probe in np.unique(presses.probe).tolist():
         rows = np.flatnonzero(presses.probe == probe)
         charge[rows] = maps[probe].charges(presses.contact[rows], presses.rotation[rows])
-    return charge
 
-
-def _samples_of_shard(maps: Sequence[ForwardMap], presses: SweepPresses, charge: Array) -> Samples:
-    """Convert the presses of a shard and their charges into the columns of a dataset.
-
-    Args:
-        maps: Forward map of each probe, and of the whole film if presses lie outside the radius of the sweep.
-        presses: Presses of the shard.
-        charge: Touch charges, shape (n, n_electrode), pC.
-    """
     probe_notations = np.array([forward_map.probe.notation for forward_map in maps])
     probe_angles = np.array([forward_map.probe.angle for forward_map in maps])
-    x, y, force = (np.ascontiguousarray(column) for column in presses.contact.T)
+    x, y, force = presses.contact.T
     rotation_deg = np.rad2deg(probe_angles[presses.probe] + presses.rotation)
     return Samples(
         x_mm=x,
@@ -464,5 +449,5 @@ def _samples_of_shard(maps: Sequence[ForwardMap], presses: SweepPresses, charge:
         probe=probe_notations[presses.probe],
         orientation_deg=np.mod(np.round(rotation_deg, 9), 360.0),  # rounded, so that 359.999... degrees become 0
         charge_pC=charge,
-        outside=presses.is_outside,
+        outside=presses.probe == OUTSIDE_PROBE,
     )
