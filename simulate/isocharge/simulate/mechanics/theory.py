@@ -270,9 +270,13 @@ class DimensionlessGroups:
         return replace(self, load=0.0, side_load=(0.0, 0.0))
 
     @property
-    def total_load(self) -> float:
-        """Force of the probe plus the magnitude of the force of the static pressure, in units of E h a A^3."""
-        return self.load + np.pi * abs(self.static_pressure)
+    def induced_tension(self) -> float:
+        """Order of magnitude of the tension that the load induces in a film without pretension, in units of E A^2.
+
+        The load is the force of the probe plus the magnitude of the force of the static pressure.
+        """
+        load = self.load + np.pi * abs(self.static_pressure)
+        return float(np.cbrt(load)) ** 2
 
     @property
     def height(self) -> float:

@@ -152,7 +152,7 @@ def sector_angles(
         centre: Position of the centre of the circle on the x axis, shape (...), in film radii.
         radius: Radius of the circle, shape (...), in film radii.
         stretch: Factor with which `stretch_angles` converts angles on the circle into angles in the template plane,
-            shape (...); see `stretch_on_circle`.
+            shape (...); see `map_stretch`.
 
     Returns:
         Angles in the template plane in increasing order, shape (..., n_sector + 1), rad.
@@ -241,24 +241,25 @@ def rim_angles(angle: Array, map_parameter: Array, template_radius: Array, gradi
         Angles in the template plane, shape (..., n_sector + 1), rad.
     """
     # A factor above 1 shifts angles towards pi. A factor below 1 would shift them back, so the factor is at least 1.
-    rim_stretch = ((1.0 + map_parameter) / (1.0 - map_parameter)) ** grading
-    remaining_stretch = rim_stretch / stretch_on_circle(map_parameter, template_radius)
+    rim_stretch = map_stretch(map_parameter, 1.0) ** grading
+    remaining_stretch = rim_stretch / map_stretch(map_parameter, template_radius)
     return stretch_angles(angle, np.maximum(remaining_stretch, 1.0))
 
 
-def stretch_on_circle(map_parameter: Array, template_radius: Array) -> Array:
+def map_stretch(map_parameter: Array, radius: Array | float) -> Array:
     """Compute the factor with which `stretch_angles` converts angles on the film into angles in the template plane.
 
-    The angles on the film are measured around the centre of the innermost circle.
+    The angles on the film are measured around the centre of the image of a circle of the template plane. On the rim,
+    the factor is also the ratio of lengths in the template plane to lengths on the film, next to the press.
 
     Args:
         map_parameter: Parameter c of the conformal map, shape (...).
-        template_radius: Radius of the innermost circle in the template plane, shape (...).
+        radius: Radius of the circle in the template plane, a number or of shape (...); 1 for the rim.
 
     Returns:
-        Factors for points on the innermost circle, shape (...), dimensionless.
+        Factors, shape (...), dimensionless.
     """
-    product = map_parameter * template_radius
+    product = map_parameter * radius
     return (1.0 + product) / (1.0 - product)
 
 

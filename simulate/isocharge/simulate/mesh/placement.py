@@ -23,10 +23,10 @@ from isocharge.simulate.mesh.blocks import Blocks
 from isocharge.simulate.mesh.conformal_map import (
     automorphism_onto,
     enclosing_circle,
+    map_stretch,
     rim_angles,
     ring_edges,
     sector_angles,
-    stretch_on_circle,
 )
 from isocharge.simulate.mesh.oval import from_oval, to_oval
 from isocharge.simulate.sensor.footprint import CurvedProbe, Probe
@@ -117,10 +117,9 @@ class Placement:
 
         # Compute the conformal map of the innermost circle, and the angles and depths of the elements around it.
         map_parameter, template_radius = automorphism_onto(centre, radius)
-        circle_stretch = stretch_on_circle(map_parameter, template_radius)
+        circle_stretch = map_stretch(map_parameter, template_radius)
         circle_angles = sector_angles(blocks, inner_points, inner_extent, centroid, centre, radius, circle_stretch)
-        largest_rim_stretch = (1.0 + map_parameter) / (1.0 - map_parameter)  # of the conformal map, next to the press
-        template_thin_ring_width = thin_ring_width * largest_rim_stretch
+        template_thin_ring_width = thin_ring_width * map_stretch(map_parameter, 1.0)
         return cls(
             map_parameter=map_parameter,
             template_radius=template_radius,

@@ -11,7 +11,7 @@ import numpy as np
 from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.theory import ACCURACY, WITH_BENDING, Theory, amplitude_squared, bending_length
 from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.mesh.conformal_map import CLEARANCE
+from isocharge.simulate.mesh.conformal_map import CLEARANCE, map_stretch
 from isocharge.simulate.mesh.oval import film_oval, from_oval
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, place
 from isocharge.simulate.mesh.placement import Placement
@@ -341,7 +341,7 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
 
     # A small radius of the innermost circle and the stretch of the conformal map require more rings (empirical
     # factors).
-    rings_for_stretch = min(2.0 * math.log(_stretch(placement)), 4.0)
+    rings_for_stretch = min(2.0 * math.log(map_stretch(placement.map_parameter, 1.0)), 4.0)
     rings = math.ceil(-1.3 * math.log(float(placement.template_radius)) + rings_for_stretch)
     first_resolution = Resolution(
         order=first_order + extra_order,
@@ -381,7 +381,7 @@ def _thin_ring_count(placement: Placement, total_width: float) -> int:
     """
     # The widths of the strip in the template plane are divided by the range of ln(r) that all rings cover. The upper
     # limit of 1 / 8 keeps the thin rings near the rim.
-    stretch = _stretch(placement)
+    stretch = float(map_stretch(placement.map_parameter, 1.0))
     log_range = -float(np.log(placement.template_radius))
     largest_width = min(total_width * stretch / log_range, 1.0 / 8.0)
     smallest_width = min(min(total_width, 0.2) / stretch / log_range, 1.0 / 8.0)
@@ -391,8 +391,3 @@ def _thin_ring_count(placement: Placement, total_width: float) -> int:
     # to 0.4 %. If the strip is 0.12 to 0.7 film radii wide, all charges are wrong by 0.02 to 0.24 %. With two rings,
     # these errors are 0.003 and 0.002 %.
     return max(2, 1 + math.floor(THIN_RINGS_PER_FACTOR * math.log(largest_width / smallest_width, 3.0)))
-
-
-def _stretch(placement: Placement) -> float:
-    """Return the factor by which the conformal map stretches the template at the rim next to the probe."""
-    return float((1.0 + placement.map_parameter) / (1.0 - placement.map_parameter))

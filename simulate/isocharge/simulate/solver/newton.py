@@ -10,7 +10,7 @@ method still converges quadratically.
 The iteration stops after `MAX_ITERATIONS` steps, or if the steps no longer become smaller (`PATIENCE`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -119,7 +119,7 @@ def solve_newton(
     Returns:
         The result, which may not have converged.
     """
-    iterate = _Iterate.create(elastic, assembly.free[:, :3], first_field)
+    iterate = _Iterate(elastic, assembly.free[:, :3], first_field)
     step_sizes: list[float] = []
     for iteration in range(MAX_ITERATIONS + 1):
         relative_residual = iterate.relative_residual
@@ -134,7 +134,7 @@ def solve_newton(
         stabilising_tension = _stabilising_tension(elastic, relative_residual)
         solve = factor_tangent(elastic, assembly, iterate.field, stabilising_tension)
         step = solve(-iterate.residual)
-        step_size = _step_size(elastic, iterate.field, step, iterate.residual)
+        step_size = iterate.size_of(step)
         step_sizes.append(step_size)
         if step_size <= ROUND_OFF:
             return iterate.result(iteration, converged=True, message=f"converged to round-off in {iteration} steps")
@@ -157,22 +157,20 @@ class _Iterate:
         elastic: Discrete model of the film.
         free: Whether each displacement component at each node is free, shape (n_node, 3).
         field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
-        residual: Out-of-balance forces at the nodes, shape (n_node, 3).
     """
 
     elastic: ElasticFilm
     free: Booleans
     field: Array
-    residual: Array
-
-    @classmethod
-    def create(cls, elastic: ElasticFilm, free: Booleans, field: Array) -> Self:
-        """Create the iterate with a given field, and compute its residual."""
-        return cls(elastic, free, field, elastic.residual(field))
 
     def after(self, step: Array) -> Self:
         """Return the iterate whose field is the present field plus a step of shape (n_node, 3)."""
-        return type(self).create(self.elastic, self.free, self.field + step)
+        return replace(self, field=self.field + step)
+
+    @cached_property
+    def residual(self) -> Array:
+        """Out-of-balance forces at the nodes, shape (n_node, 3)."""
+        return self.elastic.residual(self.field)
 
     @cached_property
     def relative_residual(self) -> float:
@@ -188,6 +186,19 @@ class _Iterate:
         transverse_ratio = np.linalg.norm(free_residual[:, 2]) / load
         in_plane_ratio = np.linalg.norm(free_residual[:, :2]) / max(in_plane_force, 1e-300)  # avoids a division by zero
         return float(max(transverse_ratio, in_plane_ratio))
+
+    def size_of(self, step: Array) -> float:
+        """Compute the size of a step from this iterate as its energy norm relative to the work of the load.
+
+        The energy of the step is divided by the work of the load. The size is the square root of the quotient.
+
+        Args:
+            step: Change of the displacements, shape (n_node, 3).
+        """
+        step_energy = abs(float(np.sum(step * self.residual)))
+        magnitude, shares = self.elastic.load
+        work = max(magnitude * abs(float(shares @ self.field[:, 2])), 1e-300)  # the limit avoids a division by zero
+        return float(np.sqrt(step_energy / work))
 
     def result(self, iterations: int, *, converged: bool, message: str) -> NewtonResult:
         """Return the result of a solve whose last iterate is this object."""
@@ -209,23 +220,6 @@ def _has_stalled(step_sizes: list[float]) -> bool:
     return min(recent) > 0.5 * min(earlier)
 
 
-def _step_size(elastic: ElasticFilm, field: Array, step: Array, residual: Array) -> float:
-    """Compute the size of a step as its energy norm relative to the work of the load.
-
-    The energy of the step is divided by the work of the load. The size is the square root of the quotient.
-
-    Args:
-        elastic: Discrete model of the film.
-        field: Scaled displacements (U1, U2, W) before the step, shape (n_node, 3).
-        step: Change of all displacements, shape (n_node, 3), or of W alone, shape (n_node,).
-        residual: Out-of-balance forces before the step, same shape as `step`.
-    """
-    step_energy = abs(float(np.sum(step * residual)))
-    magnitude, shares = elastic.load
-    work = max(magnitude * abs(float(shares @ field[:, 2])), 1e-300)  # the limit avoids a division by zero
-    return float(np.sqrt(step_energy / work))
-
-
 def _stabilising_tension(elastic: ElasticFilm, relative_residual: float) -> float:
     """Compute the tension that is added to the tangent in order to stabilise Newton's method.
 
@@ -242,12 +236,7 @@ def _stabilising_tension(elastic: ElasticFilm, relative_residual: float) -> floa
     """
     if relative_residual <= UNSTABILISED_BELOW:
         return 0.0
-    return STABILISING_TENSION * _induced_tension(elastic) * min(1.0, relative_residual)
-
-
-def _induced_tension(elastic: ElasticFilm) -> float:
-    """Return the order of magnitude of the tension that the load induces in a film without pretension."""
-    return float(np.cbrt(elastic.groups.total_load)) ** 2
+    return STABILISING_TENSION * elastic.groups.induced_tension * min(1.0, relative_residual)
 
 
 def _take_full_step(iterate: _Iterate, step: Array) -> _Iterate | None:
@@ -327,7 +316,7 @@ def _descent_step(
         The step, shape (n_node, 3). If no tension is sufficient, the step may not be a descent direction.
     """
     elastic = iterate.elastic
-    added_tension = first_tension * STABILISING_TENSION * _induced_tension(elastic)
+    added_tension = first_tension * STABILISING_TENSION * elastic.groups.induced_tension
     for _ in range(max_trials):
         energy_slope = float(np.sum(step * iterate.residual))
         is_descent_direction = np.isfinite(step).all() and energy_slope < 0.0
@@ -365,12 +354,11 @@ def _line_search(
     residual_norm = np.linalg.norm(iterate.residual[iterate.free])
     step_length = 1.0
     for _ in range(max_halvings):
-        field = iterate.field + step_length * step
-        energy_change = elastic.energy(field) - energy
+        next_iterate = iterate.after(step_length * step)
+        energy_change = elastic.energy(next_iterate.field) - energy
         lowers_energy = energy_change <= armijo_share * step_length * energy_slope
         is_round_off = abs(energy_change) <= energy_round_off * abs(energy)
         if lowers_energy or is_round_off:
-            next_iterate = _Iterate.create(elastic, iterate.free, field)
             lowers_residual = np.linalg.norm(next_iterate.residual[iterate.free]) < residual_norm
             if lowers_energy or lowers_residual:
                 return next_iterate
