@@ -73,7 +73,8 @@ class ChargeSpline:
         film: Film whose squared amplitude scales the charges.
         domain: Presses for which the splines are valid.
         force: Forces at which splines were fitted, shape (n_force,), N.
-        table: Spline in x and y that returns the scaled charges without crosstalk, shape (n_force, n_electrode), pC.
+        table: Spline in x and y that returns the scaled charges, shape (n_force, n_electrode), pC. A scaled charge is a
+            charge divided by the squared amplitude of the press.
         error: Largest difference between a charge of the splines and that of the forward map, relative to the largest
             charge of the same press, dimensionless.
     """
@@ -136,7 +137,7 @@ class ChargeSpline:
         """
         contact = self.domain.check(contact, "table")
         weights = self.force_weights(np.log(contact[:, 2]))
-        return np.asarray(np.einsum("nk,nke->ne", weights, self.scaled_charges(contact[:, :2])))
+        return np.asarray(np.einsum("nk,nke->ne", weights, self.table(contact[:, :2])))
 
     def derivatives(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to x, y and ln F.
@@ -179,9 +180,10 @@ class ChargeSpline:
         weights_below = self.force_weights(log_force - LOG_FORCE_STEP)
         weight_slopes = (weights_above - weights_below) / (2.0 * LOG_FORCE_STEP)
 
-        # Only the scaled charges depend on the position.
-        scaled_charge = self.scaled_charges(position)
-        scaled_gradient = self.scaled_gradients(position)
+        # Only the scaled charges depend on the position. The argument `nu` contains the orders of the derivative with
+        # respect to x and y.
+        scaled_charge = self.table(position)  # shape (n, n_force, n_electrode)
+        scaled_gradient = np.stack([self.table(position, nu=(1, 0)), self.table(position, nu=(0, 1))], axis=-1)
 
         # Sum over the forces of the splines (index k), for each press (n) and electrode (e). The index i is x or y.
         charge = np.einsum("nk,nke->ne", weights, scaled_charge)
@@ -204,31 +206,6 @@ class ChargeSpline:
         """
         weights = lagrange_values(np.log(self.force), log_force)
         return np.asarray(weights * amplitude_squared(self.film, np.exp(log_force))[:, None])
-
-    def scaled_charges(self, position: Array) -> Array:
-        """Compute the scaled charges for all forces at which splines were fitted.
-
-        A scaled charge is a charge divided by the squared amplitude of the press.
-
-        Args:
-            position: Positions (x, y), shape (n, 2), mm.
-
-        Returns:
-            Scaled charges, shape (n, n_force, n_electrode), pC.
-        """
-        return np.asarray(self.table(position))
-
-    def scaled_gradients(self, position: Array) -> Array:
-        """Compute the derivatives of `scaled_charges` with respect to x and y.
-
-        Args:
-            position: Positions (x, y), shape (n, 2), mm.
-
-        Returns:
-            Derivatives, shape (n, n_force, n_electrode, 2), pC/mm.
-        """
-        # The argument `nu` contains the orders of the derivative with respect to x and y.
-        return np.stack([self.table(position, nu=(1, 0)), self.table(position, nu=(0, 1))], axis=-1)
 
 
 def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:

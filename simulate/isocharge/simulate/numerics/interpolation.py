@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebpts1
 from numpy.polynomial.legendre import legder, leggauss, legvander
 from scipy.special import eval_legendre, roots_jacobi
 
@@ -67,11 +68,7 @@ def chebyshev_nodes(count: int, low: float, high: float) -> Array:
     Returns:
         Nodes in ascending order, shape (count,). The nodes do not include the ends of the interval.
     """
-    descending_numbers = np.arange(count, 0, -1)  # the cosine decreases with the angle, so the nodes are ascending
-    angles = (2.0 * descending_numbers - 1.0) * np.pi / (2.0 * count)
-    middle = 0.5 * (low + high)
-    half_width = 0.5 * (high - low)
-    return np.asarray(middle + half_width * np.cos(angles))
+    return np.asarray(0.5 * (low + high) + 0.5 * (high - low) * chebpts1(count))
 
 
 def divide_intervals(ends: Array, count: int) -> Array:
