@@ -90,15 +90,11 @@ def rotate_stress(rotated_frame_stress: Array, angle: float | Array) -> Array:
     """
     s11, s22, s12 = np.moveaxis(rotated_frame_stress, -1, 0)
 
-    # In Mohr's circle, the mean of s11 and s22 does not change. The vector of half of their difference and the shear
-    # stress is rotated by twice the angle.
+    # In Mohr's circle, the mean of s11 and s22 does not change. The deviator consists of half of their difference and
+    # the shear stress. It is rotated as a complex number by twice the angle.
     mean = 0.5 * (s11 + s22)
-    half_difference = 0.5 * (s11 - s22)
-    cosine = np.cos(2.0 * np.asarray(angle))
-    sine = np.sin(2.0 * np.asarray(angle))
-    new_half_difference = half_difference * cosine - s12 * sine
-    new_s12 = half_difference * sine + s12 * cosine
-    return np.stack([mean + new_half_difference, mean - new_half_difference, new_s12], axis=-1)
+    deviator = (0.5 * (s11 - s22) + 1j * s12) * np.exp(2j * np.asarray(angle))
+    return np.stack([mean + deviator.real, mean - deviator.real, deviator.imag], axis=-1)
 
 
 def elasticity(film: Film, angle: float) -> Array:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
+from isocharge.simulate.numerics.polygon import to_corners
 
 ROUNDING = 1e-9
 """Relative tolerance for points on the edge of a disk, dimensionless."""
@@ -63,8 +64,7 @@ class Rings:
     @classmethod
     def _at(cls, distance: Array, direction: Complexes) -> "Rings":
         """Return the positions at given distances, shape (n_ring,), and unit vectors x + iy, shape (n_angle,)."""
-        z = np.outer(distance, direction)
-        return cls(distance, np.stack([z.real, z.imag], axis=-1))
+        return cls(distance, to_corners(np.outer(distance, direction)))
 
     def contacts(self, force: float) -> Array:
         """Return one contact (x, y, F) for each position. All contacts have the same force F.

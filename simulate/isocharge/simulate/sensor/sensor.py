@@ -5,6 +5,7 @@ axis is the transverse direction (2). The film is seen from the side of the prob
 the direction of the push. The units are mm, N, MPa and pC.
 """
 
+import cmath
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -270,11 +271,8 @@ class Calibration:
         Returns:
             Calibrated positions (x, y), of the same shape, mm.
         """
-        # The points are row vectors, so they are multiplied by the transpose of the usual rotation matrix.
-        cosine = np.cos(self.rotation)
-        sine = np.sin(self.rotation)
-        transposed_rotation = np.array([[cosine, sine], [-sine, cosine]])
-        return np.asarray(points @ transposed_rotation + np.array(self.shift))
+        rotated_points = to_complex(points) * cmath.rect(1.0, self.rotation)
+        return to_corners(rotated_points) + np.array(self.shift)
 
 
 @dataclass(frozen=True)
