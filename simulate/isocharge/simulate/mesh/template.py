@@ -113,24 +113,23 @@ def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tu
 
     # First locate all points as if they were in the rings. Then locate the points inside the innermost circle again.
     template_points = placement.to_template(circular_points)
-    element, radial, angular = _locate_in_rings(placement, blocks, template_points)
+    element, coordinates = _locate_in_rings(placement, blocks, template_points)
     is_inside = np.abs(template_points) <= placement.template_radius[:, None]
     if np.any(is_inside):
         placement_index, _ = np.nonzero(is_inside)
         used_index, point_index = np.unique(placement_index, return_inverse=True)
         corners = _inner_corners(placement[used_index], blocks)[point_index]
         placement_of_point = placement[placement_index]  # one placement for each point inside the circle
-        element[is_inside], radial[is_inside], angular[is_inside] = _locate_inside(
+        element[is_inside], coordinates[:, is_inside] = _locate_inside(
             placement_of_point, blocks, circular_points[is_inside], corners
         )
 
     # Convert the coordinates from the range from 0 to 1 to the range from -1 to 1.
-    xi = 2.0 * radial - 1.0
-    eta = 2.0 * angular - 1.0
+    xi, eta = 2.0 * coordinates - 1.0
     return element, xi, eta, is_reflected
 
 
-def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Complexes) -> tuple[Integers, Array, Array]:
+def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Complexes) -> tuple[Integers, Array]:
     """Find the elements that contain points between the innermost circle and the rim.
 
     Args:
@@ -139,77 +138,49 @@ def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Comp
         template_points: Points x + iy of the template plane, shape (k, n).
 
     Returns:
-        Index of the element, and radial and angular coordinate in the element from 0 to 1, each of shape (k, n).
+        Index of the element, shape (k, n). Radial and angular coordinate in the element from 0 to 1, shape (2, k, n).
     """
     # Depth of each point, from 0 on the innermost circle to 1 on the rim. At the origin, the logarithm is infinite, and
     # the depth is clipped to 0.
     with np.errstate(divide="ignore"):
         log_ratio = np.log(np.abs(template_points)) / np.log(placement.template_radius)[:, None]
     depth = np.clip(1.0 - log_ratio, 0.0, 1.0)
+    ring, radial = _locate_in_intervals(placement.ring_depths.T[..., None], depth)
 
-    # The index of the ring is the number of edges between rings that lie inside of the point.
-    edges_between_rings = placement.ring_depths[:, None, 1:-1]  # shape (k, 1, n_ring - 1)
-    ring = np.sum(edges_between_rings <= depth[..., None], axis=-1)
-    inner_edge = np.take_along_axis(placement.ring_depths, ring, axis=1)
-    outer_edge = np.take_along_axis(placement.ring_depths, ring + 1, axis=1)
-    radial = (depth - inner_edge) / (outer_edge - inner_edge)
+    # Angles at which the sides of the sectors lie at the depths of the points, shape (n_sector + 1, k, n). Along a
+    # side, the angle changes linearly from its value on the innermost circle to its value on the rim.
+    circle_angles = placement.circle_angles.T[..., None]
+    side_angles = circle_angles + depth * (placement.rim_angles.T[..., None] - circle_angles)
 
-    sector, angular = _locate_in_sectors(placement, blocks, np.angle(template_points), depth)
-    element = blocks.n_inner + ring * blocks.n_sector + sector
-    return element, radial, angular
-
-
-def _locate_in_sectors(placement: Placement, blocks: Blocks, angle: Array, depth: Array) -> tuple[Integers, Array]:
-    """Find the sectors that contain points between the innermost circle and the rim.
-
-    Args:
-        placement: k placements, one for each row of points.
-        blocks: The elements.
-        angle: Angles of the points in the template plane, shape (k, n), rad.
-        depth: Depths of the points, from 0 on the innermost circle to 1 on the rim, shape (k, n).
-
-    Returns:
-        Index of the sector, and angular coordinate in the sector from 0 to 1, each of shape (k, n).
-    """
     # If the whole film is meshed, add full turns such that each angle lies within one turn after the first side.
+    angle = np.angle(template_points)
     if not blocks.half:
-        first_side = np.zeros(depth.shape, dtype=np.intp)
-        angle_of_first_side = _side_angles(placement, first_side, depth)
-        angle = angle_of_first_side + np.mod(angle - angle_of_first_side, 2.0 * np.pi)
-
-    # The index of the sector is the number of sides between sectors whose angles do not exceed the angle of the point.
-    circle_angles = placement.circle_angles[:, None, 1:-1]  # shape (k, 1, n_sector - 1)
-    rim_angles = placement.rim_angles[:, None, 1:-1]
-    side_angles = circle_angles + depth[..., None] * (rim_angles - circle_angles)
-    sector: Integers = np.sum(side_angles <= angle[..., None], axis=-1)
-
-    angle_of_side_before = _side_angles(placement, sector, depth)
-    angle_of_side_after = _side_angles(placement, sector + 1, depth)
-    angular = (angle - angle_of_side_before) / (angle_of_side_after - angle_of_side_before)
-    return sector, angular
+        angle = side_angles[0] + np.mod(angle - side_angles[0], 2.0 * np.pi)
+    sector, angular = _locate_in_intervals(side_angles, angle)
+    return blocks.n_inner + ring * blocks.n_sector + sector, np.stack([radial, angular])
 
 
-def _side_angles(placement: Placement, side: Integers, depth: Array) -> Array:
-    """Compute the angles at which sides of the sectors lie at the depths of given points.
-
-    Along a side, the angle changes linearly from its value on the innermost circle to its value on the rim.
+def _locate_in_intervals(edges: Array, values: Array) -> tuple[Integers, Array]:
+    """Find the intervals that contain values. Values outside all intervals belong to the first or the last interval.
 
     Args:
-        placement: k placements, one for each row of points.
-        side: Index of a side for each point, shape (k, n).
-        depth: Depth of each point, from 0 on the innermost circle to 1 on the rim, shape (k, n).
+        edges: Edges of adjacent intervals in increasing order, shape (n_interval + 1, k, n) or
+            (n_interval + 1, k, 1).
+        values: The values, shape (k, n).
 
     Returns:
-        Angles in the template plane, shape (k, n), rad.
+        Index of the interval, and coordinate in the interval, which is 0 at its start and 1 at its end, each of shape
+        (k, n).
     """
-    circle_angle = np.take_along_axis(placement.circle_angles, side, axis=1)
-    rim_angle = np.take_along_axis(placement.rim_angles, side, axis=1)
-    return circle_angle + depth * (rim_angle - circle_angle)
+    # The index of the interval is the number of inner edges that do not exceed the value.
+    index: Integers = np.sum(edges[1:-1] <= values, axis=0)
+    start, end = np.take_along_axis(edges, np.stack([index, index + 1]), axis=0)
+    return index, (values - start) / (end - start)
 
 
 def _locate_inside(
     placement: Placement, blocks: Blocks, points: Complexes, corners: Complexes, tolerance: float = 1e-9
-) -> tuple[Integers, Array, Array]:
+) -> tuple[Integers, Array]:
     """Find the elements that contain points inside the innermost circle.
 
     A straight line is drawn through each side of an element. The signed distance of a point from the line is positive
@@ -226,7 +197,7 @@ def _locate_inside(
         tolerance: Distance of a local coordinate from the range from 0 to 1 above which another element is tried.
 
     Returns:
-        Index of the element, and radial and angular coordinate in the element from 0 to 1, each of shape (n,).
+        Index of the element, shape (n,). Radial and angular coordinate in the element from 0 to 1, shape (2, n).
     """
     inner_first, inner_last, outer_first, outer_last = np.moveaxis(corners, -1, 0)
     sides = ((inner_first, outer_first), (outer_last, inner_last), (inner_last, inner_first), (outer_first, outer_last))
@@ -234,21 +205,19 @@ def _locate_inside(
     candidates = np.argsort(-np.min(distances, axis=0), axis=1)  # shape (n, n_inner)
 
     element = candidates[:, 0]
-    radial = np.full(points.shape, np.inf)
-    angular = np.full(points.shape, np.inf)
+    coordinates = np.full((2, points.size), np.inf)
     for candidate in candidates.T:
         # Select the points whose element has not been found yet.
-        selected = np.flatnonzero(_overshoot(radial, angular) > tolerance)
+        selected = np.flatnonzero(_overshoot(coordinates) > tolerance)
         if selected.size == 0:
             break
         tried = candidate[selected]
-        new_radial, new_angular = _local_coordinates(placement[selected], blocks, points[selected], tried)
-        is_better = _overshoot(new_radial, new_angular) < _overshoot(radial[selected], angular[selected])
+        new_coordinates = _local_coordinates(placement[selected], blocks, points[selected], tried)
+        is_better = _overshoot(new_coordinates) < _overshoot(coordinates[:, selected])
         improved = selected[is_better]
         element[improved] = tried[is_better]
-        radial[improved] = new_radial[is_better]
-        angular[improved] = new_angular[is_better]
-    return element, radial, angular
+        coordinates[:, improved] = new_coordinates[:, is_better]
+    return element, coordinates
 
 
 def _inner_corners(placement: Placement, blocks: Blocks) -> Complexes:
@@ -277,7 +246,7 @@ def _local_coordinates(
     negligible_step: float = 1e-13,
     max_overshoot: float = 0.1,
     difference_step: float = 1e-5,
-) -> tuple[Array, Array]:
+) -> Array:
     """Compute the local coordinates of points in given elements inside the innermost circle by Newton's method.
 
     A point with the radial coordinate r lies on the straight line between two points with the same angular coordinate:
@@ -296,13 +265,12 @@ def _local_coordinates(
             differences.
 
     Returns:
-        Radial coordinate and angular coordinate, each of shape (n,). They are between 0 and 1 for points inside the
-        element.
+        Radial coordinate and angular coordinate, shape (2, n). They are between 0 and 1 for points inside the element.
     """
-    radial = np.full(points.shape, 0.5)
-    angular = np.full(points.shape, 0.5)
+    coordinates = np.full((2, points.size), 0.5)
     for _ in range(max_steps):
         # Evaluate the sides at the angular coordinate, and before and after it for the central differences.
+        radial, angular = coordinates
         shifted_angular = angular[:, None] + np.array([0.0, -difference_step, difference_step])
         inner, outer = placement.sides(blocks, element, shifted_angular)
         shifted_points = inner + radial[:, None] * (outer - inner)
@@ -314,30 +282,27 @@ def _local_coordinates(
         # Newton step for two unknowns by Cramer's rule. The determinant of two plane vectors is the imaginary part of
         # the product of the conjugate of the first vector and the second vector.
         determinant = (np.conj(radial_derivative) * angular_derivative).imag
-        radial_step = -(np.conj(residual) * angular_derivative).imag / determinant
-        angular_step = -(np.conj(radial_derivative) * residual).imag / determinant
-        new_radial = np.clip(radial + radial_step, -max_overshoot, 1.0 + max_overshoot)
-        new_angular = np.clip(angular + angular_step, -max_overshoot, 1.0 + max_overshoot)
-        largest_step = max(np.abs(new_radial - radial).max(), np.abs(new_angular - angular).max())
-        radial = new_radial
-        angular = new_angular
+        radial_numerator = (np.conj(residual) * angular_derivative).imag
+        angular_numerator = (np.conj(radial_derivative) * residual).imag
+        step = -np.stack([radial_numerator, angular_numerator]) / determinant
+        new_coordinates = np.clip(coordinates + step, -max_overshoot, 1.0 + max_overshoot)
+        largest_step = np.abs(new_coordinates - coordinates).max()
+        coordinates = new_coordinates
         if largest_step < negligible_step:
             break
-    return radial, angular
+    return coordinates
 
 
-def _overshoot(radial: Array, angular: Array) -> Array:
+def _overshoot(coordinates: Array) -> Array:
     """Compute by how much local coordinates exceed the range from 0 to 1.
 
     Args:
-        radial: Radial coordinates, shape (n,).
-        angular: Angular coordinates, shape (n,).
+        coordinates: Radial and angular coordinates, shape (2, n).
 
     Returns:
         Larger excess of the two coordinates, shape (n,). It is negative if both coordinates lie within the range.
     """
-    distance_from_middle = np.maximum(np.abs(radial - 0.5), np.abs(angular - 0.5))
-    return distance_from_middle - 0.5
+    return np.abs(coordinates - 0.5).max(axis=0) - 0.5
 
 
 def _distance_to_left(start: Complexes, end: Complexes, points: Complexes) -> Array:
