@@ -28,6 +28,7 @@ from isocharge.simulate.forward.readout import contact_charges
 from isocharge.simulate.mechanics.theory import amplitude_squared
 from isocharge.simulate.numerics.disk import contacts_at, log_spaced_forces, sunflower
 from isocharge.simulate.numerics.interpolation import chebyshev_nodes, lagrange_values
+from isocharge.simulate.numerics.polygon import to_corners
 from isocharge.simulate.sensor.film import Film
 
 MAX_KNOT_SPACING = 0.3
@@ -323,8 +324,7 @@ def _fit_positions(cells: int, per_cell: float = 1.6, per_edge_cell: float = 2.0
     # enough positions if there are only a few cells.
     inner_count = int(per_cell * np.pi * (0.5 * cells) ** 2) + 16
     edge_count = int(per_edge_cell * np.pi * cells) + 8
-    angle = 2.0 * np.pi * np.arange(edge_count) / edge_count
-    edge_positions = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    edge_positions = to_corners(np.exp(2j * np.pi * np.arange(edge_count) / edge_count))
     return np.concatenate([sunflower(inner_count), edge_positions])
 
 

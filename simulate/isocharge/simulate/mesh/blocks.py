@@ -100,7 +100,7 @@ class Blocks:
         # consists of n_half_edge * n_half_edge elements, and there is one sector for each element of a half edge.
         self.n_corner = topology.n_corner
         self.n_half_edge = max(1, round(resolution.around / (2 * self.n_corner)))
-        self.n_meshed = self.n_corner // 2 if self.half else self.n_corner
+        self.n_meshed = self.n_corner // self.copies
         self.n_sector = 2 * self.n_meshed * self.n_half_edge
         self.n_quad = self.n_meshed * self.n_half_edge**2
 

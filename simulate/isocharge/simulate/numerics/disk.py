@@ -138,4 +138,4 @@ def sunflower(count: int) -> Array:
     number = np.arange(count)
     golden_angle = np.pi * (3.0 - np.sqrt(5.0))
     distance = np.sqrt((number + 0.5) / count)
-    return np.stack([distance * np.cos(golden_angle * number), distance * np.sin(golden_angle * number)], axis=1)
+    return to_corners(distance * np.exp(1j * golden_angle * number))

@@ -373,15 +373,14 @@ def _film(table: FilmTable) -> Film:
     Raises:
         SensorError: If a property is outside its accepted range.
     """
-    # Young's moduli along both axes, and their geometric mean. The mean of equal values is not computed, because it
-    # would have a rounding error.
+    # Young's moduli along both axes, and their geometric mean. The mean of equal values has no rounding error.
     values: dict[str, Any] = msgspec.structs.asdict(table)
     young_1, young_2 = _along_axes(table.young_GPa)
-    values["young_GPa"] = young_1 if young_1 == young_2 else math.sqrt(young_1 * young_2)
+    values["young_GPa"] = math.sqrt(young_1 * young_2)
 
     # Components of the pretension, and the mean of the components along x and y
     tension_11, tension_22, tension_12, *_ = [*_along_axes(table.pretension_MPa), 0.0]
-    values["pretension_MPa"] = tension_11 if tension_11 == tension_22 else 0.5 * (tension_11 + tension_22)
+    values["pretension_MPa"] = 0.5 * (tension_11 + tension_22)
     numbers: dict[str, Any] = {
         attribute: values[number.key] / number.factor
         for attribute, number in FILM_NUMBERS.items()
