@@ -133,7 +133,7 @@ class PlacedMesh:
         # Divide the forces by the force on the whole film. The mesh covers one of several equal copies, so the shares
         # of its nodes add up to 1 / copies.
         node_load = np.bincount(template.nodes[template.footprint].ravel(), element_load.ravel(), template.n_node)
-        return node_load / (template.copies * element_load.sum())
+        return np.asarray(node_load / (template.copies * element_load.sum()))
 
     @property
     def shape_error(self) -> float:

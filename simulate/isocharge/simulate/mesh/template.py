@@ -302,7 +302,7 @@ def _overshoot(coordinates: Array) -> Array:
     Returns:
         Larger excess of the two coordinates, shape (n,). It is negative if both coordinates lie within the range.
     """
-    return np.abs(coordinates - 0.5).max(axis=0) - 0.5
+    return np.asarray(np.abs(coordinates - 0.5).max(axis=0) - 0.5)
 
 
 def _distance_to_left(start: Complexes, end: Complexes, points: Complexes) -> Array:

@@ -272,7 +272,7 @@ class Calibration:
             Calibrated positions (x, y), of the same shape, mm.
         """
         rotated_points = to_complex(points) * cmath.rect(1.0, self.rotation)
-        return to_corners(rotated_points) + np.array(self.shift)
+        return to_corners(rotated_points + complex(*self.shift))
 
 
 @dataclass(frozen=True)
