@@ -138,7 +138,6 @@ def test_charges_and_deflection(case):
     """
     solved = solve(case.film, case.probe, case.at, case.force)
     largest_error = 0.0
-    assert len(case.charges) in (4, 8)
     for key, expected in case.charges.items():
         sensor = case.sensor(key)
         charge = touch_charge(sensor, solved)

@@ -1,7 +1,8 @@
 """Contents and reproducibility of swept datasets, and error messages."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,10 +15,8 @@ from isocharge.simulate import (
     Ellipse,
     ForwardMap,
     Polygon,
-    Resolution,
-    Sensor,
+    Probe,
     Sweep,
-    Theory,
     load_sensor,
     parse_probe,
     read_dataset,
@@ -37,23 +36,15 @@ def small(samples: int = 60, **changes) -> Sweep:
     return Sweep(**sweep | changes)
 
 
-@dataclass(frozen=True)
-class Spy:
-    """Substitute for a forward map, whose three charges are the x, y and orientation of its arguments."""
+def spy_map(forward_map: ForwardMap, probe: Probe) -> SimpleNamespace:
+    """Return a substitute for a map of a probe, whose three charges are the x, y and orientation of its arguments."""
+    names = ("sensor", "electrodes", "theory", "resolution", "solves", "error")
+    attributes = {name: getattr(forward_map, name) for name in names}
 
-    probe: Circle | Polygon
-    sensor: Sensor = SENSOR
-    theory: Theory = COARSE.theory
-    resolution: Resolution = COARSE.resolution
-    solves: int = 3
-    error: float = 1e-4
-
-    @property
-    def electrodes(self):
-        return self.sensor.electrode_names
-
-    def charges(self, contact, orientation):
+    def charges(contact, orientation):
         return np.column_stack([contact[:, :2], np.rad2deg(orientation)])
+
+    return SimpleNamespace(probe=probe, charges=charges, **attributes)
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -129,7 +120,7 @@ def test_run_sweep_writes_the_same_bytes_as_write_sweep_and_reports_progress(tmp
     assert done == total
 
 
-def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path, monkeypatch):
+def test_orientation_is_the_sum_of_probe_angle_and_rotation(three_map, tmp_path, monkeypatch):
     """The dataset contains the sum of both angles. The forward map receives the rotation of the press only.
 
     The sweeps have two shards, and each press has its own charges.
@@ -139,7 +130,8 @@ def test_orientation_is_the_sum_of_probe_angle_and_rotation(tmp_path, monkeypatc
     probes = [parse_probe(text) for text in ("rectangle:4.0x2.0@30", "triangle:4.0@-30", "circle:1.0@50")]
     for orientation in ("fixed", "random"):
         sweep = Sweep(samples=999, orientation=orientation, outside=0)
-        read = read_dataset(write_sweep(tmp_path / orientation, [Spy(probe) for probe in probes], sweep)).samples
+        maps = [spy_map(three_map, probe) for probe in probes]
+        read = read_dataset(write_sweep(tmp_path / orientation, maps, sweep)).samples
         assert read.probe.tolist() == ["rectangle:4.0x2.0", "triangle:4.0", "circle:1.0"] * 333
         np.testing.assert_array_equal(read.charge_pC[:, :2].T, [read.x_mm, read.y_mm])
         rotation = read.charge_pC[:, 2]

@@ -38,12 +38,12 @@ def test_fourier_series_is_interpolated_exactly(film: Film, probe, largest):
 
 
 @pytest.mark.parametrize(
-    ("probe", "solves", "all_pairs"),
-    [(Circle(1.0), 7, 7), (IRREGULAR, 39, 63), (Ellipse(4.0, 2.0), 21, 35), (Polygon.triangle(4.0), 13, 21)],
+    ("probe", "solves"),
+    [(Circle(1.0), 7), (IRREGULAR, 39), (Ellipse(4.0, 2.0), 21), (Polygon.triangle(4.0), 13)],
 )
-def test_fewer_turns_are_solved_than_all_pairs_of_angles(probe, solves, all_pairs):
-    """All pairs are seven directions times the rotations, of which the symmetry of the probe saves some."""
-    assert len(Turns.spread(DEFAULT_HARMONICS, probe.period, has_directions=True).solved) == solves <= all_pairs
+def test_fewer_turns_are_solved_than_all_pairs_of_angles(probe, solves):
+    """All pairs would be 7, 63, 35 and 21: seven directions times the rotations, of which the symmetry saves some."""
+    assert len(Turns.spread(DEFAULT_HARMONICS, probe.period, has_directions=True).solved) == solves
 
 
 @pytest.mark.parametrize("probe", [Ellipse(4.0, 2.0), Polygon.triangle(4.0), Polygon.rectangle(3.0, 3.0)])

@@ -103,7 +103,7 @@ def draw_frames(board, seed, seconds=20.0):
     hum_pC = rng.uniform(0.0, 1.0) * np.sin(2 * np.pi * HUM_Hz * t_s)
     drift_pC = rng.uniform(-0.1, 0.1) * t_s
     charge += (hum_pC + drift_pC)[:, None]
-    charge += np.where(is_pressed, 30.0, 0.0)[:, None] * rng.random()
+    charge += 30.0 * is_pressed[:, None] * rng.random()
     charge[rng.choice(np.flatnonzero(is_pressed), 3)] *= 40.0  # spikes, which are not peaks of a press
 
     gain = Gain(Setup(ELECTRODES, device(board)))
@@ -111,7 +111,7 @@ def draw_frames(board, seed, seconds=20.0):
     for invalid in (np.nan, np.inf, -np.inf, 3e9, 1e300):
         values[rng.integers(0, count, 2), rng.integers(0, n_electrode, 2)] = invalid
     limited = rng.random(count) < 0.003
-    tare = np.isin(np.arange(count), rng.integers(count // 2, count, 1))
+    tare = np.arange(count) == rng.integers(count // 2, count)
     return Frames(values, t_s, dt_s, limited, tare)
 
 

@@ -114,7 +114,6 @@ def played(program, path, *words):
 
 def check_records(records, expected):
     """Lines of the host example against our records."""
-    assert len(records) == len(expected)
     for theirs, mine in zip(records, expected, strict=True):
         flags = [word for word in mine.flags if word not in ONLY_PYTHON]
         assert (theirs["seq"], theirs["t_device_us"], theirs["contact"]) == (mine.seq, mine.t_device_us, mine.contact)
