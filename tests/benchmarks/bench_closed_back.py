@@ -20,7 +20,7 @@ PROBE = Circle(1.0)
 RADIUS_mm = 8.0
 FORCE_RANGE_N = (0.05, 2.0)
 PRETENSION_MPa = 0.8
-DEPTHS_mm = (2.0, 20.0, 200.0, 2000.0)
+DEPTHS_mm = (20.0, 2000.0)
 MISFIT_LIMIT = 5.0
 NOISE = noise_model("reference")
 
