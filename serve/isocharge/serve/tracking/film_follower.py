@@ -162,10 +162,12 @@ class _Conversion(NamedTuple):
     """Conversion of charges near one contact into charges of the calibrated film.
 
     Attributes:
+        contact: Contact on the calibrated film, for which and near which the conversion is used.
         shift_pC: Charges that are added, shape (n_electrode,), pC.
         covariance: Covariance of x (mm), y (mm) and the force (N) because of the errors of the state, shape (3, 3).
     """
 
+    contact: Contact
     shift_pC: Array
     covariance: Array
 
@@ -225,12 +227,9 @@ class FilmFollower(Stage):
         self._lowest = -self._highest
         self._lowest[0], self._highest[0] = series.node_MPa[[0, -1]]
 
-        radius_mm = series.domain.radius
-        smallest_N, largest_N = series.domain.force_range
-        self._contact_bounds = (
-            np.array([-radius_mm, -radius_mm, math.log(smallest_N)]),
-            np.array([radius_mm, radius_mm, math.log(largest_N)]),
-        )
+        # Smallest and largest x, y and ln F
+        domain = series.domain
+        self._contact_bounds = (domain.centre - domain.scale, domain.centre + domain.scale)
         self.is_lost = False
         # Mean squared distance of the latest touches from the predicted touches, relative to the unscaled errors
         self._mean_square = 1.0
@@ -239,8 +238,7 @@ class FilmFollower(Stage):
         self._start_estimate()
         self._applied_state: Array | None = None  # state that contacts are corrected for; None before the first one
         self._applied_covariance = self._covariance
-        self._conversion: _Conversion | None = None  # latest conversion of charges, and its contact
-        self._conversion_contact: Contact | None = None
+        self._conversion: _Conversion | None = None  # latest conversion of charges
         self.reset()
 
     def _start_estimate(self) -> None:
@@ -318,7 +316,7 @@ class FilmFollower(Stage):
             self._start_estimate()  # the film may have changed suddenly, so earlier touches do not help
         elif not self.is_lost:
             self._apply_estimate()
-            self._conversion_contact = None  # the stored conversion belongs to the earlier state
+            self._conversion = None  # the stored conversion belongs to the earlier state
 
     @property
     def _error_scale(self) -> float:
@@ -367,9 +365,9 @@ class FilmFollower(Stage):
 
     def _log_contact(self, contact: Contact) -> Array:
         """Return (x, y, ln F) of a contact, moved into the bounds of the charge map, shape (1, 3)."""
-        lowest, highest = self._contact_bounds
-        log_force = math.log(max(contact.force_N, math.exp(lowest[2])))
-        return np.clip([[contact.x_mm, contact.y_mm, log_force]], lowest, highest)
+        smallest_N, _largest_N = self._series.domain.force_range
+        log_force = math.log(max(contact.force_N, smallest_N))
+        return np.clip([[contact.x_mm, contact.y_mm, log_force]], *self._contact_bounds)
 
     def follow_contact(self, contact: Contact, charge_pC: Array) -> Contact:
         """Correct a contact for the estimated changes of the film.
@@ -385,12 +383,11 @@ class FilmFollower(Stage):
         if state is None:  # there is no estimate yet
             return contact
         conversion = self._conversion
-        if conversion is None or not is_close(contact, self._conversion_contact):
+        if conversion is None or not is_close(contact, conversion.contact):
             first = self._conversion_at(contact, state)
             corrected = self.predictor.predict(charge_pC + first.shift_pC)
-            conversion = self._conversion_at(corrected, state)
+            conversion = self._conversion_at(corrected, state)._replace(contact=contact)
             self._conversion = conversion
-            self._conversion_contact = contact
         return self.predictor.predict(charge_pC + conversion.shift_pC).with_covariance(conversion.covariance)
 
     def _conversion_at(self, contact: Contact, state: Array) -> _Conversion:
@@ -410,4 +407,4 @@ class FilmFollower(Stage):
         contact_by_state = np.linalg.pinv(weight * slopes_pC) @ (weight * present.by_state[0])  # shape (3, n_state)
         contact_by_state[2] *= contact.force_N  # from ln F to F
         covariance = contact_by_state @ self._applied_covariance @ contact_by_state.T
-        return _Conversion(calibrated_pC - present.charge_pC[0], covariance)
+        return _Conversion(contact, calibrated_pC - present.charge_pC[0], covariance)
