@@ -6,7 +6,7 @@ unknown while nothing touches the film. The device clock is unknown if the charg
 """
 
 import json
-from functools import cache
+from functools import cache, cached_property
 from types import UnionType
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
@@ -209,18 +209,18 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
             json_values[field.name] = value
         return json_values
 
+    @cached_property
+    def _json(self) -> str:
+        """The record as one line of JSON. The line is computed only once, and is then stored in the record."""
+        return _ENCODE(self.json_values)
+
     def to_json(self) -> str:
         """Return the record as one line of strictly valid JSON, in which numbers are rounded to six decimals.
-
-        The line is computed only once, and is then stored in the record.
 
         Raises:
             ValueError: If a number is not finite.
         """
-        text: str | None = self.__dict__.get("json")
-        if text is None:
-            text = self.__dict__["json"] = _ENCODE(self.json_values)
-        return text
+        return self._json
 
 
 RECORD_FIELDS: tuple[Field, ...] = fields_of(PredictionRecord)
