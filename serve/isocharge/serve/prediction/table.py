@@ -87,8 +87,7 @@ def _read_electrode_charges(table: NumberTable, electrodes: tuple[str, ...]) -> 
             `MAX_CHARGE_ROWS`.
     """
     charge_rule = replace(CHARGE_RULE, may_be_empty=False)  # a model needs the charges of all electrodes
-    column_rules = table.choose_columns(dict.fromkeys(electrodes, charge_rule))
-    columns = table.read(column_rules, MAX_CHARGE_ROWS)
+    columns = table.read(dict.fromkeys(electrodes, charge_rule), {}, MAX_CHARGE_ROWS)
     return np.column_stack([columns.values[name] for name in electrodes])
 
 

@@ -232,8 +232,7 @@ def read_presses(
         electrode_names = _electrode_columns(table) if electrodes is None else tuple(electrodes)
         with error_prefix(f"{path}: ", PressError):
             _check_electrodes(electrode_names)
-        chosen_rules = table.choose_columns(dict.fromkeys(electrode_names, CHARGE_RULE), optional=PRESS_RULES)
-        columns = _read_rows(table, chosen_rules)
+        columns = _read_rows(table, dict.fromkeys(electrode_names, CHARGE_RULE), PRESS_RULES)
 
     # Columns that the file does not have are filled with NaN. Missing standard deviations get their default values.
     unknown_values = np.full(len(columns.row_numbers), np.nan)
@@ -248,18 +247,20 @@ def read_presses(
             force_std=values["force_std"],
             electrodes=electrode_names,
             lines=tuple(columns.row_numbers.tolist()),
-            ignored=tuple(name for name in table.header if name not in chosen_rules),
+            ignored=tuple(name for name in table.header if name not in columns.values),
             row_noun=columns.row_noun,
         )
 
 
-def _read_rows(table: NumberTable, rules: Mapping[str, ColumnRule]) -> NumberColumns:
-    """Read the chosen columns of a file of presses.
+def _read_rows(
+    table: NumberTable, required: Mapping[str, ColumnRule], optional: Mapping[str, ColumnRule]
+) -> NumberColumns:
+    """Read columns of a file of presses; see `NumberTable.read`.
 
     Raises:
-        PressError: If the file has no press, or a cell is wrong.
+        PressError: If the file has no press, or the header or a cell is wrong.
     """
-    columns = table.read(rules, MAX_ROWS)
+    columns = table.read(required, optional, MAX_ROWS)
     if len(columns.row_numbers) == 0:
         raise table.source.error(": expected one press or more below the header, got none")
     return columns
@@ -295,7 +296,7 @@ def read_press_list(path: Path) -> Array:
     """
     path = Path(path)
     with open_table(path, CONTACT, PressError, f"a header with {', '.join(CONTACT)}") as table:
-        columns = _read_rows(table, table.choose_columns({name: PRESS_RULES[name] for name in CONTACT}))
+        columns = _read_rows(table, {name: PRESS_RULES[name] for name in CONTACT}, {})
     contact = np.column_stack([columns.values[name] for name in CONTACT])
     with error_prefix(f"{path}, ", PressError):
         _refuse_half_positions(contact, columns.row_numbers.tolist(), columns.row_noun)

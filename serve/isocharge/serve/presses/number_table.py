@@ -152,25 +152,27 @@ class NumberTable(ABC):
         self.header = tuple(name if name in source.names else name.strip() for name in header)
         self.source = source
 
-    def choose_columns(
-        self, required: Mapping[str, ColumnRule], optional: Mapping[str, ColumnRule] | None = None
-    ) -> dict[str, ColumnRule]:
-        """Choose the columns to read: all required columns, and the optional columns that the file contains.
+    def read(
+        self, required: Mapping[str, ColumnRule], optional: Mapping[str, ColumnRule], max_rows: int
+    ) -> NumberColumns:
+        """Read all required columns and the optional columns that the file contains, and check their values.
 
         A warning lists all other columns of the file, which are ignored.
 
         Args:
             required: Rules of the required columns, by the names of the columns.
             optional: Rules of the optional columns, by the names of the columns.
+            max_rows: Largest number of rows that is accepted.
 
         Returns:
-            The rules of the chosen columns, by the names of the columns.
+            The required columns, and then the optional columns.
 
         Raises:
-            InputError: If a required column is missing, if the file contains a chosen column twice, or if the name of a
-                column is almost that of a column that the file does not contain, such as `a (pC)` for `A`.
+            InputError: If a required column is missing, if the file contains a column to read twice, if the name of a
+                column is almost that of a column that the file does not contain, such as `a (pC)` for `A`, if the file
+                is damaged or has more than `max_rows` rows, or if a cell violates the rule of its column.
         """
-        known_rules = {**required, **(optional or {})}
+        known_rules = {**required, **optional}
         self.refuse_similar_names((name for name in self.header if name not in known_rules), known_rules)
         missing_names = [name for name in required if name not in self.header]
         if missing_names:
@@ -182,7 +184,9 @@ class NumberTable(ABC):
         ignored_names = [name for name in self.header if name not in chosen_rules]
         if ignored_names:
             log.warning("%s: ignored columns: %s", self.source.where, shown(ignored_names))
-        return chosen_rules
+        columns = self._read_columns(chosen_rules, max_rows)
+        columns.check(chosen_rules, f"{self.source.where}, ", self.source.error_class)
+        return columns
 
     def refuse_similar_names(self, columns: Iterable[str], names: Iterable[str]) -> None:
         """Refuse a column whose name differs from that of a missing column by case, brackets, blanks or its unit.
@@ -205,22 +209,6 @@ class NumberTable(ABC):
                 name = absent_names[spelling]
                 advice = f"rename {shown(column)} to {shown(name)} and check its unit, or remove the column"
                 self._refuse_header(f"{advice}; missing", [name])
-
-    def read(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
-        """Read the chosen columns, and check their values.
-
-        Args:
-            rules: Rules of the columns to read, as `choose_columns` returns them. The columns are returned in the same
-                order.
-            max_rows: Largest number of rows that is accepted.
-
-        Raises:
-            InputError: If the file is damaged or has more than `max_rows` rows, or if a cell violates the rule of its
-                column.
-        """
-        columns = self._read_columns(rules, max_rows)
-        columns.check(rules, f"{self.source.where}, ", self.source.error_class)
-        return columns
 
     @abstractmethod
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
