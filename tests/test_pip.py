@@ -135,8 +135,7 @@ def test_twine_accepts_both_distributions(distributions):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_the_version_is_that_of_the_changelog_and_of_the_citation(base, tmp_path):
-    assert run(base, "isocharge", "--version", cwd=tmp_path).stdout == f"isocharge {VERSION}\n"
+def test_the_version_is_that_of_the_changelog_and_of_the_citation():
     assert re.search(r"^## (\S+?),? ", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE)[1] == VERSION
     assert f"\nversion: {VERSION}\n" in (ROOT / "CITATION.cff").read_text("utf-8")
 

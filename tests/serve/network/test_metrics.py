@@ -6,7 +6,6 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from infer_requests import BODY, INFER, infer_request
 from isocharge.serve.flags import MISFIT
-from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol.handler import Handler
 
@@ -73,11 +72,3 @@ def test_metrics_list_loaded_and_refused_versions(film, tmp_path):
     loaded = store.get("linear", "2")
     facts = {"sensor": loaded.metadata.frame_id, "sha256": loaded.model.golden.sha256}
     assert value(samples, "model_info", model="linear", version="2", **facts) == 1
-
-
-def test_metrics_need_the_token(store):
-    handler = Handler(store, access=AccessCheck(token="yes"))
-    refused = handler.answer("GET", "/metrics", [], b"")
-    assert (refused.status, dict(refused.headers)[b"www-authenticate"]) == (401, b"Bearer")
-    metrics = handler.answer("GET", "/metrics", [(b"authorization", b"Bearer yes")], b"").body
-    assert b'isocharge_requests_total{route="/metrics",status="401",transport="http"} 1.0' in metrics

@@ -45,7 +45,9 @@ def test_asgi_app_mounted_in_starlette_answers_under_its_path(ask, predictor):
 
 def test_mounted_asgi_app_checks_token_size_and_origin(ask):
     bearer = {"Authorization": "Bearer sesame"}
-    assert ask("GET", "/touch/v2")[0] == 401
+    for path in ("/touch/v2", "/touch/metrics"):
+        status, headers, _ = ask("GET", path)
+        assert (status, headers["www-authenticate"]) == (401, "Bearer")
     assert ask("GET", "/touch/v2", Origin="http://evil.example", **bearer)[0] == 403
     assert ask("POST", "/touch" + INFER, bytes((1 << 20) + 1), **bearer)[0] == 413
 
