@@ -1,7 +1,6 @@
 """What the tests of the commands share."""
 
 import os
-import signal
 import tempfile
 from functools import partial
 from itertools import chain, islice
@@ -11,8 +10,6 @@ import numpy as np
 import pytest
 
 from boards import TcpBoard, encoded_frames, interrupt, taps
-from isocharge.cli.main import app
-from isocharge.cli.shared.terminal import warnings_to_stderr
 
 
 @pytest.fixture
@@ -34,26 +31,21 @@ def frames(tmp_path_factory, film):
 
 
 @pytest.fixture
-def run(capfd):
-    """A function that runs a command in this process; an error of ours is raised. SIGTERM acts as in `main`."""
-    previous_handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
+def run(command):
+    """A function that runs `isocharge serve ...` in this process with some bytes as its stdin."""
 
     def invoke(*arguments, stdin=b""):
         with tempfile.TemporaryFile() as file:
             file.write(stdin)
             file.seek(0)
             os.dup2(file.fileno(), 0)
-        capfd.readouterr()
-        with pytest.raises(SystemExit) as ended, warnings_to_stderr():
-            app(["serve", *map(str, arguments)])
-        printed = capfd.readouterr()
-        return SimpleNamespace(exit_code=int(ended.value.code or 0), stdout=printed.out, stderr=printed.err)
+        exit_code, stdout, stderr = command("serve", *arguments)
+        return SimpleNamespace(exit_code=exit_code, stdout=stdout, stderr=stderr)
 
     original_stdin = os.dup(0)
     yield invoke
     os.dup2(original_stdin, 0)
     os.close(original_stdin)
-    signal.signal(signal.SIGTERM, previous_handler)
 
 
 @pytest.fixture
