@@ -6,10 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from drawn_contacts import draw_contacts
-from isocharge.cli.main import app
 from isocharge.common.errors import ChargeError
 from isocharge.serve import Frame, Predictor, device_from_table
 from isocharge.serve.live.device import create_stages
@@ -68,7 +66,7 @@ def test_smaller_noise_than_in_the_training_changes_nothing(released):
     assert released.with_noise(0.5, 0.001).predict(PRESS_pC) == pytest.approx(released.predict(PRESS_pC), rel=1e-6)
 
 
-def test_device_file_with_noise_widens_the_contacts_of_a_stream_and_of_predict(released, tmp_path):
+def test_device_file_with_noise_widens_the_contacts_of_a_stream_and_of_predict(released, tmp_path, command):
     device = device_from_table({"noise": {"gain": 0.015}}, "b")
     setup = Setup(released.metadata.electrodes, device, released)
     (prediction,) = create_stages(setup, needs_contact=True)
@@ -82,8 +80,8 @@ def test_device_file_with_noise_widens_the_contacts_of_a_stream_and_of_predict(r
     presses, board = tmp_path / "presses.csv", tmp_path / "board.toml"
     presses.write_text("A,B,C,D\n1200,800,700,900\n")
     board.write_text("[noise]\ngain = 0.015\n")
-    result = CliRunner().invoke(app, ["serve", "predict", NAME, str(presses), "--json", "--device", str(board)])
-    assert json.loads(result.stdout)["x_std_mm"] == pytest.approx(expected.x_std_mm, rel=1e-5)
+    _, out, _ = command("serve", "predict", NAME, presses, "--json", "--device", board)
+    assert json.loads(out)["x_std_mm"] == pytest.approx(expected.x_std_mm, rel=1e-5)
 
 
 @pytest.mark.parametrize("noise", [(-1.0, 0.0), (np.nan, 0.0), (1.0, np.inf), (1.0, -0.01), ([1.0] * 3, 0.0)])
