@@ -109,9 +109,7 @@ def read_outside(film: Film, probe: Probe, at: tuple[float, float]) -> tuple[np.
     """Return points (x, y) on the film outside the probe, mm, and the same points as complex numbers in film radii."""
     rng = np.random.default_rng(0)
     near_probe = at + 3.0 * probe.reach * rng.uniform(-1.0, 1.0, (30, 2))
-    candidates = np.concatenate(
-        [ring(0.5 * film.radius), ring(0.95 * film.radius), rng.uniform(-25.0, 25.0, (30, 2)), near_probe]
-    )
+    candidates = np.concatenate([ring(0.5 * film.radius), ring(0.95 * film.radius), near_probe])
     is_outside_probe = np.hypot(*(candidates - at).T) > probe.reach
     is_on_film = np.hypot(*candidates.T) < film.radius
     points = candidates[is_outside_probe & is_on_film]

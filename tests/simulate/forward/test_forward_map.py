@@ -230,6 +230,7 @@ UNEVEN_FILMS = {
 """Properties that make a film differ from an axisymmetric film."""
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize(
     ("changes", "probe", "orientation"),
     [
@@ -238,9 +239,9 @@ UNEVEN_FILMS = {
             Ellipse(2.0, 1.4).rotated(0.5),
             "fixed",
         ),
-        pytest.param(UNEVEN_FILMS["moduli"], Polygon.triangle(2.5), "fixed", marks=pytest.mark.slow),
-        pytest.param(UNEVEN_FILMS["moduli"], Polygon.triangle(2.5), "random", marks=pytest.mark.slow),
-        *(pytest.param(changes, PROBE, "fixed", marks=pytest.mark.slow) for changes in UNEVEN_FILMS.values()),
+        (UNEVEN_FILMS["moduli"], Polygon.triangle(2.5), "fixed"),
+        (UNEVEN_FILMS["moduli"], Polygon.triangle(2.5), "random"),
+        *((changes, PROBE, "fixed") for changes in UNEVEN_FILMS.values()),
     ],
 )
 def test_maps_of_films_that_are_not_axisymmetric_agree_with_direct_solves(near_electrodes, changes, probe, orientation):

@@ -62,11 +62,11 @@ def test_bending_stress_outside_the_footprint(thick, share):
     c = share * thick.radius
     solved = pressed_in_the_centre(thick, c)
     for r in (1.5 * c, 0.6 * thick.radius, 0.99 * thick.radius):
-        points = r * np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), np.sqrt([0.5, 0.5])])
+        points = r * np.array([(0.0, 1.0), np.sqrt([0.5, 0.5])])
         radial, hoop = outer(thick, FORCE, c, r)
         mean = 0.5 * (radial + hoop)
         half = 0.5 * (radial - hoop)
-        expected = [(radial, hoop, 0.0), (hoop, radial, 0.0), (radial, hoop, 0.0), (mean, mean, half)]
+        expected = [(hoop, radial, 0.0), (mean, mean, half)]
         scale = max(abs(radial), abs(hoop))
         np.testing.assert_allclose(surface_stress(solved, "top", points), expected, atol=2e-3 * scale)
 
