@@ -49,21 +49,6 @@ MIN_SINE = 0.003
 """Smallest sine of an angle of the correlations in the loss. Smaller sines count as this value."""
 
 
-def contact_loss(posterior: Posterior, target: Tensor, error: Tensor) -> Tensor:
-    """Compute the loss of the contact perceptron, which is the sum of the losses of its mean and of its covariance.
-
-    The two losses have separate gradients. The first loss does not change the outputs for the covariance, and the
-    second loss does not change the mean.
-
-    Args:
-        posterior: Estimated unit coordinates with their standard deviations and correlations.
-        target: Unit coordinates that the mean should have, shape (n, 3): the true contact or a better estimate of the
-            posterior mean.
-        error: Errors of the mean that the covariance should describe, shape (n, 3).
-    """
-    return (mean_loss(posterior, target) + covariance_loss(posterior, error)).mean()
-
-
 def mean_loss(posterior: Posterior, target: Tensor) -> Tensor:
     """Compute half of the weighted squared errors of the mean of each press, shape (n,).
 
@@ -248,7 +233,10 @@ def contact_stage(
         posterior = network.posterior(charge[rows] + added_noise)
         # The errors are proportional to the noise. The division by the factor gives the errors that charges with their
         # usual noise would cause.
-        return contact_loss(posterior, target, (contact - posterior.mean) / noise_factor)
+        error = (contact - posterior.mean) / noise_factor
+        # The two losses have separate gradients. The first loss does not change the outputs for the covariance, and the
+        # second loss does not change the mean.
+        return (mean_loss(posterior, target) + covariance_loss(posterior, error)).mean()
 
     sizes = config.sizes(network.features.n_electrode)
     rate = config.learning_rate * sizes.rate_factor
