@@ -158,16 +158,16 @@ class Identification:
     def to_dict(self) -> dict[str, Any]:
         """Return the results as a dictionary for JSON, in which an infinite radius is None."""
         area = self.area
-        return {
+        table = {
             "sensor": self.sensor.name,
             "probe": self.probe.notation,
             "noise": self.noise.to_dict(),
-            "force_N": list(area.force_range),
+            "force_N": area.force_range,
             "working_area": {
                 "radius_mm": area.radius,
                 "why": area.bound,
-                "fold_radius_mm": plain_values(area.fold_radius),
-                "twin_radius_mm": plain_values(area.pairs.radius),
+                "fold_radius_mm": area.fold_radius,
+                "twin_radius_mm": area.pairs.radius,
                 "error_radius_mm": area.error_radius,
                 "unfolded_radius_mm": area.unambiguous_radius,
                 "error_mm": area.error,
@@ -177,22 +177,23 @@ class Identification:
             "mirror_region": None if self.mirror is None else self.mirror.to_dict(),
             "limits_in_working_area": [limits.statistics() for limits in self.inner_maps],
             "by_distance": self._errors_by_distance(),
-            "folds_mm": area.folds.round(3).tolist(),
+            "folds_mm": area.folds.round(3),
             "twins": self._listed_pairs(),
         }
+        return dict(plain_values(table))
 
-    def _errors_by_distance(self) -> dict[str, list[float]]:
-        """Return lists for JSON: the distances of the rings, and the median and the largest error on each ring."""
-        errors = {"distance_mm": self.maps[0].rings.distance.tolist()}
+    def _errors_by_distance(self) -> dict[str, Array]:
+        """Return arrays for JSON: the distances of the rings, and the median and the largest error on each ring."""
+        errors = {"distance_mm": self.maps[0].rings.distance}
         for limits in self.maps:
-            errors[f"median_position_mm_at_{limits.force:g}_N"] = np.median(limits.position, axis=1).tolist()
-            errors[f"worst_position_mm_at_{limits.force:g}_N"] = np.max(limits.position, axis=1).tolist()
+            errors[f"median_position_mm_at_{limits.force:g}_N"] = np.median(limits.position, axis=1)
+            errors[f"worst_position_mm_at_{limits.force:g}_N"] = np.max(limits.position, axis=1)
         return errors
 
     def _listed_pairs(self) -> list[dict[str, Any]]:
         """Return the first `MAX_LISTED_PAIRS` ambiguous pairs as dictionaries for JSON."""
         pairs = self.area.pairs
-        columns = (values[:MAX_LISTED_PAIRS].tolist() for values in (pairs.first, pairs.second, pairs.distance))
+        columns = (values[:MAX_LISTED_PAIRS] for values in (pairs.first, pairs.second, pairs.distance))
         return [
             {
                 "first": dict(zip(CONTACT_KEYS, first, strict=True)),

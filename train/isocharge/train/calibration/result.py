@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numpy as np
-
+from isocharge.common.structs import plain_values
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.simulate import Probe, Sensor
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity
@@ -78,7 +77,7 @@ class CalibrationResult:
     @property
     def bad_lines(self) -> tuple[int, ...]:
         """Numbers of the lines of presses that were left out."""
-        return self.presses[self.estimation.is_bad].lines if self.estimation.is_bad.any() else ()
+        return self.presses[self.estimation.is_bad].lines
 
     @cached_property
     def film_error(self) -> ContactError:
@@ -136,17 +135,17 @@ class CalibrationResult:
         return tuple(sentences)
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert the errors and the properties into a dictionary for JSON."""
-        chi2 = self.estimation.press_chi2
-        return {
+        """Convert the errors and the properties into a dictionary for JSON, in which a missing residual is None."""
+        table = {
             "presses": len(self.presses),
-            "left_out_lines": list(self.bad_lines),
+            "left_out_lines": self.bad_lines,
             "reduced_chi2": self.estimation.chi2 / max(self.estimation.redundancy, 1.0),
-            "press_chi2": [None if np.isnan(value) else round(float(value), 3) for value in chi2],
+            "press_chi2": self.estimation.press_chi2.round(3),
             "error_left": vars(self.film_error),
             "error_left_before": vars(self.film_error_before),
             "error_of_noise": vars(self.sensitivity.noise_error),
             "properties": {name: vars(one) | {"identified": one.identified} for name, one in self.properties.items()},
-            "summary": list(self.summary),
-            "cautions": list(self.cautions),
+            "summary": self.summary,
+            "cautions": self.cautions,
         }
+        return dict(plain_values(table))
