@@ -227,13 +227,9 @@ def solve_even_map(prior: FilmPrior, values: Array, domain: Domain, executor: Ex
     """
     sensor, probe = prior.film(values)
     nodes = few_nodes(sensor.film, domain)
-    return ForwardMap.build_unchecked(axisymmetric(sensor), round_probe(probe), domain, nodes, executor=executor)
-
-
-def axisymmetric(sensor: Sensor) -> Sensor:
-    """Return the sensor with an axisymmetric film that has the mean properties of its film."""
     film = replace(sensor.film, deviator=(0.0, 0.0), young_ratio=1.0, shear=None, oval=0.0)
-    return replace(sensor, film=film)
+    even_sensor = replace(sensor, film=film)
+    return ForwardMap.build_unchecked(even_sensor, round_probe(probe), domain, nodes, executor=executor)
 
 
 def round_probe(probe: Probe) -> Probe:

@@ -70,7 +70,9 @@ def compact_charges(
         executor: Executor that solves the films at the nodes; None for this process.
     """
     contact = draw_contacts(np.random.default_rng(SEED), domain, SERIES_CONTACTS)
-    charge = _film_charges(charges, film, contact)
+    film_charge = charges.charges(film.film_values, contact)
+    discrepancy = discrepancy_jacobian(film_charge, contact, charges.domain) @ film.values[film.layout.coefficients]
+    charge = film_charge + discrepancy  # most probable charges without offset, shape (n, n_electrode)
     names = charges.prior.sensor.electrode_names
     node_MPa = _nodes(film) if len(names) > len(CONTACT) else np.zeros(1)  # three charges only determine the contact
     factors = _tension_factors(charges, film, contact, node_MPa, executor)
@@ -106,13 +108,6 @@ def compact_charges(
         pretension_MPa=film.value(PRETENSION.name),
         tension_std_MPa=PRETENSION.drift,
     )
-
-
-def _film_charges(charges: FilmCharges, film: FilmEstimate, contact: Array) -> Array:
-    """Compute the most probable charges of contacts, with the discrepancy, without offset, shape (n, n_electrode)."""
-    charge = charges.charges(film.film_values, contact)
-    discrepancy = discrepancy_jacobian(charge, contact, charges.domain) @ film.values[film.layout.coefficients]
-    return charge + discrepancy
 
 
 def _nodes(film: FilmEstimate) -> Array:
