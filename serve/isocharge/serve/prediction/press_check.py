@@ -22,6 +22,7 @@ from isocharge.common.structs import plain_values
 from isocharge.serve.model.contact import Validity
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.predictor import Predictor
+from isocharge.serve.model.session import COLUMNS
 from isocharge.serve.prediction.press_errors import (
     FORCE,
     NOT_TRAINED,
@@ -237,26 +238,22 @@ def _bad_presses(errors: PressErrors) -> Booleans:
     Returns:
         Whether each press is bad, shape (n,).
     """
-    is_compared = errors.is_compared
-    no_bad_press = np.zeros_like(is_compared)
-    if Agreement.from_errors(errors, is_compared).acceptable:
-        return no_bad_press
-
     # The probability of such large errors is below a limit, which is divided by the number of compared presses
     # (Bonferroni correction). If all presses are good, the probability that one of them is found is therefore at most
     # `TEST_SIGNIFICANCE`.
+    is_compared = errors.is_compared
     compared_count = int(is_compared.sum())
     degrees = np.maximum(np.count_nonzero(~np.isnan(errors.error), axis=1), 1)
     deviate = chi_squared_deviate(np.nansum(errors.squared_ratio, axis=1), degrees)
     limit = NormalDist().inv_cdf(1.0 - TEST_SIGNIFICANCE / max(1, compared_count))
     is_improbable = is_compared & (deviate > limit)
+
     improbable_count = int(is_improbable.sum())
-    few_are_improbable = 0 < improbable_count <= max(1.0, MAX_BAD_FRACTION * compared_count)
+    few_are_improbable = improbable_count <= max(1.0, MAX_BAD_FRACTION * compared_count)
     enough_others_remain = compared_count - improbable_count >= MIN_PRESSES
-    if not (few_are_improbable and enough_others_remain):
-        return no_bad_press
+    all_agree = Agreement.from_errors(errors, is_compared).acceptable
     others_agree = Agreement.from_errors(errors, is_compared & ~is_improbable).acceptable
-    return is_improbable if others_agree else no_bad_press
+    return is_improbable & (few_are_improbable and enough_others_remain and others_agree and not all_agree)
 
 
 def _misfit_statement(errors: PressErrors, is_selected: Booleans, metadata: ModelMetadata) -> str:
@@ -275,12 +272,13 @@ def _misfit_statement(errors: PressErrors, is_selected: Booleans, metadata: Mode
         The statement; empty if chance can explain the number of presses with a large misfit.
     """
     selected_count = int(is_selected.sum())
-    misfit_count = int((errors.has_misfit & is_selected).sum())
+    limit = misfit_limit(metadata)
+    misfit_count = np.count_nonzero(errors.predicted[is_selected, COLUMNS["misfit"]] > limit)
     probability_of_at_most = binomial_distribution(selected_count, MISFIT_FRACTION)
     if misfit_count == 0 or 1.0 - probability_of_at_most[misfit_count - 1] >= TEST_SIGNIFICANCE:
         return ""
     return (
-        f"{misfit_count} of {selected_count} presses have a misfit above {misfit_limit(metadata):.3g}, although "
+        f"{misfit_count} of {selected_count} presses have a misfit above {limit:.3g}, although "
         "at most 1 % of good presses have: no single press on the model's film gives such charges (gain, tare, swapped "
         "or dead electrode)"
     )

@@ -44,7 +44,6 @@ class PressErrors:
             `error`, shape (n, 3).
         rig_std: Standard deviations of the measured values, in the units of `error`, shape (n, 3).
         flags: Flags of each press; empty if a charge is unknown.
-        has_misfit: Whether the misfit is above `misfit_limit`, shape (n,).
         exclusion_reasons: Reason why each press is excluded from the comparison; empty for a press that is compared.
     """
 
@@ -55,7 +54,6 @@ class PressErrors:
     noise_std: Array
     rig_std: Array
     flags: tuple[tuple[str, ...], ...]
-    has_misfit: Booleans
     exclusion_reasons: tuple[str, ...]
 
     @property
@@ -139,7 +137,6 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
         noise_std=np.where(is_unknown, np.nan, predicted[:, COLUMNS["contact_std"]] / divisor),
         rig_std=np.where(is_unknown, np.nan, rig_std),
         flags=tuple(flags if known else () for flags, known in zip(flags_of_presses, is_complete, strict=True)),
-        has_misfit=predicted[:, Contacts._fields.index("misfit")] > misfit_limit(metadata),
         exclusion_reasons=_exclusion_reasons(predictor.validity, model_presses),
     )
 
