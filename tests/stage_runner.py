@@ -9,6 +9,7 @@ from isocharge.serve import Chunk, Frame, TouchStream, Validity, device_from_tab
 from isocharge.serve.flags import INVALID, in_order
 from isocharge.serve.frames.frame import SATURATED_BIT
 from isocharge.serve.live.device import create_stages
+from isocharge.serve.model.contact import disk_corners
 from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.tracking.tracker import Tracker, TrackRule
 
@@ -60,7 +61,7 @@ def new_tracker(mixture=None, **settings):
     tracker = Tracker(Setup((), Device(rules={TrackRule: TrackRule(**settings)})))
     if mixture is not None:
         tracker._mixture = mixture
-        tracker._mixture_validity = Validity(mixture.charges.corners_mm, (0.0, np.inf))
+        tracker._mixture_validity = Validity(disk_corners(mixture.charges.domain.radius), (0.0, np.inf))
     return tracker
 
 

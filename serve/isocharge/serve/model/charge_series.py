@@ -32,7 +32,6 @@ from numpy.polynomial import chebyshev, polynomial
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.contact_domain import Domain, into_unit_domain
-from isocharge.serve.model.contact import disk_corners
 from isocharge.serve.model.robust_estimate import ModelValues
 
 CHUNK_SIZE = 4096
@@ -200,16 +199,6 @@ class ChargeSeries:
     def direction_count(self) -> int:
         """Number K of directions."""
         return 0 if self.directions is None else self.directions.shape[3]
-
-    @property
-    def calibrated_state(self) -> Array:
-        """State of the film as it was calibrated, shape (1 + K,): zeros."""
-        return np.zeros(1 + self.direction_count)
-
-    @property
-    def corners_mm(self) -> Array:
-        """Corners (x, y) of a regular polygon that encloses the circle of the domain, shape (64, 2), mm."""
-        return disk_corners(self.domain.radius)
 
     def charges(self, contact: Array) -> Array:
         """Compute the charges of contacts on the calibrated film.

@@ -214,7 +214,7 @@ class FilmFollower(Stage):
         self._offset_std_pC = RELATIVE_OFFSET_STD * self._rule.largest_offset_pC
 
         # The state consists of the state of the charge map, the logarithms of the gains and the common offset.
-        film_size = series.calibrated_state.size
+        film_size = 1 + series.direction_count
         self._film = slice(0, film_size)
         self._gains = slice(film_size, film_size + len(electrodes))
         self._offset = film_size + len(electrodes)

@@ -11,7 +11,7 @@ from dataclasses import replace
 from isocharge.serve.flags import SATURATED
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.charge_file import read_charge_map
-from isocharge.serve.model.contact import Contact
+from isocharge.serve.model.contact import Contact, disk_corners
 from isocharge.serve.record.record import OtherContact, TrackedContact, Tracking
 from isocharge.serve.signal_chain.stage import Rule, Setup, Share, Stage
 from isocharge.serve.tracking.contact_mixture import ContactHypothesis, ContactMixture
@@ -130,7 +130,7 @@ class Tracker(Stage):
             if charges is not None and charges.is_folded:
                 self._mixture = ContactMixture(charges, predictor.noise)
                 # A contact of the mixture is valid in the whole area for which the file describes the charges.
-                self._mixture_validity = replace(predictor.validity, corners_mm=charges.corners_mm)
+                self._mixture_validity = replace(predictor.validity, corners_mm=disk_corners(charges.domain.radius))
         self._time_s = 0.0  # time of the latest frame on a clock that is never set back
         self._latest_clock_s = math.inf
         self._events: TouchEvents | None = None  # None without a touch
