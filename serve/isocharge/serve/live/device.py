@@ -80,18 +80,19 @@ class Prediction(Stage):
     needs_contact = True
 
     def __init__(self, setup: Setup) -> None:
-        """Store the limits within which contacts are valid, which are those of the calibrated film."""
-        self._setup = setup
-        setup.predictor = predictor_for(setup.device, setup.model)
-        self._validity = setup.model.validity
+        """Store the predictor, and the limits within which contacts are valid, which are those of the calibrated film.
+
+        The later stages use the same predictor.
+        """
+        self._predictor = predictor_for(setup.device, setup.model)
+        self._validity = self._predictor.validity
+        setup.predictor = self._predictor
 
     def step(self, frame: Frame) -> None:
         """Predict the contact of a frame, unless nothing touches the film or the frame has no charges."""
         if frame.charge_pC is None or not frame.is_contact:
             return
-        predictor = self._setup.predictor
-        assert predictor is not None
-        frame.set_contact(predictor.predict(frame.charge_pC), self._validity)
+        frame.set_contact(self._predictor.predict(frame.charge_pC), self._validity)
 
 
 STAGES: tuple[type[Stage], ...] = (
@@ -179,10 +180,8 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     if isinstance(frames, Mapping):  # `convert` adds a missing section, and reports an error if it is not a mapping
         complete_table["frames"] = {"format": "auto", **frames}
     sections: Any = convert(complete_table, DeviceSections, where, DeviceError)
-    rules: dict[type[Rule], Rule] = {}
-    for section in structs.asdict(sections).values():
-        if isinstance(section, Rule) and section.on:
-            rules[type(section)] = section
+    used_rules = [section for section in structs.asdict(sections).values() if isinstance(section, Rule) and section.on]
+    rules = {type(rule): rule for rule in used_rules}
     return Device(sections.name, sections.front_end, sections.frames, sections.channels, rules, table, where)
 
 

@@ -293,16 +293,15 @@ class TouchStream(ReadingStream):
         else:
             contact_fields = NO_CONTACT if frame.is_valid else UNKNOWN_CONTACT
         flags = (*frame.flags, *frame.contact_flags)
-        charge_pC, charge_raw_pC, tare_pC = self._by_electrode(frame.charge_pC, frame.raw_pC, frame.tare_pC)
         return PredictionRecord(
             timestamp=frame.host_s,
             t_device_us=frame.device_us,
             seq=frame.seq,
             **contact_fields,
             contact=frame.is_contact,
-            charge_pC=charge_pC,
-            charge_raw_pC=charge_raw_pC,
-            tare_pC=tare_pC,
+            charge_pC=self._by_electrode(frame.charge_pC),
+            charge_raw_pC=self._by_electrode(frame.raw_pC),
+            tare_pC=self._by_electrode(frame.tare_pC),
             flags=flags if len(flags) < 2 else in_order(flags),
             latency_us=(time.perf_counter_ns() - chunk.clock_ns) / 1e3,  # includes the time that the stages have taken
             model=self._label,
@@ -311,17 +310,13 @@ class TouchStream(ReadingStream):
             film=frame.film,
         )
 
-    def _by_electrode(self, *charges_pC: Array | None) -> list[Charges | None]:
-        """Return charges as dictionaries by electrode name. A charge that is not a finite number becomes None.
+    def _by_electrode(self, charge_pC: Array | None) -> Charges | None:
+        """Return charges as a dictionary by electrode name. A charge that is not a finite number becomes None.
 
         Args:
-            charges_pC: Arrays of charges in the order of the electrodes, shape (n_electrode,), pC; None for no charges.
+            charge_pC: Charges in the order of the electrodes, shape (n_electrode,), pC; None for no charges.
         """
-        charges: list[Charges | None] = []
-        for charge_pC in charges_pC:
-            if charge_pC is None:
-                charges.append(None)
-                continue
-            pairs = zip(self._setup.electrodes, charge_pC.tolist(), strict=True)
-            charges.append({name: charge if math.isfinite(charge) else None for name, charge in pairs})
-        return charges
+        if charge_pC is None:
+            return None
+        pairs = zip(self._setup.electrodes, charge_pC.tolist(), strict=True)
+        return {name: charge if math.isfinite(charge) else None for name, charge in pairs}
