@@ -43,6 +43,7 @@ from isocharge.cli.shared.terminal import (
     write_stdout,
 )
 from isocharge.common.errors import InputError, is_printable, shown
+from isocharge.common.files import refuse_existing
 from isocharge.serve import (
     PredictionRecord,
     Predictor,
@@ -223,6 +224,9 @@ def stream_command(
     if name is not None and not (name and is_printable(name)):
         raise InputError(f"--name: expected printable characters, got {shown(name)}")
 
+    if record is not None:
+        refuse_existing(record)
+
     # The options take precedence over the settings of the device file.
     load_latest = partial(Predictor, model, models=models)
     predictor = load_latest()
@@ -253,8 +257,8 @@ def stream_command(
         on_signal(signal.SIGUSR1, stream.request_tare),
         on_signal(signal.SIGHUP, unless_hung_up(partial(stream.request_model, load_latest))),
         open_source(port, baud=baud, reconnect=True, request=board.request, wait=wait) as source,
-        recorder or nullcontext(),
         command_outputs(output, touch, is_live=source.is_live) as open_outputs,
+        recorder or nullcontext(),
         closing(stream.follow(source)) as records,  # closed before the recorder
     ):
         outputs = open_outputs
