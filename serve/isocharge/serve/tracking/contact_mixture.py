@@ -122,12 +122,11 @@ class Components(NamedTuple):
 
     def select(self, rows: list[int]) -> "Components":
         """Return only the components with the indices `rows`."""
-        return Components(self.mean[rows], self.covariance[rows], self.log_weight[rows])
+        return Components(*(array[rows] for array in self))
 
     def joined(self, other: "Components") -> "Components":
         """Return the components of both mixtures."""
-        mean, covariance, log_weight = (np.concatenate(arrays) for arrays in zip(self, other, strict=True))
-        return Components(mean, covariance, log_weight)
+        return Components(*map(np.concatenate, zip(self, other, strict=True)))
 
 
 def contacts_of(states: Array) -> Array:

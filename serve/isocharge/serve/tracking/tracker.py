@@ -190,13 +190,15 @@ class Tracker(Stage):
                 hypotheses = self._mixture.update(frame.charge_pC, t_s)
             if not hypotheses:  # the frame contains no information
                 return None
-            contact, *others = [hypothesis.contact(t_s - self._mixture.time_s) for hypothesis in hypotheses]
+            best, *others = hypotheses
+            delay_s = t_s - self._mixture.time_s
+            contact = best.contact(delay_s)
             frame.set_contact(contact, self._mixture_validity)
             self._other = None
-            if hypotheses[0].probability < CERTAIN_PROBABILITY:
-                self._other = OtherContact(*others[0][:3], hypotheses[1].probability)
-            vx_mm_s, vy_mm_s = hypotheses[0].mean[VELOCITY].tolist()
-            tracked = TrackedContact(*contact[:6], vx_mm_s, vy_mm_s, hypotheses[0].moving_probability)
+            if best.probability < CERTAIN_PROBABILITY:
+                self._other = OtherContact(*others[0].contact(delay_s)[:3], others[0].probability)
+            vx_mm_s, vy_mm_s = best.mean[VELOCITY].tolist()
+            tracked = TrackedContact(*contact[:6], vx_mm_s, vy_mm_s, best.moving_probability)
 
         self._tracked = tracked
         if self._events is None:
