@@ -129,8 +129,8 @@ def follower_after(predictor: Predictor, touches: np.ndarray) -> FilmFollower:
     clock_s = 0.0
     for charges in touches:
         for charge_pC in charges:
-            contact = predictor.predict(charge_pC)
-            follower.step(Frame(None, None, (), clock_s=clock_s, charge_pC=charge_pC, contact=contact))
+            # Every frame counts, whatever its flags, because the figures apply to touches all over the film.
+            follower._peak.add_frame(predictor.predict(charge_pC), charge_pC)
             clock_s += 0.01
         follower.step(Frame(None, None, (), clock_s=clock_s))
         clock_s += 1.0
