@@ -8,7 +8,8 @@ from contextlib import suppress
 
 import numpy as np
 
-from isocharge.serve import Frame, encode_frame
+from isocharge.serve import Chunk, Frame, encode_frame
+from isocharge.serve.examination.listening import ReceivedData
 
 BATCH = 20
 """Frames that are sent at once."""
@@ -18,6 +19,12 @@ def encoded_frames(rows, rate_Hz=200.0):
     """Yield the bytes of each frame of a board that sends rows of charges, pC, at a rate."""
     for number, row in enumerate(rows):
         yield encode_frame(Frame(number % 65536, round(1e6 * number / rate_Hz), tuple(row)))
+
+
+def received(data, rate_Hz, start_s=1.7e9):
+    """What a program receives at a port from a board that sends pieces of data at a rate."""
+    chunks = [Chunk(piece, start_s + number / rate_Hz, 0) for number, piece in enumerate(data)]
+    return ReceivedData("/dev/ttyACM0", 115200, chunks=chunks, seconds=len(chunks) / rate_Hz)
 
 
 class TcpBoard:

@@ -9,6 +9,7 @@ from dataclasses import asdict
 
 import pytest
 
+from boards import received
 from isocharge.cli.serve.doctor import brief_report, device_text
 from isocharge.cli.shared.terminal import say, show, show_json, show_result, warnings_to_stderr
 from isocharge.common.errors import IsochargeError
@@ -22,7 +23,6 @@ from isocharge.serve import (
     load_model,
     read_charges,
 )
-from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import find_model
@@ -124,9 +124,8 @@ def sent(notation, names):
 @pytest.mark.parametrize("notation", NOTATIONS)
 def test_names_of_a_board_through_the_doctor(notation, attack):
     def read(names):
-        chunks = [Chunk(data, 1.7e9 + 0.005 * number, 0) for number, data in enumerate(sent(notation, names))]
         with checked_terminal():
-            examination = examine_received(ReceivedData("/dev/ttyACM0", 115200, chunks=chunks, seconds=1.0))
+            examination = examine_received(received(sent(notation, names), 200.0))
             show_result(brief_report(examination), json=False)
             show_json(asdict(examination))
             comments = [line for line in device_text(examination).splitlines() if line.startswith("#")]

@@ -5,9 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from boards import encoded_frames
-from isocharge.serve import Chunk, device_from_table
-from isocharge.serve.examination.listening import ReceivedData
+from boards import encoded_frames, received
+from isocharge.serve import device_from_table
 from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.examination.press_detector import find_held_press
 from isocharge.serve.signal_chain.leak import LeakRule
@@ -89,8 +88,7 @@ def test_no_press_or_a_short_press_has_no_result(until_s):
 
 def test_proposed_file_has_the_leak_and_the_offset_before_the_press():
     values = board(decays(10.0)) - 300.0
-    chunks = [Chunk(data, 1e9 + time_s, 0) for time_s, data in zip(T_S, encoded_frames(values), strict=True)]
-    report = examine_received(ReceivedData("/dev/ttyACM0", 115200, chunks=chunks, seconds=20.0))
+    report = examine_received(received(encoded_frames(values), 200.0))
     assert device_from_table(report.device, "board").rule(LeakRule).tau_s == pytest.approx(10.0, rel=0.05)
     assert max(abs(channel.offset_pC) for channel in report.channels) < 1.0
     assert report.missing == ()

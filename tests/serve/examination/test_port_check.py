@@ -7,11 +7,11 @@ from functools import partial
 import numpy as np
 import pytest
 
+from boards import received
 from isocharge.cli.serve.doctor import brief_report
 from isocharge.common.errors import DeviceError
-from isocharge.serve import Chunk, Frame, device_from_table, encode_frame, encode_text
+from isocharge.serve import Frame, device_from_table, encode_frame, encode_text
 from isocharge.serve.examination.board_health import measure_channel_health
-from isocharge.serve.examination.listening import ReceivedData
 from isocharge.serve.examination.port_check import examine_received
 
 RATE_HZ = 200.0
@@ -20,15 +20,9 @@ LINES = partial(encode_text, notation="csv")
 AT_REST = device_from_table({"leak": {"tau_s": 10.0}}, "test")
 
 
-def received(encode):
-    """Return the bytes of a board that sends `encode(number)` 200 times per second."""
-    chunks = [Chunk(encode(number), 1.7e9 + number / RATE_HZ, 0) for number in range(400)]
-    return ReceivedData("/dev/ttyACM0", 115200, chunks=chunks, seconds=400 / RATE_HZ)
-
-
-def examined(encode, **settings):
-    """Return the report about a board that sends `encode(number)`."""
-    return examine_received(received(encode), **settings)
+def examined(encode, url="/dev/ttyACM0", **settings):
+    """Return the report about a board that sends `encode(number)` 200 times per second."""
+    return examine_received(replace(received(map(encode, range(400)), RATE_HZ), url=url), **settings)
 
 
 def charges(*, offset=(5.0, -6.0, 7.0), noise=0.3, hum=0.0, drift=0.0, press=None, encode=encode_frame):
@@ -199,8 +193,8 @@ def test_channels_are_proposed_by_their_names(names, channels, message):
 
 @pytest.mark.parametrize("noise", [0.3, 1.0])
 def test_doubled_bytes_of_a_serial_server_lead_to_the_advice_about_telnet(noise):
-    data = received(charges(noise=noise, encode=lambda frame: encode_frame(frame).replace(b"\xff", b"\xff\xff")))
-    report = examine_received(replace(data, url="tcp://127.0.0.1:4001"), device=AT_REST)
+    board = charges(noise=noise, encode=lambda frame: encode_frame(frame).replace(b"\xff", b"\xff\xff"))
+    report = examined(board, "tcp://127.0.0.1:4001", device=AT_REST)
     assert "if a serial server uses the telnet protocol" in missing(report)
     assert "baud" not in missing(report)
 

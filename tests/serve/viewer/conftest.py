@@ -1,6 +1,7 @@
 """Fixtures that serve a live page, and send requests to it."""
 
 import json
+import re
 from contextlib import ExitStack
 
 import pytest
@@ -66,6 +67,20 @@ def start_page(film):
             return Client(page, stack.enter_context(serve_page(page, Address())))
 
         yield start
+
+
+@pytest.fixture
+def start_live(models, start_command):
+    """Return a function that starts a command with a live page, and returns the process and a client of the page."""
+
+    def start(*words):
+        process = start_command("serve", *words, "--models", models, "--live", "127.0.0.1:0")
+        while line := process.stderr.readline():
+            if match := re.search(r"page: (http\S+?);?\s", line):
+                return process, Client(None, match[1])
+        raise AssertionError(process.communicate())
+
+    return start
 
 
 @pytest.fixture

@@ -1,11 +1,8 @@
 """The start page and the live page in headless Chromium: the live page draws each press where and as hard as it is."""
 
-import contextlib
 import re
 import signal
-import socket
 import time
-from itertools import chain
 
 import numpy as np
 import pytest
@@ -44,48 +41,23 @@ def presses():
 
 
 @pytest.fixture
-def free_port():
-    with contextlib.closing(socket.socket()) as place:
-        place.bind(("127.0.0.1", 0))
-        return place.getsockname()[1]
-
-
-@pytest.fixture
-def start_stream(sensor, models, free_port, start_command, tmp_path, monkeypatch):
-    """Start `serve stream --live`, on the same port again and again."""
+def stream(sensor, start_live, tmp_path, monkeypatch):
+    """Start `serve stream --live`. Return the process and a client of its page."""
     monkeypatch.chdir(tmp_path)
-
-    def start():
-        process = start_command(
-            *("serve", "stream", "linear", "--models", models, "--port", sensor.url, "--output", "none"),
-            *("--live", f"127.0.0.1:{free_port}"),
-        )
-        while "live page" not in (line := process.stderr.readline()):
-            assert line, "the page did not start"
-        return process
-
-    return start
+    return start_live("stream", "linear", "--port", sensor.url, "--output", "none")
 
 
 @pytest.fixture
-def open_page(chromium, free_port):
-    """Open the page in a new window; whatever it complains about fails the test."""
-    complaints, contexts = [], []
-
-    def start():
-        contexts.append(chromium.new_context(viewport={"width": 1280, "height": 820}))
-        page = contexts[-1].new_page()
-        complaints.append(errors_of(page))
-        page.goto(f"http://127.0.0.1:{free_port}/", timeout=120_000)
-        wait_for(page, "isocharge.page.film?.history.latest != null")
-        return page
-
-    yield start
-    for context in contexts:
-        context.close()
-    assert [
-        text for text in chain(*complaints) if not re.search(r"ERR_CONNECTION|WebSocket|Failed to load", text)
-    ] == []
+def page(chromium, stream):
+    """The page of the stream in a window. Whatever it complains about fails the test."""
+    context = chromium.new_context(viewport={"width": 1280, "height": 820})
+    page = context.new_page()
+    complaints = errors_of(page)
+    page.goto(stream[1].url, timeout=120_000)
+    wait_for(page, "isocharge.page.film?.history.latest != null")
+    yield page
+    context.close()
+    assert [text for text in complaints if not re.search(r"ERR_CONNECTION|WebSocket|Failed to load", text)] == []
 
 
 def wait_for(page, expression, timeout_s=40.0):
@@ -97,11 +69,7 @@ def wait_for(page, expression, timeout_s=40.0):
     return value
 
 
-def test_live_page_shows_numbers_and_sends_tare_pause_record_and_marker(
-    start_stream, open_page, sensor, film, presses, tmp_path
-):
-    start_stream()
-    page = open_page()
+def test_live_page_shows_numbers_and_sends_tare_pause_record_and_marker(page, sensor, film, presses, tmp_path):
     wait_for(page, "isocharge.page.film.drawnKind === 'none'")
     sensor.use(film.charges, presses)
     # The kind and the numbers are read at once: a press that ends in between takes its numbers away.
@@ -140,9 +108,8 @@ def test_live_page_shows_numbers_and_sends_tare_pause_record_and_marker(
         assert plan["y"] + plan["height"] <= height  # the film is seen without scrolling
 
 
-def test_live_page_takes_the_numbers_away_when_the_frames_stop(start_stream, open_page, sensor, film):
-    process = start_stream()
-    page = open_page()
+def test_live_page_takes_the_numbers_away_when_the_frames_stop(stream, page, sensor, film):
+    process, _ = stream
     wait_for(page, "isocharge.page.film.drawnKind === 'none'")
     one = np.ones(round(RATE_HZ))
     sensor.use(film.charges, Script(2.0 * one, one, one, RATE_HZ))

@@ -1,6 +1,5 @@
 """`serve stream --live` and `serve replay --live` as a person starts them."""
 
-import re
 import signal
 import time
 from itertools import islice
@@ -10,21 +9,6 @@ import pytest
 from mcap.reader import make_reader
 
 from boards import encoded_frames, taps
-from serve.viewer.conftest import Client
-
-
-@pytest.fixture
-def start(models, start_command):
-    """Start a command with a page: the process, and a client of the page."""
-
-    def start(*words):
-        process = start_command("serve", *words, "--models", models, "--live", "127.0.0.1:0")
-        while line := process.stderr.readline():
-            if match := re.search(r"page: (http\S+?);?\s", line):
-                return process, Client(None, match[1])
-        raise AssertionError(process.communicate())
-
-    return start
 
 
 def follow(client, until):
@@ -47,9 +31,9 @@ def touched(samples, _):
     return samples["contact"].sum() > 10
 
 
-def test_live_page_shows_a_press_and_carries_out_requests(board, start, tmp_path, monkeypatch):
+def test_live_page_shows_a_press_and_carries_out_requests(board, start_live, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    process, client = start("stream", "linear", "--port", board.url, "--output", "none")
+    process, client = start_live("stream", "linear", "--port", board.url, "--output", "none")
     samples, state = follow(client, lambda samples, state: touched(samples, state) and state.get("rate_Hz"))
     is_contact = samples["contact"] == 1.0
     assert [np.median(samples[name][is_contact]) for name in ("x_mm", "force_N")] == pytest.approx([3.0, 1.0], abs=0.01)
@@ -73,12 +57,12 @@ def test_live_page_shows_a_press_and_carries_out_requests(board, start, tmp_path
     assert (process.returncode, "Traceback" in err) == (0, False)
 
 
-def test_replay_page_shows_the_whole_recording(film, models, start, command, tmp_path):
+def test_replay_page_shows_the_whole_recording(film, models, start_live, command, tmp_path):
     """Ctrl-C is the only end of such a replay: its MCAP file is whole before."""
     path, mcap = tmp_path / "touch.rec", tmp_path / "touch.mcap"
     (tmp_path / "frames").write_bytes(b"".join(encoded_frames(islice(taps(film), 600))))
     command("serve", "stream", "linear", "--models", models, "--port", tmp_path / "frames", "--record", path)
-    process, client = start("replay", path, "--output", "none", "--output", mcap)
+    process, client = start_live("replay", path, "--output", "none", "--output", mcap)
 
     samples, state = follow(client, lambda _, state: state.get("is_complete") and state.get("samples") == 600)
     assert state["counters"]["frames"] == 600  # also if the recording is read faster than counters are shown
@@ -90,9 +74,9 @@ def test_replay_page_shows_the_whole_recording(film, models, start, command, tmp
         assert 600 in make_reader(file).get_summary().statistics.channel_message_counts.values()
 
 
-def test_page_behind_a_proxy_has_the_host_name_of_allow_host(board, start):
+def test_page_behind_a_proxy_has_the_host_name_of_allow_host(board, start_live):
     """The proxy keeps the name in Host, or replaces it by the address of the page."""
-    _, client = start("stream", "linear", "--port", board.url, "--output", "none", "--allow-host", "proxy.example")
+    _, client = start_live("stream", "linear", "--port", board.url, "--output", "none", "--allow-host", "proxy.example")
     for host in ("proxy.example", client.url.removeprefix("http://")):
         assert client.send("GET", "/session.json", Host=host, Origin="http://proxy.example")[0] == 200
 
