@@ -56,6 +56,12 @@ class StageRunner:
         return found
 
 
+def charges_and_contacts(frames):
+    """Return the touch charges of n frames, shape (n, n_electrode), pC, NaN before the tare, and whether they touch."""
+    charges = [np.full(len(frame.values), np.nan) if frame.charge_pC is None else frame.charge_pC for frame in frames]
+    return np.array(charges), np.array([frame.is_contact for frame in frames])
+
+
 def new_tracker(mixture=None, **settings):
     """Return a tracker with settings of the section `[track]`, and with a mixture for a film with a fold."""
     tracker = Tracker(Setup((), Device(rules={TrackRule: TrackRule(**settings)})))

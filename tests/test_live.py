@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import load_amplifier
-from stage_runner import StageRunner
+from stage_runner import StageRunner, charges_and_contacts
 
 RATE_HZ = 200.0
 
@@ -30,13 +30,7 @@ def undo(measurement, charge_pC, seed):
         "hum": {"on": True},
         "leak": {"tau_s": dict(zip("ABC", tau.tolist(), strict=True))},
     }
-    chain = StageRunner(**sections)
-    charges, contact = [], []
-    for k, row in enumerate(output):
-        reading = chain.advance(row, k / RATE_HZ, 1 / RATE_HZ)
-        charges.append(np.full(3, np.nan) if reading.charge_pC is None else reading.charge_pC)
-        contact.append(reading.is_contact)
-    return np.array(charges), np.array(contact)
+    return charges_and_contacts(StageRunner(**sections).run(output, RATE_HZ))
 
 
 @pytest.mark.parametrize("tau", [10.0, 1.0])

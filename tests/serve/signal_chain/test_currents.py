@@ -11,7 +11,7 @@ import pytest
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Chunk, Frame, TouchStream, device_from_table, encode_frame
 from isocharge.train.export_c.folder import device_header
-from stage_runner import StageRunner
+from stage_runner import StageRunner, charges_and_contacts
 
 RATE_HZ = 500.0
 T_S = np.arange(0.0, 20.0, 1.0 / RATE_HZ)
@@ -39,13 +39,11 @@ def run(values, **sections):
 def test_integral_of_currents_is_the_charge_and_detects_touches(tau_s, force):
     charge_pC = 1000.0 * force[:, None] * RATIOS
     sections = {} if math.isinf(tau_s) else {"leak": {"tau_s": tau_s}}
-    frames = run(currents(charge_pC, tau_s), **sections)
-    is_contact = np.array([frame.is_contact for frame in frames])
+    integral_pC, is_contact = charges_and_contacts(run(currents(charge_pC, tau_s), **sections))
     is_held = force > 0.3  # a contact of currents ends at 0.3 of its peak
     assert is_contact[is_held].sum() >= 0.98 * is_held.sum()
     assert not is_contact[(T_S < 3.0) | (np.abs(T_S - 9.5) < 1.0)].any()
     assert is_contact.any() == force.any()
-    integral_pC = np.array([[np.nan] * 3 if frame.charge_pC is None else frame.charge_pC for frame in frames])
     np.testing.assert_allclose(integral_pC[is_held], charge_pC[is_held], atol=60.0)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from stage_runner import StageRunner
+from stage_runner import StageRunner, charges_and_contacts
 
 RATE_HZ = 200.0
 """Number of frames per second, Hz."""
@@ -51,9 +51,7 @@ def correct_leak(output_pC, every=1, tau_s=TAU_S, **settings):
         Touch charges, shape (m, 3), pC, NaN before the tare; and whether something touches, shape (m,).
     """
     chain = StageRunner(tare={"frames": 20}, leak={"tau_s": tau_s} | settings)
-    readings = chain.run(np.tile(output_pC[::every, None], 3), RATE_HZ / every)
-    charges = [[np.nan] * 3 if reading.charge_pC is None else reading.charge_pC for reading in readings]
-    return np.array(charges), np.array([reading.is_contact for reading in readings])
+    return charges_and_contacts(chain.run(np.tile(output_pC[::every, None], 3), RATE_HZ / every))
 
 
 def test_held_press_keeps_its_charge_despite_the_leak():
