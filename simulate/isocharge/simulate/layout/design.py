@@ -127,14 +127,28 @@ class Search:
     case: DesignCase
     fields: ForwardMap
 
+    def error_map(self, sensor: Sensor) -> "ErrorMap":
+        """Compute the position errors of a sensor for the many presses, with its electrodes at their nominal positions.
+
+        Args:
+            sensor: Sensor whose layout is evaluated.
+
+        Returns:
+            Position errors for the noise alone, and for the noise together with the nuisances.
+        """
+        case = self.case
+        charge_rows = rows_of(self.fields, case.fine_presses, sensor.electrodes)
+        error_by_noise = case.position_errors(charge_rows, NO_NUISANCES)
+        error_with_nuisances = case.position_errors(charge_rows, case.nuisances)
+        return ErrorMap(case.fine_presses, error_by_noise, error_with_nuisances)
+
     def errors(self, positions: Array) -> Array:
-        """Compute the position error of each of the many presses, shape (n_press,), mm.
+        """Compute the position error of each of the many presses with uncertain nuisances, shape (n_press,), mm.
 
         Args:
             positions: Centres (x, y) of the new squares, shape (n_new, 2), mm.
         """
-        electrodes = self.case.layout(positions).electrodes
-        return self.case.position_errors(rows_of(self.fields, self.case.fine_presses, electrodes), self.case.nuisances)
+        return self.error_map(self.case.layout(positions)).with_nuisances
 
     def minimised_error(self, positions: Array) -> float:
         """Compute the largest error or the root mean square of the errors of the many presses, mm.
@@ -369,8 +383,8 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
 
     # If all layouts are ambiguous, choose the first layout, which has the smallest error.
     chosen = summaries.index(UNAMBIGUOUS) if UNAMBIGUOUS in summaries else 0
-    errors_before = error_map(case, fields, case.sensor) if len(case.sensor.electrodes) >= 3 else None
-    errors_after = error_map(case, fields, sensors[chosen])
+    errors_before = search.error_map(case.sensor) if len(case.sensor.electrodes) >= 3 else None
+    errors_after = search.error_map(sensors[chosen])
     error = refined_layouts[chosen].error
     return Design(case, sensors[chosen], error, summaries[chosen], chosen, errors_before, errors_after)
 
@@ -414,20 +428,3 @@ def describe_ambiguities(case: DesignCase, charges: ChargeMap) -> str:
     if len(area.pairs):
         findings.append(f"{len(area.pairs)} pairs of contacts have the same charges")
     return "; ".join(findings) or UNAMBIGUOUS
-
-
-def error_map(case: DesignCase, fields: ForwardMap, sensor: Sensor) -> ErrorMap:
-    """Compute the position errors of a sensor whose electrodes lie at their nominal positions.
-
-    Args:
-        case: Design case with the presses, the noise and the nuisances.
-        fields: Stress fields of the case.
-        sensor: Sensor whose layout is evaluated.
-
-    Returns:
-        Position errors for the noise alone, and for the noise together with the nuisances.
-    """
-    charge_rows = rows_of(fields, case.fine_presses, sensor.electrodes)
-    error_by_noise = case.position_errors(charge_rows, NO_NUISANCES)
-    error_with_nuisances = case.position_errors(charge_rows, case.nuisances)
-    return ErrorMap(case.fine_presses, error_by_noise, error_with_nuisances)

@@ -85,10 +85,6 @@ class RoundProbe(CurvedProbe):
         """Return points x + iy of the circle, mm. The parameter is the polar angle, rad."""
         return np.asarray(self.radius * np.exp(1j * parameter))
 
-    def farthest_distance(self, at: tuple[float, float]) -> float:
-        """Return the distance from the centre of the film to the farthest point of the circle, mm."""
-        return float(np.hypot(*at)) + self.radius
-
     def force_share(self, corners: Array, at: complex) -> float:
         """Return the fraction of a uniformly distributed force that acts on a convex polygon of the film."""
         return float(area_in_disk(to_complex(corners), at, self.radius)) / self.area
