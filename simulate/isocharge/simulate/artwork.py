@@ -10,11 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from isocharge.common.errors import require
 from isocharge.common.files import new_folder, write_whole
 from isocharge.simulate.layout.design import Design
+from isocharge.simulate.numerics.polygon import to_corners
 from isocharge.simulate.plots.error_maps import error_maps_picture
 from isocharge.simulate.plots.figure import picture_bytes
 from isocharge.simulate.sensor.sensor import Sensor
@@ -59,9 +58,8 @@ def draw_layout(sensor: Sensor) -> Drawing:
     # Draw the film and the electrodes with their names.
     space = document.modelspace()
     if sensor.film.oval:
-        angle = np.radians(np.arange(360))
-        rim = sensor.film.rim_distance(angle) * np.array([np.cos(angle), np.sin(angle)])
-        space.add_lwpolyline(rim.T.tolist(), close=True, dxfattribs={"layer": "FILM"})
+        rim = to_corners(sensor.film.rim[:-1]).tolist()
+        space.add_lwpolyline(rim, close=True, dxfattribs={"layer": "FILM"})
     else:
         space.add_circle((0.0, 0.0), sensor.film.radius, dxfattribs={"layer": "FILM"})
     for electrode in sensor.electrodes:

@@ -8,8 +8,9 @@ from matplotlib.patches import Circle as Disk
 from matplotlib.patches import Polygon as Patch
 from matplotlib.patheffects import withStroke
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Complexes
 from isocharge.simulate.forward.charge_map import ChargeMap
+from isocharge.simulate.numerics.polygon import to_corners
 from isocharge.simulate.plots.figure import FELT, INK
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.sensor import Sensor, outermost_corner
@@ -59,9 +60,7 @@ def draw_rim(axes: Any, film: Film, **style: Any) -> None:
         film: Film whose rim is drawn.
         **style: Arguments that are passed to the patch of matplotlib.
     """
-    angle = np.linspace(0.0, 2.0 * np.pi, 361)
-    rim = film.rim_distance(angle) * np.array([np.cos(angle), np.sin(angle)])
-    axes.add_patch(Patch(rim.T, fill=False, **style))
+    axes.add_patch(Patch(to_corners(film.rim), fill=False, **style))
 
 
 def draw_working_area(axes: Any, radius: float, label: str = "") -> None:
@@ -116,7 +115,8 @@ def draw_charge_map(axes: Any, charge_map: ChargeMap, electrode: int) -> None:
         charge_map: Map that computes the charges of contacts.
         electrode: Index of the electrode in the order of the charges.
     """
-    x, y = _polar_grid(np.full(81, charge_map.domain.radius), rings=40)
+    edge = charge_map.domain.radius * np.exp(2j * np.pi * np.linspace(0.0, 1.0, 81))
+    x, y = _polar_grid(edge, rings=40)
     contact = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
     charge = charge_map.charges(contact)[:, electrode].reshape(x.shape)
     axes.contourf(x, y, charge, levels=30, cmap="YlGnBu")
@@ -131,8 +131,7 @@ def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
         axes: Axes of matplotlib.
         equilibrium: Equilibrium of the film under a press.
     """
-    rim_distance = equilibrium.film.rim_distance(np.linspace(0.0, 2.0 * np.pi, 361))
-    x, y = _polar_grid(rim_distance, rings=240)
+    x, y = _polar_grid(equilibrium.film.rim, rings=240)
     points = np.stack([x.ravel(), y.ravel()], axis=1)
     depth = deflection(equilibrium, points).reshape(x.shape)
     shades = axes.contourf(x, y, depth, levels=24, cmap="viridis_r")
@@ -172,18 +171,16 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
     )
 
 
-def _polar_grid(rim_distance: Array, rings: int) -> tuple[Array, Array]:
+def _polar_grid(outermost_ring: Complexes, rings: int) -> tuple[Array, Array]:
     """Return the points of a polar grid. The areas between neighbouring rings are equal.
 
     Args:
-        rim_distance: Distance of the outermost ring from the centre at evenly distributed angles from 0 to 2 pi, shape
-            (n_angle,), mm.
+        outermost_ring: Points x + iy of the outermost ring, which is closed, shape (n_angle,), mm.
         rings: Number of rings, including the centre.
 
     Returns:
         Coordinates x and y, each of shape (rings, n_angle), mm.
     """
-    share_of_rim = np.sqrt(np.linspace(0.0, 1.0, rings))
-    angle = np.linspace(0.0, 2.0 * np.pi, rim_distance.size)
-    points = np.outer(share_of_rim, rim_distance * np.exp(1j * angle))
+    share_of_outermost_ring = np.sqrt(np.linspace(0.0, 1.0, rings))
+    points = np.outer(share_of_outermost_ring, outermost_ring)
     return points.real, points.imag

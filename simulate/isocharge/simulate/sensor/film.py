@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, Self
 
 import numpy as np
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import InputError, SensorError
 
 Surface = Literal["middle", "top", "bottom"]
@@ -113,6 +113,12 @@ class Film:
             angle: Angles from the x axis, anticlockwise, any shape, rad.
         """
         return self.radius * (1.0 + self.oval * np.cos(2.0 * (angle - self.oval_axis)))
+
+    @property
+    def rim(self) -> Complexes:
+        """Points x + iy of the rim for drawings, one for each degree from 0 to 360, anticlockwise, shape (361,), mm."""
+        angle = np.radians(np.arange(361.0))
+        return np.asarray(self.rim_distance(angle) * np.exp(1j * angle))
 
     @property
     def expands_evenly(self) -> bool:
