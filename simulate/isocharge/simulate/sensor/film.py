@@ -114,6 +114,17 @@ class Film:
         """
         return self.radius * (1.0 + self.oval * np.cos(2.0 * (angle - self.oval_axis)))
 
+    def relative_distance(self, points: Complexes) -> Array:
+        """Return the distance of points from the centre, divided by the distance of the rim in the same direction.
+
+        Args:
+            points: Points x + iy, any shape, mm.
+
+        Returns:
+            Ratios, same shape, dimensionless. They are less than 1 on the film and 1 on the rim.
+        """
+        return np.asarray(np.abs(points) / self.rim_distance(np.angle(points)))
+
     @property
     def rim(self) -> Complexes:
         """Points x + iy of the rim for drawings, one for each degree from 0 to 360, anticlockwise, shape (361,), mm."""

@@ -442,16 +442,13 @@ def _check_on_film(electrode: Electrode, film: Film, calibration: Calibration) -
         SensorError: If a part of the electrode lies on or beyond the rim.
     """
     placed_corners = calibration.place(np.concatenate(electrode.collecting_polygons))  # shape (n, 2), mm
-    corner_angle = np.arctan2(placed_corners[:, 1], placed_corners[:, 0])
-    rim_distance = film.rim_distance(corner_angle)
-    margin = rim_distance - np.linalg.norm(placed_corners, axis=1)
-    if not (margin > 0.0).all():
-        worst = np.argmin(margin)
-        x, y = placed_corners[worst]
+    relative_distance = film.relative_distance(to_complex(placed_corners))
+    if not (relative_distance < 1.0).all():
+        x, y = placed_corners[np.argmax(relative_distance)]
         hint = "; end its traces before the rim" if electrode.more else ""
         raise SensorError(
             f"electrode {electrode.name!r} lies outside the film: corner ({x:.6g}, {y:.6g}) mm, film radius "
-            f"{rim_distance[worst]:.6g} mm{hint}"
+            f"{film.rim_distance(np.arctan2(y, x)):.6g} mm{hint}"
         )
 
 

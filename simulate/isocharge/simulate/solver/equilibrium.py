@@ -302,20 +302,17 @@ def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, A
     Raises:
         SceneError: If a point lies outside the film.
     """
-    points = np.asarray(points, dtype=float)
     film = equilibrium.film
-    distance = np.hypot(points[:, 0], points[:, 1])  # from the centre of the film
-    rim_distance = film.rim_distance(np.arctan2(points[:, 1], points[:, 0]))
+    complex_points = to_complex(np.asarray(points, dtype=float))
 
     # The condition is negated, so that points with NaN count as outside. The tolerance is for rounding errors.
-    is_outside = ~(distance <= rim_distance * (1.0 + 1e-9))
+    is_outside = ~(film.relative_distance(complex_points) <= 1.0 + 1e-9)
     if is_outside.any():
-        first_outside = np.argmax(is_outside)
-        x, y = points[first_outside]
+        x, y = points[np.argmax(is_outside)]
         raise SceneError(f"point ({x:.4g}, {y:.4g}) mm is off the film of radius {film.radius:.4g} mm")
 
     # Rotate the points, x + iy in film radii, into the frame in which the press lies on the positive x axis.
-    rotated_points = to_complex(points) / film.radius * np.exp(-1j * equilibrium.direction)
+    rotated_points = complex_points / film.radius * np.exp(-1j * equilibrium.direction)
 
     # `locate_points` expects one row of points for each placement. Here, there is a single placement.
     mesh = equilibrium.mesh

@@ -214,7 +214,7 @@ def _patch_charges(
     points = to_corners(complex_points)
 
     # Stress at the integration points. The stress is set to zero outside the film.
-    is_on_film = np.abs(complex_points) < equilibrium.film.rim_distance(np.angle(complex_points))
+    is_on_film = equilibrium.film.relative_distance(complex_points) < 1.0
     stress = np.zeros((len(points), 3))
     stress[is_on_film] = touch_stress(equilibrium, points[is_on_film])
 

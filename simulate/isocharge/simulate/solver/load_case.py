@@ -129,13 +129,13 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
 
     farthest = farthest_distance(film, probe, at)
     outline = complex(*at) + probe.outline
-    outline_rim_distance = film.rim_distance(np.angle(outline))
-    margin = outline_rim_distance - np.abs(outline)
-    if not (farthest < film.radius * (1.0 - 1e-6) and margin.min() > 0.0):
+    relative_distance = film.relative_distance(outline)
+    if not (farthest < film.radius * (1.0 - 1e-6) and relative_distance.max() < 1.0):
+        worst_angle = np.angle(outline[relative_distance.argmax()])
         raise SceneError(
             f"probe off the film: centre ({at[0]:.4g}, {at[1]:.4g}) mm, farthest point of {probe.notation} "
             f"{probe.farthest_distance(at):.4g} mm from the film's centre, the rim "
-            f"{outline_rim_distance[margin.argmin()]:.4g} mm from it there"
+            f"{film.rim_distance(worst_angle):.4g} mm from it there"
         )
     rim_distance = film.radius - farthest
     min_rim_distance = MIN_RIM_DISTANCE * probe.reach
