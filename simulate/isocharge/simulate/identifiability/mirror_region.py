@@ -132,7 +132,7 @@ class MirrorRegion:
             "share": self.total_share,
             "from_mm": self.inner,
             "to_mm": self.outer,
-            "force_N": [float(self.forces[0]), float(self.forces[-1])],
+            "force_N": self.forces[[0, -1]].tolist(),
             "by_distance": {"distance_mm": self.distance.tolist(), "share": self.share.mean(axis=1).tolist()},
             "words": self.summary,
         }

@@ -21,7 +21,7 @@ import numpy as np
 import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array, Booleans, Integers
-from isocharge.common.contact_domain import into_unit_domain
+from isocharge.common.contact_domain import Domain, into_unit_domain
 from isocharge.simulate.forward.charge_map import ChargeMap, linearised
 from isocharge.simulate.numerics.disk import INNER_RADIUS, ROUNDING
 
@@ -170,16 +170,10 @@ def explain(
         Contacts (x, y, F) within the domain of the map, shape (n, 3), mm and N. Residuals, which are the given charges
         minus the charges of the contacts, divided by `sigma`, shape (n, n_electrode), dimensionless.
     """
-    force_range = charge_map.domain.force_range
     domain = charge_map.domain.within(INNER_RADIUS * charge_map.domain.radius)
+    min_force, max_force = domain.force_range
     # With a single force, the charges do not depend on the third unit coordinate.
-    half_width = domain.scale * [1.0, 1.0, force_range[1] > force_range[0]]
-
-    def to_contact(unit_coordinates: Array) -> Array:
-        """Convert unit coordinates, shape (k, 3), into contacts (x, y, F), shape (k, 3), mm and N."""
-        contact = domain.to_contact(unit_coordinates)
-        contact[:, 2] = np.clip(contact[:, 2], *force_range)  # rounding must not move it out of the range
-        return contact
+    half_width = domain.scale * [1.0, 1.0, max_force > min_force]
 
     def residuals(rows: Integers, unit_coordinates: Array) -> tuple[Array, Array]:
         """Compute the residuals (Q - Q(c)) / sigma for selected rows of charges, and the derivatives of the residuals.
@@ -192,12 +186,19 @@ def explain(
             Residuals, shape (k, n_electrode). Their derivatives with respect to the unit coordinates, shape (k, 3,
             n_electrode).
         """
-        predicted, slopes = linearised(charge_map, to_contact(unit_coordinates))
+        predicted, slopes = linearised(charge_map, _to_contact(domain, unit_coordinates))
         derivatives = -slopes * half_width / sigma[rows][..., None]
         return (charge[rows] - predicted) / sigma[rows], derivatives.swapaxes(1, 2)
 
     unit_solution, residual = minimise(residuals, domain.to_unit(start), min_change=min_change)
-    return to_contact(unit_solution), residual
+    return _to_contact(domain, unit_solution), residual
+
+
+def _to_contact(domain: Domain, unit_coordinates: Array) -> Array:
+    """Convert unit coordinates, shape (k, 3), into contacts (x, y, F) in a domain, shape (k, 3), mm and N."""
+    contact = domain.to_contact(unit_coordinates)
+    contact[:, 2] = np.clip(contact[:, 2], *domain.force_range)  # rounding must not move it out of the range
+    return contact
 
 
 def search(
@@ -266,8 +267,7 @@ def starting_contacts(
     """
     # Compute the charges of the candidates, and find the pairs of candidates that lie close together.
     unit_candidates = _unit_candidates(candidates)
-    contact = charge_map.domain.to_contact(INNER_RADIUS * unit_candidates)
-    contact[:, 2] = np.clip(contact[:, 2], *charge_map.domain.force_range)
+    contact = _to_contact(charge_map.domain, INNER_RADIUS * unit_candidates)
     candidate_charges = charge_map.charges(contact)
     positions = unit_candidates[:, :2]
     is_neighbour = scipy.spatial.distance.cdist(positions, positions) < START_SEPARATION
