@@ -323,9 +323,7 @@ class Validity:
     @cached_property
     def centre_mm(self) -> tuple[float, float]:
         """Centre (x, y) of the bounding box of the working area, mm."""
-        lowest = self.corners_mm.min(axis=0)
-        highest = self.corners_mm.max(axis=0)
-        x_mm, y_mm = (0.5 * (lowest + highest)).tolist()
+        x_mm, y_mm = box_middle(self.corners_mm).tolist()
         return x_mm, y_mm
 
     @cached_property
@@ -456,6 +454,11 @@ class Validity:
             MISFIT: contact.misfit > self.misfit_limit,
             STRESS: contact.force_N > self.yield_force_N,
         }
+
+
+def box_middle(corners: Array) -> Array:
+    """Return the middle of the bounding box of corners (x, y), shape (2,), in their unit."""
+    return np.asarray(0.5 * (corners.min(axis=0) + corners.max(axis=0)))
 
 
 def inside_polygon(x: Reals, y: Reals, corners: Array) -> Booleans:

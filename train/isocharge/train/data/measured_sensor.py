@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import PressError, shown
-from isocharge.serve.model.contact import inside_polygon
+from isocharge.serve.model.contact import box_middle, inside_polygon
 from isocharge.serve.presses.measured_presses import CONTACT, MeasuredPresses
 from isocharge.simulate import Domain
 from isocharge.train.data.channel_noise import LEAST_SHARE
@@ -68,14 +68,14 @@ class PressedArea(Domain):
             # Both ends are moved by the same factor, so that their geometric mean remains.
             min_force /= LEAST_RANGE**0.5
             max_force *= LEAST_RANGE**0.5
-        distance_from_middle = np.linalg.norm(corners - _box_middle(corners), axis=1)
+        distance_from_middle = np.linalg.norm(corners - box_middle(corners), axis=1)
         corner_places = tuple((x, y) for x, y in corners.tolist())
         return cls(float(distance_from_middle.max()), (min_force, max_force), corner_places)
 
     @cached_property
     def centre(self) -> Array:
         """Middles of the ranges of x, y and ln F, shape (3,), with x and y in mm and F in N."""
-        return np.append(_box_middle(np.array(self.corners)), super().centre[2])
+        return np.append(box_middle(np.array(self.corners)), super().centre[2])
 
     @cached_property
     def scale(self) -> Array:
@@ -94,11 +94,6 @@ class PressedArea(Domain):
         x, y, _ = contact.T
         is_off_area = np.isfinite(x + y) & ~inside_polygon(x, y, np.array(self.corners))
         return np.asarray(is_off_area | Domain(np.inf, self.force_range).is_outside(contact))
-
-
-def _box_middle(corners: Array) -> Array:
-    """Return the middle of the bounding box of corners (x, y), shape (2,), mm."""
-    return np.asarray(0.5 * (corners.min(axis=0) + corners.max(axis=0)))
 
 
 def outline(places: Array) -> Array:
