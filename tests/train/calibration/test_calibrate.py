@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -18,13 +19,21 @@ from solved_charges import with_film
 pytestmark = pytest.mark.usefixtures("never_solved", "few_hypotheses")
 
 
-def fit(presses, problem, synthetic):
-    return calibrate(presses, problem, start=synthetic, accurate=False)
+@pytest.fixture
+def fit(problem, synthetic):
+    """Function that calibrates the synthetic film."""
+    return partial(calibrate, problem=problem, start=synthetic, accurate=False)
 
 
-def test_errors_become_smaller_and_the_sentences_name_them(problem, synthetic):
+@pytest.fixture
+def press_film(problem, synthetic):
+    """Function that presses the synthetic film, and returns the measured presses; see `rig`."""
+    return partial(rig_presses, problem, synthetic)
+
+
+def test_errors_become_smaller_and_the_sentences_name_them(fit, problem, synthetic):
     values, _, presses = rig(problem, synthetic, 12, seed=11)
-    result = fit(presses, problem, synthetic)
+    result = fit(presses)
     after, before = result.film_error, result.film_error_before
     assert after.position_mm < 0.3 * before.position_mm
     assert after.force_percent < 0.2 * before.force_percent
@@ -66,83 +75,83 @@ def test_sensor_of_two_electrodes_is_refused(problem):
 
 
 @pytest.mark.parametrize("offset", [10.0, -12.0])
-def test_offset_of_all_charges_is_found_with_its_sign(problem, synthetic, offset):
-    presses = rig_presses(problem, synthetic, 15, seed=12)
-    result = fit(replace(presses, charge_pC=presses.charge_pC + offset), problem, synthetic)
+def test_offset_of_all_charges_is_found_with_its_sign(fit, press_film, offset):
+    presses = press_film(15, seed=12)
+    result = fit(replace(presses, charge_pC=presses.charge_pC + offset))
     assert abs(result.film.value("offset") - offset) < 4.0 * result.film.std("offset") < 8.0
     (caution,) = result.cautions
     assert "contain an offset of" in caution
     assert re.search(r"offset of (-?\d+)", caution)[1].startswith("-") == (offset < 0.0)
 
 
-def test_bad_press_and_press_outside_are_named_by_their_lines(problem, synthetic):
-    presses = rig_presses(problem, synthetic, 12, seed=13)
+def test_bad_press_and_press_outside_are_named_by_their_lines(fit, press_film):
+    presses = press_film(12, seed=13)
     presses.contact[4, 1] -= 3.0
     presses.contact[8] = [9.5, 0.0, 1.0]
-    result = fit(presses, problem, synthetic)
+    result = fit(presses)
     assert result.bad_lines == (6,)
     assert result.cautions[0].startswith("line 10: a calibration takes presses within 8.5 mm")
     assert any(caution.startswith("line 6: does not agree") for caution in result.cautions)
 
 
-def test_forces_that_scatter_more_than_stated_are_named(problem, synthetic):
-    presses = rig_presses(problem, synthetic, 25, seed=14)
+def test_forces_that_scatter_more_than_stated_are_named(fit, press_film):
+    presses = press_film(25, seed=14)
     scattered = presses.contact.copy()
     scattered[:, 2] *= np.exp(0.04 * np.random.default_rng(0).standard_normal(25))
-    result = fit(replace(presses, contact=np.clip(scattered, [-9, -9, 0.05], [9, 9, 2.0])), problem, synthetic)
+    result = fit(replace(presses, contact=np.clip(scattered, [-9, -9, 0.05], [9, 9, 2.0])))
     assert any("the forces scatter by about 3 % more than stated" in caution for caution in result.cautions)
 
 
-def presses_on_shifted_electrodes(problem, synthetic, shift_mm):
+def presses_on_shifted_electrodes(problem, press_film, shift_mm):
     values = problem.prior.layout.prior.mean.copy()
     values[problem.prior.layout.index("shift_x")] = shift_mm
-    return rig_presses(problem, synthetic, 20, seed=15, values=values)
+    return press_film(20, seed=15, values=values)
 
 
-def test_electrodes_far_from_their_places_are_named(problem, synthetic):
-    cautions = fit(presses_on_shifted_electrodes(problem, synthetic, 1.1), problem, synthetic).cautions
+def test_electrodes_far_from_their_places_are_named(fit, press_film, problem):
+    cautions = fit(presses_on_shifted_electrodes(problem, press_film, 1.1)).cautions
     assert any("is the origin of the stage the centre of the film" in caution for caution in cautions)
 
 
-def test_electrodes_that_are_farther_away_than_considered_are_refused(problem, synthetic):
+def test_electrodes_that_are_farther_away_than_considered_are_refused(fit, press_film, problem):
     """The film would otherwise be fitted with the largest shift, and its uncertainty would not contain the rest."""
     with pytest.raises(PressError, match=r"along x: the presses agree best with 1\.2 mm or more, .* the origin"):
-        fit(presses_on_shifted_electrodes(problem, synthetic, 2.0), problem, synthetic)
+        fit(presses_on_shifted_electrodes(problem, press_film, 2.0))
 
 
 @pytest.mark.parametrize("scatter_mm", [0.0, 0.005])
-def test_presses_at_one_place_are_named(problem, synthetic, scatter_mm):
+def test_presses_at_one_place_are_named(fit, problem, synthetic, scatter_mm):
     """A stage reads the same place with a scatter of 5 um; only positions near the centre may be metres."""
     contact = np.column_stack([np.full((8, 2), 3.0), np.geomspace(0.1, 1.9, 8)])
     charge = synthetic.charges(problem.prior.layout.prior.mean, contact)
     contact[:, :2] += scatter_mm * np.random.default_rng(0).standard_normal((8, 2))
-    cautions = fit(measured_presses(problem, contact, charge), problem, synthetic).cautions
+    cautions = fit(measured_presses(problem, contact, charge)).cautions
     assert any("at one place" in caution for caution in cautions)
 
 
-def test_presses_with_few_known_values_change_nothing(problem, synthetic):
+def test_presses_with_few_known_values_change_nothing(fit, press_film):
     """Two known values do not determine a contact, and state nothing about the film."""
-    presses = rig_presses(problem, synthetic, 12, seed=17)
+    presses = press_film(12, seed=17)
     presses.charge_pC[11, :2] = np.nan
     presses.contact[11] = np.nan
-    without = fit(presses[:11], problem, synthetic).film
-    film = fit(presses, problem, synthetic).film
+    without = fit(presses[:11]).film
+    film = fit(presses).film
     np.testing.assert_allclose(film.film_values, without.film_values, atol=0.01)
     assert film.std("pretension") == pytest.approx(without.std("pretension"), rel=0.01)
 
 
-def test_one_press_states_nothing_about_the_noise(problem, synthetic):
-    presses = rig_presses(problem, synthetic, 1, seed=18)
-    (caution,) = fit(presses, problem, synthetic).cautions
+def test_one_press_states_nothing_about_the_noise(fit, press_film):
+    presses = press_film(1, seed=18)
+    (caution,) = fit(presses).cautions
     assert caution.startswith("all known positions are at one place")
 
 
 @pytest.mark.parametrize("is_exact", [True, False])
-def test_uneven_film_whose_solution_changes_the_estimate_again_is_a_caution(problem, synthetic, monkeypatch, is_exact):
+def test_uneven_film_whose_solution_changes_the_estimate_again_is_a_caution(fit, press_film, monkeypatch, is_exact):
     monkeypatch.setattr(calibrate_module, "_fit_uneven_film", lambda _problem, _data, estimation, _executor: estimation)
     monkeypatch.setattr(calibrate_module, "_is_exact", lambda *_: is_exact)
-    presses = rig_presses(problem, synthetic, 12, seed=11)
-    cautions = calibrate(presses, problem, start=synthetic).cautions
+    presses = press_film(12, seed=11)
+    cautions = fit(presses, accurate=True).cautions
     assert cautions == (() if is_exact else (calibrate_module.NOT_CONVERGED,))
 
 
@@ -153,47 +162,47 @@ def test_three_charges_need_a_known_contact_inside():
     presses.contact[:2, 0] = 9.5
     presses.contact[2:] = np.nan
     with pytest.raises(PressError, match=r"^lines 2, 3: a calibration takes presses within 8\.5 mm"):
-        fit(presses, three, film)
+        calibrate(presses, three, start=film, accurate=False)
 
 
-def test_continued_calibration_needs_fewer_presses(problem, synthetic):
+def test_continued_calibration_needs_fewer_presses(fit, press_film, problem, synthetic):
     values, _, presses = rig(problem, synthetic, 20, seed=19)
-    earlier = fit(presses, problem, synthetic).film.drifted()
+    earlier = fit(presses).film.drifted()
     values[0] += 0.2 if values[0] < 2.0 else -0.2
-    three = rig_presses(problem, synthetic, 3, seed=20, values=values)
-    continued = fit(three, replace(problem, earlier=earlier), synthetic)
-    fresh = fit(three, problem, synthetic)
+    three = press_film(3, seed=20, values=values)
+    continued = fit(three, problem=replace(problem, earlier=earlier))
+    fresh = fit(three)
     assert continued.film_error.position_mm < 0.5 * fresh.film_error.position_mm
     assert abs(continued.film.value("pretension") - values[0]) < 3.0 * continued.film.std("pretension")
 
 
-def test_proposed_presses_reduce_the_errors_as_announced(problem, synthetic):
+def test_proposed_presses_reduce_the_errors_as_announced(fit, press_film, problem, synthetic):
     """The announced errors are those of a calibration with the proposed presses; random presses leave larger ones."""
     proposed = next_presses(problem, synthetic, 6)
     errors = [press.position_mm for press in proposed]
     assert errors == sorted(errors, reverse=True)
     contact = np.array([press.contact for press in proposed])
     charge = synthetic.charges(problem.prior.layout.prior.mean, contact)
-    chosen = fit(measured_presses(problem, contact, charge), problem, synthetic).film_error.position_mm
+    chosen = fit(measured_presses(problem, contact, charge)).film_error.position_mm
     assert chosen == pytest.approx(errors[-1], rel=0.6)
     random_errors = []
     for seed in range(3):
-        presses = rig_presses(problem, synthetic, 6, seed, values=problem.prior.layout.prior.mean)
-        random_errors.append(fit(presses, problem, synthetic).film_error.position_mm)
+        presses = press_film(6, seed, values=problem.prior.layout.prior.mean)
+        random_errors.append(fit(presses).film_error.position_mm)
     assert chosen < np.mean(random_errors)
 
 
-def test_errors_that_are_announced_after_noisy_presses_contain_the_noise(problem, synthetic):
+def test_errors_that_are_announced_after_noisy_presses_contain_the_noise(fit, problem, synthetic):
     """With the noise of a good amplifier, the announced errors would be a tenth too small."""
     noisy = replace(problem, noise=NoiseModel("bench", 1.0, 0.016))
     values, _, presses = rig(noisy, synthetic, 12, seed=22)
-    proposed = next_presses(problem, synthetic, 8, fit(presses, problem, synthetic).film)
+    proposed = next_presses(problem, synthetic, 8, fit(presses).film)
     further = np.array([press.contact for press in proposed])
     charge = noisy.noise.add(synthetic.charges(values, further), np.random.default_rng(23))
     all_presses = measured_presses(
         problem, np.vstack([presses.contact, further]), np.vstack([presses.charge_pC, charge])
     )
-    after = fit(all_presses, problem, synthetic).film_error
+    after = fit(all_presses).film_error
     assert proposed[-1].position_mm == pytest.approx(after.position_mm, rel=0.05)
 
 
@@ -206,11 +215,11 @@ def test_errors_that_are_announced_after_noisy_presses_contain_the_noise(problem
     ],
     ids=["unknown", "outside", "mixed up"],
 )
-def test_presses_that_no_film_explains_are_refused(problem, synthetic, change, message):
-    presses = rig_presses(problem, synthetic, 12, seed=21)
+def test_presses_that_no_film_explains_are_refused(fit, press_film, change, message):
+    presses = press_film(12, seed=21)
     changed = change(presses)
     if message is None:  # four charges of unknown contacts are accepted
-        assert len(fit(changed, problem, synthetic).presses) == 3
+        assert len(fit(changed).presses) == 3
         return
     with pytest.raises(PressError, match=message):
-        fit(changed, problem, synthetic)
+        fit(changed)
