@@ -134,6 +134,7 @@ def start_command():
     def start(*words, program=("-m", "isocharge.cli")):
         process = subprocess.Popen(
             [sys.executable, *program, *map(str, words)],
+            stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -183,7 +183,7 @@ SERVICES = [
 
 @pytest.mark.parametrize(("words", "secrets"), SERVICES, ids=["unit", "stream unit", "container", "stream container"])
 def test_the_command_of_a_service_listens_with_tls_and_needs_the_token(
-    words, secrets, tmp_path, monkeypatch, authority, trusted
+    words, secrets, tmp_path, monkeypatch, authority, trusted, start_command
 ):
     """On a free port of this machine; the stream reads frames from a pipe in place of the port."""
     issued = authority.issue_cert("127.0.0.1")
@@ -194,20 +194,15 @@ def test_the_command_of_a_service_listens_with_tls_and_needs_the_token(
     line = re.sub(r"0\.0\.0\.0(:| --port )\d+", r"127.0.0.1\g<1>0", line)
     line = re.sub(r"--port /dev/\S+", "--port -", line)
     monkeypatch.setenv("ISOCHARGE_TOKEN", "s3cret")
-    process = subprocess.Popen(
-        [PROGRAM, *line.split()], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-    try:
-        url = next(found[0] for text in process.stdout if (found := re.search(r"https://127\.0\.0\.1:\d+", text)))
-        path = "/session.json" if "stream" in words else "/v2/models/three-25um-biaxial"
-        with pytest.raises(urllib.error.HTTPError, match="401"):
-            urllib.request.urlopen(url + path, timeout=20, context=trusted)
-        request = urllib.request.Request(url + path, headers={"Authorization": "Bearer s3cret"})
-        with urllib.request.urlopen(request, timeout=20, context=trusted) as answer:
-            assert json.loads(answer.read())
-    finally:
-        process.terminate()
-        process.communicate(timeout=30)
+    process = start_command(*line.split())
+    printed = process.stderr if "stream" in words else process.stdout
+    url = next(found[0] for text in printed if (found := re.search(r"https://127\.0\.0\.1:\d+", text)))
+    path = "/session.json" if "stream" in words else "/v2/models/three-25um-biaxial"
+    with pytest.raises(urllib.error.HTTPError, match="401"):
+        urllib.request.urlopen(url + path, timeout=20, context=trusted)
+    request = urllib.request.Request(url + path, headers={"Authorization": "Bearer s3cret"})
+    with urllib.request.urlopen(request, timeout=20, context=trusted) as answer:
+        assert json.loads(answer.read())
 
 
 def test_the_compose_file_agrees_with_the_schema_of_compose():
