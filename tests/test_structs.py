@@ -1,11 +1,13 @@
 """Typed structs from TOML and JSON. Errors state the position, the expected value and the given value."""
 
+import json
 import math
 import re
 from functools import partial
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
 import pytest
 from msgspec import Meta
 
@@ -21,6 +23,7 @@ from isocharge.common.structs import (
     convert,
     parse_json,
     parse_toml,
+    plain_values,
     read_json,
     read_toml,
 )
@@ -150,3 +153,17 @@ def test_key_that_imitates_the_path_of_a_message_is_named(path):
     key = f"a` - at `{path}"
     with pytest.raises(DeviceError, match=re.escape(key)):
         convert({"name": "x", key: 1}, Part, "board.toml", DeviceError)
+
+
+def test_nested_values_become_json_and_values_without_a_notation_null():
+    value = {
+        1.0: np.array([[1.0, np.nan], [np.inf, 4.0]]),
+        "counts": (np.int64(3), np.bool_(True)),
+        "deep": [{"x": np.float64(-np.inf)}, "text", None],
+    }
+    text = json.dumps(plain_values(value), allow_nan=False)
+    assert json.loads(text) == {
+        "1.0": [[1.0, None], [None, 4.0]],
+        "counts": [3, True],
+        "deep": [{"x": None}, "text", None],
+    }

@@ -15,7 +15,7 @@ from isocharge.serve import Contact, Frame
 from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.signal_chain.stage import Device, Setup
-from isocharge.serve.tracking.film_follower import FilmFollower
+from isocharge.serve.tracking.film_follower import FilmFollower, TouchPeak
 from isocharge.simulate import NoiseModel, noise_model
 from model_files import put_charge_map
 
@@ -261,3 +261,11 @@ def test_contacts_are_corrected_from_the_first_touch(series, model):
     assert np.mean(after**2) < np.mean(before**2)
     assert np.mean(np.abs(normalised_before) < 2.0) < 0.1
     assert np.mean(np.abs(normalised_after) < 2.0) > 0.85
+
+
+def test_only_the_frames_near_the_largest_force_are_averaged():
+    peak = TouchPeak()
+    for force_N in (0.2, 0.6, 1.0, 1.02, 0.98, 0.6, 0.2):
+        contact = Contact(1.0, 0.0, force_N, x_std_mm=0.1, y_std_mm=0.1, force_std_N=0.01, misfit=0.5)
+        peak.add_frame(contact, force_N * np.array([100.0, 50.0]))
+    np.testing.assert_allclose(peak.mean_charge_pC, [100.0, 50.0])
