@@ -179,7 +179,8 @@ class TextParser(DelimitedParser):
     def _examine_line(self, text: str, size: int) -> list[Frame]:
         """Examine a line that does not have the recognised layout, and return the frames that become readable.
 
-        A line without numbers may be a header. A line with numbers is collected until a layout is recognised.
+        Until a layout is recognised, lines with numbers are collected, and other lines are stored as possible headers.
+        Later, a line is rejected unless it is a header that names the columns without names.
 
         Args:
             text: The line.

@@ -304,8 +304,8 @@ def _tokens(text: str, number_kind: str) -> list[_Token]:
 def _index_positions(tokens: list[_Token]) -> list[int]:
     """Return the positions of the numbers that are indices of channels, and therefore names.
 
-    Each number before a colon or an equals sign is an index, as in `1:801,2:799` and `ch 1 = 801 pC`. In lines such as
-    `pad #1 801 pad #2 799`, the indices count the channels from 0 or 1, and follow the same word or mark.
+    If a line ends with pairs such as `1:801,2:799` or `ch 1 = 801 pC`, the first number of each pair is an index. In
+    pairs such as `pad #1 801 pad #2 799`, the indices count from 0 or 1, and follow the same word or mark.
 
     Args:
         tokens: Parts of the line.

@@ -80,9 +80,9 @@ class Prediction(Stage):
     needs_contact = True
 
     def __init__(self, setup: Setup) -> None:
-        """Store the predictor, and the limits within which contacts are valid, which are those of the calibrated film.
+        """Create the predictor for the noise of the board, and store it in the setup for the later stages, too.
 
-        The later stages use the same predictor.
+        Contacts are valid within the limits of the calibrated film.
         """
         self._predictor = predictor_for(setup.device, setup.model)
         self._validity = self._predictor.validity
@@ -166,7 +166,7 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     """Convert the content of a device file to the settings of a board.
 
     If the section `[frames]` has no key `format`, the format of the frames is `auto`. If a section contains the key
-    `on = false`, the stage of the section is switched off, and the section is None in the result.
+    `on = false`, the stage of the section is switched off, and the result has no settings for it.
 
     Args:
         table: Sections and keys of the file, as the docstring of this module describes them.

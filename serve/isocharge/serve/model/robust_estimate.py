@@ -210,24 +210,24 @@ class RobustProblem:
     def normal_equations(self, point: RobustPoint, damping: float) -> tuple[Array, Array, Array, Array]:
         """Compute the normal equations of a step of the state, from which the contacts are eliminated.
 
-        With the whitened derivatives C_i with respect to the contact and S_i with respect to the state, the contact of
-        a press moves by du_i = (C_i' C_i + D_i)^-1 (C_i' (r_i - S_i ds) + ...) for a step ds of the state.
+        The whitened derivatives of press i are C_i with respect to its contact and S_i with respect to the state. For a
+        step ds of the state, the contact moves by du_i = a_i - B_i ds, with a_i = (C_i' C_i + D_i)^-1 (C_i' r_i + ...)
+        and B_i = (C_i' C_i + D_i)^-1 C_i' S_i. D_i contains the damping and the weights of measured coordinates.
 
         Args:
             point: State and contacts.
             damping: Damping of the contacts, relative to the diagonal of their normal matrices.
 
         Returns:
-            Normal matrix, shape (p, p), and right side, shape (p,). Shift of each contact if the state does not change,
-            shape (n, 3), and its derivative with respect to the step of the state with the opposite sign, shape
-            (n, 3, p).
+            Normal matrix, shape (p, p), and right side, shape (p,). The shifts a_i, shape (n, 3), and the matrices B_i,
+            shape (n, 3, p).
         """
         transposed = point.by_contact.swapaxes(1, 2)
         contact_matrix = transposed @ point.by_contact
         diagonal = np.einsum("nkk->nk", contact_matrix)  # a view, through which the matrices are changed
         diagonal += self._contact_weight**2
         diagonal *= 1.0 + damping
-        # The smallest number is for contacts on which no charge depends.
+        # The smallest number is for contacts that change no charge.
         diagonal += RELATIVE_RIDGE * diagonal.sum(axis=1, keepdims=True) + np.finfo(float).tiny
         charge_part = (transposed @ point.residual[:, :, None])[:, :, 0]
         right_side = charge_part + self._contact_weight * point.contact_residual

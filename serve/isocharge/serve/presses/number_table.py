@@ -168,7 +168,7 @@ class NumberTable(ABC):
             The required columns, and then the optional columns.
 
         Raises:
-            InputError: If a required column is missing, if the file contains a column to read twice, if the name of a
+            InputError: If a required column is missing, if one of these columns occurs twice, if the name of a
                 column is almost that of a column that the file does not contain, such as `a (pC)` for `A`, if the file
                 is damaged or has more than `max_rows` rows, or if a cell violates the rule of its column.
         """

@@ -203,7 +203,7 @@ def _distinctive_parts(names: list[str]) -> list[str]:
 
 
 def _reversed_without_common_start(texts: list[str]) -> list[str]:
-    """Remove the characters at the beginning that all texts have in common, and return the texts backwards."""
+    """Remove the beginning that all texts have in common, and return the characters of each text in reversed order."""
     n_common = len(commonprefix(texts))  # noqa: RUF071  # the texts are no paths
     return [text[n_common:][::-1] for text in texts]
 

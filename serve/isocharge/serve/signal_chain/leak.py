@@ -178,8 +178,8 @@ class Leak(OffsetStage):
     def _advance(self, frame: Frame, previous: Frame, output_pC: Array) -> None:
         """Add the charge that is new since the previous frame to the touch charge.
 
-        Out of contact, any touch charge is an error and decays to zero, and the new charge shows the inflow. If frames
-        are missing, the touch may have ended meanwhile, or its charge may have become wrong.
+        Out of contact, the touch charge should be zero. It therefore decays to zero, and the inflow is learned from the
+        new charge. If frames are missing, the touch may have ended meanwhile, or its charge may have become wrong.
 
         Args:
             frame: The frame.

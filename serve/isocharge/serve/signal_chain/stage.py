@@ -222,7 +222,10 @@ class Stage(ABC):
         """Discard the state of the present touch, because the film is tared again."""
 
     def continue_touch(self, previous: "Stage") -> None:  # noqa: B027  # most stages begin again
-        """Continue the touch of a stage of the same class, whose model this stage replaces."""
+        """Continue the touch of a stage of the same class with another model, which this stage replaces.
+
+        By default, nothing is continued, and the stage begins as if nothing touched the film.
+        """
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:

@@ -384,14 +384,15 @@ class FilmFollower(Stage):
             return contact
         conversion = self._conversion
         if conversion is None or not is_close(contact, conversion.contact):
-            first = self._conversion_at(contact, state)
-            corrected = self.predictor.predict(charge_pC + first.shift_pC)
+            # The conversion is computed at a roughly corrected contact, and stored for contacts near the given one.
+            rough_conversion = self._conversion_at(contact, state)
+            corrected = self.predictor.predict(charge_pC + rough_conversion.shift_pC)
             conversion = self._conversion_at(corrected, state)._replace(contact=contact)
             self._conversion = conversion
         return self.predictor.predict(charge_pC + conversion.shift_pC).with_covariance(conversion.covariance)
 
     def _conversion_at(self, contact: Contact, state: Array) -> _Conversion:
-        """Return the conversion of charges near a contact.
+        """Return the conversion of charges near a contact into charges of the calibrated film.
 
         Args:
             contact: Contact on the calibrated film.
@@ -401,8 +402,8 @@ class FilmFollower(Stage):
         present = self._values(log_contact, state)
         (calibrated_pC,), (slopes_pC,) = self._series.linearised(contacts_of(log_contact))
 
-        # An error of the state shifts the contact whose charges are nearest to the converted charges. The norm is that
-        # of the noise of the charges.
+        # An error of the state shifts the contact whose charges are nearest to the converted charges. The distance of
+        # charges is measured in standard deviations of their noise.
         weight = 1.0 / np.sqrt(self.predictor.noise.variance(calibrated_pC))[:, None]
         contact_by_state = np.linalg.pinv(weight * slopes_pC) @ (weight * present.by_state[0])  # shape (3, n_state)
         contact_by_state[2] *= contact.force_N  # from ln F to F

@@ -175,7 +175,7 @@ class Tracker(Stage):
         frame.tracking = Tracking(self._tracked, event, self._other)
 
     def _follow(self, frame: Frame, contact: Contact) -> str | None:
-        """Update the tracked contact with a frame in contact, and return the event that begins.
+        """Update the tracked contact with a frame in contact, and return the event that begins, or None.
 
         Args:
             frame: The frame. If contacts are tracked by a mixture, its contact is replaced by the most probable one.
@@ -188,7 +188,7 @@ class Tracker(Stage):
             hypotheses: list[ContactHypothesis] = []  # possible contacts, the most probable first
             if SATURATED not in frame.flags and frame.charge_pC is not None:  # saturated charges are wrong
                 hypotheses = self._mixture.update(frame.charge_pC, t_s)
-            if not hypotheses:  # the frame contains no information
+            if not hypotheses:  # the frame contains no information, so the tracked contact remains
                 return None
             best, *others = hypotheses
             delay_s = t_s - self._mixture.time_s

@@ -81,7 +81,7 @@ class LimitMap:
         The weight of a position is the area that it represents. Errors of the force are in percent of the force.
         """
         # The area that a position represents is proportional to its distance from the centre, and therefore to the
-        # number of its ring. Each position counts as often in the median.
+        # number of its ring. In the median, the error of a position of ring k counts k times.
         n_ring, n_angle = self.position.shape
         area = np.repeat(np.arange(1, n_ring + 1), n_angle)
         statistics = {"force_N": self.force}

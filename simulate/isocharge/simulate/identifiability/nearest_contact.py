@@ -125,7 +125,7 @@ def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -
     outward = -np.einsum("nbi,ni->nb", normals, gradient)
     normals = normals * (outward > 0.0)[..., None]
 
-    # The curvature of the circle adds a second derivative along the tangent, which is the outward component.
+    # The curvature of the circle adds the outward component to the second derivative along the tangent.
     tangent = normals[:, 0, [1, 0, 2]] * np.array([-1.0, 1.0, 0.0])
     matrix = matrix + outward[:, 0, None, None] * tangent[:, :, None] * tangent[:, None, :]
 

@@ -75,7 +75,7 @@ def calibrate(
         problem: The calibration problem.
         executor: Executor that runs the solves; None for this process.
         start: A solved film that is used first, from an earlier calibration of the same problem; None to solve one.
-        accurate: Whether an uneven film is solved. Without it, its unevenness is a first-order change, which is enough
+        accurate: Whether an uneven film is solved. If False, its unevenness is a first-order change, which is enough
             to choose further presses.
 
     Raises:

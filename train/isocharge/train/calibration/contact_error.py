@@ -196,13 +196,14 @@ def _candidates(problem: CalibrationProblem) -> Array:
 def _linearise_at(
     film: FilmEstimate, charges: FilmCharges, contact: Array, contact_std: tuple[float, float, float] = (1.0, 1.0, 1.0)
 ) -> Linearised:
-    """Compute the derivatives of the residuals of presses whose charges are exactly those of a film.
+    """Compute the derivatives of the residuals of presses without noise on a film.
 
     Args:
         film: The film and the noise of the charges.
         charges: Charges of a film and of similar films.
         contact: Contacts (x, y, F) of the presses, shape (n, 3), mm and N.
-        contact_std: Standard deviations of x and y, mm, and of ln F.
+        contact_std: Standard deviations of x and y, mm, and of ln F. The default is for callers that do not use the
+            residuals of the contact, which are the last three of each press.
     """
     charge = charges.charges(film.film_values, contact)
     log_contact = with_log_force(contact)

@@ -158,9 +158,10 @@ class Prior:
     def parts(self) -> Array:
         """Parts of the covariance of the unknowns, shape (4 + n_session, n_unknown, n_unknown).
 
-        The parts are the covariance that is the same under all hypotheses, and the covariances of the uneven tension,
-        of the other imperfections, of the discrepancy, and of each unknown of the session, all of the size 1. After an
-        earlier calibration, its covariance contains the imperfections, and the discrepancy grows.
+        The first part is the covariance that is the same under all hypotheses. The other parts are the covariances of
+        the uneven tension, of the other imperfections, of the discrepancy, and of each unknown of the session. A
+        hypothesis multiplies each of them by a factor. After an earlier calibration, the first part is the covariance
+        of its result, which contains the imperfections, and the discrepancy is only its change since then.
         """
         layout = self.layout
         parts = np.zeros((4 + len(SESSION), *(layout.coefficients.stop,) * 2))

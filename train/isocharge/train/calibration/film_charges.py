@@ -213,7 +213,7 @@ class FilmCharges:
 
 
 def solve_even_map(prior: FilmPrior, values: Array, domain: Domain, executor: Executor | None) -> ForwardMap:
-    """Solve the axisymmetric film with the mean properties, under an axisymmetric probe, at a few presses.
+    """Solve the film with given properties but without its unevenness, under an axisymmetric probe, at a few presses.
 
     Args:
         prior: Declarations of the properties, with the described sensor and probe.

@@ -210,7 +210,8 @@ def training_data(
     domain = series.domain
     contact = draw_contacts(rng, domain, PRESSES)
     charge = _drawn_charges(series, rng, contact)
-    drift = np.hypot(film.value("drift"), film.std("drift")) / np.sqrt(12.0)  # all gains of the session can occur
+    # The gain changes linearly during the session, so that its values have the standard deviation drift / sqrt(12).
+    drift = np.hypot(film.value("drift"), film.std("drift")) / np.sqrt(12.0)
     charge = charge * (1.0 + drift * rng.standard_normal((PRESSES, 1)))
     charge = charge + film.std("offset") * rng.standard_normal((PRESSES, 1))
     sensor, probe = charges.prior.film(film.film_values)

@@ -340,7 +340,7 @@ def write_calibration(
         fitted = with_guarantee(fitted, held_out)
 
     sensor, _ = result.sensor_and_probe
-    is_folded = CHARGES in fitted.files
+    is_folded = CHARGES in fitted.files  # a training writes this file only if the charges fold
     files = {
         CHARGES: charge_map_bytes(replace(series, is_folded=is_folded)),
         RESULT: json_text(result_table(result)).encode(),

@@ -95,7 +95,7 @@ class CalibrationResult:
         before = self.problem.film_before
         estimates = {}
         for one in self.film.layout.prior.properties:
-            # The prior of imperfections for planning has half of their standard deviations.
+            # `film_before`, with which presses are planned, has only half of the declared std of imperfections.
             before_std = one.std if self.problem.earlier is None else before.std(one.name)
             estimates[one.name] = PropertyEstimate(
                 one.meaning, one.unit, self.film.value(one.name), self.film.std(one.name), before_std
