@@ -322,11 +322,18 @@ class TextParser(DelimitedParser):
 
 
 def _decoded(line: bytes) -> str:
-    """Decode a line in UTF-8, or else in Latin-1, in which some instruments write the signs of micro and degree."""
+    """Decode a line in UTF-8, or else in Latin-1, in which some instruments write the signs of micro and degree.
+
+    Raises:
+        UnicodeDecodeError: If the line is not in UTF-8, and contains other signs of Latin-1.
+    """
     try:
         return line.decode()
     except UnicodeDecodeError:
-        return line.decode("latin-1")
+        text = line.decode("latin-1")
+        if not text.replace("µ", "").replace("°", "").isascii():
+            raise
+        return text
 
 
 def _frame_lines(lines: Sequence[Line], cycle_length: int) -> Sequence[Line]:

@@ -203,8 +203,8 @@ class FilmFollower(Stage):
         if series is None or series.node_MPa.size < 2:
             raise ModelError(
                 f"{predictor.folder}: expected the file {FILE} with the charges of the film at several pretensions; a "
-                "film is followed from a model that `isocharge train calibrate` made of presses on it: calibrate it, "
-                "or again with this version"
+                "film is followed from a model that `isocharge train calibrate` made of presses on it: calibrate it "
+                "with this version"
             )
         self.predictor = predictor
         self._rule = setup.device.rule(FollowRule) or FollowRule()

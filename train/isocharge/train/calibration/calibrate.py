@@ -228,15 +228,16 @@ def _check_placement(film: FilmEstimate) -> None:
     """Check that the shift and the rotation of the electrodes are within their bounds.
 
     Raises:
-        PressError: If one of them is at its bound. It is then probably larger, and its standard deviation is too small.
+        PressError: If one of them is at a bound. The true value is then probably beyond the bound, and the standard
+            deviation is too small.
     """
     for one in film.layout.prior.properties:
         lowest, highest = one.limits
         if one.name in PLACEMENT and not lowest < film.value(one.name) < highest:
             raise PressError(
-                f"{one.meaning}: the presses agree best with {film.value(one.name):.3g} {one.unit} or more, the "
-                "largest value that is considered: is the origin of the stage the centre of the film, are its axes "
-                "those of the film, and are the electrodes where the sensor file describes them?"
+                f"{one.meaning}: the presses agree best with {film.value(one.name):.3g} {one.unit}, which is "
+                "an end of the considered range: is the origin of the stage the centre of the film, are its axes those "
+                "of the film, and are the electrodes where the sensor file describes them?"
             )
 
 

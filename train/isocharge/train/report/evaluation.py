@@ -338,7 +338,7 @@ class DatasetEvaluation:
 def _noise_of(model: ModelMetadata) -> NoiseModel:
     """Return the noise for which a model was trained; `reference` for a training without noise or with measured noise.
 
-    Measured noise has other parameters for each electrode.
+    Measured noise has different parameters for each electrode.
     """
     name, white_pC, gain = structs.astuple(model.noise)
     if isinstance(white_pC, tuple) or isinstance(gain, tuple):
