@@ -79,11 +79,11 @@ from isocharge.cli.main import main
 from isocharge.simulate.dataset import sweep
 from isocharge.simulate.forward import forward_map
 
-forward_map.CHECK_COUNT = 1
+forward_map.CHECK_COUNT = 2
 sweep.outside_map = lambda *_, **__: None
 main()
 """
-"""Program of the command, with a single direct solve for comparison and without presses outside the radius."""
+"""Program of the command, with two direct solves for comparison and without presses outside the radius."""
 
 
 def test_a_stopped_sweep_leaves_no_file_and_no_process(tmp_path):
