@@ -136,8 +136,10 @@ class DeviceClock:
         step_us = self._unwrap(frame, t_us, modulus)  # time since the previous reading
         predicted_s = self._predict(self._device_us)
 
-        # No reading can be taken long after its arrival, so a clock was set. All chunks of a file have the same arrival
-        # time, which contains no information about the clock. A provisional fit may be early by the length of a chunk.
+        # A reading is taken before it arrives. If the predicted time is much later than the arrival, the clock of the
+        # host or of the device was set, and the fit is wrong. Two cases are not examined. All chunks of a file have the
+        # same arrival time, which contains no information. The times of a provisional fit may be wrong by the length of
+        # a chunk.
         is_new_arrival = self._chunk_arrival_s not in (None, arrival_s)
         has_fit = self._fitted_us is not None and not self._is_fit_provisional
         if has_fit and is_new_arrival and predicted_s - arrival_s > MAX_LEAD_s:

@@ -82,7 +82,7 @@ class Prediction(Stage):
     def __init__(self, setup: Setup) -> None:
         """Create the predictor for the noise of the board, and store it in the setup for the later stages, too.
 
-        Contacts are valid within the limits of the calibrated film.
+        A contact is valid within the working area and the forces of this predictor.
         """
         self._predictor = predictor_for(setup.device, setup.model)
         self._validity = self._predictor.validity

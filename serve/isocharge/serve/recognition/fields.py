@@ -230,7 +230,9 @@ def _number_parts(
 
 
 def _wraps_early(steps: Array, size: int) -> bool:
-    """Return whether a counter or clock has fewer bytes than are read, because it wraps without a carry to the others.
+    """Return whether a counter or clock wraps although the upper bytes that are read with it do not change.
+
+    The upper bytes then do not belong to it.
 
     A damaged byte may cause the same step back, but then also an equal step forwards.
 

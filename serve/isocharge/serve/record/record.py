@@ -59,9 +59,9 @@ class Field(NamedTuple):
 def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
     """Return the fields of a struct in the order of their declaration.
 
-    The annotation of each field contains a sentence that describes the value. If it is `FLATTENED`, the fields of the
-    nested struct are returned instead. The group of a field of a nested struct, and of a field of the kind `object`, is
-    the name of the field that contains the struct.
+    The annotation of each field contains a sentence that describes the value. If this sentence is `FLATTENED`, the
+    fields of the nested struct are returned instead. The group of a field of a nested struct, and of a field of the
+    kind `object`, is the name of the field that contains the struct.
 
     Raises:
         TypeError: If the annotation of a field contains no sentence.

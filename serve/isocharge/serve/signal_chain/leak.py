@@ -216,7 +216,7 @@ class Leak(OffsetStage):
         return (output_pC - decay * self._output_pC) * 2.0 / (1.0 + decay)
 
     def _growth(self, frame: Frame) -> Array:
-        """Return the charge at the previous frame divided by the part that the leak has left, shape (n_electrode,).
+        """Return the ratio of a charge before the leak of one frame to the same charge after it, shape (n_electrode,).
 
         The ratio is limited to avoid an overflow.
         """

@@ -222,9 +222,10 @@ class Stage(ABC):
         """Discard the state of the present touch, because the film is tared again."""
 
     def continue_touch(self, previous: "Stage") -> None:  # noqa: B027  # most stages begin again
-        """Continue the touch of a stage of the same class with another model, which this stage replaces.
+        """Continue the touch of the stage that this stage replaces because the model changes.
 
-        By default, nothing is continued, and the stage begins as if nothing touched the film.
+        Both stages have the same class. By default, nothing is continued, and the stage begins as if nothing touched
+        the film.
         """
 
     @classmethod

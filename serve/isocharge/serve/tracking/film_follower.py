@@ -159,10 +159,11 @@ class FollowRule(Rule, frozen=True, kw_only=True):
 
 
 class _Conversion(NamedTuple):
-    """Conversion of charges near one contact into charges of the calibrated film.
+    """Shift that converts charges of the changed film into charges of the calibrated film.
 
     Attributes:
-        contact: Contact on the calibrated film, for which and near which the conversion is used.
+        contact: Contact that the model computes from charges before the conversion. The conversion is used for this
+            contact and for contacts near it.
         shift_pC: Charges that are added, shape (n_electrode,), pC.
         covariance: Covariance of x (mm), y (mm) and the force (N) because of the errors of the state, shape (3, 3).
     """
@@ -327,10 +328,11 @@ class FilmFollower(Stage):
         return min(max(self._mean_square, SMALLEST_ERROR_SCALE), 1.0)
 
     def _apply_estimate(self) -> None:
-        """Correct contacts for the mean of the state, if the pretension may not have changed at all.
+        """Compute the state for which contacts are corrected, if the pretension may also be unchanged.
 
-        Before the touches, the probability that the pretension is unchanged is 1/2. The touches change the odds by the
-        ratio of the probability densities of t = 0 after and before them (Savage-Dickey ratio, Dickey 1971).
+        The state is the mean over two cases: the pretension has changed, or it has not. Before the touches, both cases
+        have the probability 1/2. The touches multiply the odds of the second case by the ratio of the probability
+        densities of no change (t = 0) after and before the touches (Savage-Dickey ratio, Dickey 1971).
 
         The covariance remains that of a film which has changed, because hardly any film keeps its pretension exactly.
         The square of the shift to the estimate without a change is added to it, times the probability of this estimate.
@@ -392,7 +394,7 @@ class FilmFollower(Stage):
         return self.predictor.predict(charge_pC + conversion.shift_pC).with_covariance(conversion.covariance)
 
     def _conversion_at(self, contact: Contact, state: Array) -> _Conversion:
-        """Return the conversion of charges near a contact into charges of the calibrated film.
+        """Return the conversion of charges of the changed film, near a contact, into charges of the calibrated film.
 
         Args:
             contact: Contact on the calibrated film.

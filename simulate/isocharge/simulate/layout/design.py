@@ -96,9 +96,10 @@ def random_layouts(case: DesignCase) -> list[Array]:
 
 
 def _layouts_within(radius: float, case: DesignCase) -> list[Array]:
-    """Choose random layouts of which all centres are within a radius, mm; an empty list if a layout is not complete.
+    """Choose random layouts whose centres all lie within a radius, mm.
 
-    Each layout is filled with random points, as long as the next point satisfies the distance rules.
+    Random points are added to each layout if they satisfy the distance rules. The list of the layouts is empty if one
+    of them remains incomplete.
     """
     grid = radius * sunflower(1000)
     grid = grid[case.clearance(grid) >= 0.0]

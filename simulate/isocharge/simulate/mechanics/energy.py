@@ -4,7 +4,8 @@ The potential energy of the film is
 
     Pi = stretching energy + bending energy + pressure energy - load * mean(W) - dot(side load, mean(U1, U2)).
 
-The two means are taken over the footprint of the probe and weighted with the pressure of the probe. The class
+Here, W is the deflection, and U1 and U2 are the displacements in the plane. Their means are taken over the footprint of
+the probe and weighted with the pressure of the probe. The class
 `ElasticFilm` computes the potential energy. It adds the energies that the classes `Membrane`, `Bending` and
 `BackPressure` compute. The pressure energy is the energy of a static pressure and of trapped air.
 

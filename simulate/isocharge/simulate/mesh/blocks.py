@@ -96,8 +96,9 @@ class Blocks:
         self.topology = topology
         self.half = topology.fills_circle and not whole
 
-        # Each meshed corner of the core polygon belongs to one quadrilateral and to two half edges. The quadrilateral
-        # consists of n_half_edge * n_half_edge elements, and there is one sector for each element of a half edge.
+        # In the meshed part of the film, the core polygon is divided into one quadrilateral for each corner. A
+        # quadrilateral consists of n_half_edge * n_half_edge elements. At each corner, two half edges meet. Each
+        # element along the edges begins a sector outside the core polygon.
         self.n_corner = topology.n_corner
         self.n_half_edge = max(1, round(resolution.around / (2 * self.n_corner)))
         self.n_meshed = self.n_corner // self.copies

@@ -14,7 +14,7 @@ UNDEFORMED_RADIUS = 0.5
 
 
 def film_oval(film: Film, direction: float | Array) -> Complexes:
-    """Return the shape of the clamp of a film in the frame of a press.
+    """Return the shape e exp(2 i alpha) of the clamp of a film, with alpha measured from the direction of a press.
 
     Args:
         film: The film.
@@ -51,7 +51,7 @@ def from_oval(points: Complexes, oval: complex | Complexes, newton_steps: int = 
     Args:
         points: Points x + iy of the oval film, any shape, in film radii.
         oval: Shape e exp(2 i alpha) of the clamp, a number or an array that broadcasts with the points.
-        newton_steps: Number of Newton steps of `from_oval`. After this number of steps, the error is of the order of
+        newton_steps: Number of Newton steps. After this number of steps, the error is of the order of
             rounding errors for oval parameters up to e = 0.05.
 
     Returns:

@@ -237,7 +237,10 @@ class _ElementRule(NamedTuple):
 
     @classmethod
     def of(cls, order: int, xi: Array, eta: Array, weights: Array) -> "_ElementRule":
-        """Evaluate the basis functions of elements of the given order at the points of a rule, each (n_point,)."""
+        """Evaluate the basis functions of elements of the given order at the points of a quadrature rule.
+
+        The coordinates xi and eta and the weights of the points each have the shape (n_point,).
+        """
         values, derivatives = tensor_basis(order, xi, eta)
         return cls(values, derivatives[:, None], weights)
 

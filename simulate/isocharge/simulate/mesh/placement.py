@@ -8,9 +8,9 @@ the element. The sides of the elements lie on the core polygon, on the boundary 
 circle. The edges of a polygonal footprint remain straight, so the load is integrated exactly over the footprint. The
 values of fields at the nodes are smooth functions of the position of the probe.
 
-The class `Placement` combines these steps for one or several presses on a circular film. If the clamp is oval, the
-module `oval` finally displaces the points. The function `template.locate_points` finds the element that contains a film
-point.
+The class `Placement` combines these steps for one or several presses on a circular film. If the clamp is oval, it then
+displaces the points by the functions of the module `oval`. The function `template.locate_points` finds the element that
+contains a film point.
 """
 
 from dataclasses import dataclass, fields, replace

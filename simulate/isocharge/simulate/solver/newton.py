@@ -188,9 +188,7 @@ class _Iterate:
         return float(max(transverse_ratio, in_plane_ratio))
 
     def size_of(self, step: Array) -> float:
-        """Compute the size of a step from this iterate as its energy norm relative to the work of the load.
-
-        The energy of the step is divided by the work of the load. The size is the square root of the quotient.
+        """Compute the size of a step from this iterate: the square root of (energy of the step / work of the load).
 
         Args:
             step: Change of the displacements, shape (n_node, 3).

@@ -101,7 +101,11 @@ class ContactSensitivity:
         return ContactError.of(self.film_limits(covariance))
 
     def film_limits(self, covariance: Array) -> CramerRao:
-        """Return the errors of each contact that a covariance of the unknowns causes, shape (n_unknown, n_unknown)."""
+        """Return the errors of each contact that a covariance of the unknowns causes.
+
+        Args:
+            covariance: Covariance of the unknowns, shape (n_unknown, n_unknown).
+        """
         return CramerRao(self.film_gain @ covariance @ self.film_gain.swapaxes(1, 2))
 
 

@@ -161,7 +161,7 @@ class FilmCharges:
         return sensor
 
     def _mechanics(self, values: Array) -> dict[str, float]:
-        """Return values by the names of their properties, with the uneven parts of the pretension in MPa, not shares.
+        """Return values by the names of their properties. The uneven parts of the pretension are converted into MPa.
 
         Args:
             values: Properties of a film, shape (n_property,).

@@ -238,10 +238,10 @@ class DatasetEvaluation:
     def prepare(cls, dataset: Dataset, model_folder: Path, settings: Settings) -> "DatasetEvaluation":
         """Select the presses that the model covers, and hold out a part of them for the test.
 
-        Of simulated presses, a tenth of the positions is held out, which a training on the same dataset also holds out.
-        If the model was trained on this dataset and held fewer positions out, only these are held out.
-        Of measured presses, which are fewer, a fifth is held out. A held-out press is
-        left out if a calibration of the model has used it.
+        In a simulated dataset, a tenth of the positions is held out. A training on the same dataset also holds these
+        positions out. If the training of the model has held fewer positions out, only those are held out here, too.
+        Measured datasets are smaller. In them, a fifth of the positions is held out, except presses that a calibration
+        of the model has used.
 
         Args:
             dataset: The dataset.

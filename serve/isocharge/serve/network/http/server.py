@@ -106,10 +106,10 @@ class Connection(HttpToolsProtocol):
         """Begin a request, and refuse it if too many requests wait for the response to an earlier request."""
         self._is_reading = True
         self.deadline = self.loop.time() + self._limits.header_seconds
-        most = self._limits.queued_requests
-        if len(self.pipeline) >= most:
-            self.refuse(429, f"more than {most} requests wait; read the responses first")
-            raise httptools.HttpParserError  # ends the parsing of these data
+        max_waiting = self._limits.queued_requests
+        if len(self.pipeline) >= max_waiting:
+            self.refuse(429, f"more than {max_waiting} requests wait; read the responses first")
+            raise httptools.HttpParserError  # the parser ignores the rest of the received data
         super().on_message_begin()
 
     def on_headers_complete(self) -> None:
