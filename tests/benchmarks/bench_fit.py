@@ -29,7 +29,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isocharge.common.arrays import Array
-from isocharge.common.defaults import DEFAULT_FORCE_RANGE, FEW_ELECTRODES
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.simulate import (
     ChargeSpline,
     Circle,
@@ -43,7 +43,7 @@ from isocharge.simulate import (
 from isocharge.train import LabelledPresses, NetworkConfig, TrainingConfig
 from isocharge.train.data.contact_errors import contact_error_statistics
 from isocharge.train.data.presses import LOWEST_CHARGE
-from isocharge.train.training.contact_training import LinearTargets, contact_stage
+from isocharge.train.training.contact_training import contact_stage
 from isocharge.train.training.fit import threads_and_seed
 from isocharge.train.training.network import InverseNetwork, fold_network, logarithmic_features
 
@@ -129,7 +129,6 @@ TRAINING = "isocharge.train.training"
 WITHOUT = {
     "SOAP, but Adam": patch(f"{TRAINING}.descent.Soap", Adam),
     "sharpened first layer": patch(f"{TRAINING}.network.TrainablePerceptron.sharpen_first_layer"),
-    "linear targets": patch(f"{TRAINING}.contact_training.LINEAR_TARGET_FRACTION", 0.0),
 }
 """Changes of the training, each of which removes one part of it, by the name of the part."""
 
@@ -138,10 +137,7 @@ def train(case: Case, steps: int | None, change: AbstractContextManager[object] 
     """Train as `isocharge train fit` does, or with a change."""
     with threads_and_seed(1, 0), change or nullcontext():
         network = case.network()
-        linear_targets = None
-        if network.features.n_electrode > FEW_ELECTRODES:
-            linear_targets = LinearTargets.compute(case.train, case.charge_map, case.noise)
-        contact_stage(network, case.train, case.noise, TrainingConfig(steps=steps), linear_targets=linear_targets).run()
+        contact_stage(network, case.train, case.noise, TrainingConfig(steps=steps)).run()
     return predictor(network)
 
 
@@ -186,8 +182,6 @@ def main() -> None:
     for steps in map(int, asked.steps.split(",")):
         fits[f"training, {steps} steps"] = partial(train, case, steps)
     for name, change in WITHOUT.items():
-        if name == "linear targets" and case.charge_map.charges(case.truth[:1]).shape[1] <= FEW_ELECTRODES:
-            continue  # they are not used
         fits[f"without {name}"] = partial(train, case, None, change)
     for name in REGRESSORS:
         fits[name] = partial(regressor, case, name)

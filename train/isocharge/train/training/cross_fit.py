@@ -378,7 +378,7 @@ def _distillation_stage(
         outputs = [fold_network.posterior(charge) for fold_network in fold_networks]
     targets = Posterior(*(torch.stack(values).mean(dim=0) for values in zip(*outputs, strict=True)))
 
-    def loss(_: float, random: torch.Generator) -> Tensor:  # the loss is the same in every step
+    def loss(random: torch.Generator) -> Tensor:
         """Return the mean squared differences from the targets for a random batch.
 
         The differences of the means are divided by the standard deviations.

@@ -112,8 +112,7 @@ class TrainingStage:
     Attributes:
         name: Name of the network, for messages.
         network: Network to train.
-        loss: Function that computes the loss of a new batch from the fraction of completed steps, 0 to 1, and a random
-            generator.
+        loss: Function that computes the loss of a new batch, which a random generator selects.
         steps: Number of steps.
         rate: Largest learning rate.
         seed: Seed of the batches and the noise.
@@ -121,7 +120,7 @@ class TrainingStage:
 
     name: str
     network: TrainablePerceptron
-    loss: Callable[[float, torch.Generator], Tensor]
+    loss: Callable[[torch.Generator], Tensor]
     steps: int
     rate: float
     seed: int
@@ -145,8 +144,7 @@ class TrainingStage:
         stored_weights = copy.deepcopy(self.network.state_dict())
         random = torch.Generator().manual_seed(self.seed)
         for step in range(self.steps):
-            progress = step / self.steps
-            loss = self.loss(progress, random)
+            loss = self.loss(random)
             self.network.zero_grad(set_to_none=False)
             loss.backward()  # type: ignore[no-untyped-call]
             gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
@@ -166,7 +164,7 @@ class TrainingStage:
             if is_reported:
                 stored_weights = copy.deepcopy(self.network.state_dict())
             for optimiser in optimisers:
-                optimiser.step(rate * relative_rate(progress))
+                optimiser.step(rate * relative_rate(step / self.steps))
             if is_reported:
                 report(f"training the {self.name} network", step + 1, self.steps, f"loss {loss.item():.3f}")
 

@@ -15,7 +15,6 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from isocharge.common.arrays import Array
-from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.common.progress import second_thread
 from isocharge.serve.model.charge_file import FILE as CHARGES_FILE
 from isocharge.serve.model.charge_file import charge_map_bytes
@@ -25,7 +24,7 @@ from isocharge.train.data.channel_noise import Noise, misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.config import FitConfig
-from isocharge.train.training.contact_training import LinearTargets, contact_stage
+from isocharge.train.training.contact_training import contact_stage
 from isocharge.train.training.descent import TrainingStage
 from isocharge.train.training.folded_network import FoldedNetwork
 from isocharge.train.training.misfit_training import misfit_examples, misfit_stage
@@ -119,8 +118,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
         TrainingError: If the loss is not finite.
     """
     data = source if isinstance(source, TrainingData) else TrainingData.of(source)
-    n_electrode = len(data.sensor.electrode_names)
-    settings = (config or FitConfig()).checked().for_electrodes(n_electrode)
+    settings = (config or FitConfig()).checked().for_electrodes(len(data.sensor.electrode_names))
     training = settings.training
     with threads_and_seed(training.threads, training.seed), second_thread() as executor:
         split = Split.by_position(data, training)
@@ -137,11 +135,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
 
         # Second thread: train the misfit perceptron. This thread: train the contact perceptron
         misfit_training = executor.submit(train_misfit)
-        linear_targets = None
-        has_many_electrodes = n_electrode > FEW_ELECTRODES
-        if has_many_electrodes and training.noise_model.white > 0.0:
-            linear_targets = LinearTargets.compute(split.train, split.field, training.noise_model)
-        stage = contact_stage(network, split.train, training.noise_model, training, linear_targets=linear_targets)
+        stage = contact_stage(network, split.train, training.noise_model, training)
         train_perceptron(stage, settings)
         misfit_training.result()
 
@@ -193,7 +187,7 @@ def threads_and_seed(count: int, seed: int) -> Iterator[None]:
 def train_perceptron(stage: TrainingStage, config: FitConfig) -> None:
     """Train a perceptron. If the configuration requires it, also round the hidden weights to 8 bits.
 
-    After the rounding, the other weights are trained further, with the loss of the last step.
+    After the rounding, the other weights are trained further.
 
     Args:
         stage: The perceptron, its loss and the number of steps.
@@ -205,4 +199,4 @@ def train_perceptron(stage: TrainingStage, config: FitConfig) -> None:
 
     stage.network.round_hidden_matrices()
     steps = round(ROUNDED_FRACTION * stage.steps)
-    replace(stage, loss=lambda _, random: stage.loss(1.0, random), steps=steps).run()
+    replace(stage, steps=steps).run()

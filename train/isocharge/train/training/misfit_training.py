@@ -107,7 +107,7 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
     targets = compress_length(torch.tensor(residuals)).float()
     focus = float(np.arcsinh(FOCUS_MISFIT / MISFIT_LIMIT))  # compressed length of a residual of length `FOCUS_MISFIT`
 
-    def loss(_: float, random: torch.Generator) -> Tensor:  # the loss is the same in every step
+    def loss(random: torch.Generator) -> Tensor:
         """Return the weighted mean of the squared distances for a random batch of the examples."""
         rows = torch.randint(len(inputs), (config.batch,), generator=random)
         return focused_squared_distance(network.misfit_vector(inputs[rows]), targets[rows], focus)
