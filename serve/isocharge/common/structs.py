@@ -25,6 +25,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -148,14 +149,11 @@ def parse_json(text: str | bytes, where: str, error_class: type[InputError], tar
         error_class: If the text is not JSON, or its content is wrong.
     """
     try:
-        return msgspec.json.decode(text, type=target_type)
-    except (ValueError, RecursionError) as decoding_error:
-        cause = decoding_error  # the name after `as` exists only in this clause
-
-    # The text is either not JSON, or JSON with wrong content. Decoding without a type distinguishes the two cases.
-    try:
-        content = msgspec.json.decode(text)
-    except (ValueError, RecursionError):
+        try:
+            return msgspec.json.decode(text, type=target_type)
+        except msgspec.ValidationError:  # the beginning is JSON with wrong content, but the end may not be JSON
+            content = msgspec.json.decode(text)
+    except (ValueError, RecursionError) as cause:
         raise error_class(f"{_prefix(where)}expected JSON, got {shown(text)} ({cut(str(cause))})") from cause
     return convert(content, target_type, where, error_class)
 
@@ -173,15 +171,12 @@ def convert(value: object, target_type: type[T], where: str, error_class: type[I
         error_class: If the value does not have the type. The message describes the first mistake.
     """
     try:
-        return msgspec.convert(value, target_type)
+        try:
+            return msgspec.convert(value, target_type)
+        except msgspec.ValidationError as cause:
+            raise error_class(_prefix(where) + _describe_mistake(value, target_type, cause)) from cause
     except RecursionError as cause:
         raise error_class(f"{_prefix(where)}nested too deeply") from cause
-    except msgspec.ValidationError as cause:
-        try:
-            mistake = _describe_mistake(value, target_type, cause)
-        except (LookupError, ValueError, StopIteration):  # a key of the file imitates the keys in a message of msgspec
-            mistake = cut(str(cause))
-        raise error_class(_prefix(where) + mistake) from cause
 
 
 def plain_values(value: object) -> Any:
@@ -202,49 +197,33 @@ def _prefix(where: str) -> str:
     return f"{where}: " if where else ""
 
 
-_MESSAGE = re.compile(r"^(.*?)(?: - at `\$([^`]*)`)?$", re.DOTALL)
-"""Message of msgspec, and the keys with which it ends."""
-
-_STEP = re.compile(r"\.([^.\[`]+)|\[(\d+|\.\.\.)\]")
-"""One of the keys at the end of a message of msgspec, or an index of a list."""
-
 _WRONG_KEY = re.compile(r"Object (missing required|contains unknown) field `(.*)`$", re.DOTALL)
 """Message of msgspec about a key that is missing or unknown."""
 
 
-def _describe_mistake(content: object, target_type: Any, error: msgspec.ValidationError) -> str:
+def _describe_mistake(value: Any, expected_type: Any, error: msgspec.ValidationError, path: str = "") -> str:
     """Return a description of a mistake, with the names of the keys that lead to the wrong value.
 
-    The message of msgspec ends with these keys, as in "Expected `float`, got `str` - at `$.parts[1].gain[...]`". A
-    number is an index of a list, and three points are any key of a dictionary.
+    The items of a table or of a list are converted separately. If an item cannot be converted, the mistake is in this
+    item. Otherwise, the table or the list itself is wrong, for example because a key is missing.
 
     Args:
-        content: Value from TOML or JSON.
-        target_type: Type to which the value could not be converted.
+        value: Value from TOML or JSON.
+        expected_type: Type to which the value cannot be converted.
         error: Exception of msgspec. If `__post_init__` of a struct has raised an exception, it is the cause of `error`.
+        path: Names of the keys that lead to the value; empty for the whole content.
     """
-    message, steps = _MESSAGE.findall(str(error))[0]  # without keys if the content itself is wrong
-    value: Any = content
-    expected_type = target_type
-    path = ""
-    for name, index in _STEP.findall(steps):
-        members = list(_union_members(expected_type))
-        key: str | int = name
-        if name:
-            expected_type = _key_types(value, members)[name]
-        elif index.isdigit():
-            (item_types,) = (get_args(member) for member in members if get_origin(member) in (list, tuple))
-            is_uniform = len(item_types) == 1 or Ellipsis in item_types
-            key = int(index)
-            expected_type = item_types[0 if is_uniform else key]
-        else:
-            (expected_type,) = (get_args(member)[1] for member in members if get_origin(member) is dict)
-            key = next(key for key, item in value.items() if not _has_type(item, expected_type))
-        value = value[key]
-        path = f"{path}[{key}]" if isinstance(key, int) else _join(path, key)
+    item_types = _item_types(value, expected_type)
+    for key, item_type in item_types.items():
+        with suppress(LookupError):  # the table need not have this key
+            item = value[key]
+            try:
+                msgspec.convert(item, item_type)
+            except msgspec.ValidationError as item_error:
+                item_path = f"{path}[{key}]" if isinstance(key, int) else _join(path, key)
+                return _describe_mistake(item, item_type, item_error, item_path)
 
-    members = list(_union_members(expected_type))
-    wrong_key = _WRONG_KEY.match(message)
+    wrong_key = _WRONG_KEY.match(str(error))
     cause = error.__cause__
     if isinstance(cause, WrongKey):
         key_path = _join(path, cause.key)
@@ -256,37 +235,40 @@ def _describe_mistake(content: object, target_type: Any, error: msgspec.Validati
         return f"{_prefix(path)}expected {expected}, got {shown(value)}"
     kind, name = wrong_key.groups()
     if kind == "contains unknown":
-        return unknown_key(_join(path, name), name, _key_types(value, members))
+        return unknown_key(_join(path, name), name, map(str, item_types))
     return f"key {_join(path, name)!r} is missing"
 
 
-def _has_type(value: object, expected_type: Any) -> bool:
-    """Return whether msgspec can convert a value to a type."""
-    try:
-        msgspec.convert(value, expected_type)
-    except msgspec.ValidationError:
-        return False
-    return True
-
-
-def _key_types(table: Mapping[str, Any], members: Iterable[Any]) -> dict[str, Any]:
-    """Return the types of the keys that a table may have.
+def _item_types(value: Any, expected_type: Any) -> dict[str | int, Any]:
+    """Return the types of the items that a table or a list may have, by their keys or indices.
 
     A struct is a class that declares the keys of a table. If several structs are possible, the table has a key that
     states which of them applies. The value of this key is called the tag.
 
     Args:
-        table: Table from TOML or JSON.
-        members: Types that the table may have. Types that are no structs are ignored.
+        value: Value from TOML or JSON. If it is neither a table nor a list, the result is empty.
+        expected_type: Type that the value may have.
     """
-    structs = [member for member in members if isinstance(member, type) and issubclass(member, Struct)]
-    tags = [struct.__struct_config__.tag for struct in structs]
-    tag_key = structs[0].__struct_config__.tag_field  # all structs of a union have the same tag key
-    types = {} if tag_key is None else {tag_key: Literal[tuple(tags)]}
-    tag = table.get(tag_key or "")
-    struct = structs[tags.index(tag) if tag in tags else 0]
-    types_of_fields = get_type_hints(struct, include_extras=True)
-    return types | {field.encode_name: types_of_fields[field.name] for field in msgspec.structs.fields(struct)}
+    members = list(_union_members(expected_type))
+    types: dict[str | int, Any] = {}
+    if isinstance(value, Mapping):
+        structs = [member for member in members if isinstance(member, type) and issubclass(member, Struct)]
+        tags = [struct.__struct_config__.tag for struct in structs]
+        for struct, tag in zip(structs, tags, strict=True):
+            tag_key = struct.__struct_config__.tag_field  # all structs of a union have the same tag key
+            if tag_key is not None:
+                types[tag_key] = Literal[tuple(tags)]
+            if len(structs) == 1 or value.get(tag_key) == tag:
+                types_of_fields = get_type_hints(struct, include_extras=True)
+                types |= {field.encode_name: types_of_fields[field.name] for field in msgspec.structs.fields(struct)}
+    for member in members:
+        arguments = get_args(member)
+        if isinstance(value, Mapping) and get_origin(member) is dict:
+            types |= dict.fromkeys(value, arguments[1])
+        elif isinstance(value, list | tuple) and get_origin(member) in (list, tuple):
+            is_uniform = len(arguments) == 1 or Ellipsis in arguments
+            types |= enumerate(arguments[:1] * len(value) if is_uniform else arguments)
+    return types
 
 
 def unknown_key(name: str, key: str, known: Iterable[str]) -> str:
