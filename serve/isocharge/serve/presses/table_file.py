@@ -58,6 +58,9 @@ _MAX_LINES_TO_HEADER = 100
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:([.,])[0-9]*)?|([.,])[0-9]+)(?:[eE][-+]?[0-9]+)?")
 """Number with or without a decimal mark, which is a group."""
 
+_WRONG_BYTE = re.compile("[\0\udc80-\udcff]")
+"""Zero byte, or a byte that is not UTF-8, which the error handler `surrogateescape` replaces by a surrogate."""
+
 _THOUSANDS = re.compile(r"[-+]?[1-9][0-9]{0,2}[.,][0-9]{3}")
 """Number whose mark may be a separator of thousands."""
 
@@ -203,25 +206,21 @@ def _checked_lines(lines: Iterable[str], source: TableSource) -> Iterator[str]:
     Raises:
         InputError: If the lines are not text in UTF-8, or a line is too long.
     """
-    line_count = 0
-    advice = (
-        "is not text in UTF-8: export the file as CSV in UTF-8; convert other text with: iconv -f UTF-16 (or "
-        "WINDOWS-1252) -t UTF-8 FILE > NEW.csv"
-    )
+    line_number = 0
     try:
-        for line in lines:
-            if "\0" in line:  # the file is binary, or text in UTF-16
-                raise source.error(f", line {line_count + 1}: the byte 0x00 {advice}")
-            yield line.removeprefix("\ufeff") if line_count == 0 else line
-            line_count += 1
-    except UnicodeDecodeError as cause:
-        # The exception contains the part of the file that was decoded last.
-        line_number = line_count + cause.object[: cause.start].count(b"\n") + 1
-        raise source.error(f", line {line_number}: the byte 0x{cause.object[cause.start]:02x} {advice}") from cause
+        for line_number, line in enumerate(lines, start=1):
+            wrong_byte = _WRONG_BYTE.search(line)
+            if wrong_byte:  # the file is binary, or text in another encoding
+                raise source.error(
+                    f", line {line_number}: the byte 0x{ord(wrong_byte[0]) & 0xFF:02x} is not text in UTF-8: export the "
+                    "file as CSV in UTF-8; convert other text with: iconv -f UTF-16 (or WINDOWS-1252) -t UTF-8 FILE > "
+                    "NEW.csv"
+                )
+            yield line.removeprefix("\ufeff") if line_number == 1 else line
     except InputError:  # is a ValueError, too
         raise
     except ValueError as cause:  # the next line is too long
-        raise source.error(f", line {line_count + 1}: not CSV text ({cause})") from cause
+        raise source.error(f", line {line_number + 1}: not CSV text ({cause})") from cause
 
 
 def _numbered_rows(
@@ -415,8 +414,10 @@ def open_table(
                 yield ParquetTable(file, source)
         else:
             file_or_descriptor = STDIN_FILENO if is_stdin else path
-            # The CSV reader handles the line ends.
-            with open(file_or_descriptor, encoding="utf-8-sig", newline="", closefd=not is_stdin) as text:
+            # The CSV reader handles the line ends. The table refuses bytes that are not UTF-8.
+            with open(
+                file_or_descriptor, encoding="utf-8", errors="surrogateescape", newline="", closefd=not is_stdin
+            ) as text:
                 yield CsvTable(bounded_lines(text), source)
     except IsochargeError:  # some errors of isocharge, such as OutputError, inherit from OSError
         raise
