@@ -138,9 +138,8 @@ def test_presses_outside_the_domain_or_with_unknown_values_are_excluded(predicto
     presses.charge_pC[3, 1] = np.nan
     check = check_presses(predictor, presses)
     assert (check.presses, check.compared, check.fits) == (10, 6, True)
-    assert check.errors.exclusion_reasons[:5] == (
-        *("not trained for", "not trained for", "neither place nor force is known", "a charge is unknown", ""),
-    )
+    reasons = ["not trained for", "not trained for", "neither place nor force is known", "a charge is unknown", ""]
+    assert check.errors.exclusion_reasons.tolist()[:5] == reasons
     assert "0.05 to 2 N); if these are most, look at the units (lines 2, 3)" in check.notes[2]
     row = check.to_dict()["each"][3]
     assert (row["x_mm"], row["x_error_mm"], row["left_out"]) == (None, None, "a charge is unknown")

@@ -56,7 +56,8 @@ def check_command(
         if check.presses > MAX_ROWS:
             say(f"the table has the {MAX_ROWS} worst of {check.presses} presses; --json has all")
         rows = [each_press[index] for index in sorted(worst_indices)]
-        worst_presses = [{check.errors.row_noun: row["line"]} | {name: row[name] for name in SHOWN} for row in rows]
+        row_noun = check.errors.presses.row_noun
+        worst_presses = [{row_noun: row["line"]} | {name: row[name] for name in SHOWN} for row in rows]
         result = {"each": worst_presses, "errors": errors} | result
         if check.std_factor is not None:
             result["std_factor"] = f"{check.std_factor.statement}, if they were not used for the model"

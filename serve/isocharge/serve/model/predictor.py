@@ -99,19 +99,20 @@ class Predictor:
             structs.replace(self.metadata, noise=noise)  # makes the checks of the metadata
         except WrongKey as error:
             raise ChargeError(f"{error.key}: {error}") from error
-        return self._with_stated_noise(noise)
-
-    def _with_stated_noise(self, noise: ModelNoise) -> "Predictor":
-        """Return a predictor of the same model for another noise. A touch must also exceed this noise."""
+        # The new predictor uses the same session. A touch must also exceed the stated noise.
         new_predictor = object.__new__(type(self))
-        new_predictor.__dict__.update(self.__dict__)
-        new_predictor.noise = noise
-        new_predictor.validity = replace(self.validity, white_pC=noise.white_pC)
+        validity = replace(self.validity, white_pC=noise.white_pC)
+        new_predictor.__dict__.update(self.__dict__, noise=noise, validity=validity)
         return new_predictor
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return how `copy` and `pickle` create the predictor again, because the onnxruntime session has no copy."""
-        return _load_again, (type(self), self.folder, self.noise)
+        """Return how `copy` and `pickle` create the predictor again, because the onnxruntime session has no copy.
+
+        The predictor is loaded again from its folder. A stated noise is then restored with its limits of a touch.
+        """
+        is_stated = self.noise is not self.metadata.noise
+        state = {"noise": self.noise, "validity": self.validity} if is_stated else None
+        return type(self), (self.folder,), state
 
     def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
         """Compute the contact of one press. Call `flags` to find out whether the contact is valid.
@@ -273,16 +274,6 @@ class Predictor:
             contact.y_mm,
             contact.force_N,
         )
-
-
-def _load_again(predictor_class: type[Predictor], folder: Path, noise: ModelNoise) -> Predictor:
-    """Load a predictor from its folder, with the noise of `with_noise`.
-
-    Raises:
-        ModelError: If the model is no longer in the folder, or is damaged.
-    """
-    predictor = predictor_class(folder)
-    return predictor if noise == predictor.noise else predictor._with_stated_noise(noise)
 
 
 def _describe(value: object) -> str:

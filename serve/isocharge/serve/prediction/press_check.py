@@ -33,7 +33,7 @@ from isocharge.serve.prediction.press_errors import (
     misfit_limit,
     press_errors,
 )
-from isocharge.serve.presses.measured_presses import PRESS_RULES, MeasuredPresses, row_words
+from isocharge.serve.presses.measured_presses import PRESS_RULES, MeasuredPresses
 from isocharge.serve.presses.std_factor import FEWEST_HELD_OUT, StdFactor, binomial_distribution
 
 MIN_PRESSES = 3
@@ -206,8 +206,7 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
         notes += _remedies(errors, is_selected, position, force)
     notes += _exclusion_notes(errors, predictor.validity)
     if is_bad.any():
-        bad_lines = row_words(np.array(errors.lines)[is_bad].tolist(), errors.row_noun)
-        notes.append(f"{bad_lines}: nothing like the other presses, left out; look at it")
+        notes.append(f"{errors.presses[is_bad].row_words}: nothing like the other presses, left out; look at it")
     if fits is not None:
         notes += _common_notes(agreement)
     return PressCheck(
@@ -362,13 +361,11 @@ def _exclusion_notes(errors: PressErrors, validity: Validity) -> Iterator[str]:
         f"outside the model's working area ({area}) or forces ({min_force_N:.3g} to {max_force_N:.3g} N); if these "
         "are most, look at the units"
     )
-    reasons = np.array(errors.exclusion_reasons)
-    for reason in sorted(set(errors.exclusion_reasons) - {""}):  # a press that is compared has an empty reason
-        lines = np.array(errors.lines)[reasons == reason].tolist()
+    reasons = errors.exclusion_reasons
+    for reason in sorted(set(reasons.tolist()) - {""}):  # a press that is compared has an empty reason
+        excluded = errors.presses[reasons == reason]
         explanation = domain if reason == NOT_TRAINED else reason
-        yield (
-            f"{len(lines)} of {len(reasons)} presses do not count: {explanation} ({row_words(lines, errors.row_noun)})"
-        )
+        yield f"{len(excluded)} of {len(reasons)} presses do not count: {explanation} ({excluded.row_words})"
 
 
 def _common_notes(agreement: Agreement) -> Iterator[str]:

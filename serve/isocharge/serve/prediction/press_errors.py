@@ -12,7 +12,7 @@ from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.model.contact import MISFIT_LIMIT, Contacts, Validity, inside_polygon
@@ -35,8 +35,7 @@ class PressErrors:
     """Contacts that a model computed for n measured presses, and the errors of these contacts.
 
     Attributes:
-        lines: Number of the line of each press in its file.
-        row_noun: What `lines` counts: "line" of a CSV file, "row" of a Parquet file, or "press".
+        presses: The measured presses, with the charges of the model's electrodes.
         predicted: Values of the attributes of `Contact` for each press, shape (n, 10); NaN if a charge is unknown.
         error: Predicted minus measured values of x (mm), y (mm) and the force (relative to the measured force), shape
             (n, 3). The error is NaN if the measured value is unknown.
@@ -44,22 +43,22 @@ class PressErrors:
             `error`, shape (n, 3).
         rig_std: Standard deviations of the measured values, in the units of `error`, shape (n, 3).
         flags: Flags of each press; empty if a charge is unknown.
-        exclusion_reasons: Reason why each press is excluded from the comparison; empty for a press that is compared.
+        exclusion_reasons: Reason why each press is excluded from the comparison; empty for a press that is compared;
+            shape (n,).
     """
 
-    lines: tuple[int, ...]
-    row_noun: str
+    presses: MeasuredPresses
     predicted: Array
     error: Array
     noise_std: Array
     rig_std: Array
     flags: tuple[tuple[str, ...], ...]
-    exclusion_reasons: tuple[str, ...]
+    exclusion_reasons: NDArray[np.str_]
 
     @property
     def is_compared(self) -> Booleans:
         """Whether each press is compared, shape (n,)."""
-        return np.array([not reason for reason in self.exclusion_reasons], dtype=np.bool_)
+        return np.asarray(self.exclusion_reasons == "")
 
     @property
     def variance(self) -> Array:
@@ -84,7 +83,7 @@ class PressErrors:
         x_error_mm, y_error_mm, force_error = self.error.T  # the force is relative to the measured force
         contact_names = Contacts._fields[:N_WITHOUT_CORRELATION]
         columns: dict[str, Any] = {
-            "line": self.lines,
+            "line": self.presses.lines,
             **dict(zip(contact_names, self.predicted.T, strict=False)),  # the last columns are the correlations
             "x_error_mm": x_error_mm,
             "y_error_mm": y_error_mm,
@@ -130,8 +129,7 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
     rig_std = np.column_stack([position_std_mm, position_std_mm, model_presses.force_std])
     is_unknown = np.isnan(measured)
     return PressErrors(
-        lines=model_presses.lines,
-        row_noun=model_presses.row_noun,
+        presses=model_presses,
         predicted=predicted,
         error=(predicted[:, COLUMNS["contact"]] - measured) / divisor,
         noise_std=np.where(is_unknown, np.nan, predicted[:, COLUMNS["contact_std"]] / divisor),
@@ -159,7 +157,7 @@ def misfit_limit(metadata: ModelMetadata) -> float:
     return NOISE_ALLOWANCE * float(metadata.errors["misfit_p99"])
 
 
-def _exclusion_reasons(validity: Validity, presses: MeasuredPresses) -> tuple[str, ...]:
+def _exclusion_reasons(validity: Validity, presses: MeasuredPresses) -> NDArray[np.str_]:
     """For each press, return why the press is excluded from the comparison, or an empty text if it is compared.
 
     The model is compared with presses in its domain, which consists of the working area and the range of forces. The
@@ -177,8 +175,7 @@ def _exclusion_reasons(validity: Validity, presses: MeasuredPresses) -> tuple[st
     is_charge_unknown = np.isnan(presses.charge_pC).any(axis=1)
     # If several conditions are true, the first condition in the list determines the reason.
     conditions = [is_charge_unknown, is_contact_unknown, is_outside_area | is_outside_forces]
-    reasons = np.select(conditions, [CHARGE_UNKNOWN, CONTACT_UNKNOWN, NOT_TRAINED], default="")
-    return tuple(reasons.tolist())
+    return np.select(conditions, [CHARGE_UNKNOWN, CONTACT_UNKNOWN, NOT_TRAINED], default="")
 
 
 TEST_SIGNIFICANCE = 0.01 / 3.0

@@ -20,8 +20,9 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import PressError, cut, error_prefix, shown
+from isocharge.common.files import as_output_errors, write_whole
 from isocharge.serve.presses.number_table import CHARGE_RULE, MAX_COLUMNS, ColumnRule, NumberColumns, NumberTable
-from isocharge.serve.presses.table_file import open_table, write_columns
+from isocharge.serve.presses.table_file import csv_text, is_parquet, open_table, parquet_bytes
 
 POSITION_STD_MM = 0.1
 """Default standard deviation of a position, mm. It is typical of a stage that is set by hand."""
@@ -131,6 +132,15 @@ class MeasuredPresses:
             )
         column_indices = [self.electrodes.index(name) for name in names]
         return replace(self, charge_pC=self.charge_pC[:, column_indices], electrodes=names)
+
+    @property
+    def row_words(self) -> str:
+        """Lines or rows of the presses for a message, such as "line 3" or "lines 3, 4, 7".
+
+        Only the first ones are listed.
+        """
+        plural = {"line": "lines", "row": "rows", "press": "presses"}[self.row_noun]
+        return f"{self.row_noun if len(self) == 1 else plural} {cut(', '.join(map(str, self.lines)))}"
 
     @property
     def columns(self) -> dict[str, Array]:
@@ -319,18 +329,10 @@ def write_presses(path: Path, presses: MeasuredPresses) -> None:
     """
     if not 0 < len(presses) <= MAX_ROWS:
         raise PressError(f"{path}: expected 1 to {MAX_ROWS:,} presses to write, got {len(presses):,}")
-    write_columns(Path(path), presses.columns)
-
-
-def row_words(rows: Sequence[int], row_noun: str) -> str:
-    """List the lines or rows of presses for a message, for example as "line 3" or "lines 3, 4, 7".
-
-    Args:
-        rows: Numbers of the lines or rows of the presses in their file. Only the first ones are listed.
-        row_noun: What the numbers count: "line", "row" or "press".
-    """
-    plural = {"line": "lines", "row": "rows", "press": "presses"}[row_noun]
-    return f"{row_noun if len(rows) == 1 else plural} {cut(', '.join(map(str, rows)))}"
+    path = Path(path)
+    data = parquet_bytes(presses.columns) if is_parquet(path) else csv_text(presses.columns).encode()
+    with as_output_errors(path):
+        write_whole(path, data)
 
 
 def _check_electrodes(electrodes: Collection[str]) -> None:

@@ -24,17 +24,14 @@ from contextlib import contextmanager, suppress
 from itertools import chain, islice
 from pathlib import Path
 from pty import STDIN_FILENO
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, IsochargeError, cut, require, shown
-from isocharge.common.files import as_output_errors, bounded_lines, open_regular, write_whole
+from isocharge.common.files import bounded_lines, open_regular
 from isocharge.serve.presses.number_table import ColumnRule, NumberColumns, NumberTable, TableSource
-
-if TYPE_CHECKING:
-    from pyarrow import DataType
 
 STDIN = Path("-")
 """Path that stands for standard input, from which CSV text is read."""
@@ -212,9 +209,9 @@ def _checked_lines(lines: Iterable[str], source: TableSource) -> Iterator[str]:
             wrong_byte = _WRONG_BYTE.search(line)
             if wrong_byte:  # the file is binary, or text in another encoding
                 raise source.error(
-                    f", line {line_number}: the byte 0x{ord(wrong_byte[0]) & 0xFF:02x} is not text in UTF-8: export the "
-                    "file as CSV in UTF-8; convert other text with: iconv -f UTF-16 (or WINDOWS-1252) -t UTF-8 FILE > "
-                    "NEW.csv"
+                    f", line {line_number}: the byte 0x{ord(wrong_byte[0]) & 0xFF:02x} is not text in UTF-8: export "
+                    "the file as CSV in UTF-8; convert other text with: iconv -f UTF-16 (or WINDOWS-1252) -t UTF-8 "
+                    "FILE > NEW.csv"
                 )
             yield line.removeprefix("\ufeff") if line_number == 1 else line
     except InputError:  # is a ValueError, too
@@ -309,13 +306,16 @@ class ParquetTable(NumberTable):
                 damaged.
         """
         import pyarrow
+        from pyarrow import types
 
         row_count = self._parquet.metadata.num_rows
         if row_count > max_rows:
             self._refuse_row_count(max_rows)
         fields = {name: self._schema.field(self.header.index(name)) for name in rules}
+        # A column of nulls is an empty column.
+        is_of_type = (types.is_integer, types.is_floating, types.is_decimal, types.is_null)
         for name, field in fields.items():
-            if not _is_number_type(field.type):
+            if not any(check(field.type) for check in is_of_type):
                 raise self.source.error(
                     f", column {shown(name)}: expected numbers ({rules[name].description}), got a column of type "
                     f"{cut(str(field.type))}; convert it to float64"
@@ -370,14 +370,6 @@ def _pyarrow_errors_converted(source: TableSource) -> Iterator[None]:
         raise source.error(f": not a Parquet file, or a damaged one ({reason}); write it again, or as CSV") from cause
 
 
-def _is_number_type(given_type: "DataType") -> bool:
-    """Return whether a type of pyarrow contains only numbers and null. A column of nulls is an empty column."""
-    from pyarrow import types
-
-    checks = (types.is_integer, types.is_floating, types.is_decimal, types.is_null)
-    return any(check(given_type) for check in checks)
-
-
 def is_parquet(path: Path) -> bool:
     """Return whether the name of a file ends in `.parquet`, in any mixture of capital and small letters."""
     return path.suffix.lower() == SUFFIX
@@ -425,19 +417,3 @@ def open_table(
         raise error_class(
             f"{source.where}: cannot be read ({cause.strerror or cause}); expected a {kind} file of presses"
         ) from cause
-
-
-def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
-    """Write columns of numbers to a file. An existing file is replaced.
-
-    Args:
-        path: The file, whose name determines the format.
-        columns: Columns by their names, each of shape (n,).
-
-    Raises:
-        OutputError: If the file cannot be written.
-        MissingExtra: If the format is Parquet and pyarrow is not installed.
-    """
-    data = parquet_bytes(columns) if is_parquet(path) else csv_text(columns).encode()
-    with as_output_errors(path):
-        write_whole(path, data)

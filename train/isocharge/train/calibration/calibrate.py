@@ -6,7 +6,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
-from isocharge.serve.presses.measured_presses import MeasuredPresses, row_words
+from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.simulate import FilmSlopes
 from isocharge.simulate.solver.assembly import single_threaded_blas
 from isocharge.train.calibration.contact_error import ContactSensitivity
@@ -214,7 +214,7 @@ def _outside_words(presses: MeasuredPresses, problem: CalibrationProblem) -> str
     domain = problem.solved_domain
     low, high = domain.force_range
     return (
-        f"{row_words(presses.lines, presses.row_noun)}: a calibration takes presses within "
+        f"{presses.row_words}: a calibration takes presses within "
         f"{domain.radius:.3g} mm of the centre (--radius) and of {low:.2g} to {high:.2g} N"
     )
 
@@ -246,8 +246,7 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
     cautions = []
     film = estimation.film
     if estimation.is_bad.any():
-        rows = row_words(presses[estimation.is_bad].lines, presses.row_noun)
-        cautions.append(f"{rows}: does not agree with the other presses; left out")
+        cautions.append(f"{presses[estimation.is_bad].row_words}: does not agree with the other presses; left out")
     errors = estimation.hypothesis.errors
     if errors.noise.gain > MAX_USUAL_NOISE:
         cautions.append(

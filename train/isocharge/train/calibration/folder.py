@@ -40,7 +40,7 @@ from isocharge.common.structs import Text, plain_values, read_json
 from isocharge.serve.model.charge_file import FILE as CHARGES
 from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.model_folder import check_target, version_folders
-from isocharge.serve.presses.measured_presses import MeasuredPresses, row_words
+from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.serve.presses.std_factor import FEWEST_HELD_OUT, StdFactor
 from isocharge.serve.presses.table_file import csv_text
 from isocharge.simulate import NoiseModel
@@ -378,7 +378,7 @@ def usable_held_out(
     is_learned = have_charges_of(held_out.charge_pC, presses.charge_pC)
     if is_learned.any():
         raise PressError(
-            f"{row_words(held_out[is_learned].lines, held_out.row_noun)}: expected held-out presses that are not among "
+            f"{held_out[is_learned].row_words}: expected held-out presses that are not among "
             "those of the calibration, got the same charges; take them out of one of the files"
         )
     is_known = np.isfinite(held_out.charge_pC).all(axis=1) & np.isfinite(held_out.contact).any(axis=1)
