@@ -5,7 +5,7 @@ the answer carries no flag other than `stress`, which says that the film yields 
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 
@@ -107,8 +107,10 @@ def answer_shares(predictor: Predictor, contact: Array, charge: Array, rng: np.r
     return Shares(100.0 * float(flagged.mean()), 100.0 * float((wrong & ~flagged).mean()))
 
 
-class FaultStudy:
-    """Presses inside the working area of one released model, with every fault in turn.
+def fault_shares(
+    model: str, nominal: ForwardMap, variants: dict[str, ForwardMap], presses: int, seed: int
+) -> dict[str, Shares]:
+    """Measure the shares of presses inside the working area of a released model with every fault, by its name.
 
     Args:
         model: Name of the released model, which is also the name of its sensor.
@@ -117,80 +119,50 @@ class FaultStudy:
         presses: Number of presses.
         seed: Seed of the presses, the noise and the faults.
     """
+    predictor = Predictor(model)
+    sensor = load_sensor(model)
+    rng = np.random.default_rng(seed)
+    radius_mm = math.sqrt(predictor.validity.inscribed_radius_squared_mm2)
+    film = with_electrodes(nominal, sensor)
+    contact = draw_contacts(rng, presses, radius_mm, FORCE_RANGE_N)
+    clean = film.charges(contact)
 
-    def __init__(
-        self, model: str, nominal: ForwardMap, variants: dict[str, ForwardMap], presses: int, seed: int
-    ) -> None:
-        self.predictor = Predictor(model)
-        sensor = load_sensor(model)
-        self.nominal = with_electrodes(nominal, sensor)
-        self.variants = {name: with_electrodes(variant, sensor) for name, variant in variants.items()}
-        self.rng = np.random.default_rng(seed)
-        self.radius_mm = math.sqrt(self.predictor.validity.inscribed_radius_squared_mm2)
-        self.contact = draw_contacts(self.rng, presses, self.radius_mm, FORCE_RANGE_N)
-        self.clean_charge = self.nominal.charges(self.contact)
-
-    def shares(self, contact: Array, charge: Array) -> Shares:
-        """Add noise, predict, and count.
-
-        Args:
-            contact: True contacts, shape (n, 3), mm and N.
-            charge: Charges with the fault and without noise, shape (n, n_electrode), pC.
-        """
-        return answer_shares(self.predictor, contact, charge, self.rng)
-
-    def average(self, faulty_charges: list[Array]) -> Shares:
-        """Return the mean over several forms of a fault, for example over the electrode that has it."""
-        contact = np.tile(self.contact, (len(faulty_charges), 1))
-        return self.shares(contact, np.concatenate(faulty_charges))
-
-    def with_gain(self, *gains: float) -> list[Array]:
+    def with_gains(*gains: float) -> list[Array]:
         """Return the charges with one electrode's gain changed, for every gain and every electrode."""
-        count = self.clean_charge.shape[1]
-        return [self.clean_charge * (1.0 + (gain - 1.0) * unit) for gain in gains for unit in np.eye(count)]
+        return [clean * (1.0 + (gain - 1.0) * unit) for gain in gains for unit in np.eye(clean.shape[1])]
 
-    def swapped(self) -> Iterator[tuple[str, Array]]:
-        """Yield a name and the charges for every pair of electrodes that is swapped."""
-        names = self.predictor.metadata.electrodes
-        for first, second in combinations(range(len(names)), 2):
-            charge = self.clean_charge.copy()
-            charge[:, [first, second]] = charge[:, [second, first]]
-            yield f"{names[first]} and {names[second]} swapped", charge
+    # Charges of the presses with each fault. A fault may have several forms, for example at several electrodes.
+    faults = {"none": [clean]}
+    for percent in (1, 2, 5, 20):
+        faults[f"one gain {percent} % off"] = with_gains(1.0 - 0.01 * percent, 1.0 + 0.01 * percent)
+    faults["one electrode dead"] = with_gains(0.0)
+    names = predictor.metadata.electrodes
+    for first, second in combinations(range(len(names)), 2):
+        swapped = clean.copy()
+        swapped[:, [first, second]] = swapped[:, [second, first]]
+        faults[f"{names[first]} and {names[second]} swapped"] = [swapped]
+    faults["all turned by one place"] = [np.roll(clean, 1, axis=1), np.roll(clean, -1, axis=1)]
+    phase = rng.uniform(0.0, 2.0 * np.pi, presses)
+    faults["hum of 5 pC"] = [clean + HUM_pC * np.sin(phase)[:, None]]
+    for offset_pC in (10.0, 30.0):
+        faults[f"warmth of {offset_pC:g} pC"] = [clean + offset_pC, clean - offset_pC]
+    for name, forward_map in variants.items():
+        faults[name] = [with_electrodes(forward_map, sensor).charges(contact)]
+    results = {}
+    for name, charges in faults.items():
+        all_contacts = np.tile(contact, (len(charges), 1))
+        results[name] = answer_shares(predictor, all_contacts, np.concatenate(charges), rng)
 
-    def of_two_fingers(self) -> tuple[Array, Array]:
-        """Return contacts of the first finger and the charges of both.
-
-        The charges of two presses are added, which is exact for a taut film and approximate for a slack one.
-        """
-        second = draw_contacts(self.rng, len(self.contact), self.radius_mm, SECOND_FINGER_FORCE_N)
-        distance = np.linalg.norm((second - self.contact)[:, :2], axis=1)
-        apart = distance > SECOND_FINGER_DISTANCE_mm
-        charge = self.clean_charge[apart] + self.nominal.charges(second[apart])
-        return self.contact[apart], charge
-
-    def results(self) -> dict[str, Shares]:
-        """Return the shares of every fault, by its name."""
-        contact = self.contact
-        clean = self.clean_charge
-        results = {"none": self.shares(contact, clean)}
-        for percent in (1, 2, 5, 20):
-            change = 0.01 * percent
-            results[f"one gain {percent} % off"] = self.average(self.with_gain(1.0 - change, 1.0 + change))
-        results["one electrode dead"] = self.average(self.with_gain(0.0))
-        for name, charge in self.swapped():
-            results[name] = self.shares(contact, charge)
-        results["all turned by one place"] = self.average([np.roll(clean, 1, axis=1), np.roll(clean, -1, axis=1)])
-
-        clipped = (clean > CLIPPING_pC).any(axis=1)
-        results["clipped, no `[saturation]`"] = self.shares(contact[clipped], np.minimum(clean, CLIPPING_pC)[clipped])
-        phase = self.rng.uniform(0.0, 2.0 * np.pi, len(clean))
-        results["hum of 5 pC"] = self.shares(contact, clean + HUM_pC * np.sin(phase)[:, None])
-        for offset_pC in (10.0, 30.0):
-            results[f"warmth of {offset_pC:g} pC"] = self.average([clean + offset_pC, clean - offset_pC])
-        results["two fingers"] = self.shares(*self.of_two_fingers())
-        for name, forward_map in self.variants.items():
-            results[name] = self.shares(contact, forward_map.charges(contact))
-        return results
+    # Faults that only some of the presses have
+    clipped = (clean > CLIPPING_pC).any(axis=1)
+    clipped_charge = np.minimum(clean, CLIPPING_pC)[clipped]
+    results["clipped, no `[saturation]`"] = answer_shares(predictor, contact[clipped], clipped_charge, rng)
+    # The charges of two presses are added, which is exact for a taut film and approximate for a slack one.
+    second_contact = draw_contacts(rng, presses, radius_mm, SECOND_FINGER_FORCE_N)
+    apart = np.linalg.norm((second_contact - contact)[:, :2], axis=1) > SECOND_FINGER_DISTANCE_mm
+    charge_of_both = (clean + film.charges(second_contact))[apart]
+    results["two fingers"] = answer_shares(predictor, contact[apart], charge_of_both, rng)
+    return results
 
 
 @dataclass(frozen=True)
@@ -205,64 +177,46 @@ class RingShares(Shares):
     mirrored: float
 
 
-class WholeFilmStudy:
-    """Presses anywhere on the film of one released model.
+def whole_film_shares(model: str, presses: int, seed: int, edges_mm: Sequence[float]) -> dict[str, RingShares]:
+    """Measure the shares inside the working area of a model, of every ring outside it, of all rings, and of the film.
+
+    A ring that the working area covers is left out, and one that it covers in part begins at the edge of the area.
 
     Args:
         model: Name of the released model.
         presses: Number of presses in each ring.
         seed: Seed of the presses and the noise.
+        edges_mm: Radii that part the rings, ascending, mm.
     """
+    predictor = Predictor(model)
+    rng = np.random.default_rng(seed)
+    sensor = sensor_from_dict(predictor.metadata.sensor)
+    probe = parse_probe(predictor.metadata.probes[0])
+    radius_mm = round(math.sqrt(predictor.validity.inscribed_radius_squared_mm2), 3)
+    inner_map = with_fast_derivatives(ForwardMap.build(sensor, probe, radius_mm, FORCE_RANGE_N))
+    outer_map = whole_film_map(sensor, probe, FORCE_RANGE_N)
 
-    def __init__(self, model: str, presses: int, seed: int) -> None:
-        self.predictor = Predictor(model)
-        self.presses = presses
-        self.rng = np.random.default_rng(seed)
-        metadata = self.predictor.metadata
-        sensor = sensor_from_dict(metadata.sensor)
-        probe = parse_probe(metadata.probes[0])
-        self.radius_mm = round(math.sqrt(self.predictor.validity.inscribed_radius_squared_mm2), 3)
-        self.inner_map = with_fast_derivatives(ForwardMap.build(sensor, probe, self.radius_mm, FORCE_RANGE_N))
-        self.film_map = whole_film_map(sensor, probe, FORCE_RANGE_N)
-
-    def ring(self, inner_mm: float, outer_mm: float) -> RingShares:
+    def ring(inner_mm: float, outer_mm: float) -> RingShares:
         """Press a ring, and count what the model answers."""
-        reachable_mm = min(outer_mm, self.film_map.domain.radius)
-        contact = draw_contacts(self.rng, self.presses, reachable_mm, WHOLE_FILM_FORCES_N, inner_mm)
-        is_inside = np.hypot(contact[:, 0], contact[:, 1]) <= self.inner_map.domain.radius
-        clean_charge = self.film_map.charges(contact)
-        clean_charge[is_inside] = self.inner_map.charges(contact[is_inside])
-        shares = answer_shares(self.predictor, contact, clean_charge, self.rng)
-        is_mirrored = np.zeros(len(contact), dtype=bool)
-        is_mirrored[~is_inside] = has_mirror(self.inner_map, clean_charge[~is_inside], noise_model("reference"))
+        reachable_mm = min(outer_mm, outer_map.domain.radius)
+        contact = draw_contacts(rng, presses, reachable_mm, WHOLE_FILM_FORCES_N, inner_mm)
+        is_inside = np.hypot(contact[:, 0], contact[:, 1]) <= inner_map.domain.radius
+        charge = outer_map.charges(contact)
+        charge[is_inside] = inner_map.charges(contact[is_inside])
+        shares = answer_shares(predictor, contact, charge, rng)
+        is_mirrored = np.zeros(presses, dtype=bool)
+        is_mirrored[~is_inside] = has_mirror(inner_map, charge[~is_inside], noise_model("reference"))
         return RingShares(shares.flagged, shares.unnoticed, 100.0 * float(is_mirrored.mean()))
 
-    def rings(self, edges_mm: Sequence[float]) -> dict[str, RingShares]:
-        """Return the shares inside the working area, of every ring outside it, of all these rings, and of the film.
+    limits_mm = {"inside the working area": (0.0, radius_mm)}
+    for inner, outer in pairwise(edges_mm):
+        if outer > radius_mm:
+            limits_mm[f"{inner:g} to {outer:g} mm"] = (max(inner, radius_mm), outer)
+    results = {name: ring(*limits) for name, limits in limits_mm.items()}
 
-        A ring that the working area covers is left out, and one that it covers in part begins at the edge of the area.
-
-        Args:
-            edges_mm: Radii that part the rings, ascending, mm.
-        """
-        inside = self.ring(0.0, self.radius_mm)
-        results = {"inside the working area": inside}
-        outside = []
-        for inner, outer in pairwise(edges_mm):
-            if outer <= self.radius_mm:
-                continue
-            start = max(inner, self.radius_mm)
-            shares = self.ring(start, outer)
-            results[f"{inner:g} to {outer:g} mm"] = shares
-            outside.append((outer**2 - start**2, shares))
-        results["all outside the working area"] = weighted_mean(outside)
-        results["whole film"] = weighted_mean([(self.radius_mm**2, inside), *outside])
-        return results
-
-
-def weighted_mean(items: Sequence[tuple[float, RingShares]]) -> RingShares:
-    """Return the mean shares of rings, given with their weights."""
-    weights = [weight for weight, _ in items]
-    rows = [(shares.flagged, shares.unnoticed, shares.mirrored) for _, shares in items]
-    flagged, unnoticed, mirrored = np.average(rows, axis=0, weights=weights).tolist()
-    return RingShares(flagged, unnoticed, mirrored)
+    # The means over several rings are weighted by the areas of the rings.
+    areas = [outer**2 - inner**2 for inner, outer in limits_mm.values()]
+    rows = [list(vars(shares).values()) for shares in results.values()]
+    results["all outside the working area"] = RingShares(*np.average(rows[1:], axis=0, weights=areas[1:]).tolist())
+    results["whole film"] = RingShares(*np.average(rows, axis=0, weights=areas).tolist())
+    return results

@@ -10,7 +10,7 @@ from isocharge.simulate import Circle, load_sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 from isocharge.train import fit, release
 from kept import ROOT, kept
-from press_faults import FaultStudy, WholeFilmStudy, film_map
+from press_faults import fault_shares, film_map, whole_film_shares
 
 PAGE = (ROOT / "serve" / "docs" / "unnoticed.md").read_text("utf-8")
 
@@ -37,7 +37,7 @@ def column(table_name, model):
 @pytest.mark.first_cases(1)
 @pytest.mark.parametrize("model", ["three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial"])
 def test_shares_of_flagged_and_unnoticed_faults_are_those_of_the_page(model):
-    results = FaultStudy(model, kept(film_map), {}, PRESSES, SEED).results()
+    results = fault_shares(model, kept(film_map), {}, PRESSES, SEED)
     page = column("fault", model)
     for fault, shares in results.items():
         # Only presses with large charges reach the amplifier's limit, and too few of them are drawn here.
@@ -48,7 +48,7 @@ def test_shares_of_flagged_and_unnoticed_faults_are_those_of_the_page(model):
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["three-25um-biaxial", "four-25um-biaxial-15mm"])
 def test_shares_of_presses_on_the_whole_film_are_those_of_the_page(model):
-    rings = WholeFilmStudy(model, 500, SEED).rings((15.0, 20.0, 40.0, 43.0))
+    rings = whole_film_shares(model, 500, SEED, (15.0, 20.0, 40.0, 43.0))
     page = column("distance", model)
     for ring in ("inside the working area", "15 to 20 mm", "40 to 43 mm"):
         shares = rings[ring]
@@ -65,7 +65,7 @@ def test_a_trained_model_with_an_electrode_in_the_centre_notices_presses_anywher
     sensor = sensor_from_dict(table | {"name": "five"})
     dataset = simulated_presses(sensor, [Circle(1.0)], 8.0, (0.05, 2.0))
     model = release(fit(dataset), tmp_path / "five")
-    rings = WholeFilmStudy(str(model.folder), 500, SEED).rings((8.0, 15.0, 20.0, 30.0, 43.0))
+    rings = whole_film_shares(str(model.folder), 500, SEED, (8.0, 15.0, 20.0, 30.0, 43.0))
     assert rings["inside the working area"].flagged < 1.0
     assert rings["whole film"].unnoticed < 1.0
     _, share_of_four, _ = column("distance", "four-25um-biaxial")["whole film"]

@@ -14,7 +14,7 @@ from shared import arguments, print_shares
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from press_faults import FaultStudy, film_map, film_variants
+from press_faults import fault_shares, film_map, film_variants
 
 RELEASED = "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial"
 
@@ -24,9 +24,7 @@ def main() -> None:
     models = requested.models.split(",")
     nominal = film_map()
     variants = film_variants()
-    inside = {
-        model: FaultStudy(model, nominal, variants, requested.presses, requested.seed).results() for model in models
-    }
+    inside = {model: fault_shares(model, nominal, variants, requested.presses, requested.seed) for model in models}
     print_shares("flags", requested, "fault", inside)
 
 

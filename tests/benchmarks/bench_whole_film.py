@@ -16,7 +16,7 @@ from shared import arguments, print_shares
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from press_faults import WholeFilmStudy
+from press_faults import whole_film_shares
 
 RELEASED = (
     "three-25um-biaxial,four-25um-biaxial,four-25um-uniaxial,four-25um-biaxial-15mm,three-25um-biaxial-12mm,"
@@ -28,7 +28,7 @@ RING_EDGES_mm = (8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 43.0)
 def main() -> None:
     requested = arguments(__doc__, models=RELEASED, presses=2000, seed=1)
     models = requested.models.split(",")
-    results = {model: WholeFilmStudy(model, requested.presses, requested.seed).rings(RING_EDGES_mm) for model in models}
+    results = {model: whole_film_shares(model, requested.presses, requested.seed, RING_EDGES_mm) for model in models}
     print_shares("whole film", requested, "distance", results, empty="-")
 
 

@@ -280,11 +280,9 @@ def unknown_key(name: str, key: str, known: Iterable[str]) -> str:
         known: Names of the known keys.
     """
     known_keys = list(known)
-    known_text = cut(", ".join(known_keys))  # `cut` limits the length of a text
     similar_keys = difflib.get_close_matches(cut(key), known_keys, n=1)
-    if similar_keys:
-        return f"unknown key {shown(name)}; did you mean {similar_keys[0]!r}? Known are {known_text}"
-    return f"unknown key {shown(name)}; known are {known_text}"
+    advice = f"did you mean {similar_keys[0]!r}? Known are" if similar_keys else "known are"
+    return f"unknown key {shown(name)}; {advice} {cut(', '.join(known_keys))}"
 
 
 def _union_members(expected_type: Any) -> Iterator[Any]:
