@@ -1,5 +1,7 @@
 """Headers and encodings of other programs: the message shows the header and names the column, or the wrong byte."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -49,8 +51,9 @@ def test_headers_where_every_other_column_is_an_electrode(write):
     """A channel may have any name, but not one that stands for position or force."""
     assert read_presses(write("X_N,X_P,Y\n1,2,3")).electrodes == ("X_N", "X_P", "Y")
     assert read_presses(write(f"x_mm,y_mm,force_N,a,f,Ladung [pC]\n{ROW}")).electrodes == ("a", "f", "Ladung [pC]")
-    with pytest.raises(PressError, match=r"rename 'force \[N\]' to 'force_N' and check"):
-        read_presses(write(f"x_mm,y_mm,force [N],a,b,c\n{ROW}"))
+    for misspelt, name in (("force [N]", "force_N"), ("Temperature_C", "temperature_C")):
+        with pytest.raises(PressError, match=f"rename '{re.escape(misspelt)}' to '{name}' and check"):
+            read_presses(write(f"x_mm,y_mm,{misspelt},a,b,c\n{ROW}"))
 
 
 TEXT = f"# Größe\nx_mm,y_mm,force_N,A,B,C\n{ROW}"

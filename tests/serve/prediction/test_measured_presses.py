@@ -70,13 +70,6 @@ def test_a_list_of_presses_for_a_machine(tmp_path):
         read_press_list(tmp_path / "list.csv")
 
 
-def test_misspelt_temperature_is_no_electrode(tmp_path):
-    path = tmp_path / "presses.csv"
-    path.write_text(f"{HEADER},Temperature_C\n1,2,0.5,10,20,30,21.5\n")
-    with pytest.raises(PressError, match="temperature_C"):
-        read_presses(path)
-
-
 def test_empty_cells_are_unknown_values(read):
     presses = read(f"{HEADER}\n,,0.5,10,20,30\n1,2,,10,,30\n,,,10,20,30\n")
     nan = np.nan

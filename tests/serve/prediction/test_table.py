@@ -107,12 +107,6 @@ def test_rows_of_a_table_become_csv_and_records(film, predictor):
     assert records[3]["force_N"] == 0.0
 
 
-def test_noise_may_differ_between_electrodes():
-    corners = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
-    validity = Validity(corners, (0.1, 1.0), white_pC=(1.0, 10.0))
-    assert validity.is_touch(np.array([[20.0, 0.0], [0.0, 20.0]])).tolist() == [True, False]
-
-
 GOOD = Contact(1.0, -2.0, 0.5, 0.1, 0.1, 0.01, 0.3)
 
 
