@@ -350,19 +350,15 @@ class Validity:
         limit_pC = TOUCH_LIMIT * np.asarray(self.white_pC)
         return np.asarray((np.abs(charge_pC) > limit_pC).any(axis=1))
 
-    @property
-    def is_centred(self) -> bool:
-        """Whether the centre of the working area is close to the origin."""
-        return math.hypot(*self.centre_mm) < MAX_CENTRE_OFFSET * self.radius_mm
-
     @cached_property
     def area_text(self) -> str:
         """Description of the working area for messages.
 
         The text states the radius of the area if its centre is close to the origin, and its bounding box otherwise.
         """
-        if self.is_centred:
-            return f"up to {self.radius_mm:.3g} mm"
+        is_centred = math.hypot(*self.centre_mm) < MAX_CENTRE_OFFSET * self.radius_mm
+        if is_centred:
+            return f"up to {self.radius_mm:.3g} mm from the centre"
         # The limits are the corners of the bounding box of the working area.
         left_mm, bottom_mm = self.corners_mm.min(axis=0)
         right_mm, top_mm = self.corners_mm.max(axis=0)

@@ -356,10 +356,9 @@ def _exclusion_notes(errors: PressErrors, validity: Validity) -> Iterator[str]:
         validity: The working area and the range of forces of the model.
     """
     min_force_N, max_force_N = validity.force_range_N
-    area = f"{validity.area_text} from the centre" if validity.is_centred else validity.area_text
     domain = (
-        f"outside the model's working area ({area}) or forces ({min_force_N:.3g} to {max_force_N:.3g} N); if these "
-        "are most, look at the units"
+        f"outside the model's working area ({validity.area_text}) or forces ({min_force_N:.3g} to {max_force_N:.3g} N)"
+        "; if these are most, look at the units"
     )
     reasons = errors.exclusion_reasons
     for reason in sorted(set(reasons.tolist()) - {""}):  # a press that is compared has an empty reason
