@@ -149,11 +149,14 @@ def parse_json(text: str | bytes, where: str, error_class: type[InputError], tar
         error_class: If the text is not JSON, or its content is wrong.
     """
     try:
-        try:
-            return msgspec.json.decode(text, type=target_type)
-        except msgspec.ValidationError:  # the beginning is JSON with wrong content, but the end may not be JSON
-            content = msgspec.json.decode(text)
-    except (ValueError, RecursionError) as cause:
+        return msgspec.json.decode(text, type=target_type)
+    except (ValueError, RecursionError) as decoding_error:
+        cause = decoding_error  # the name after `as` exists only in this clause
+
+    # The text is either not JSON, or JSON with wrong content. Decoding without a type distinguishes the two cases.
+    try:
+        content = msgspec.json.decode(text)
+    except (ValueError, RecursionError):
         raise error_class(f"{_prefix(where)}expected JSON, got {shown(text)} ({cut(str(cause))})") from cause
     return convert(content, target_type, where, error_class)
 
