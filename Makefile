@@ -120,7 +120,7 @@ release: $(VENV)/installed
 	$(BIN)/isocharge train fit --sensor eight-25um-biaxial --radius 15 -o models/eight-25um-biaxial
 	$(BIN)/isocharge train fit --sensor six-25um-biaxial-30mm --radius 30 -o models/six-25um-biaxial-30mm
 	$(BIN)/isocharge train fit --sensor eight-25um-biaxial-36mm --radius 36 -o models/eight-25um-biaxial-36mm
-	$(BIN)/isocharge train fit three-25um-biaxial --config train/configs/student.toml -o models/three-25um-biaxial-student
+	$(BIN)/isocharge train fit --sensor three-25um-biaxial --config train/configs/student.toml -o models/three-25um-biaxial-student
 	$(BIN)/isocharge train fit --sensor four-25um-biaxial --radius auto --config train/configs/student.toml -o models/four-25um-biaxial-student
 
 # Speed against error of the released models: report/report.md. Nothing else should run meanwhile.

@@ -23,13 +23,7 @@ from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError, ModelError, OutputError, OutputExists
 from isocharge.serve import read_presses
 from isocharge.serve.model.model_folder import check_target
-from isocharge.simulate import (
-    Dataset,
-    built_in_sensors,
-    load_sensor,
-    parse_probe,
-    read_dataset,
-)
+from isocharge.simulate import Sensor, load_sensor, parse_probe, read_dataset
 from isocharge.train import FitConfig, Fitted, TrainingConfig, TrainingData, fit, fit_presses, load_config, release
 from isocharge.train.data.channel_noise import misfit_noise
 from isocharge.train.data.presses import is_measured, measured_presses_of
@@ -50,10 +44,10 @@ def fit_command(
     dataset: Annotated[
         Path | None,
         typer.Argument(
-            metavar="DATASET|PRESSES.csv|SENSOR",
+            metavar="DATASET|PRESSES.csv",
             help="A dataset folder of `isocharge simulate sweep` or of measured presses, or a CSV file of measured "
             "presses with the columns x_mm, y_mm, force_N and the names of the channels (pC). The file needs 500 or "
-            "more presses. A SENSOR is the same as --sensor SENSOR alone. (default: --sensor)",
+            "more presses. (default: --sensor)",
         ),
     ] = None,
     sensor: Annotated[
@@ -79,25 +73,23 @@ def fit_command(
 ) -> None:
     """Train a network on charges, measure its errors, and write a model folder: ONNX file, card, golden vectors.
 
-    The presses come from DATASET. With a SENSOR and no DATASET, presses are simulated first. The option --probe states
-    the probes of the simulated presses, and --radius states their largest distance from the centre.
+    The presses come from DATASET. With --sensor, presses are simulated first. The option --probe states the probes of
+    the simulated presses, and --radius states their largest distance from the centre.
 
     With measured presses, a network is trained on the presses alone. Any sensor with 3 to 32 channels is
     possible. Each column of the file whose name has no other meaning is a channel. The errors are measured by
     cross-validation, in which all presses at a place are left out together. If a sensor file describes the film,
     `isocharge train calibrate` needs far fewer presses.
 
-    Example: isocharge train fit three-25um-biaxial -o models/three-25um-biaxial
+    Example: isocharge train fit --sensor three-25um-biaxial -o models/three-25um-biaxial
 
     Example: isocharge train fit presses.csv -o models/pad
     """
-    if dataset is not None and _is_sensor(dataset):
-        if sensor is not None:
-            raise InputError(f"expected one sensor, got {dataset} and --sensor {sensor}; leave one of them out")
-        sensor = str(dataset)
-        dataset = None
     if dataset is not None and not dataset.exists():
-        raise InputError(f"{dataset}: expected a dataset folder or a file of measured presses; there is neither")
+        raise InputError(
+            f"{dataset}: expected a dataset folder or a file of measured presses; there is neither. The option "
+            "--sensor names a sensor"
+        )
     if dataset is not None and sensor is not None:
         if dataset.is_dir():
             raise InputError("expected either a DATASET folder or --sensor SENSOR, got both; leave one of them out")
@@ -111,17 +103,25 @@ def fit_command(
     train: Callable[[FitConfig], Fitted]
     if sensor is not None:
         _refuse_options(context, "simulated presses", "probe", "radius")
-        electrodes = load_sensor(sensor).electrode_names
-        train = partial(_fit_simulated_presses, sensor, probe or [DEFAULT_PROBE], radius)
+        described_sensor = load_sensor(sensor)
+        electrodes = described_sensor.electrode_names
+        train = partial(_fit_simulated_presses, described_sensor, probe or [DEFAULT_PROBE], radius)
     elif dataset is None:
-        raise InputError("expected either a DATASET folder or a SENSOR, got neither")
+        raise InputError("expected either a DATASET folder or --sensor SENSOR, got neither")
     elif dataset.is_dir():
         _refuse_options(context, "a dataset folder")
         loaded_dataset = read_dataset(dataset)
         electrodes = loaded_dataset.sensor.electrode_names
         if is_measured(loaded_dataset):
             _refuse_settings(config, fit_config)
-        train = partial(_fit_dataset, loaded_dataset)
+            presses = measured_presses_of(loaded_dataset)
+            probes = loaded_dataset.samples.probes
+            train = partial(fit_presses, presses, loaded_dataset.sensor.name, probes=probes)
+        else:
+            training_data = TrainingData.of(loaded_dataset)
+            if training_data.yield_force_N is not None:
+                say(f"caution: PVDF yields beyond {training_data.yield_force_N:g} N, and a dent stays")
+            train = partial(fit, training_data)
     else:  # a file or a pipe
         _refuse_options(context, "measured presses", "probe", "position_std_mm", "force_std")
         _refuse_settings(config, fit_config)
@@ -196,36 +196,18 @@ def _release(fitted: Fitted, version_folder: Path) -> Release:
         raise type(error)(f"{error}. The trained model is kept in {kept.folder}") from error
 
 
-def _is_sensor(argument: Path) -> bool:
-    """Return whether an argument is the name of a built-in sensor or a sensor file, and not a dataset or presses."""
-    is_built_in = str(argument) in built_in_sensors() and not argument.exists()
-    return is_built_in or argument.suffix.lower() == ".toml"
-
-
-def _fit_simulated_presses(sensor_name: str, notations: Sequence[str], radius: str, config: FitConfig) -> Fitted:
+def _fit_simulated_presses(sensor: Sensor, notations: Sequence[str], radius: str, config: FitConfig) -> Fitted:
     """Train a network on presses that are simulated on a sensor.
 
     Args:
-        sensor_name: Name or file of the sensor.
+        sensor: The sensor.
         notations: Notations of the probes.
         radius: Largest distance of a press from the centre: a number of mm, or "auto".
         config: Training settings.
     """
-    sensor = load_sensor(sensor_name)
     probes = [parse_probe(notation) for notation in notations]
     warn_of_stress(sensor.film, probes, DEFAULT_FORCE_RANGE[1])
     noise = misfit_noise(config.training.noise_model)
     with solving_executor(sensor.film) as executor:
         radius_mm = sweep_radius(radius, sensor, probes, DEFAULT_FORCE_RANGE, executor, noise)
-    return fit(TrainingData.of(simulated_presses(sensor, probes, radius_mm, DEFAULT_FORCE_RANGE)), config)
-
-
-def _fit_dataset(dataset: Dataset, config: FitConfig) -> Fitted:
-    """Train a network on the simulated or the measured presses of a dataset."""
-    if is_measured(dataset):
-        presses = measured_presses_of(dataset)
-        return fit_presses(presses, dataset.sensor.name, config, probes=dataset.samples.probes)
-    data = TrainingData.of(dataset)
-    if data.yield_force_N is not None:
-        say(f"caution: PVDF yields beyond {data.yield_force_N:g} N, and a dent stays")
-    return fit(data, config)
+    return fit(simulated_presses(sensor, probes, radius_mm, DEFAULT_FORCE_RANGE), config)
