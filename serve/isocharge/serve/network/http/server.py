@@ -51,7 +51,6 @@ class Connection(HttpToolsProtocol):
         self._traffic = traffic
         self._is_reading = False  # whether a request has begun and is not complete
         self._pending_bytes = 0  # bytes since the latest complete head, part of a body, or complete request
-        self._refusal: Any = None  # status and reason of a refusal that follows the responses to earlier requests
 
     def connection_made(self, transport: Any) -> None:
         """Begin the connection. If there are too many connections, end one that waits for a request.
@@ -86,30 +85,26 @@ class Connection(HttpToolsProtocol):
         twice as long.
         """
         limit = self._limits.header_bytes
-        while data and not (self._refusal or self.transport.is_closing()):
+        while data and not self.transport.is_closing():
             size = limit + 1 - self._pending_bytes  # so many bytes of a head show that it is too long
             self._pending_bytes += len(data[:size])
             super().data_received(data[:size])
             data = data[size:]
             if self._pending_bytes > limit:
                 self.refuse(431, f"the request line and headers are longer than {limit} bytes")
+                return
 
     def eof_received(self) -> bool:  # type: ignore[override]
         """Keep the connection open until all complete requests are answered, although the client sends no more data."""
-        has_open_request = self.cycle is not None and not self.cycle.response_complete and not self.cycle.more_body
-        if has_open_request:
-            self.cycle.keep_alive = False  # the latest response closes the connection
         # With TLS, both directions can only be closed together.
-        return has_open_request and self.scheme == "http"
+        return self._close_after_responses() and self.scheme == "http"
 
     def on_message_begin(self) -> None:
         """Begin a request, and refuse it if too many requests wait for the response to an earlier request."""
+        if len(self.pipeline) >= self._limits.queued_requests:
+            raise httptools.HttpParserError  # uvicorn calls `send_400_response`; the parser ignores all later data
         self._is_reading = True
         self.deadline = self.loop.time() + self._limits.header_seconds
-        max_waiting = self._limits.queued_requests
-        if len(self.pipeline) >= max_waiting:
-            self.refuse(429, f"more than {max_waiting} requests wait; read the responses first")
-            raise httptools.HttpParserError  # the parser ignores the rest of the received data
         super().on_message_begin()
 
     def on_headers_complete(self) -> None:
@@ -148,6 +143,19 @@ class Connection(HttpToolsProtocol):
         else:
             self.transport.abort()
 
+    def _close_after_responses(self) -> bool:
+        """Let the response to the latest complete request close the connection.
+
+        Returns:
+            Whether there is such a request that is not answered yet.
+        """
+        cycle = self.cycle
+        is_owed = cycle is not None and not (cycle.response_complete or cycle.more_body or cycle.disconnected)
+        if is_owed:
+            cycle.keep_alive = False
+            self.deadline = math.inf
+        return is_owed
+
     def refuse_unanswered(self) -> None:
         """Refuse the open request because the server stops, unless its response has begun."""
         if self.cycle is not None and not self.cycle.response_started:
@@ -161,19 +169,14 @@ class Connection(HttpToolsProtocol):
     def refuse(self, status: int, message: str) -> None:
         """Send a refusal as the last response of the connection, and count it.
 
-        If earlier requests are complete, the refusal follows their responses, and later data are ignored. If the body
-        of the refused request has begun, or the server has stopped, the refusal is sent at once.
+        If earlier, complete requests are not answered yet, their responses are the last ones, and the refusal is not
+        sent. If the body of the refused request has begun, or the server has stopped, the refusal is sent at once.
 
         Args:
             status: HTTP status.
             message: Reason of the refusal.
         """
-        if self.transport.is_closing():
-            return
-        cycle = self.cycle
-        if cycle is not None and not (cycle.response_complete or cycle.more_body or cycle.disconnected):
-            self._refusal = self._refusal or (status, message)
-            self.deadline = math.inf
+        if self.transport.is_closing() or self._close_after_responses():
             return
         response = json_response({"error": message}, status)
         exchange = Exchange("http", "none", status, bytes_out=len(response.body), client=self.client)
@@ -182,12 +185,6 @@ class Connection(HttpToolsProtocol):
         self.transport.write(STATUS_LINE[status] + headers + b"connection: close\r\n\r\n" + response.body)
         self.transport.close()
         self.deadline = self.loop.time() + self._limits.header_seconds
-
-    def on_response_complete(self) -> None:
-        """Begin to answer the next request that waits. If none waits, send the refusal, if there is one."""
-        if self._refusal and not self.pipeline:
-            self.refuse(*self._refusal)
-        super().on_response_complete()
 
 
 class HttpServer:
