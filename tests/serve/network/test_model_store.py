@@ -20,12 +20,12 @@ from prometheus_client import generate_latest
 from infer_requests import BODY, INFER
 from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.serve.network.browser_check import AccessCheck
-from isocharge.serve.network.grpc.service import SERVICE
 from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol.handler import Handler
 from isocharge.serve.network.protocol.routes import ROUTES
 from model_files import put_graph
+from serve.network.grpc.test_service import call
 from serve.network.http.test_server import exchange
 
 
@@ -127,9 +127,9 @@ def test_load_and_unload_add_and_remove_versions(film, store, folder):
 
 @pytest.mark.parametrize("name", ["", "..", "linear/1", "../models/linear", "/"])
 def test_model_name_is_not_taken_as_a_path(store, name):
-    for call in (store.get, store.load, store.unload):
+    for method in (store.get, store.load, store.unload):
         with pytest.raises(ModelNotFound):
-            call(name)
+            method(name)
 
 
 SECRET = 'open "sesame"'
@@ -210,11 +210,10 @@ def test_log_has_a_line_for_each_grpc_call(app, lines, start_grpc):
         start_grpc(app) as url,
         grpc.insecure_channel(url.removeprefix("grpc://")) as channel,
     ):
-        ask = {name: channel.unary_unary(f"/{SERVICE}/{name}") for name in ("ModelReady", "ModelInfer")}
-        ask["ModelReady"](b"\x0a\x06linear\x12\x011", metadata=with_secret, timeout=20)
+        call(channel, "ModelReady", with_secret, name="linear", version="1")
         for metadata in (with_secret, []):
             with pytest.raises(grpc.RpcError):
-                ask["ModelInfer"](b"\x0a\x06linear", metadata=metadata, timeout=20)
+                call(channel, "ModelInfer", metadata, model_name="linear")
     logged = [(line["route"], line["status"], line["model"], line["error"]) for line in map(json.loads, lines)]
     assert logged == [
         ("ModelReady", "OK", "linear/1", None),

@@ -65,8 +65,6 @@ ROUTES = [(route.method, path.format(model="linear", version="1")) for route in 
 
 @pytest.mark.parametrize(("method", "path"), ROUTES)
 def test_every_route_answers_its_method_only(ask, method, path):
-    needs_charges = path.endswith("/infer")
-    assert ask(method, path)[0] == (400 if needs_charges else 200)
     answer = ask("DELETE", path)
     assert refusal(answer) == (405, f"{path}: expected the method {method}, got DELETE")
     assert answer[1]["allow"] == method
