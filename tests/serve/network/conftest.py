@@ -1,11 +1,9 @@
 """Fixtures with certificates for servers and clients on this machine."""
 
-import asyncio
 from contextlib import contextmanager
-from threading import Thread
 
 import pytest
-import uvloop
+from anyio.from_thread import start_blocking_portal
 
 from isocharge.serve.network.grpc.server import grpc_server
 
@@ -27,20 +25,10 @@ def start_grpc():
 
     @contextmanager
     def start(handler, **settings):
-        loop = uvloop.new_event_loop()
-        thread = Thread(target=loop.run_forever)
-        thread.start()
-        server = grpc_server(handler, "127.0.0.1", 0, **settings)
-        try:
-            url = asyncio.run_coroutine_threadsafe(server.__aenter__(), loop).result()
-            try:
-                yield url
-            finally:
-                asyncio.run_coroutine_threadsafe(server.__aexit__(None, None, None), loop).result()
-        finally:
-            asyncio.run_coroutine_threadsafe(loop.shutdown_default_executor(), loop).result()
-            loop.call_soon_threadsafe(loop.stop)
-            thread.join()
-            loop.close()
+        with (
+            start_blocking_portal(backend_options={"use_uvloop": True}) as portal,
+            portal.wrap_async_context_manager(grpc_server(handler, "127.0.0.1", 0, **settings)) as url,
+        ):
+            yield url
 
     return start

@@ -156,7 +156,6 @@ def with_data(text):
 
 BAD = {
     "nothing": (b"", 400, "expected JSON, got b''"),
-    "no JSON": (b"{", 400, "expected JSON, got"),
     "NaN": (with_data(b"[1,NaN,3]"), 400, "expected JSON, got .*NaN"),
     "beyond float64": (
         with_data(b"[1,1e999,3]"),

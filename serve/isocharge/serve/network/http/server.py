@@ -252,8 +252,7 @@ class HttpServer:
                 await contexts.enter_async_context(beside or nullcontext())
                 await self._server.serve([self._socket])
 
-        with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-            runner.run(serve())
+        uvloop.run(serve())
 
     def stop(self) -> None:
         """End the method `run` as soon as the open requests are finished or, if called again, without finishing them.
