@@ -1,7 +1,6 @@
 """`isocharge serve http` as a user meets it: addresses on stdout, words on stderr, clear refusals, a clean end."""
 
 import json
-import shutil
 import signal
 import socket
 
@@ -63,11 +62,9 @@ def test_killed_server_can_be_started_again_on_the_same_port(start):
     assert send(url, "POST", INFER, BODY)[0] == 200
 
 
-def test_http_command_refuses_wrong_options_and_models(refused, models, tmp_path):
+def test_http_command_refuses_wrong_options_and_models(refused, film, models, tmp_path):
     (tmp_path / "empty").mkdir()
-    (tmp_path / "damaged").mkdir()
-    shutil.copytree(models / "linear", tmp_path / "damaged/linear")
-    (tmp_path / "damaged/linear/1/golden.json").write_text("{")
+    (film.write(tmp_path / "damaged") / "golden.json").unlink()
     (tmp_path / "cert.pem").write_text("no certificate")
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

@@ -9,8 +9,6 @@ import tritonclient.http
 from google.protobuf.json_format import MessageToDict
 from tritonclient.utils import InferenceServerException
 
-from isocharge.serve import Predictor
-
 
 @pytest.fixture(params=(tritonclient.http, tritonclient.grpc), ids=("http", "grpc"))
 def module(request):
@@ -40,16 +38,16 @@ def tensor(module, values):
     return made
 
 
-def expected(tmp_path, values):
+def expected(predictor, values):
     """Return the outputs that the same model computes in this process."""
-    columns = np.column_stack(Predictor(tmp_path / "models/linear").predict_batch(values))
+    columns = np.column_stack(predictor.predict_batch(values))
     return {"contact": columns[:, :3], "contact_std": columns[:, 3:6], "misfit": columns[:, 6:7]}
 
 
-def test_tritonclient_infer_with_defaults(client, module, film, tmp_path):
+def test_tritonclient_infer_with_defaults(client, module, film, predictor):
     values = charges(film)
     answer = client.infer("linear", [tensor(module, values)], request_id="press 7")
-    for name, rows in expected(tmp_path, values).items():
+    for name, rows in expected(predictor, values).items():
         np.testing.assert_array_equal(answer.as_numpy(name), rows)
     response = plain(answer.get_response())
     assert (response["id"], response["model_version"]) == ("press 7", "2")
@@ -57,18 +55,17 @@ def test_tritonclient_infer_with_defaults(client, module, film, tmp_path):
 
 @pytest.mark.parametrize("n", [1, 5])
 @pytest.mark.parametrize("binary", [True, False])
-def test_tritonclient_output_flags(client, module, tmp_path, n, binary):
+def test_tritonclient_output_flags(client, module, predictor, n, binary):
     """The flags equal those computed in this process, for a press far outside and for charges that no press gives."""
     values = np.resize(np.float32([[800.0, 10.0, 10.0], [-3.0, 900.0, 900.0], [800.0, 800.0, 800.0]]), (n, 3))
     options = {} if module is tritonclient.grpc else {"binary_data": binary}
     outputs = [module.InferRequestedOutput(name, **options) for name in ("flags", "contact")]
     answer = client.infer("linear", [tensor(module, values)], outputs=outputs)
-    touch = Predictor(tmp_path / "models/linear")
-    expected_words = [",".join(words) for words in touch.validity.batch_flags(touch.predict_batch(values))]
+    expected_words = [",".join(words) for words in predictor.validity.batch_flags(predictor.predict_batch(values))]
     flags = [text.decode() if isinstance(text, bytes) else text for text in answer.as_numpy("flags")[:, 0]]
     assert flags == expected_words
     assert any(flags)
-    np.testing.assert_array_equal(answer.as_numpy("contact"), expected(tmp_path, values)["contact"])
+    np.testing.assert_array_equal(answer.as_numpy("contact"), expected(predictor, values)["contact"])
 
 
 def test_tritonclient_repository_index_unload_and_load(client, module, film):
@@ -122,7 +119,7 @@ def test_tritonclient_statistics(client, module, film):
     assert len(plain(client.get_inference_statistics()).popitem()[1]) == 2
 
 
-def test_tritonclient_stream_infer(handler, film, tmp_path, start_grpc):
+def test_tritonclient_stream_infer(handler, film, predictor, start_grpc):
     values = charges(film)
     answers = []
     with start_grpc(handler) as url:
@@ -134,7 +131,7 @@ def test_tritonclient_stream_infer(handler, film, tmp_path, start_grpc):
         client.close()
     assert [error is None for _, error in answers] == [True, False, True]
     assert "is not found" in str(answers[1][1])
-    np.testing.assert_array_equal(answers[2][0].as_numpy("contact"), expected(tmp_path, values)["contact"])
+    np.testing.assert_array_equal(answers[2][0].as_numpy("contact"), expected(predictor, values)["contact"])
     counted = handler.answer("GET", "/metrics", [], b"").body
     for status, count in (("OK", 2), ("NOT_FOUND", 1)):
         line = f'{{route="ModelStreamInfer message",status="{status}",transport="grpc"}} {count}.0'

@@ -102,14 +102,14 @@ def binary_request(charges, **changes):
 def test_optional_fields_may_be_null(ask):
     """Older clients of KServe send null for every field that is not given."""
     null_parameters = dict.fromkeys(["binary_data", "binary_data_output", "binary_data_size", "classification"])
-    fields = {"id": None, "outputs": None, "parameters": None}
-    body = infer_request([[1.0, 2.0, 3.0]])
+    body = infer_request()
     expected = ask("POST", INFER, orjson.dumps(body))
     for parameters in (None, null_parameters):
         body["inputs"][0]["parameters"] = parameters
-        assert ask("POST", INFER, orjson.dumps(body | fields | {"parameters": parameters})) == expected
-        outputs = [{"name": "contact", "parameters": parameters}]
-        assert ask("POST", INFER, orjson.dumps(body | {"outputs": outputs}))[0] == 200
+        body |= {"id": None, "outputs": None, "parameters": parameters}
+        assert ask("POST", INFER, orjson.dumps(body)) == expected
+        body["outputs"] = [{"name": "contact", "parameters": parameters}]
+        assert ask("POST", INFER, orjson.dumps(body))[0] == 200
     assert ask("POST", "/v2/repository/index", b'{"ready": null}')[0] == 200
     assert ask("POST", "/v2/repository/models/linear/load", b'{"parameters": null}')[0] == 200
 
@@ -231,10 +231,9 @@ def test_binary_data_of_another_size_is_refused(ask, changes, spoil, message):
     assert message in error
 
 
-def test_output_that_is_not_finite_is_null(ask, bare):
+def test_output_that_is_not_finite_is_null(ask):
     """The model of the test divides by the sum of the charges. The OpenAPI document allows null instead of NaN."""
     status, _, body = ask("POST", INFER, orjson.dumps(infer_request([[0.0, 0.0, 0.0]])))
-    np.testing.assert_array_equal(bare([[0.0, 0.0, 0.0]])["contact"].ravel(), [np.nan, np.nan, 0.0])
     assert (status, orjson.loads(body)["outputs"][0]["data"]) == (200, [None, None, 0.0])
     schema = orjson.loads(ask("GET", "/openapi.json")[2])["components"]["schemas"]["answer"]
     jsonschema_rs.Draft202012Validator(schema).validate(orjson.loads(body))
