@@ -30,8 +30,11 @@ def encode_layout(layout, frame):
     values |= dict(zip(layout.columns.names, frame.values, strict=True))
     numbers = [packed_number(field, values[field.name], layout.byte_order) for field in layout.fields]
     data = bytearray(layout.sync + layout.body.pack(*numbers))
-    for position, constant in layout.constants:
-        data[position : position + len(constant)] = constant
+    position = len(layout.sync)
+    for field in layout.fields_and_padding:
+        if field.value:
+            data[position : position + field.size] = bytes.fromhex(field.value)
+        position += field.size
     return bytes(data) + layout.compute_checksum(bytes(data))
 
 

@@ -30,6 +30,7 @@ delimiters are dropped if they are not an intact frame. In a datagram, only the 
 length of the datagram is wrong.
 """
 
+import re
 import struct
 from functools import cached_property
 from typing import Annotated, Any, Final, Literal
@@ -258,18 +259,16 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         return tuple((position, field.is_signed) for position, field in enumerate(self.fields) if field.size == 3)
 
     @cached_property
-    def constants(self) -> tuple[tuple[int, bytes], ...]:
-        """Constant bytes that every frame contains after the sync pattern, and the position of these bytes.
+    def body_pattern(self) -> re.Pattern[bytes]:
+        """Regular expression of the bytes between the sync pattern and the checksum.
 
-        Constant bytes are padding for which the device file states a `value`.
+        Padding for which the device file states a `value` must have this value. All other bytes are arbitrary.
         """
-        constants = []
-        position = len(self.sync)  # the first field follows the sync pattern
-        for part in self.fields_and_padding:
-            if part.value:
-                constants.append((position, bytes.fromhex(part.value)))
-            position += part.size
-        return tuple(constants)
+        patterns = [
+            re.escape(bytes.fromhex(field.value)) if field.value else b".{%d}" % field.size
+            for field in self.fields_and_padding
+        ]
+        return re.compile(b"".join(patterns), re.DOTALL)
 
     def compute_checksum(self, frame_without_checksum: bytes) -> bytes:
         """Return the checksum of a frame as bytes in the order in which they are sent.
@@ -301,9 +300,8 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         checksum_start = self.length - self.selected_checksum.size
         if has_checksum and self.compute_checksum(data[:checksum_start]) != data[checksum_start:]:
             raise ChecksumError("the checksum is wrong")
-        for position, constant in self.constants:
-            if not data.startswith(constant, position):
-                raise ValueError(f"the constant at byte {position} is wrong")
+        if not self.body_pattern.match(data, len(self.sync)):
+            raise ValueError("a constant byte is wrong")
         numbers: list[Any] = list(self.body.unpack_from(data, len(self.sync)))
         for position, is_signed in self.three_byte_fields:  # `struct` has unpacked these fields as bytes
             numbers[position] = int.from_bytes(numbers[position], self.byte_order, signed=is_signed)

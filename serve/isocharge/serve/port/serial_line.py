@@ -49,63 +49,6 @@ class Request:
     rate_Hz: float = 100.0
 
 
-class Requester:
-    """Scheduler of the requests to a board, which also removes the echoes of the requests from received bytes."""
-
-    def __init__(self, request: Request) -> None:
-        """Store the request that the board needs for each frame, and make the first request due at once."""
-        self._request = request
-        self.reset()
-
-    def reset(self) -> None:
-        """Make the next request due at once, for example because the line was opened again."""
-        self._requested_s = -float("inf")  # time of the latest request
-        self._received_s = -float("inf")  # time of the latest received byte
-        self._expects_echo = False  # whether the next bytes may be an echo of the request
-        self._kept_bytes = b""  # first bytes after the request, which may be the beginning of its echo
-
-    def wait_s(self) -> float:
-        """Return the time until the next request is due, s, or 0 if a request is due now.
-
-        At least 1 / `rate_Hz` must pass between two requests. After a request without an answer, also at least
-        `REPEAT_TIME_s` must pass. After the latest received byte, also at least `QUIET_TIME_s` must pass.
-        """
-        now_s = time.monotonic()
-        due_s = self._requested_s + 1.0 / self._request.rate_Hz
-        is_unanswered = self._received_s < self._requested_s
-        if is_unanswered:
-            due_s = max(due_s, self._requested_s + REPEAT_TIME_s)
-        quiet_end_s = self._received_s + QUIET_TIME_s  # bytes of the answer may arrive until then
-        return max(0.0, due_s - now_s, quiet_end_s - now_s)
-
-    def next_request(self) -> bytes:
-        """Return the bytes of the next request, which the caller must send now."""
-        self._requested_s = time.monotonic()
-        self._expects_echo = True
-        self._kept_bytes = b""
-        return self._request.data
-
-    def remove_echo(self, received: bytes) -> bytes:
-        """Return the received bytes without the echo of the request.
-
-        The echo consists of the same bytes as the request, and may arrive in several parts. Bytes that may be the
-        beginning of an echo are kept back. If later bytes differ from the request, the kept bytes are returned, too.
-
-        Args:
-            received: Bytes that arrived after the latest request; may be empty.
-        """
-        if received:
-            self._received_s = time.monotonic()
-        if not self._expects_echo:
-            return received
-        self._kept_bytes += received
-        request = self._request.data
-        if request != self._kept_bytes and request.startswith(self._kept_bytes):
-            return b""
-        self._expects_echo = False
-        return self._kept_bytes.removeprefix(request)
-
-
 MAX_READ_BYTES = 65536
 """Largest number of bytes that are read at the same time, and after which no waiting bytes are added to a chunk.
 
@@ -146,6 +89,9 @@ class SerialLine:
     Many boards restart when the signal DTR of the port rises. The operating system sets the signal when a port is
     opened. If possible, the signal remains set when the line is closed, so that the next opening does not restart the
     board.
+
+    Attributes:
+        is_stream: Whether bytes may still wait after `receive`. They continue the bytes that were received before.
     """
 
     def __init__(self, url: str, baud: int) -> None:
@@ -173,6 +119,7 @@ class SerialLine:
         self._descriptor: int | None = None
         with suppress(AttributeError, io.UnsupportedOperation):
             self._descriptor = int(self._serial.fileno())
+        self.is_stream = self._descriptor is not None  # pyserial returns all bytes that have arrived
         if self._descriptor is not None and os.isatty(self._descriptor):
             _keep_ready_signal(self._descriptor)
 
@@ -216,12 +163,6 @@ class SerialLine:
             raise OSError("it is readable and has no data: it was unplugged, or the other end has closed")
         return data
 
-    def receive_waiting(self) -> bytes:
-        """Return the bytes that have already arrived; empty if there are none, or if pyserial reads the line."""
-        if self._descriptor is None:  # `_receive_by_pyserial` returns all bytes that have arrived
-            return b""
-        return self.receive(0.0)
-
     def _receive_by_pyserial(self, timeout_s: float) -> bytes:
         """Receive bytes from a line without a file descriptor.
 
@@ -239,6 +180,98 @@ class SerialLine:
         return data
 
 
+class Requester:
+    """Line to a board that sends a frame only on request. It sends the requests, and removes their echoes.
+
+    Attributes:
+        is_stream: Always False, because such a board sends nothing more before the next request.
+    """
+
+    is_stream = False
+
+    def __init__(self, line: SerialLine, request: Request) -> None:
+        """Make the first request due at once.
+
+        Args:
+            line: The open line to the board.
+            request: Request that the board needs for each frame.
+        """
+        self._line = line
+        self._request = request
+        self._requested_s = -float("inf")  # time of the latest request
+        self._received_s = -float("inf")  # time of the latest received byte
+        self._expects_echo = False  # whether the next bytes may be an echo of the request
+        self._kept_bytes = b""  # first bytes after the request, which may be the beginning of its echo
+
+    def receive(self, timeout_s: float) -> bytes:
+        """Send requests whenever they are due until an answer arrives, and return the answer.
+
+        Args:
+            timeout_s: Longest time to wait, s.
+
+        Returns:
+            The answer; empty if no answer arrives in time.
+
+        Raises:
+            READ_ERRORS: If the line disappears.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        while (remaining_s := deadline_s - time.monotonic()) > 0.0:
+            if self.wait_s() == 0.0:
+                self._line.write(self.next_request())
+            # Wait for bytes, at most until the next request is due or the timeout has passed.
+            received = self._line.receive(min(self.wait_s(), remaining_s))
+            answer = self.remove_echo(received)
+            if answer:
+                return answer
+        return b""
+
+    def close(self) -> None:
+        """Close the line."""
+        self._line.close()
+
+    def wait_s(self) -> float:
+        """Return the time until the next request is due, s, or 0 if a request is due now.
+
+        At least 1 / `rate_Hz` must pass between two requests. After a request without an answer, also at least
+        `REPEAT_TIME_s` must pass. After the latest received byte, also at least `QUIET_TIME_s` must pass.
+        """
+        now_s = time.monotonic()
+        due_s = self._requested_s + 1.0 / self._request.rate_Hz
+        is_unanswered = self._received_s < self._requested_s
+        if is_unanswered:
+            due_s = max(due_s, self._requested_s + REPEAT_TIME_s)
+        quiet_end_s = self._received_s + QUIET_TIME_s  # bytes of the answer may arrive until then
+        return max(0.0, due_s - now_s, quiet_end_s - now_s)
+
+    def next_request(self) -> bytes:
+        """Return the bytes of the next request, which the caller must send now."""
+        self._requested_s = time.monotonic()
+        self._expects_echo = True
+        self._kept_bytes = b""
+        return self._request.data
+
+    def remove_echo(self, received: bytes) -> bytes:
+        """Return the received bytes without the echo of the request.
+
+        The echo consists of the same bytes as the request, and may arrive in several parts. Bytes that may be the
+        beginning of an echo are kept back. If later bytes differ from the request, the kept bytes are returned, too.
+
+        Args:
+            received: Bytes that arrived after the latest request; may be empty.
+        """
+        if received:
+            self._received_s = time.monotonic()
+        if not self._expects_echo:
+            return received
+        self._kept_bytes += received
+        request = self._request.data
+        if request != self._kept_bytes and request.startswith(self._kept_bytes):
+            return b""
+        self._expects_echo = False
+        return self._kept_bytes.removeprefix(request)
+
+
 UDP_SCHEME = "udp://"
 """First characters of the URL of a UDP socket, `udp://HOST:PORT`.
 
@@ -252,7 +285,12 @@ _CONTROL_CHARACTER = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
 
 class UdpSocket:
-    """An open UDP socket that receives datagrams from a board."""
+    """An open UDP socket that receives datagrams from a board.
+
+    Attributes:
+        is_stream: Whether the latest datagram is text, which is valid UTF-8 without control characters. Datagrams of
+            binary frames must not be joined, because the beginning of a datagram is the beginning of a frame.
+    """
 
     def __init__(self, url: str) -> None:
         """Open the socket, and bind it to the address in the URL.
@@ -277,8 +315,8 @@ class UdpSocket:
             raise
         self._board_ends_lines = False  # whether the board ends its lines, although a line may need several datagrams
         self._datagrams_without_end = 0  # number of successive datagrams without a line feed
-        self._is_text = False  # whether the latest datagram is valid UTF-8 without control characters
-        self._peer: tuple[str, int] | None = None  # sender of the latest datagram, to which answers are sent
+        self.is_stream = False
+        self._peer: tuple[str, int] | None = None  # sender of the latest datagram
         self._has_warned = False  # whether a warning about a second sender was given
 
     def reset_input_buffer(self) -> None:
@@ -310,21 +348,9 @@ class UdpSocket:
                 )
             if data:
                 is_utf8 = data.decode("utf-8", "replace").encode() == data  # decoding replaces invalid bytes
-                self._is_text = is_utf8 and _CONTROL_CHARACTER.search(data.removesuffix(b"\0")) is None
+                self.is_stream = is_utf8 and _CONTROL_CHARACTER.search(data.removesuffix(b"\0")) is None
                 return self._with_line_feed(data)
         return b""
-
-    def receive_waiting(self) -> bytes:
-        """Return the next datagram if it has already arrived and the latest datagram is text, otherwise empty bytes.
-
-        Datagrams of binary frames must not be joined, because the beginning of a datagram is the beginning of a frame.
-        """
-        return self.receive(0.0) if self._is_text else b""
-
-    def write(self, data: bytes) -> None:
-        """Send bytes to the sender of the latest datagram. If no datagram was received yet, nothing is sent."""
-        if self._peer is not None:
-            self._socket.sendto(data, self._peer)
 
     def close(self) -> None:
         """Close the socket."""
@@ -349,4 +375,4 @@ class UdpSocket:
             self._board_ends_lines = False
         elif data.endswith(b"\n"):
             self._board_ends_lines = True
-        return data + b"\n" if self._is_text and not self._board_ends_lines else data
+        return data + b"\n" if self.is_stream and not self._board_ends_lines else data

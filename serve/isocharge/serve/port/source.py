@@ -105,10 +105,10 @@ class Port:
         self._baud = baud
         self._silence_s = silence_s
         self._reconnect = reconnect
-        self._requester = Requester(request) if request else None
+        self._request = request
         self._wait = wait
         self.start_up_s = max(wait, silence_s, START_UP_s)
-        self._line: SerialLine | UdpSocket | None = None
+        self._line: SerialLine | UdpSocket | Requester | None = None
         self._is_starting_up = True  # whether no byte has arrived since the port was opened
 
     def __enter__(self) -> Self:
@@ -153,29 +153,19 @@ class Port:
             else:
                 self._line = SerialLine(self.url, self._baud)
             self._line.reset_input_buffer()  # needed for a socket; opening a terminal has discarded the bytes already
+            if self._request is not None and isinstance(self._line, SerialLine):
+                self._line = Requester(self._line, self._request)  # no other kind of line needs requests
         except OPEN_ERRORS as error:
             self._close()
-            raise self._opening_error(error, is_path=is_path) from error
+            speed = f" at {self._baud} baud" if is_path else ""
+            hint = "check the host and the port number, that the board is on, and that no other program uses it"
+            if is_path:
+                hint = (
+                    "check the cable and the name, that no other program has it open, and that you may read it (on "
+                    "Linux, the group 'dialout')"
+                )
+            raise PortError(f"{self.url}: cannot be opened{speed} ({error}); {hint}") from error
         self._is_starting_up = True
-        if self._requester:
-            self._requester.reset()  # the first request is due at once
-
-    def _opening_error(self, cause: Exception, *, is_path: bool) -> PortError:
-        """Return the exception for a port that cannot be opened. Its message contains the cause and advice.
-
-        Args:
-            cause: Exception of the operating system or of pyserial.
-            is_path: Whether the port is a device path, and not a URL.
-        """
-        speed = ""
-        hint = "check the host and the port number, that the board is on, and that no other program uses it"
-        if is_path:
-            speed = f" at {self._baud} baud"
-            hint = (
-                "check the cable and the name, that no other program has it open, and that you may read it (on Linux, "
-                "the group 'dialout')"
-            )
-        return PortError(f"{self.url}: cannot be opened{speed} ({cause}); {hint}")
 
     def __exit__(self, *_: object) -> None:
         """Close the port when the context is left."""
@@ -275,16 +265,14 @@ class Port:
                 f"{self.url}: no data for {timeout_s:g} s; check that the board is powered and sends{speed_advice}"
             )
         self._is_starting_up = False
-        has_answered = self._requester is not None  # such a board sends nothing more before the next request
-        if self._line is None or has_answered:
-            return data
+        line = self._line
         with contextlib.suppress(*READ_ERRORS):  # the next call reports the error
-            while len(data) < MAX_READ_BYTES and (waiting := self._line.receive_waiting()):
+            while line and line.is_stream and len(data) < MAX_READ_BYTES and (waiting := line.receive(0.0)):
                 data += waiting
         return data
 
     def _receive(self, timeout_s: float) -> bytes:
-        """Wait for bytes, and return them. If the board needs requests, send the requests that are due.
+        """Wait for bytes, and return them.
 
         Args:
             timeout_s: Longest time to wait, s.
@@ -299,9 +287,7 @@ class Port:
         if self._line is None:
             raise PortError(f"{self.url}: the port is not open; use `with Port(...) as port`")
         try:
-            if self._requester is None:
-                return self._line.receive(timeout_s)
-            return self._receive_answer(self._line, self._requester, timeout_s)
+            return self._line.receive(timeout_s)
         except OtherReader as error:
             raise PortLost(
                 f"{self.url}: another program reads this port, too, and takes some of its bytes; end that program (on "
@@ -311,30 +297,6 @@ class Port:
             raise PortLost(
                 f"{self.url}: the port disappeared while it was read ({error}); check the plug and the cable"
             ) from error
-
-    def _receive_answer(self, line: SerialLine | UdpSocket, requester: Requester, timeout_s: float) -> bytes:
-        """Send requests whenever they are due until an answer arrives, and return the answer.
-
-        Args:
-            line: The open line to the board.
-            requester: Object that computes when a request is due, and removes the echo of the requests.
-            timeout_s: Longest time to wait, s.
-
-        Returns:
-            The answer; empty if no answer arrives in time.
-        """
-        deadline_s = time.monotonic() + timeout_s
-        while True:
-            remaining_s = deadline_s - time.monotonic()
-            if remaining_s <= 0.0:
-                return b""
-            if requester.wait_s() == 0.0:
-                line.write(requester.next_request())
-            # Wait for bytes, at most until the next request is due or the timeout has passed.
-            received = line.receive(min(requester.wait_s(), remaining_s))
-            answer = requester.remove_echo(received)
-            if answer:
-                return answer
 
 
 def has_speed(url: str) -> bool:

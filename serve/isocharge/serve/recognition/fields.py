@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Array
 from isocharge.serve.frames.frame_layout import STRUCT_FORMATS, ByteOrder, FieldType
 from isocharge.serve.recognition.framing import INTACT_SHARE, Bytes, usual_bytes
 
@@ -147,35 +147,22 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[
     Returns:
         For each of the `length` bytes, a list of parts, of which the first is padding.
     """
-    usual, is_constant = usual_bytes(rows)
-    is_zero = is_constant & (usual == 0)
+    _usual, is_constant = usual_bytes(rows)
     row_length = rows.shape[1]
-    length = row_length // 2  # a row has the bytes of two frames
     byte_step = 1 if order == "little" else -1  # reverses big-endian numbers, so that the lowest byte comes first
     parts_at_each_byte: list[list[Part]] = []
-    for position in range(length):
+    for position in range(row_length // 2):  # a row has the bytes of two frames
         pad_score = Weights.constant if is_constant[position] else Weights.noise
         parts = [Part("pad", "pad", 1, pad_score)]  # one byte of padding
         for type_name in STRUCT_FORMATS:  # such as "u16", whose size is 16 bits
-            size = int(type_name[1:]) // 8  # in bytes
-            end = position + size
+            end = position + int(type_name[1:]) // 8
             if end <= row_length:
-                # The bytes of the number in all frames, shape (n, size), and the properties of each byte, shape (size,)
-                number_bytes = rows[:, position:end][:, ::byte_step]
-                byte_is_constant = is_constant[position:end][::byte_step]
-                byte_is_zero = is_zero[position:end][::byte_step]
-                parts += _number_parts(number_bytes, byte_is_constant, byte_is_zero, type_name, frame_rate_Hz)
+                parts += _number_parts(rows[:, position:end][:, ::byte_step], type_name, frame_rate_Hz)
         parts_at_each_byte.append(parts)
     return parts_at_each_byte
 
 
-def _number_parts(
-    number_bytes: Bytes,
-    is_constant: Booleans,
-    is_zero: Booleans,
-    type_name: FieldType,
-    frame_rate_Hz: float,
-) -> Iterator[Part]:
+def _number_parts(number_bytes: Bytes, type_name: FieldType, frame_rate_Hz: float) -> Iterator[Part]:
     """Yield the possible parts of a frame for bytes that contain a number of a given type.
 
     Every number may be a channel. A number may also be the frame counter or a clock if its steps, the differences
@@ -184,11 +171,11 @@ def _number_parts(
 
     Args:
         number_bytes: Bytes of the number, the lowest first, shape (n, size).
-        is_constant: Whether each byte is constant, shape (size,).
-        is_zero: Whether each byte is always 0, shape (size,).
         type_name: Type of the number, such as "u16", "i16" or "f32".
         frame_rate_Hz: Number of frames per second, Hz.
     """
+    usual, is_constant = usual_bytes(number_bytes)  # each of shape (size,)
+    is_zero = is_constant & (usual == 0)
     size = len(is_constant)  # bytes
     if is_constant.all():
         yield Part("channel", type_name, size, Weights.constant, is_constant=True)

@@ -9,7 +9,7 @@ is determined later.
 All checksums with a name are tried for every possible position of the first byte that they cover.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from itertools import product
@@ -112,7 +112,7 @@ def possible_divisions(chunks: Sequence[bytes], *, are_datagrams: bool) -> Itera
                 yield _adjacent_frames(DATAGRAM, data, length)
     for name, stuffing in STUFFINGS.items():
         yield from _stuffed_frames(name, stuffing, data)
-    yield from _synchronised_frames(np.frombuffer(data, np.uint8))
+    yield from _synchronised_frames(data)
 
 
 def _adjacent_frames(framing: Framing, data: bytes, length: int) -> FrameDivision:
@@ -168,7 +168,7 @@ def _most_common_length(frames: Sequence[bytes]) -> tuple[int, int]:
     return Counter(map(len, frames)).most_common(1)[0]
 
 
-def _synchronised_frames(stream: Bytes, max_lengths: int = 3) -> Iterator[FrameDivision]:
+def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDivision]:
     """Yield divisions of a stream into frames that begin at a repeated byte or a repeated pair of bytes.
 
     If a byte or a pair of bytes is the same in every frame, it repeats at a distance of one frame length. Frames are
@@ -177,66 +177,37 @@ def _synchronised_frames(stream: Bytes, max_lengths: int = 3) -> Iterator[FrameD
     divisions with the highest scores are yielded.
 
     Args:
-        stream: Bytes of the stream, shape (n,).
+        data: Bytes of the stream.
         max_lengths: Largest number of divisions.
     """
-    single_bytes = stream.astype(np.int64)
-    byte_pairs = 256 * single_bytes[:-1] + single_bytes[1:]
+    # Positions of each byte and each pair of bytes after which it occurs again, by the distance to the next occurrence
+    starts_by_distance: defaultdict[tuple[int, bytes, int], list[int]] = defaultdict(list)
+    for size in (2, 1):
+        latest_position: dict[bytes, int] = {}
+        for position in range(len(data) - size + 1):
+            code = data[position : position + size]
+            start = latest_position.get(code, position)
+            starts_by_distance[-size, code, position - start].append(start)
+            latest_position[code] = position
 
-    # For each length of a frame, the highest score so far, and the positions at which the frames begin
-    best_score: dict[int, float] = {}
-    best_starts: dict[int, NDArray[np.int64]] = {}
-    for codes in (byte_pairs, single_bytes):
-        for length, frame_starts in _frequent_distances(codes):
-            score = len(frame_starts) * length / len(stream)
-            if score > best_score.get(length, COVERED_SHARE):
-                best_score[length] = score
-                best_starts[length] = frame_starts
+    # For each length of a frame, the largest number of positions at which frames of this length begin
+    best_starts: dict[int, list[int]] = {}
+    for (*_code, length), starts in sorted(starts_by_distance.items()):  # the first of equal counts: a pair of bytes
+        is_frequent = len(starts) * length > COVERED_SHARE * len(data)
+        is_best = len(starts) > len(best_starts.get(length, ()))
+        if is_frequent and is_best and MIN_FRAME_BYTES <= length <= MAX_FRAME_BYTES:
+            best_starts[length] = starts
 
     def best_first(length: int) -> tuple[float, int]:
         """Return the key for sorting lengths by decreasing score, and equal scores by increasing length.
 
         The scores are rounded to 0.1, so that of two lengths with about equal scores the shorter length comes first.
         """
-        return -round(best_score[length], 1), length
+        score = len(best_starts[length]) * length / len(data)
+        return -round(score, 1), length
 
-    best_lengths = sorted(best_score, key=best_first)[:max_lengths]
-    for length in best_lengths:
-        yield FrameDivision(SYNC, stream, best_starts[length], length)
-
-
-def _frequent_distances(codes: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Yield each frequent distance from a code to the next equal code, and the positions from which it is measured.
-
-    A code is a byte, or a pair of bytes as a number. Only distances that can be the length of a frame are yielded. A
-    distance is frequent if frames of this length at the yielded positions would cover a large share of the stream. The
-    same distance may be yielded several times, for different codes.
-
-    Args:
-        codes: Code at each position of the stream, shape (n,).
-    """
-    # A stable sort puts the positions of equal codes side by side, in ascending order. Neighbours in the sorted array
-    # are therefore successive positions of the same code, unless the code changes.
-    sorted_positions = np.argsort(codes, kind="stable")
-    distances_to_next = np.diff(sorted_positions)  # shape (n - 1,)
-    next_code_is_equal = np.diff(codes[sorted_positions]) == 0
-
-    # Select the distances that can be the length of a frame, and the position before each of them.
-    has_frame_length = (distances_to_next >= MIN_FRAME_BYTES) & (distances_to_next <= MAX_FRAME_BYTES)
-    is_selected = next_code_is_equal & has_frame_length
-    positions = sorted_positions[:-1][is_selected]
-    distances = distances_to_next[is_selected]
-
-    # Count how often each pair of a code and a distance occurs. Each pair is encoded as one number, in which the last
-    # digit is the distance. The base of the digits is larger than every distance.
-    base = MAX_FRAME_BYTES + 1
-    code_distance_pairs = codes[positions] * base + distances
-    different_pairs, pair_counts = np.unique(code_distance_pairs, return_counts=True)
-    for pair, count in zip(different_pairs, pair_counts, strict=True):
-        distance = int(pair) % base
-        covered_positions = count * distance
-        if covered_positions >= COVERED_SHARE * len(codes):
-            yield distance, positions[code_distance_pairs == pair]
+    for length in sorted(best_starts, key=best_first)[:max_lengths]:
+        yield FrameDivision(SYNC, np.frombuffer(data, np.uint8), np.array(best_starts[length]), length)
 
 
 ORDERS: tuple[ByteOrder, ...] = ("little", "big")
@@ -278,18 +249,14 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
     # Number of constant bytes at the beginning of the frames. It is the position of the first False.
     leading_constant_count = int(np.argmin([*is_constant[:MAX_CONSTANT_BYTES], False]))
     for size in (4, 3, 2, 1):  # in bytes
-        is_too_wide = size + 2 > length  # at least two bytes must remain
-        last_bytes_are_constant = is_constant[-size:].all()  # a checksum would differ from frame to frame
-        if is_too_wide or last_bytes_are_constant:
+        if is_constant[-size:].all():  # a checksum would differ from frame to frame
             continue
 
         # Try each position for the first covered byte, up to the first byte that is not constant.
-        last_possible_start = min(leading_constant_count, length - size - 1)  # the checksum covers at least one byte
-        possible_starts = range(last_possible_start + 1)
-        orders = ORDERS if size > 1 else ORDERS[:1]  # a single byte has no byte order
+        last_possible_start = min(leading_constant_count, length - size - 2)  # the checksum covers at least two bytes
         names = [name for name, checksum in CHECKSUMS.items() if checksum.size == size]
-        for order in orders:
-            for start, name in product(possible_starts, names):
+        for order in ORDERS[:size]:  # a single byte has no byte order
+            for start, name in product(range(last_possible_start + 1), names):
                 if _fits(CHECKSUMS[name].compute, frames, start, size, order):
                     yield Check(size, order, name, start)
                     break
