@@ -9,7 +9,7 @@ from msgspec import structs
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ChargeError, printable, shown
-from isocharge.serve.examination.listening import Capture, ReceivedData
+from isocharge.serve.examination.listening import Capture
 from isocharge.serve.examination.press_detector import HeldPress
 from isocharge.serve.port.source import has_speed
 from isocharge.serve.signal_chain.channels import Channels
@@ -115,13 +115,13 @@ CLEAN_SHARE = 0.99
 """Smallest share of bytes in good frames with a good cable and the right baud rate, dimensionless."""
 
 
-def transmission_sentences(capture: Capture, received: ReceivedData) -> Iterator[str]:
+def transmission_sentences(capture: Capture) -> Iterator[str]:
     """Yield one sentence if no frames were received, or for each fault of the transmission.
 
     Args:
-        capture: The frames, with the share of intact bytes and the gaps in the frame numbers.
-        received: The bytes of the frames.
+        capture: The frames, with their bytes, the share of intact bytes and the gaps in the frame numbers.
     """
+    received = capture.received
     unread_line = shown(capture.parser.unread_line) if capture.parser.unread_line else ""
     advice = "check the cable, and whether the baud rate of the board is exact"
     if not has_speed(received.url):
@@ -129,7 +129,7 @@ def transmission_sentences(capture: Capture, received: ReceivedData) -> Iterator
             "if a serial server uses the telnet protocol, which doubles each byte 0xFF, set the port of the server to "
             'raw TCP (also called "raw", "TCP server" or "TCP socket")'
         )
-    if not capture.bytes_seen:
+    if not received.bytes_seen:
         yield (
             "no bytes were received: check the power and the cable; if the board sends only after a request, state the "
             "request with --request"

@@ -92,14 +92,10 @@ def check_electrodes(
     columns = assign_channels(changes, electrodes)
 
     # A channel is inverted if its value falls under the press near its own electrode.
-    found_channels = {}
-    inverted_channels = []
-    for press, column in enumerate(columns):
-        channel = channel_names[column]
-        found_channels[electrodes[press]] = channel
-        if changes[press, column] < 0.0:
-            inverted_channels.append(channel)
-    return ElectrodeCheck(expected=dict(channels), found=found_channels, inverted=tuple(inverted_channels))
+    found_channels = [channel_names[column] for column in columns]
+    own_changes = changes[np.arange(len(columns)), columns]
+    inverted_channels = tuple(name for name, change in zip(found_channels, own_changes, strict=True) if change < 0.0)
+    return ElectrodeCheck(dict(channels), dict(zip(electrodes, found_channels, strict=True)), inverted_channels)
 
 
 def assign_channels(changes: Array, electrodes: Sequence[str], min_advantage: float = 1.1) -> list[int]:
@@ -162,9 +158,10 @@ def corrected_table(table: Mapping[str, Any], check: ElectrodeCheck) -> dict[str
             return setting
         return {electrode: setting[source] for electrode, source in source_electrode.items()}
 
-    sections = {name: section for name, section in table.items() if isinstance(section, Mapping)}
     moved_sections = {
-        name: {key: moved(setting) for key, setting in section.items()} for name, section in sections.items()
+        name: {key: moved(setting) for key, setting in section.items()}
+        for name, section in table.items()
+        if isinstance(section, Mapping)
     }
     return {**table, **moved_sections, "channels": dict(check.found)}
 

@@ -146,21 +146,21 @@ class Capture:
     """Frames that were received from a port.
 
     Attributes:
+        received: The bytes of the frames.
         parser: The parser, with its counters.
         frames: Good frames. Their times are those of the clock of the device if the frames contain a time.
-        bytes_seen: Number of bytes that were received.
     """
 
+    received: ReceivedData
     parser: Parser
     frames: list[Frame]
-    bytes_seen: int
 
     @property
     def intact_share(self) -> float:
         """Share of the received bytes that were part of a good frame, dimensionless. It is 0 without frames."""
         if not self.frames:
             return 0.0
-        return 1.0 - self.parser.counts.bytes_dropped / self.bytes_seen
+        return 1.0 - self.parser.counts.bytes_dropped / self.received.bytes_seen
 
     @property
     def rate_Hz(self) -> float:
@@ -210,4 +210,4 @@ def read_frames(received: ReceivedData, device: Device) -> Capture:
         all_frames += frames
         for frame in frames:
             parser.sequence_flags(frame.seq)
-    return Capture(parser, all_frames, received.bytes_seen)
+    return Capture(received, parser, all_frames)

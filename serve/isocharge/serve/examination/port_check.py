@@ -156,7 +156,7 @@ def examine_received(
     is_proposed = device is ANY_BOARD
     device = _board(received, device)
     capture = read_frames(received, device)
-    missing = list(transmission_sentences(capture, received))
+    missing = list(transmission_sentences(capture))
     counts = capture.parser.counts
     examination = Examination(
         url=received.url,
@@ -239,14 +239,14 @@ def electrodes_by_position(capture: Capture, device: Device) -> dict[int, str]:
     Electrodes whose channel is missing in the frames are left out.
 
     Args:
-        capture: The frames. Without frames, the result is empty.
+        capture: The frames, at least one.
         device: Settings of the board. `channels` contains the name of the channel of each electrode.
     """
-    if not device.channels or not capture.frames:
+    if not device.channels:
         return dict(enumerate(capture.names))
-    electrode_at_position = {}
-    for electrode, channel in device.channels.items():
-        position = channel_index(channel, capture.frames[-1])
-        if position is not None:
-            electrode_at_position[position] = electrode
-    return electrode_at_position
+    last_frame = capture.frames[-1]
+    return {
+        position: electrode
+        for electrode, channel in device.channels.items()
+        if (position := channel_index(channel, last_frame)) is not None
+    }

@@ -20,8 +20,9 @@ film that creeps, the error of the charges increases with time.
 """
 
 import math
+import warnings
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -134,16 +135,12 @@ def block_medians(values: Array, times_s: Array) -> Array:
         block, which may be incomplete. NaN if a block of a channel has no finite value.
     """
     block_numbers = np.floor(times_s / BLOCK_S + 1e-6).astype(int)  # a rounding error must not move a frame
-    begins_block = np.diff(block_numbers, prepend=-1) != 0  # true for the first frame, whose block has the number 0
-    first_rows = np.flatnonzero(begins_block)  # first frame of each block
-    blocks = np.split(values, first_rows[1:])
-    complete_blocks = blocks[:-1]  # the last block may be incomplete
-    if not complete_blocks:
-        channel_count = values.shape[1]
-        return np.zeros((0, channel_count))
-    masked_median: Any = np.ma.median  # has no types
-    medians = [masked_median(np.ma.masked_invalid(block), axis=0) for block in complete_blocks]
-    return np.array([np.ma.filled(median, np.nan) for median in medians])
+    first_rows = np.flatnonzero(np.diff(block_numbers, prepend=-1))  # first frame of each block; the first has number 0
+    finite_values = np.where(np.isfinite(values), values, np.nan)
+    complete_blocks = np.split(finite_values, first_rows[1:])[:-1]
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of a block without finite values
+        medians = [np.nanmedian(block, axis=0) for block in complete_blocks]
+    return np.reshape(medians, (-1, values.shape[1]))  # also without a block
 
 
 def channel_noise(values: Array) -> Array:
@@ -159,30 +156,30 @@ def channel_noise(values: Array) -> Array:
     """
     are_whole_numbers = ((values == np.round(values)) | ~np.isfinite(values)).all(axis=0)
     rounding_noise = np.where(are_whole_numbers, 12.0**-0.5, 0.0)
-    return np.maximum([estimate_noise(column) for column in values.T], rounding_noise)
+    return np.maximum(estimate_noise(values), rounding_noise)
 
 
-def estimate_noise(values: Array) -> float:
-    """Estimate the noise of a channel from the differences between consecutive values.
+def estimate_noise(values: Array) -> Array:
+    """Estimate the noise of each channel from the differences between consecutive values.
 
     Presses have little effect on these differences. If the noise is normally distributed, the median magnitude of a
     difference is 0.6745 * sqrt(2) standard deviations. For coarse counts, most differences may be 0. In this case, the
     mean magnitude of a difference is used, which is 2 / sqrt(pi) standard deviations.
 
     Args:
-        values: Values of the channel, shape (n,), any unit. Values that are not finite are left out.
+        values: Values of the channels, shape (n, channels), any unit. Values that are not finite are left out.
 
     Returns:
-        The standard deviation in the unit of the values; 0 if there are fewer than two finite values.
+        The standard deviations, shape (channels,), in the unit of the values; 0 for a channel with fewer than two
+        finite values.
     """
-    finite_values = values[np.isfinite(values)].astype(float)
-    differences = np.abs(np.diff(finite_values))
-    if len(differences) == 0:
-        return 0.0
-    median_difference = float(np.median(differences))
-    if median_difference > 0.0:
-        return median_difference / (0.6745 * math.sqrt(2.0))
-    return float(differences.mean()) * math.sqrt(math.pi) / 2.0
+    noise = np.zeros(values.shape[1])
+    for column, channel_values in enumerate(values.T):
+        differences = np.abs(np.diff(channel_values[np.isfinite(channel_values)]))
+        if len(differences) > 0:
+            by_median = np.median(differences) / (0.6745 * math.sqrt(2.0))
+            noise[column] = by_median or differences.mean() * math.sqrt(math.pi) / 2.0
+    return noise
 
 
 MIN_HELD_S = 4.0

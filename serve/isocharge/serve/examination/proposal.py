@@ -89,7 +89,7 @@ def unit_of(capture: Capture, max_noise_V: float = 0.02) -> str:
     finite_values = values[np.isfinite(values)]
     if finite_values.size and bool((finite_values == np.round(finite_values)).all()):
         return "counts"
-    largest_noise = max(estimate_noise(column) for column in values.T)
+    largest_noise = estimate_noise(values).max()
     names_state_volts = all(name.endswith("V") for name in capture.names)
     return "V" if names_state_volts or 0.0 < largest_noise <= max_noise_V else "pC"
 
@@ -114,7 +114,7 @@ def _choose_channels(
         Position of the channel in the frame by the name of the electrode; empty if there are too few channels.
     """
     # A channel is left out if its values do not vary, vary much less than the others, or are mostly not finite.
-    noise = np.array([estimate_noise(column) for column in values.T])
+    noise = estimate_noise(values)
     noise[2 * np.isfinite(values).sum(axis=0) <= len(values)] = 0.0
     usual_noise = np.median(noise[noise > 0.0]) if noise.any() else 0.0
     candidates = np.flatnonzero(noise >= min_noise_share * usual_noise).tolist()

@@ -125,9 +125,7 @@ class Field(Settings, frozen=True, kw_only=True, omit_defaults=True):
         """
         if self.type_name != PADDING:
             return STRUCT_FORMATS[self.type_name]
-        padding_size = self.count
-        if self.value:  # the bytes that the padding must have, in hexadecimal
-            padding_size = len(bytes.fromhex(self.value))
+        padding_size = len(bytes.fromhex(self.value)) if self.value else self.count
         return f"{padding_size}x"
 
     @property

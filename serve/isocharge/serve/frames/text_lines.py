@@ -355,9 +355,8 @@ def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], 
         for token, following in pairwise([*parts, _Token("mark", "", 0, False)])
         if token.kind in _NUMBER_KINDS
     ]
-    # A word such as `C` may be the name of an electrode, but a word behind several numbers is no name.
-    repeated_units = {unit for unit in OTHER_CHARGE_UNITS if following_units.count(unit) > 1}
-    known_units = _CHARGE_UNITS | repeated_units
+    # The word `C` may be the name of an electrode, but a word behind several numbers is no name.
+    known_units = OTHER_CHARGE_UNITS if following_units.count("C") > 1 else _CHARGE_UNITS
     # The first word after the previous number is a name, or the unit of the previous number.
     preceding_units = [[token.name.strip("[]") for token in path[1:]] for path in _paths(tokens)]
     units = [
@@ -455,8 +454,8 @@ def _value(number: str) -> float:
     """Return the value of a number, which is NaN for `ovf`, or the seconds since midnight of a time of day."""
     if ":" in number:
         hours, minutes, seconds = number.split(":")
-        whole, _, fraction = seconds.replace(",", ".").partition(".")
-        return 3600.0 * int(hours) + 60.0 * int(minutes) + float(f"{whole}.{fraction.replace('.', '')}")
+        fraction = re.sub("[.,]", "", seconds[2:])  # two digits are before the fraction
+        return 3600.0 * int(hours) + 60.0 * int(minutes) + float(f"{seconds[:2]}.{fraction}")
     if "x" in number.lower():
         return float(int(number, 16))
     if number[-3:].lower() == "ovf":

@@ -124,11 +124,6 @@ class Part(NamedTuple):
     name: str = ""
     scale: float = 1.0
 
-    @property
-    def channel_type(self) -> str:
-        """Type of the channel; empty for a part that is not a channel."""
-        return self.type_name if self.role == "channel" else ""
-
 
 @np.errstate(all="ignore")
 def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[list[Part]]:
@@ -274,11 +269,11 @@ def split_frame(
         best_score = np.inf
         best_parts: tuple[Part, ...] = ()
         for part in parts_at_each_byte[position]:
-            is_channel = part.role == "channel"
-            begins_group = is_channel and part.channel_type != previous_channel_type
+            channel_type = part.type_name if part.role == "channel" else ""
+            begins_group = channel_type not in ("", previous_channel_type)
             if begins_group and part.is_constant:
                 continue
-            rest_score, rest_parts = best_division(position + part.size, part.channel_type)
+            rest_score, rest_parts = best_division(position + part.size, channel_type)
             score = part.score + rest_score
             if begins_group:
                 score += Weights.channel_group
