@@ -8,7 +8,7 @@ from msgspec import structs
 
 from isocharge.serve import find_model, load_model, write_model
 from isocharge.train.model_release.onnx_graph import write_graph
-from isocharge.train.training.folded_network import ANGLES, LARGEST_INT8, TANH, FoldedNetwork, Layer, Perceptron
+from isocharge.train.training.folded_network import ANGLES, LARGEST_INT8, FoldedNetwork, Layer, Perceptron
 from isocharge.train.training.network import logarithmic_features
 
 TYPICAL_pC = 512.0
@@ -18,7 +18,7 @@ FLOORS = np.array([1.0, 1.0, 0.1, 1.0, 1.0, 0.1, 20.0, 5.0, 5.0, 5.0])
 """Values of a contact, mm, N, misfit and correlations, below which differences count as absolute differences."""
 
 
-def random_perceptron(rng, widths, activation=TANH):
+def random_perceptron(rng, widths):
     """Return a perceptron with random weights; `widths` are those of the inputs, the hidden layers and the outputs."""
     layers = []
     for n_input, n_output in itertools.pairwise(widths):
@@ -26,10 +26,10 @@ def random_perceptron(rng, widths, activation=TANH):
         layers.append(Layer(weight, 0.3 * rng.standard_normal(n_output)))
     *hidden, last = layers
     skip = 0.1 * rng.standard_normal((widths[0], widths[-1]))
-    return Perceptron(tuple(hidden), last, skip, activation)
+    return Perceptron(tuple(hidden), last, skip)
 
 
-def random_network(n_electrode, hidden, misfit_hidden, *, is_int8=False, activation=TANH):
+def random_network(n_electrode, hidden, misfit_hidden, *, is_int8=False):
     """Return a network with random weights.
 
     Args:
@@ -37,15 +37,14 @@ def random_network(n_electrode, hidden, misfit_hidden, *, is_int8=False, activat
         hidden: Widths of the hidden layers of the contact perceptron.
         misfit_hidden: Widths of the hidden layers of the misfit perceptron.
         is_int8: Whether the weights between hidden layers are rounded to 8 bits.
-        activation: Activation of the hidden layers.
     """
     rng = np.random.default_rng(0)
     n_contact = ANGLES.stop
-    contact = random_perceptron(rng, (n_electrode, *hidden, n_contact), activation)
+    contact = random_perceptron(rng, (n_electrode, *hidden, n_contact))
     weight, bias = contact.last
     millimetres = np.array([8.0, 8.0, *np.ones(n_contact - 2)])
     contact = replace(contact, last=Layer(weight * millimetres, bias * millimetres), skip=contact.skip * millimetres)
-    misfit = random_perceptron(rng, (n_electrode, *misfit_hidden, n_electrode), activation)
+    misfit = random_perceptron(rng, (n_electrode, *misfit_hidden, n_electrode))
     if is_int8:
         contact, misfit = map(round_to_int8, (contact, misfit))
     return FoldedNetwork(logarithmic_features(np.full((1, n_electrode), TYPICAL_pC)), contact, misfit)

@@ -16,7 +16,6 @@ from isocharge.serve.model.contact import MISFIT_LIMIT
 from isocharge.simulate import noise_model
 from isocharge.train.model_release.onnx_graph import check_graph, read_graph, write_graph
 from isocharge.train.training.config import NetworkConfig
-from isocharge.train.training.folded_network import ACTIVATIONS
 from isocharge.train.training.network import InverseNetwork, fold_network
 
 REFERENCE = noise_model("reference")
@@ -75,12 +74,11 @@ def largest_differences(given, expected):
     ]
 
 
-@pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_folded_network_gives_the_answers_of_pytorch(split, activation):
+def test_folded_network_gives_the_answers_of_pytorch(split):
     """The network has random weights, which are evaluated with PyTorch in double precision."""
     torch.manual_seed(0)
     network = InverseNetwork(
-        split.domain, split.features(REFERENCE), split.train.charge, NetworkConfig((32, 32), (24, 24), activation)
+        split.domain, split.features(REFERENCE), split.train.charge, NetworkConfig((32, 32), (24, 24))
     )
     for perceptron in (network.contact, network.misfit_vector):
         torch.nn.init.normal_(perceptron.skip.weight, std=0.1)

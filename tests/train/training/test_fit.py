@@ -271,7 +271,7 @@ def test_focused_distance_is_a_mean_with_smaller_weights_for_long_targets():
         ("[network]\nhidden = []\n", "network.hidden: expected widths"),
         ("[network]\nhidden = [64]\nmisfit_hidden = [64, 64]\n", "as many layers as network.hidden"),
         ("[network]\nweights = 'int4'\n", "network.weights: expected one of float32, int8, got 'int4'"),
-        ("[network]\nactivation = 'step'\n", "network.activation: expected one of tanh"),
+        ("[network]\nactivation = 'step'\n", "network.activation: expected one of tanh, got 'step'"),
     ],
 )
 def test_wrong_files_are_refused_with_file_and_key(tmp_path, text, message):

@@ -19,18 +19,12 @@ def source_text(name: str, **values: object) -> str:
 
 def c_float(value: float) -> str:
     """Return the shortest C literal that represents a finite float32 number exactly."""
-    return _with_point(str(np.float32(value))) + "f"
+    return str(np.float32(value)) + "f"
 
 
 def c_double(value: float) -> str:
     """Return the shortest C literal that represents a finite double exactly."""
-    return _with_point(repr(float(value)))
-
-
-def _with_point(digits: str) -> str:
-    """Append a decimal point to the digits of an integer, so that C reads a floating-point number."""
-    has_point = "." in digits or "e" in digits
-    return digits if has_point else f"{digits}.0"
+    return repr(float(value))
 
 
 def c_array(name: str, values: NDArray[Any]) -> str:

@@ -46,7 +46,6 @@ from isocharge.train.training.folded_network import (
     LARGEST_INT8,
     LOG_STD,
     POSITION,
-    Activation,
     ChargeFeatures,
     FoldedNetwork,
     Perceptron,
@@ -58,7 +57,7 @@ N_ROWS = 4
 The program then reads and writes each output only once for all of these rows."""
 
 
-def layer_source(name: str, weight: Array, bias: Array | None = None, activation: Activation | None = None) -> str:
+def layer_source(name: str, weight: Array, bias: Array | None = None, *, is_hidden: bool = False) -> str:
     """Return the C text of a layer: its constant arrays, and the function `void name(x, c, y)`.
 
     The arguments of the C function are the inputs x, the bias c and the outputs y. The function computes y = f(x W + c)
@@ -68,7 +67,7 @@ def layer_source(name: str, weight: Array, bias: Array | None = None, activation
         name: Name of the function.
         weight: Weights W, shape (inputs, outputs).
         bias: Bias c, shape (outputs,), which is written as the array `name_bias`. None if c is not constant.
-        activation: The function f; None for the identity.
+        is_hidden: Whether f is the hyperbolic tangent. Otherwise, f is the identity.
     """
     n_input, n_output = weight.shape
 
@@ -83,8 +82,8 @@ def layer_source(name: str, weight: Array, bias: Array | None = None, activation
     # C expression for output j. At first, y[j] contains the sum of the products for this output. If the weights are
     # integers, the sum is multiplied by the scale of its column.
     result = "y[j] + c[j]" if scale is None else f"y[j] * {name}_scale[j] + c[j]"
-    if activation is not None:
-        result = f"{activation.c_function}({result})"
+    if is_hidden:
+        result = f"tanh_of({result})"
 
     # The function: set the sums to zero, add the products, and compute the outputs.
     lines = [
@@ -226,7 +225,6 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
     return source_text(
         "isocharge_model.c",
         label=c_comment(metadata.label),
-        activation=network.contact.activation.c_source,
         features=_features_source(network.features),
         layers="\n".join((*contact_layers, *misfit_layers)),
         widest=max(bias.size for _, bias in (*network.contact.hidden, *network.misfit.hidden)),
@@ -269,7 +267,7 @@ def _perceptron_source(
     calls = []
     buffer = "logs"
     for index, (weight, bias) in enumerate([(first_weight, first_bias), *later]):
-        layers.append(layer_source(f"{name}_{index}", weight, bias, perceptron.activation))
+        layers.append(layer_source(f"{name}_{index}", weight, bias, is_hidden=True))
         next_buffer = f"rows[{index % 2}]"
         calls.append(f"{name}_{index}({buffer}, {name}_{index}_bias, {next_buffer});")
         buffer = next_buffer

@@ -19,7 +19,6 @@ from isocharge.serve.model.session import FLOORS, RELATIVE_TOLERANCE, open_sessi
 from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.presses import LOWEST_CHARGE, LabelledPresses
 from isocharge.train.training.folded_network import (
-    ACTIVATIONS,
     ANGLES,
     ChargeFeatures,
     FoldedNetwork,
@@ -85,14 +84,13 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
         graph: The graph.
 
     Raises:
-        LookupError: If the graph has no activation.
-        ValueError: If the shapes of the constants do not fit a network, or a constant is not finite.
+        LookupError: If the graph has no nodes.
+        ValueError: If there is no hidden layer, the shapes of the constants do not fit a network, or a constant is not
+            finite.
         StopIteration: If the graph has too few constants.
     """
     operators = [node.op_type for node in graph.node]
-    activations = {activation.onnx_operator: activation for activation in ACTIVATIONS.values()}
-    activation = activations[operators[operators.index("Gemm") + 1]]
-    n_hidden = operators.count(activation.onnx_operator)  # each hidden layer has one activation
+    n_hidden = operators.count("Tanh")  # one after each hidden layer
     is_signed = operators[0] == "Max"  # the first node of a graph for charges of both signs
 
     constants = (np.asarray_chkfinite(numpy_helper.to_array(tensor), dtype=float) for tensor in graph.initializer)
@@ -105,8 +103,9 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     bias = next(constants)
     last = Layer(weight=next(constants), bias=bias)
     # ONNX would also repeat a single number for all columns, C does not.
-    if any(layer.bias.shape != layer.weight.shape[1:] for layer in (*hidden, last, Layer(skip, bias))):
-        raise ValueError("expected a bias for each column of the weights")
+    has_biases = all(layer.bias.shape == layer.weight.shape[1:] for layer in (*hidden, last, Layer(skip, bias)))
+    if not (hidden and has_biases):
+        raise ValueError("expected hidden layers, and a bias for each column of the weights")
 
     # In the outputs of each layer, find where those of the misfit perceptron begin, from the last layer to the first.
     # The inputs of the misfit perceptron begin at the first input with a weight for one of its outputs.
@@ -119,7 +118,7 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
         rows = (slice(None), *columns)  # both perceptrons have the same inputs
         parts = zip((*hidden, last), rows, columns, strict=False)
         *hidden_parts, last_part = (Layer(weight[row, column], bias[column]) for (weight, bias), row, column in parts)
-        return Perceptron(tuple(hidden_parts), last_part, skip[:, columns[-1]], activation)
+        return Perceptron(tuple(hidden_parts), last_part, skip[:, columns[-1]])
 
     contact = perceptron(*(slice(start) for start in reversed(starts)))
     return FoldedNetwork(features, contact, perceptron(*(slice(start, None) for start in reversed(starts))))

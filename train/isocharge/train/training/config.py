@@ -13,7 +13,6 @@ from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.common.errors import ConfigError
 from isocharge.common.structs import Settings, WrongKey, convert, read_toml
 from isocharge.simulate import NoiseModel, noise_model
-from isocharge.train.training.folded_network import ACTIVATIONS, TANH
 
 Width = Annotated[int, Meta(ge=1, le=4096)]
 Widths = Annotated[tuple[Width, ...], Meta(min_length=1, description="widths from 1 to 4096")]
@@ -64,18 +63,18 @@ class NetworkConfig(Settings, frozen=True):
         hidden: Widths of the hidden layers of the contact network; None for the default.
         misfit_hidden: Widths of the hidden layers of the misfit network, which must have as many hidden layers as the
             contact network; None for the default.
-        activation: Name of the activation of the hidden layers (`isocharge.train.training.folded_network`).
+        activation: Activation of the hidden layers, which is always the hyperbolic tangent.
         weights: "float32", or "int8" to round the weights between hidden layers to 8 bits and then train the other
             weights further. In C, the rounded weights take a quarter of the memory.
     """
 
     hidden: Widths | None = None
     misfit_hidden: Widths | None = None
-    activation: str = TANH.name
+    activation: Literal["tanh"] = "tanh"
     weights: Literal["float32", "int8"] = "float32"
 
     def __post_init__(self) -> None:
-        """Check the settings, and raise WrongKey for the first wrong setting.
+        """Check the widths, and raise WrongKey for wrong widths.
 
         If the widths of both networks are given, both networks must have the same number of hidden layers, because they
         are folded into one perceptron.
@@ -85,8 +84,6 @@ class NetworkConfig(Settings, frozen=True):
             if len(self.misfit_hidden) != layer_count:
                 expected = f"as many layers as network.hidden ({layer_count}; they run side by side)"
                 raise WrongKey("misfit_hidden", expected, list(self.misfit_hidden))
-        if self.activation not in ACTIVATIONS:
-            raise WrongKey("activation", f"one of {', '.join(ACTIVATIONS)}", self.activation)
 
     def widths(self, n_electrode: int) -> tuple[Widths, Widths]:
         """Return the widths of the hidden layers of the contact network and of the misfit network.

@@ -14,7 +14,7 @@ released model, and in double precision in the reference implementation of ONNX.
 Perceptron
 ----------
 
-For inputs x, the hidden layer l computes h_l = f(h_(l-1) W_l + b_l), where h_0 = x and f is the activation function.
+For inputs x, the hidden layer l computes h_l = tanh(h_(l-1) W_l + b_l), where h_0 = x.
 The output layer computes y = h_L V + c + x S from the result h_L of the last hidden layer. The skip layer S maps the
 inputs linearly to the outputs. The hidden layers therefore only need to learn the nonlinear part of the function.
 
@@ -55,62 +55,6 @@ from isocharge.common.contact_domain import Domain
 from isocharge.serve.model.contact import MISFIT_LIMIT
 from isocharge.serve.model.session import CORRELATION, INPUT, OUTPUTS
 from isocharge.train.data.channel_noise import LARGEST_LOGARITHM
-
-
-@dataclass(frozen=True)
-class Activation:
-    """Activation function that is applied to each output of a hidden layer.
-
-    Attributes:
-        name: Name of the activation function in configurations and files.
-        torch_name: Name of the function in `torch.nn.functional`. The attribute is a text, and not the function itself,
-            because only training needs PyTorch.
-        onnx_operator: Name of the ONNX operator, which has one input, one output and no attributes.
-        c_source: C99 source of the function `static float <c_function>(float x)`, in single precision.
-    """
-
-    name: str
-    torch_name: str
-    onnx_operator: str
-    c_source: str
-
-    @property
-    def c_function(self) -> str:
-        """Name of the function in C."""
-        return f"{self.name}_of"
-
-
-_TANH_C = """\
-/* tanh within 4e-7 for every x, as x P(x^2) / Q(x^2); beyond +-9.02 it is +-1 in single precision. NaN gives NaN.
-   Without branches, so that a compiler can work on several numbers at once. All terms have one sign: nothing\
- cancels. */
-static float tanh_of(float x)
-{
-    const float bound = 9.02f;
-    float square, p, q;
-
-    x = x > bound ? bound : x;
-    x = x < -bound ? -bound : x;
-    square = x * x;
-    p = 1.331876784e-8f;
-    p = p * square + 2.058327738e-5f;
-    p = p * square + 3.494022072e-3f;
-    p = p * square + 1.337970746e-1f;
-    p = p * square + 1.0f;
-    q = 7.761905190e-7f;
-    q = q * square + 3.283072452e-4f;
-    q = q * square + 2.587102576e-2f;
-    q = q * square + 4.671302270e-1f;
-    q = q * square + 1.0f;
-    return x * p / q;
-}
-"""
-
-TANH = Activation("tanh", torch_name="tanh", onnx_operator="Tanh", c_source=_TANH_C)
-"""Hyperbolic tangent, the activation of all released models."""
-
-ACTIVATIONS = {activation.name: activation for activation in (TANH,)}
-"""All activations of hidden layers, by name. Training, the ONNX graph and the C export look them up here."""
 
 
 @dataclass(frozen=True)
@@ -161,16 +105,14 @@ class Perceptron:
     """A multilayer perceptron with a skip layer.
 
     Attributes:
-        hidden: Hidden layers, from the first to the last layer. The activation function follows each hidden layer.
+        hidden: Hidden layers, from the first to the last layer. The hyperbolic tangent follows each hidden layer.
         last: Output layer.
         skip: Weights of the skip layer from the inputs directly to the outputs, shape (n_input, n_output).
-        activation: Activation function of the hidden layers.
     """
 
     hidden: tuple[Layer, ...]
     last: Layer
     skip: Array
-    activation: Activation
 
 
 POSITION = slice(0, 2)
@@ -364,7 +306,7 @@ def _add_features(builder: GraphBuilder, features: ChargeFeatures) -> str:
 
 
 def _add_perceptrons(builder: GraphBuilder, inputs: str, perceptrons: Sequence[Perceptron]) -> str:
-    """Add nodes that evaluate several perceptrons with the same inputs and activation as one perceptron.
+    """Add nodes that evaluate several perceptrons with the same inputs as one perceptron.
 
     The weights of the first layers and of the skip layers stand side by side. Those of the later layers are blocks on
     the diagonal of a matrix. The operator `Gemm` computes inputs @ weights + bias. The last layer adds the output of
@@ -373,7 +315,7 @@ def _add_perceptrons(builder: GraphBuilder, inputs: str, perceptrons: Sequence[P
     Args:
         builder: Builder of the graph.
         inputs: Name of the tensor with the inputs.
-        perceptrons: Weights and biases of the layers, and the activation.
+        perceptrons: Weights and biases of the layers.
 
     Returns:
         Name of the tensor with the outputs of all perceptrons.
@@ -384,7 +326,7 @@ def _add_perceptrons(builder: GraphBuilder, inputs: str, perceptrons: Sequence[P
         joined_weights = np.hstack(weights) if hidden_outputs is inputs else block_diag(*weights)
         constants = (builder.constant(joined_weights), builder.constant(np.concatenate(biases)))
         linear = builder.add("Gemm", hidden_outputs, *constants)
-        hidden_outputs = builder.add(perceptrons[0].activation.onnx_operator, linear)
+        hidden_outputs = builder.add("Tanh", linear)
     skip = builder.constant(np.hstack([perceptron.skip for perceptron in perceptrons]))
     weights, biases = zip(*(perceptron.last for perceptron in perceptrons), strict=True)
     skip_and_bias = builder.add("Gemm", inputs, skip, builder.constant(np.concatenate(biases)))
@@ -417,7 +359,6 @@ def fold(perceptron: Perceptron, mean: Array, matrix: Array, answer_map: Layer) 
         hidden=(Layer(first_weight, first.bias - mean @ first_weight), *later),
         last=Layer(perceptron.last.weight @ answer_map.weight, last_bias),
         skip=skip,
-        activation=perceptron.activation,
     )
 
 

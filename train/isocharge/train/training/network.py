@@ -26,14 +26,11 @@ from isocharge.serve.model.contact import MISFIT_LIMIT
 from isocharge.train.data.presses import HIGHEST_CHARGE, LOWEST_CHARGE
 from isocharge.train.training.config import NetworkConfig
 from isocharge.train.training.folded_network import (
-    ACTIVATIONS,
     LARGEST_INT8,
     LOG_FORCE,
     LOG_STD,
     MEAN,
-    TANH,
     TURN,
-    Activation,
     ChargeFeatures,
     FoldedNetwork,
     Layer,
@@ -120,20 +117,17 @@ class TrainablePerceptron(nn.Module):
         n_input: Number of inputs.
         hidden: Widths of the hidden layers.
         n_output: Number of outputs.
-        activation: Activation of the hidden layers.
     """
 
-    def __init__(self, n_input: int, hidden: tuple[int, ...], n_output: int, activation: Activation = TANH) -> None:
+    def __init__(self, n_input: int, hidden: tuple[int, ...], n_output: int) -> None:
         """Create the layers with random weights. The weights of the skip layer are zero.
 
         Args:
             n_input: Number of inputs.
             hidden: Widths of the hidden layers.
             n_output: Number of outputs.
-            activation: Activation of the hidden layers.
         """
         super().__init__()
-        self.activation = activation
         widths = (n_input, *hidden, n_output)
         self.linear_layers = [nn.Linear(n_in, n_out) for n_in, n_out in pairwise(widths)]  # from first to last
         self.layers = nn.ModuleList(self.linear_layers)  # makes the parameters of the layers those of the perceptron
@@ -146,7 +140,7 @@ class TrainablePerceptron(nn.Module):
         Near the rim of the working area, the posterior mean of the contact is a strongly nonlinear function of the
         charges. Units that are nearly linear for all inputs learn such a function slowly. Therefore, each unit gets a
         random direction in the space of the inputs, a random slope along this direction, and a random centre. The
-        centre is the point of this space at which the argument of the activation is zero.
+        centre is the point of this space at which the argument of the hyperbolic tangent is zero.
         """
         first, *_ = self.linear_layers
         n_unit = first.out_features
@@ -167,18 +161,17 @@ class TrainablePerceptron(nn.Module):
         Returns:
             Outputs, shape (n, n_output).
         """
-        activation = getattr(nn.functional, self.activation.torch_name)
         *hidden, last = self.linear_layers
         value = inputs
         for layer in hidden:
-            value = activation(layer(value))
+            value = torch.tanh(layer(value))
         outputs: Tensor = last(value) + self.skip(inputs)
         return outputs
 
     def to_numpy(self) -> Perceptron:
         """Return a copy of the perceptron as NumPy arrays in double precision."""
         *hidden, last = (Layer(_to_numpy(layer.weight.T), _to_numpy(layer.bias)) for layer in self.linear_layers)
-        return Perceptron(tuple(hidden), last, _to_numpy(self.skip.weight.T), self.activation)
+        return Perceptron(tuple(hidden), last, _to_numpy(self.skip.weight.T))
 
     def round_hidden_matrices(self) -> None:
         """Round the weights between hidden layers to 8 bits, and exclude these weights from further training.
@@ -235,10 +228,9 @@ class InverseNetwork(nn.Module):
         self.features = features
         n_electrode = features.n_electrode
         widths, misfit_widths = config.widths(n_electrode)
-        activation = ACTIVATIONS[config.activation]
-        self.contact = TrainablePerceptron(n_electrode, widths, TURN.stop, activation)
+        self.contact = TrainablePerceptron(n_electrode, widths, TURN.stop)
         self.contact.sharpen_first_layer()
-        self.misfit_vector = TrainablePerceptron(n_electrode, misfit_widths, n_electrode, activation)
+        self.misfit_vector = TrainablePerceptron(n_electrode, misfit_widths, n_electrode)
         self.output_factor = nn.Buffer(torch.ones(TURN.stop))
         self.output_offset = nn.Buffer(torch.zeros(TURN.stop))
         if force_std is not None:
