@@ -18,9 +18,9 @@ from isocharge.serve.model.model_folder import load_model
 from isocharge.simulate import Circle, NoiseModel, Sweep, load_sensor
 from isocharge.simulate.dataset.sweep import write_sweep
 from isocharge.train.data.contact_errors import contact_error_statistics
-from isocharge.train.data.presses import dataset_of
+from isocharge.train.data.presses import LabelledPresses, dataset_of
 from isocharge.train.report import QUICK, evaluation, page, write_report
-from isocharge.train.report.evaluation import contact_errors
+from isocharge.train.report.evaluation import Method, measure_methods
 
 NAME = "three-25um-biaxial"
 SMALL = replace(QUICK, presses=128, seconds=1e-3)
@@ -87,10 +87,11 @@ def test_presses_without_an_estimate_are_left_out_of_the_errors():
     truth = np.random.default_rng(2).uniform(0.5, 2.0, (10, 3))
     estimate = truth + 0.1
     estimate[3] = np.nan
-    answered, errors = contact_errors(estimate, truth)
-    assert answered == 0.9
-    assert errors == contact_error_statistics(np.delete(estimate, 3, 0), np.delete(truth, 3, 0))
-    assert contact_errors(np.full((10, 3), np.nan), truth) == (0.0, {})
+    methods = [Method("most", "", lambda _: estimate), Method("none", "", lambda _: np.full((10, 3), np.nan))]
+    most, none = measure_methods(methods, LabelledPresses(truth, truth), seconds=1e-4)
+    assert most.answered == 0.9
+    assert most.errors == contact_error_statistics(np.delete(estimate, 3, 0), np.delete(truth, 3, 0))
+    assert (none.answered, none.errors) == (0.0, {})
 
 
 def section_of(methods, *, is_measured=False, limits=()):

@@ -79,15 +79,17 @@ class Method:
     estimate: Callable[[Array], Array]
     single_call: Callable[[Array], Callable[[], object]] | None = None
 
-    def call_for(self, charge: Array) -> Callable[[], object]:
-        """Return a function without arguments that estimates the contact of one press, to measure its duration.
+    def call_in_turn(self, charge: Array) -> Callable[[], object]:
+        """Return a function without arguments whose calls estimate the contacts of presses, one after the other.
+
+        The duration of the calls is measured. After the last press, the function begins again with the first press.
 
         Args:
-            charge: Charges of the press, shape (n_electrode,), pC.
+            charge: Charges of the presses, shape (n, n_electrode), pC.
         """
-        if self.single_call is None:
-            return partial(self.estimate, charge[None])
-        return self.single_call(charge)
+        call_for = self.single_call or (lambda press_charge: partial(self.estimate, press_charge[None]))
+        calls = cycle([call_for(press_charge) for press_charge in charge])
+        return lambda: next(calls)()
 
 
 def triangulation(task: FittingTask) -> Method:
@@ -406,31 +408,16 @@ def measure_methods(methods: Sequence[Method], presses: LabelledPresses, seconds
     Returns:
         The records of the methods, in the order of `methods`.
     """
-    estimates = [method.estimate(presses.charge) for method in track(methods, "estimating contacts")]
-    contenders = []
-    for method in methods:
-        calls = cycle([method.call_for(press_charge) for press_charge in presses.charge[:SINGLE_PRESSES]])
-        contenders.append(Contender(method.name, 1, partial(lambda calls: next(calls)(), calls)))
+    timed_charge = presses.charge[:SINGLE_PRESSES]
+    contenders = [Contender(method.name, 1, method.call_in_turn(timed_charge)) for method in methods]
     timings = take_turns(contenders, len(methods) * seconds)
     records = []
-    for method, estimate, timing in zip(methods, estimates, timings, strict=True):
-        answered, errors = contact_errors(estimate, presses.contact)
+    for method, timing in zip(track(methods, "estimating contacts"), timings, strict=True):
+        estimate = method.estimate(presses.charge)
+        is_answered = np.isfinite(estimate).all(axis=1)
+        errors = {}
+        if is_answered.any():
+            errors = contact_error_statistics(estimate[is_answered], presses.contact[is_answered])
+        answered = float(np.mean(is_answered))
         records.append(MethodRecord(method.name, method.library, answered, errors, rounded(timing.p50_us)))
     return records
-
-
-def contact_errors(estimate: Array, truth: Array) -> tuple[float, dict[str, float]]:
-    """Compute the statistics of the errors of estimated contacts.
-
-    Args:
-        estimate: Estimated contacts (x, y, F), shape (n, 3), mm and N. Presses without an estimate are NaN.
-        truth: True contacts (x, y, F), shape (n, 3), mm and N.
-
-    Returns:
-        The fraction of the presses with an estimate; and the statistics of the errors on these presses, by the names of
-        `contact_error_statistics`. Without any estimate, there are no statistics.
-    """
-    has_estimate = np.isfinite(estimate).all(axis=1)
-    if not has_estimate.any():
-        return 0.0, {}
-    return float(np.mean(has_estimate)), contact_error_statistics(estimate[has_estimate], truth[has_estimate])
