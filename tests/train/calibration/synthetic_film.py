@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.simulate import Domain
-from isocharge.train.calibration.film_charges import FilmCharges
 
 LENGTH_MM = 7.0
 """Distance over which a charge changes by a factor e."""
@@ -33,8 +32,6 @@ class SyntheticFilm:
 
     prior: object
     domain: Domain
-
-    into_domain = FilmCharges.into_domain
 
     @property
     def values(self):

@@ -17,7 +17,7 @@ from isocharge.train.calibration import estimator
 from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.estimator import NOISE_RATIOS, Hypothesis, Prior, estimate, hypotheses
 from isocharge.train.calibration.film_estimate import SESSION, terms
-from isocharge.train.calibration.press_data import Linearised, PressData, PressErrors
+from isocharge.train.calibration.press_data import Linearised, PressData, PressErrors, in_domain
 from isocharge.train.data.presses import draw_contacts
 
 ONE = Hypothesis(
@@ -93,9 +93,7 @@ def test_estimate_minimises_the_sum_of_squares_of_all_unknowns_and_contacts(prob
 
     def residuals(parameters):
         values, contact = prior.mean + parameters[:n_unknown], parameters[n_unknown:].reshape(-1, 3)
-        charge = model(
-            problem, synthetic, values, synthetic.into_domain(contact * [1, 1, 0] + np.exp(contact) * [0, 0, 1])
-        )
+        charge = model(problem, synthetic, values, in_domain(contact, synthetic.domain))
         return np.concatenate(
             [
                 whitening @ parameters[:n_unknown],

@@ -28,7 +28,7 @@ def written(problem, synthetic, tmp_path_factory):
     """Folder of a calibrated film, the result of the calibration, and the properties of the film."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(calibrate_module, "SAME_FILM_STD", np.inf)
-        patch.setattr(film_network, "NODES_MPa", (0.0,))
+        patch.setattr(film_network, "_nodes", lambda _: np.zeros(1))
         patch.setattr(film_network, "PRESSES", 6_000)
         patch.setattr(film_network, "_outside_presses", lambda *_: None)
         for name, values_and_probabilities in FEW_VALUES.items():

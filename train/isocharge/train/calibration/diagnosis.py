@@ -13,10 +13,12 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from isocharge.common.arrays import Array
+from isocharge.common.contact_domain import with_log_force
 from isocharge.common.errors import PressError
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.simulate.sensor.film import Film
 from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.calibration.press_data import in_domain
 
 MAX_DEAD_RATIO = 0.1
 """Ratio of the typical charge of a channel to that of all channels, below which the channel counts as dead.
@@ -188,7 +190,7 @@ def expected_charges(charges: FilmCharges, contact: Array) -> Array:
     prior = charges.prior
     films = np.tile(prior.mean, (len(PRETENSIONS_MPa), 1))
     films[:, prior.index("pretension")] = PRETENSIONS_MPa
-    contact_in_domain = charges.into_domain(contact)
+    contact_in_domain = in_domain(with_log_force(contact), charges.domain)
     return np.array([charges.charges(values, contact_in_domain) for values in films])
 
 

@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -23,7 +22,7 @@ from scipy.special import chdtrc, chdtri, softmax
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.contact_domain import with_log_force
-from isocharge.serve.model.robust_estimate import ModelValues, RobustProblem
+from isocharge.serve.model.robust_estimate import ModelValues, RobustPoint, RobustProblem
 from isocharge.serve.model.robust_estimate import Prior as StatePrior
 from isocharge.simulate import NoiseModel, noise_model
 from isocharge.simulate.sensor.film_properties import UNEVEN_TENSIONS
@@ -274,25 +273,9 @@ def _estimate_with_errors(
         previous: Estimate from which the search begins; None for the prior mean and the measured contacts.
     """
     data = stated.with_errors(assumed)
-    layout = prior.layout
-    unknowns = prior.mean
-    log_contact = data.contact
-    if previous is not None:
-        unknowns = previous.film.values
-        log_contact = with_log_force(previous.contact)
-    charge_variance = np.nan_to_num(data.charge_std**2)  # the largest number for a charge that was not measured
-    robust_problem = RobustProblem(
-        lambda contacts, state: model_values(charges, layout, data, state, contacts),
-        data.charge,
-        charge_variance[:, :, None] * np.eye(charge_variance.shape[1]),
-        StatePrior(prior.mean, prior.covariance(TYPICAL)),
-        measured_contacts=data.contact,
-        contact_std=data.contact_std,
-    )
-    found = robust_problem.estimate(unknowns, log_contact, state_bounds=prior.bounds)
-    unknowns, log_contact = found.state, found.contacts.copy()
-    redundancy = _redundancy(data)
-    is_bad = (redundancy > 0) & (chdtrc(np.maximum(redundancy, 1), found.chi2) < BAD_PROBABILITY)
+    point = _most_probable_point(charges, data, prior, previous)
+    redundancy = np.maximum(np.isfinite(data.measured_std).sum(axis=1) - 3, 0)  # a contact has three unknowns
+    is_bad = (redundancy > 0) & (chdtrc(np.maximum(redundancy, 1), point.chi2) < BAD_PROBABILITY)
     # Presses are bad only if most presses agree with each other. Otherwise, no film explains the presses.
     if is_bad.mean() > 0.5 or len(data) <= FEW_PRESSES:
         is_bad[:] = False
@@ -300,60 +283,99 @@ def _estimate_with_errors(
 
     # The estimate of each hypothesis follows from the linearised problem at the most probable unknowns so far.
     # The second round considers only the hypotheses that are possible after the first.
-    used_data, used_contact = data[is_used], log_contact[is_used]
+    used_data, used_contact = data[is_used], point.contacts[is_used]
+    unknowns = point.state
     probable = all_hypotheses
     for _ in range(2):
-        model = model_values(charges, layout, used_data, unknowns, used_contact)
+        model = model_values(charges, prior.layout, used_data, unknowns, used_contact)
         evidence = {
             errors: _Evidence.of(model, stated[is_used].with_errors(errors), used_contact, unknowns, prior)
             for errors in {one.errors for one in probable}
         }
-        fits = [evidence[one.errors].fit(one) for one in probable]
-        weight = softmax([one.log_evidence for one in fits])
-        rows = np.flatnonzero(weight >= MIN_WEIGHT)
-        probable, fits, weight = [probable[row] for row in rows], [fits[row] for row in rows], weight[rows]
-        posteriors = [evidence[one.errors].posterior(one, fit) for one, fit in zip(probable, fits, strict=True)]
-        means, covariances = zip(*posteriors, strict=True)
+        all_fits = [evidence[one.errors].fit(one) for one in probable]
+        all_weights = softmax([fit.log_evidence for fit in all_fits])
+        weight = all_weights[all_weights >= MIN_WEIGHT]
+        fits = [fit for fit, one_weight in zip(all_fits, all_weights, strict=True) if one_weight >= MIN_WEIGHT]
+        probable = [fit.hypothesis for fit in fits]
+        means, covariances = zip(*(fit.posterior() for fit in fits), strict=True)
         mean = np.average(means, axis=0, weights=weight)
         covariance = np.average(covariances, axis=0, weights=weight)
         covariance += np.cov(means, rowvar=False, ddof=0, aweights=weight)
         used_contact = used_contact + Linearised.of(model, used_data, used_contact).contact_change(mean - unknowns)
         unknowns = np.clip(mean, *prior.bounds)
 
-    best = int(weight.argmax())
+    best = fits[int(weight.argmax())]
+    log_contact = point.contacts.copy()
     log_contact[is_used] = used_contact
-    final_model = model_values(charges, layout, data, unknowns, log_contact)
+    final_model = model_values(charges, prior.layout, data, unknowns, log_contact)
     final_residual, _ = Linearised.of(final_model, data, log_contact).eliminated()
     final_chi2 = (final_residual**2).sum(axis=1)
     gain_variance = np.average([one.errors.noise.gain**2 for one in probable], weights=weight)
     noise = NoiseModel("presses", stated.noise.white, float(np.sqrt(gain_variance)))
-    film = FilmEstimate(layout, unknowns, covariance, noise)
     return Estimation(
         charges=charges,
-        film=film,
+        film=FilmEstimate(prior.layout, unknowns, covariance, noise),
         contact=in_domain(log_contact, charges.domain),
         is_bad=is_bad,
         press_chi2=np.divide(final_chi2, redundancy, out=np.full(len(data), np.nan), where=redundancy > 0),
-        chi2=fits[best].chi2,
+        chi2=best.chi2,
         redundancy=float(redundancy[is_used].sum()),
-        hypothesis=probable[best],
+        hypothesis=best.hypothesis,
     )
 
 
-class _Fit(NamedTuple):
-    """Residuals at the prior means, compared with their covariance under one hypothesis.
+def _most_probable_point(
+    charges: FilmCharges, data: PressData, prior: Prior, previous: Estimation | None
+) -> RobustPoint:
+    """Search for the most probable unknowns and contacts (x, y, ln F), with low weights for presses that may be bad.
+
+    Args:
+        charges: Charges of a solved film and of similar films.
+        data: The presses with the assumed errors.
+        prior: Prior distribution of the unknowns.
+        previous: Estimate from which the search begins; None for the prior mean and the measured contacts.
+    """
+    charge_variance = np.nan_to_num(data.charge_std**2)  # the largest number for a charge that was not measured
+    problem = RobustProblem(
+        lambda contacts, state: model_values(charges, prior.layout, data, state, contacts),
+        data.charge,
+        charge_variance[:, :, None] * np.eye(charge_variance.shape[1]),
+        StatePrior(prior.mean, prior.covariance(TYPICAL)),
+        measured_contacts=data.contact,
+        contact_std=data.contact_std,
+    )
+    unknowns, log_contact = prior.mean, data.contact
+    if previous is not None:
+        unknowns, log_contact = previous.film.values, with_log_force(previous.contact)
+    return problem.estimate(unknowns, log_contact, state_bounds=prior.bounds)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Estimate of the unknowns under one hypothesis: residuals at the prior means, compared with their covariance.
 
     Attributes:
+        evidence: The linearised problem.
+        hypothesis: The hypothesis.
         factor: Cholesky factor of the covariance S of the residuals, as `cho_factor` returns it.
         weighted: S^-1 r, shape (m,).
         log_evidence: Logarithm of the evidence.
         chi2: Sum of the squared residuals of the presses and of the prior distribution after the fit.
     """
 
+    evidence: "_Evidence"
+    hypothesis: Hypothesis
     factor: tuple[Array, bool]
     weighted: Array
     log_evidence: float
     chi2: float
+
+    def posterior(self) -> tuple[Array, Array]:
+        """Return the mean, shape (n_unknown,), and the covariance of the unknowns, shape (n_unknown, n_unknown)."""
+        prior = self.evidence.prior
+        prior_covariance = prior.covariance(self.hypothesis)
+        gain = self.evidence.jacobian @ prior_covariance
+        return prior.mean - gain.T @ self.weighted, prior_covariance - gain.T @ cho_solve(self.factor, gain)
 
 
 @dataclass(frozen=True)
@@ -399,8 +421,7 @@ class _Evidence:
         contact_precision = by_contact.swapaxes(1, 2) @ by_contact
         contact_precision += 1e-6 * np.eye(3)  # without it, the volume of fewer than three measurements is infinite
         log_contact_volume = -0.5 * np.linalg.slogdet(contact_precision)[1].sum()
-        measured_std = np.column_stack([data.charge_std, data.contact_std])
-        log_density = -np.log(measured_std[np.isfinite(measured_std)]).sum()
+        log_density = -np.log(data.measured_std[np.isfinite(data.measured_std)]).sum()
         return cls(
             prior=prior,
             residual=residual - jacobian @ (unknowns - prior.mean),
@@ -418,16 +439,4 @@ class _Evidence:
         chi2 = self.other_chi2 + float(self.residual @ weighted)
         log_determinant = 2.0 * np.log(np.diag(factor[0])).sum()
         log_evidence = self.log_volume - 0.5 * (chi2 + log_determinant) + np.log(hypothesis.probability)
-        return _Fit(factor, weighted, float(log_evidence), chi2)
-
-    def posterior(self, hypothesis: Hypothesis, fit: _Fit) -> tuple[Array, Array]:
-        """Return the mean, shape (n_unknown,), and the covariance of the unknowns under a hypothesis with its fit."""
-        prior_covariance = self.prior.covariance(hypothesis)
-        gain = self.jacobian @ prior_covariance
-        return self.prior.mean - gain.T @ fit.weighted, prior_covariance - gain.T @ cho_solve(fit.factor, gain)
-
-
-def _redundancy(data: PressData) -> Array:
-    """Return the number of measurements of each press minus the three unknowns of its contact, shape (n,)."""
-    measured = np.isfinite(data.charge_std).sum(axis=1) + np.isfinite(data.contact_std).sum(axis=1)
-    return np.asarray(np.maximum(measured - 3, 0))
+        return _Fit(self, hypothesis, factor, weighted, float(log_evidence), chi2)

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.contact_domain import into_unit_domain
 from isocharge.simulate import Circle, Domain, FilmPrior, FilmSlopes, ForwardMap, Probe, Sensor, SolveSettings
 from isocharge.simulate.forward.derivative_maps import few_nodes
 from isocharge.simulate.forward.family import nearest_to_clamp
@@ -78,10 +77,6 @@ class FilmCharges:
     def domain(self) -> Domain:
         """Contacts for which the charges are known."""
         return self.film.domain
-
-    def into_domain(self, contact: Array) -> Array:
-        """Move each contact (x, y, F), shape (n, 3), that lies outside the domain to the nearest contact in it."""
-        return self.domain.to_contact(into_unit_domain(self.domain.to_unit(contact)))
 
     def charges(self, values: Array, contact: Array) -> Array:
         """Compute the charges of presses on a film with given properties, shape (n, n_electrode), pC."""

@@ -115,8 +115,8 @@ def _nodes(film: FilmEstimate) -> Array:
     node_MPa = np.array(NODES_MPa)
     sensor, _ = film.layout.prior.film(film.film_values)
     lowest_MPa = -0.95 * (sensor.film.pretension - np.hypot(*sensor.film.deviator))
-    reach = min(1.0, lowest_MPa / node_MPa.min()) if node_MPa.min() < 0.0 else 1.0
-    return np.unique(np.where(node_MPa < 0.0, reach * node_MPa, node_MPa))
+    factor = min(1.0, lowest_MPa / node_MPa.min())
+    return np.unique(np.where(node_MPa < 0.0, factor * node_MPa, node_MPa))
 
 
 def _tension_factors(

@@ -78,6 +78,11 @@ class PressData:
     def __len__(self) -> int:
         return len(self.charge)
 
+    @property
+    def measured_std(self) -> Array:
+        """Standard deviations of the charges and of the contacts, shape (n, n_electrode + 3); infinite if unknown."""
+        return np.column_stack([self.charge_std, self.contact_std])
+
     def __getitem__(self, rows: Booleans) -> "PressData":
         """Return some of the presses. Their times keep their reference."""
         names = ("charge", "charge_std", "contact", "contact_std", "time")
@@ -117,14 +122,13 @@ class Linearised:
             data: The presses.
             contact: Contacts (x, y, ln F), shape (n, 3).
         """
-        weight = 1.0 / data.charge_std
-        contact_weight = 1.0 / data.contact_std
-        charge_residual = weight * (model.charge_pC - data.charge)
-        contact_rows = contact_weight[:, :, None] * np.eye(3)
+        weight = 1.0 / data.measured_std
+        residual = np.column_stack([model.charge_pC - data.charge, contact - data.contact])
+        contact_rows = np.tile(np.eye(3), (len(data), 1, 1))
         return cls(
-            np.column_stack([charge_residual, contact_weight * (contact - data.contact)]),
-            np.pad(weight[:, :, None] * model.by_state, ((0, 0), (0, 3), (0, 0))),
-            np.concatenate([weight[:, :, None] * model.by_contact, contact_rows], axis=1),
+            weight * residual,
+            weight[:, :, None] * np.pad(model.by_state, ((0, 0), (0, 3), (0, 0))),
+            weight[:, :, None] * np.concatenate([model.by_contact, contact_rows], axis=1),
         )
 
     def eliminated(self) -> tuple[Array, Array]:

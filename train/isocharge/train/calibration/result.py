@@ -27,6 +27,7 @@ class PropertyEstimate:
         value: Most probable value.
         std: Standard deviation after the presses.
         before_std: Standard deviation before the presses.
+        identified: Whether the presses have reduced the standard deviation by at least half.
     """
 
     meaning: str
@@ -34,11 +35,7 @@ class PropertyEstimate:
     value: float
     std: float
     before_std: float
-
-    @property
-    def identified(self) -> bool:
-        """Whether the presses have reduced the standard deviation by at least half."""
-        return self.std <= IDENTIFIED_RATIO * self.before_std
+    identified: bool
 
 
 @dataclass(frozen=True)
@@ -97,9 +94,9 @@ class CalibrationResult:
         for one in self.film.layout.prior.properties:
             # `film_before`, with which presses are planned, has only half of the declared std of imperfections.
             before_std = one.std if self.problem.earlier is None else before.std(one.name)
-            estimates[one.name] = PropertyEstimate(
-                one.meaning, one.unit, self.film.value(one.name), self.film.std(one.name), before_std
-            )
+            value, std = self.film.value(one.name), self.film.std(one.name)
+            is_identified = std <= IDENTIFIED_RATIO * before_std
+            estimates[one.name] = PropertyEstimate(one.meaning, one.unit, value, std, before_std, is_identified)
         return estimates
 
     @property
@@ -144,7 +141,7 @@ class CalibrationResult:
             "error_left": vars(self.film_error),
             "error_left_before": vars(self.film_error_before),
             "error_of_noise": vars(self.sensitivity.noise_error),
-            "properties": {name: vars(one) | {"identified": one.identified} for name, one in self.properties.items()},
+            "properties": {name: vars(one) for name, one in self.properties.items()},
             "summary": self.summary,
             "cautions": self.cautions,
         }

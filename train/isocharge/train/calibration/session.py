@@ -20,7 +20,6 @@ from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITIO
 from isocharge.train.calibration.calibrate import calibrate, solve_even
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
 from isocharge.train.calibration.estimator import FEW_PRESSES
-from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.calibration.result import CalibrationResult
 
@@ -121,7 +120,7 @@ class PressSession:
         """
         self.problem = problem
         self._executor = executor
-        self._solved: FilmCharges | None = None  # the film that was solved last, with which the next fit begins
+        self._charges = solve_even(problem, executor)  # of the film that was solved last; the next fit begins with it
         self._save = save
         self._until = until
         self._stds = {"position_std_mm": position_std_mm, "force_std": force_std}
@@ -154,13 +153,6 @@ class PressSession:
         plan = next_presses(self.problem, self._charges, count, film, **self._stds)
         self._proposed = plan[-1]
         return self._proposed
-
-    @property
-    def _charges(self) -> FilmCharges:
-        """The film that was solved last, or the film of the sensor file."""
-        if self._solved is None:
-            self._solved = solve_even(self.problem, self._executor)
-        return self._solved
 
     @property
     def enough(self) -> bool:
@@ -250,7 +242,7 @@ class PressSession:
         except PressError as error:
             self.refusal = str(error)
             return
-        self._solved = self.result.charges
+        self._charges = self.result.charges
 
     @property
     def summary(self) -> tuple[str, ...]:

@@ -147,12 +147,8 @@ def _measure_detection(
 
     def detected_fraction(*wrong_gains: float) -> float:
         """Return the mean share of presses that cause an alarm if one electrode in turn has one of some wrong gains."""
-        n_electrode = noisy_charge.shape[1]
-        faulty_charges = [
-            noisy_charge * np.where(np.arange(n_electrode) == electrode, gain, 1.0)
-            for electrode in range(n_electrode)
-            for gain in wrong_gains
-        ]
+        is_faulty = np.eye(noisy_charge.shape[1], dtype=bool)  # one electrode in each row
+        faulty_charges = [noisy_charge * gains for gain in wrong_gains for gains in np.where(is_faulty, gain, 1.0)]
         _, _, misfit = predict(np.concatenate(faulty_charges))
         return rounded(np.mean(misfit > threshold))
 
