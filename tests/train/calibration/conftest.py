@@ -60,10 +60,17 @@ def rig_presses(*arguments, **options):
     return presses
 
 
+def film_values(prior, **changes):
+    """Return the mean properties of films, shape (n_property,), with other values of some named properties."""
+    values = prior.mean.copy()
+    for name, value in changes.items():
+        values[prior.index(name)] = value
+    return values
+
+
 def uneven_film(problem):
     """Return the estimate of a film whose tension is uneven, without uncertainty."""
     layout = problem.prior.layout
     values = problem.prior.mean.copy()
-    values[layout.index("pretension")] = 1.2
-    values[layout.index("tension_difference")] = -0.25
+    values[layout.film] = film_values(layout.prior, pretension=1.2, tension_difference=-0.25)
     return FilmEstimate(layout, values, np.zeros((len(values), len(values))))

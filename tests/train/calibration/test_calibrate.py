@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 from tests.benchmarks.measured_films import measured_presses
-from tests.train.calibration.conftest import rig, rig_presses
+from tests.train.calibration.conftest import film_values, rig, rig_presses
 from tests.train.calibration.synthetic_film import SyntheticFilm
 
 from isocharge.common.errors import PressError, SceneError, SensorError
@@ -61,17 +61,14 @@ def test_film_is_solved_beyond_the_radius_but_not_at_the_clamp(problem):
 def test_described_film_that_cannot_be_found_is_refused(problem):
     with pytest.raises(SensorError, match=r"pretension_MPa: expected at most 4 MPa.*got 8; train on many presses"):
         replace(problem, sensor=with_film(problem.sensor, pretension=8.0))
+    with pytest.raises(SceneError, match="at least three electrodes"):
+        replace(problem, sensor=replace(problem.sensor, electrodes=problem.sensor.electrodes[:2]))
 
 
-@pytest.mark.parametrize("radius", [44.5, 100.0, np.inf, np.nan])
+@pytest.mark.parametrize("radius", [44.5, np.inf, np.nan])
 def test_working_area_beyond_the_clamp_is_refused(problem, radius):
     with pytest.raises(SceneError, match="radius"):
         replace(problem, radius=radius)
-
-
-def test_sensor_of_two_electrodes_is_refused(problem):
-    with pytest.raises(SceneError, match="at least three electrodes"):
-        replace(problem, sensor=replace(problem.sensor, electrodes=problem.sensor.electrodes[:2]))
 
 
 @pytest.mark.parametrize("offset", [10.0, -12.0])
@@ -103,9 +100,7 @@ def test_forces_that_scatter_more_than_stated_are_named(fit, press_film):
 
 
 def presses_on_shifted_electrodes(problem, press_film, shift_mm):
-    values = problem.prior.layout.prior.mean.copy()
-    values[problem.prior.layout.index("shift_x")] = shift_mm
-    return press_film(20, seed=15, values=values)
+    return press_film(20, seed=15, values=film_values(problem.prior.layout.prior, shift_x=shift_mm))
 
 
 def test_electrodes_far_from_their_places_are_named(fit, press_film, problem):
@@ -125,7 +120,7 @@ def test_electrodes_that_are_farther_away_than_considered_are_refused(fit, press
 def test_presses_at_one_place_are_named(fit, problem, synthetic, scatter_mm):
     """A stage reads the same place with a scatter of 5 um; only positions near the centre may be metres."""
     contact = np.column_stack([np.full((8, 2), 3.0), np.geomspace(0.1, 1.9, 8)])
-    charge = synthetic.charges(problem.prior.layout.prior.mean, contact)
+    charge = synthetic.charges(synthetic.values, contact)
     contact[:, :2] += scatter_mm * np.random.default_rng(0).standard_normal((8, 2))
     cautions = fit(measured_presses(problem, contact, charge)).cautions
     assert any("at one place" in caution for caution in cautions)
@@ -184,12 +179,12 @@ def test_proposed_presses_reduce_the_errors_as_announced(fit, press_film, proble
     errors = [press.position_mm for press in proposed]
     assert errors == sorted(errors, reverse=True)
     contact = np.array([press.contact for press in proposed])
-    charge = synthetic.charges(problem.prior.layout.prior.mean, contact)
+    charge = synthetic.charges(synthetic.values, contact)
     chosen = fit(measured_presses(problem, contact, charge)).film_error.position_mm
     assert chosen == pytest.approx(errors[-1], rel=0.6)
     random_errors = []
     for seed in range(3):
-        presses = press_film(6, seed, values=problem.prior.layout.prior.mean)
+        presses = press_film(6, seed, values=synthetic.values)
         random_errors.append(fit(presses).film_error.position_mm)
     assert chosen < np.mean(random_errors)
 

@@ -18,7 +18,6 @@ EXPLAINED = {
     "columns": (lambda c, q: (c, q[:, [1, 2, 0, 3]]), "columns are swapped: those named A, B, C, D hold B, C, A, D"),
     "rotated": (lambda c, q: (c @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]]), q), "turned by -?90 degrees"),
     "mirrored": (lambda c, q: (c * [-1.0, 1.0, 1.0], q), "x is mirrored"),
-    "grams": (lambda c, q: (c / [1.0, 1.0, 9.80665e-3], q), "forces are in g, not N"),
     "millinewtons": (lambda c, q: (c / [1.0, 1.0, 1e-3], q), "forces are in mN, not N"),
     "centimetres": (lambda c, q: (c / [10.0, 10.0, 1.0], q), "positions are in cm, not mm"),
     "nanocoulombs": (lambda c, q: (c, q / 1e3), "charges are in nC, not pC"),

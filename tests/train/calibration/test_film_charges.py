@@ -6,13 +6,13 @@ from functools import partial
 import numpy as np
 import pytest
 from tests.benchmarks.measured_films import measured_presses, with_rig_errors
+from tests.train.calibration.conftest import film_values
 
 from isocharge.serve import Predictor
 from isocharge.simulate import (
     Circle,
     FilmPrior,
     Finger,
-    ForwardMap,
     GrowingFinger,
     load_sensor,
     local_workers,
@@ -68,7 +68,7 @@ def test_negative_charges_agree_with_direct_solves(problem, solved):
     swapped = with_piezo(problem.sensor, d31=-piezo.d31, d32=-piezo.d32)
     charges = replace(solved, prior=FilmPrior(swapped, problem.probe))
     prior = charges.prior
-    values = prior.mean + 0.3 * prior.std * (np.array(prior.names) == "pretension")
+    values = film_values(prior, pretension=1.76)
     expected = solved_charges(*prior.film(values), CONTACT)
     change = expected - charges.charges(prior.mean, CONTACT)
     assert expected.max() < 0.0 < np.abs(change).min()
@@ -118,8 +118,7 @@ def test_derivatives_are_those_of_direct_solves(solved, name):
     step = 0.1 * prior.std[index]
     charges = []
     for sign in (1.0, -1.0):
-        values = prior.mean.copy()
-        values[index] += sign * step
+        values = film_values(prior, **{name: prior.mean[index] + sign * step})
         charges.append(solved_charges(*prior.film(values), contact))
     expected = (charges[0] - charges[1]) / (2.0 * step)
     _, jacobian = solved.linearised(prior.mean, contact)
@@ -130,8 +129,7 @@ def test_derivatives_are_those_of_direct_solves(solved, name):
 @pytest.mark.parametrize("name", ["pretension", "tension_difference", "tension_shear", "young", "oval_x"])
 def test_derivatives_at_a_changed_uneven_film_are_differences_of_the_charges(solved, name):
     prior = solved.prior
-    values = prior.mean.copy()
-    values[[prior.index(one) for one in ("pretension", "tension_difference", "tension_shear")]] = 1.1, 0.2, -0.1
+    values = film_values(prior, pretension=1.1, tension_difference=0.2, tension_shear=-0.1)
     _, jacobian = solved.linearised(values, CONTACT)
     step = 1e-5 * (np.array(prior.names) == name)
     expected = (solved.charges(values + step, CONTACT) - solved.charges(values - step, CONTACT)) / 2e-5
@@ -169,6 +167,12 @@ def five_electrodes():
     return CalibrationProblem(sensor, parse_probe("rectangle:4.0x2.0"), radius=5.0, force_range=(0.2, 1.5))
 
 
+def opposite_coefficients():
+    """Return the problem of a film on which the electrodes on the y axis have negative charges."""
+    sensor = with_piezo(load_sensor("four-25um-biaxial"), d31=12.0, d32=-8.0)
+    return CalibrationProblem(sensor, Circle(1.0), radius=5.0, force_range=(0.1, 1.0))
+
+
 FILMS = {
     "T1 / T2 = 1.7 and E1 / E2 = 1.3": (
         lambda: CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0)),
@@ -176,6 +180,7 @@ FILMS = {
         ("pretension", "tension_difference", "d31"),
     ),
     "five electrodes": (five_electrodes, {"pretension": 1.2, "shift_x": 0.3}, ("shift_x",)),
+    "charges of both signs": (opposite_coefficients, {"pretension": 1.2}, ("pretension",)),
 }
 """Problems, properties that differ from the described film, and the properties of them that the presses determine."""
 
@@ -186,31 +191,9 @@ def test_film_is_calibrated_and_its_model_finds_contacts(film, tmp_path):
     make_problem, changes, determined = FILMS[film]
     problem = make_problem()
     prior = problem.prior.layout.prior
-    values = prior.mean.copy()
-    for name, value in changes.items():
-        values[prior.index(name)] = value
-    result, distance, force_error = calibrated(problem, *prior.film(values), tmp_path / "film")
+    sensor_and_probe = prior.film(film_values(prior, **changes))
+    result, distance, force_error = calibrated(problem, *sensor_and_probe, tmp_path / "film")
     for name in determined:
         assert abs(result.film.value(name) - changes[name]) < 4.0 * result.film.std(name)
     assert np.sqrt(np.mean(distance**2)) < 0.3
     assert np.sqrt(np.mean(force_error**2)) < 0.03
-
-
-@pytest.mark.slow
-def test_film_with_charges_of_both_signs_is_calibrated():
-    """The electrodes on the x axis have positive charges, and those on the y axis negative charges."""
-    sensor = with_piezo(load_sensor("four-25um-biaxial"), d31=12.0, d32=-8.0)
-    problem = CalibrationProblem(sensor, Circle(1.0), radius=5.0, force_range=(0.1, 1.0))
-    prior = problem.prior.layout.prior
-    values = prior.mean.copy()
-    values[prior.index("pretension")] = 1.2
-    film = ForwardMap.build(*prior.film(values), 5.2, (0.08, 1.2))
-    rng = np.random.default_rng(2)
-    contact = draw_contacts(rng, problem.domain, 15)
-    charge = film.charges(contact)
-    assert 0.3 < (charge < 0.0).mean() < 0.7
-    presses = measured_presses(problem, with_rig_errors(contact, rng), problem.noise.add(charge, rng))
-    result = calibrate(presses, problem)
-    assert abs(result.film.value("pretension") - 1.2) < 4.0 * result.film.std("pretension") < 1.2
-    residual = result.charges.charges(result.film.film_values, contact) - charge
-    assert np.sqrt(np.mean((residual / problem.noise.sigma(charge)) ** 2)) < 3.0

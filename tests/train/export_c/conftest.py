@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from isocharge.serve import find_model
+from isocharge.serve import Contact, find_model, load_model
 from isocharge.serve.live.device import ANY_BOARD
 from isocharge.train.export_c.folder import export_c
 from processes import finished
@@ -37,19 +37,17 @@ class Exported:
     Attributes:
         library: The shared library.
         electrodes: Number of electrodes.
-        numbers: Number of values of a contact: 10, or 7 of a model without correlations.
         source: Text of `isocharge_model.c`.
     """
 
     library: ctypes.CDLL
     electrodes: int
-    numbers: int
     source: str
 
     def predict(self, charge_pC):
-        """Return contacts, shape (n, numbers), from charges of shape (n, electrodes), pC."""
+        """Return contacts, shape (n, 10), from charges of shape (n, electrodes), pC."""
         charges = np.ascontiguousarray(charge_pC, dtype=np.float32)
-        contacts = np.empty((len(charges), self.numbers), np.float32)
+        contacts = np.empty((len(charges), len(Contact._fields)), np.float32)
         self.library.bridge_predict(_pointer(charges), len(charges), 1, _pointer(contacts))
         return contacts
 
@@ -133,21 +131,13 @@ def build(tmp_path_factory):
         sources = (HERE / "bridge.c", "isocharge_chain.c", "isocharge_frames.c", networks[key])
         library_options = (*options, "-fPIC", "-shared")
         library = compile_strictly(compiler, folder, folder / "bridge.so", *sources, options=library_options)
-        header = (folder / "isocharge_model.h").read_text()
         return Exported(
             library=ctypes.CDLL(str(library)),
-            electrodes=_defined_number(header, "ISOCHARGE_ELECTRODES"),
-            numbers=_defined_number(header, "ISOCHARGE_CONTACT_NUMBERS"),
+            electrodes=len(load_model(find_model(model)).metadata.electrodes),
             source=(folder / "isocharge_model.c").read_text(),
         )
 
     return build
-
-
-def _defined_number(header, name):
-    """Return the number that a header defines by `#define name number`."""
-    _, after_name = header.split(f"{name} ")[:2]
-    return int(after_name.split()[0])
 
 
 @pytest.fixture(scope="session")

@@ -55,6 +55,9 @@ BOARDS = {
 ELECTRODES = ("A", "B", "C", "D")
 RATE_Hz = 200.0
 HUM_Hz = 60.0
+SINGLE_PRECISION = ("-DISOCHARGE_CHAIN_FLOAT", "-Wdouble-promotion")
+"""Options of the compiler. The second refuses double precision, which small processors would emulate."""
+
 T_OF_HOLD_s = np.arange(0.0, 30.0, 1.0 / RATE_Hz)
 
 
@@ -91,20 +94,13 @@ def draw_frames(board, seed, seconds=20.0):
     dt_s[0] = 0.0
     t_s = 5.0 + np.cumsum(dt_s)
 
-    ratio = rng.uniform(0.6, 1.4, n_electrode)
-    press_pC = np.zeros(count)
-    for begin in np.cumsum(rng.integers(200, 700, 8)):
-        end = begin + int(rng.integers(20, 400))
-        press_pC[begin:end] = rng.uniform(20.0, 1500.0)
-    is_pressed = press_pC > 0.0
-    noise_pC = 0.3 * rng.standard_normal((count, n_electrode))
-    offset_pC = rng.uniform(-20.0, 20.0, n_electrode)
-    charge = press_pC[:, None] * ratio + noise_pC + offset_pC
+    # Every second of these intervals is a press.
+    press_pC = np.repeat(rng.uniform(20.0, 1500.0, 40) * (np.arange(40) % 2), rng.integers(100, 400, 40))[:count]
     hum_pC = rng.uniform(0.0, 1.0) * np.sin(2 * np.pi * HUM_Hz * t_s)
     drift_pC = rng.uniform(-0.1, 0.1) * t_s
-    charge += (hum_pC + drift_pC)[:, None]
-    charge += 30.0 * is_pressed[:, None] * rng.random()
-    charge[rng.choice(np.flatnonzero(is_pressed), 3)] *= 40.0  # spikes, which are not peaks of a press
+    charge = np.outer(press_pC, rng.uniform(0.6, 1.4, n_electrode)) + (hum_pC + drift_pC)[:, None]
+    charge += 0.3 * rng.standard_normal(charge.shape) + rng.uniform(-20.0, 20.0, n_electrode)
+    charge[rng.choice(np.flatnonzero(press_pC), 3)] *= 40.0  # spikes, which are not peaks of a press
 
     gain = Gain(Setup(ELECTRODES, device(board)))
     values = charge / gain.gain_pC + gain.zero
@@ -187,8 +183,7 @@ def test_c_and_python_give_the_same_charges_and_states_for_each_frame(board, bui
 
 @pytest.mark.parametrize("board", ["any board", "hum"])
 def test_single_precision_changes_charges_by_less_than_a_twentieth_of_a_picocoulomb(board, build, misfit):
-    """The compiler option -Wdouble-promotion refuses double precision, which small processors would emulate."""
-    exported = build("four-25um-biaxial", device(board), options=("-DISOCHARGE_CHAIN_FLOAT", "-Wdouble-promotion"))
+    exported = build("four-25um-biaxial", device(board), options=SINGLE_PRECISION)
     frames = draw_frames(board, seed=4)
     frames.values[np.abs(frames.values) > 1e30] = np.inf
     compare_chains(exported, device(board), frames, misfit, tolerance_pC=0.05)
@@ -200,7 +195,7 @@ def test_single_precision_does_not_add_up_its_errors_in_a_held_press(tau_s, lear
     board = device_from_table({"leak": {"tau_s": tau_s, "learn": learn}}, "board")
     held_pC = np.where(T_OF_HOLD_s < 2.0, 0.0, 850.0 * np.exp(-(T_OF_HOLD_s - 2.0) / tau_s))
     frames = regular_frames(held_pC[:, None] + np.random.default_rng(1).standard_normal((len(held_pC), 4)))
-    exported = build("four-25um-biaxial", board, options=("-DISOCHARGE_CHAIN_FLOAT", "-Wdouble-promotion"))
+    exported = build("four-25um-biaxial", board, options=SINGLE_PRECISION)
     compare_chains(exported, board, frames, tolerance_pC=0.2)
 
 
@@ -214,11 +209,8 @@ def test_single_precision_learns_the_leak_from_the_same_frames_after_a_release(r
     leaking_pC = lfilter([1.0, -1.0], [1.0, -decay], pressed_pC)  # output of an amplifier that leaks
     values = leaking_pC[:, None] + np.random.default_rng(1).standard_normal((len(t_s), 4))
     frames = regular_frames(values)._replace(t_s=t_s, dt_s=np.full(len(t_s), 1.0 / rate_Hz))
-    expected_charge, _, expected_contact, _ = python_chain(board, frames, None)
-    exported = build("four-25um-biaxial", board, options=("-DISOCHARGE_CHAIN_FLOAT", "-Wdouble-promotion"))
-    charge, _, contact, _ = exported.chain(*frames)
-    np.testing.assert_array_equal(contact, expected_contact)
-    np.testing.assert_allclose(charge, expected_charge, rtol=0, atol=0.1)
+    exported = build("four-25um-biaxial", board, options=SINGLE_PRECISION)
+    compare_chains(exported, board, frames, tolerance_pC=0.1)
 
 
 def test_contact_that_a_drift_begins_has_the_flag_drift_in_c_as_in_python(build):

@@ -250,8 +250,6 @@ def test_keys_left_out_keep_their_defaults(tmp_path):
     config = load_config(write(tmp_path, "[training]\nsteps = 7\n"))
     assert config == FitConfig(network=NetworkConfig(), training=TrainingConfig(steps=7))
     assert load_config(CONFIGS / "quick.toml").network == NetworkConfig()
-    released = TrainingConfig(steps=2_000, misfit_steps=3_000, misfit_charges=80_000)
-    assert load_config(CONFIGS / "release.toml").training == released
 
 
 def test_focused_distance_is_a_mean_with_smaller_weights_for_long_targets():

@@ -1,5 +1,7 @@
 """The optimiser SOAP: against PyTorch's Adam, and on an ill-conditioned problem."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -11,21 +13,20 @@ from isocharge.train.training.descent import Soap
 BETAS = (descent.DECAY, descent.DECAY)
 
 
-def run(take_step, parameter, loss, steps):
+def soap_step(parameter):
+    return partial(Soap(parameter).step, 0.03)
+
+
+def adam_step(parameter):
+    return torch.optim.Adam([parameter], lr=0.03, betas=BETAS, eps=torch.finfo(torch.float32).tiny).step
+
+
+def run(make_step, parameter, loss, steps):
+    take_step = make_step(parameter)
     for _ in range(steps):
         parameter.grad = None
         loss(parameter).backward()
         take_step()
-
-
-def run_soap(parameter, loss, steps, rate):
-    optimiser = Soap(parameter)
-    run(lambda: optimiser.step(rate), parameter, loss, steps)
-
-
-def run_adam(parameter, loss, steps, rate):
-    optimiser = torch.optim.Adam([parameter], lr=rate, betas=BETAS, eps=torch.finfo(torch.float32).tiny)
-    run(optimiser.step, parameter, loss, steps)
 
 
 def test_a_matrix_with_a_diagonal_gradient_is_trained_by_adam():
@@ -36,8 +37,8 @@ def test_a_matrix_with_a_diagonal_gradient_is_trained_by_adam():
     def loss(parameter):
         return ((parameter - target) ** 2).sum()
 
-    run_soap(ours, loss, 25, rate=0.03)
-    run_adam(theirs, loss, 25, rate=0.03)
+    run(soap_step, ours, loss, 25)
+    run(adam_step, theirs, loss, 25)
     torch.testing.assert_close(ours, theirs)
 
 
@@ -54,9 +55,9 @@ def test_an_ill_conditioned_problem_is_solved_far_better_than_by_adam():
         return ((factors[0] @ (weight - solution) @ factors[1]) ** 2).sum()
 
     losses = []
-    for run_optimiser in (run_soap, run_adam):
+    for make_step in (soap_step, adam_step):
         weight = nn.Parameter(torch.zeros(8, 12))
-        run_optimiser(weight, loss, 300, rate=0.03)
+        run(make_step, weight, loss, 300)
         losses.append(loss(weight).item())
     assert losses[0] < 0.1 * losses[1]
 
