@@ -84,6 +84,8 @@ class Frame:
         tare_pC: Charge at rest that was subtracted, shape (n_electrode,), pC; None without touch charges.
         noise_pC: Standard deviation of the charges at rest, shape (n_electrode,), pC. It requires a tare.
         is_contact: Whether something touches the film.
+        warming_pC: Part of the charges that is due to a warming of the film since the previous frame, shape
+            (n_electrode,) or one number for all electrodes, pC. It was subtracted from `charge_pC`.
         base_relax_s: Time constant with which the charge out of contact decays to zero, s.
         is_base_held: Whether a finger is touching or leaving the film. A positive base of the touch detection then does
             not decay.
@@ -113,6 +115,7 @@ class Frame:
     tare_pC: Array | None = None
     noise_pC: Array = field(init=False, repr=False, compare=False)
     is_contact: bool = False
+    warming_pC: Array | float = 0.0
     base_relax_s: float = math.inf
     is_base_held: bool = False
     contact: Contact | None = None

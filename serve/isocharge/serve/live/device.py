@@ -31,18 +31,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from msgspec import defstruct, field, structs
+from msgspec import defstruct, structs
 
 from isocharge.common.errors import DeviceError
-from isocharge.common.structs import Settings, convert, read_toml
-from isocharge.serve.frames.formats import AutoFrames, Frames
+from isocharge.common.structs import convert, read_toml
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.gain import Gain, Saturation
 from isocharge.serve.signal_chain.hum import Hum
 from isocharge.serve.signal_chain.leak import Integrator, Leak
-from isocharge.serve.signal_chain.stage import Device, FrontEnd, Rule, Setting, Setup, Share, Stage
+from isocharge.serve.signal_chain.stage import Board, Device, Rule, Setting, Setup, Share, Stage
 from isocharge.serve.signal_chain.tare import Tare
 from isocharge.serve.signal_chain.thermal import Warming
 from isocharge.serve.signal_chain.touch import Touch
@@ -114,17 +113,11 @@ STAGES: tuple[type[Stage], ...] = (
 DeviceSections = defstruct(
     "DeviceSections",
     [
-        ("name", str, "unnamed board"),
-        ("front_end", FrontEnd, "charge"),
-        ("frames", Frames, AutoFrames()),
-        ("channels", dict[str, str], field(default_factory=dict)),
-        *[
-            (stage.section, stage.rule_class | None, stage.rule_class() if stage.is_default else None)
-            for stage in STAGES
-            if stage.section
-        ],
+        (stage.section, stage.rule_class | None, stage.rule_class() if stage.is_default else None)
+        for stage in STAGES
+        if stage.section
     ],
-    bases=(Settings,),
+    bases=(Board,),
     frozen=True,
 )
 """Content of a device file. Each stage with settings has a section."""

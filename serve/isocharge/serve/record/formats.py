@@ -12,7 +12,7 @@ import io
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from isocharge.serve.record.record import DECIMALS, RECORD_FIELDS, Field, Kind, PredictionRecord
+from isocharge.serve.record.record import DECIMALS, RECORD_FIELDS, Field, PredictionRecord
 
 
 def csv_header(electrodes: Sequence[str], fields: Sequence[Field]) -> str:
@@ -58,8 +58,10 @@ def _columns(electrodes: Sequence[str], fields: Sequence[Field]) -> Iterator[tup
 
 
 def _part_names(field: Field, electrodes: Sequence[str]) -> Sequence[str]:
-    """Return the names of the numbers in a field: the electrodes for charges, and the parts of an object."""
-    return electrodes if field.kind == "charges" else [part.name for part in field.parts]
+    """Return the names of the numbers in an object: the fields of a struct, or the electrodes; empty without object."""
+    if field.json_type != "object":
+        return ()
+    return [part.name for part in field.parts] or electrodes
 
 
 def _line(cells: Iterable[str]) -> str:
@@ -88,16 +90,6 @@ def cell_text(value: Any) -> str:
 
 SCHEMA_NAME = "isocharge.PredictionRecord"
 """Title of the schema."""
-
-JSON_TYPES: dict[Kind, str] = {
-    "number": "number",
-    "integer": "integer",
-    "boolean": "boolean",
-    "text": "string",
-    "words": "array",
-    "charges": "object",
-    "object": "object",
-}
 
 
 def record_schema(electrodes: Sequence[str]) -> dict[str, Any]:
@@ -140,7 +132,7 @@ def _property(field: Field, electrodes: Sequence[str], *, allows_null: bool) -> 
         allows_null: Whether the schema allows null for every field that may be unknown, and for every number in an
             object. If not, the schema declares only the type of known values.
     """
-    json_type = JSON_TYPES[field.kind]
+    json_type = field.json_type
     number_in_object: dict[str, Any] = {"type": "number"}  # schema of a number in an object
     if allows_null:
         number_in_object = {"type": ["number", "null"]}
@@ -148,7 +140,7 @@ def _property(field: Field, electrodes: Sequence[str], *, allows_null: bool) -> 
     schema: dict[str, Any] = {"type": json_type}
     if allows_null and field.may_be_null:
         schema["type"] = [json_type, "null"]
-    if field.kind == "words":  # a list of texts
+    if json_type == "array":  # a list of texts
         schema["items"] = {"type": "string"}
     if json_type == "object":  # its parts are all numbers
         schema["properties"] = dict.fromkeys(_part_names(field, electrodes), number_in_object)

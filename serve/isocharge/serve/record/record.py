@@ -8,27 +8,24 @@ unknown while nothing touches the film. The device clock is unknown if the charg
 import json
 from functools import cache, cached_property
 from types import UnionType
-from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
 from msgspec import Struct, structs
 
 from isocharge.serve.model.contact import Contact
 
-Kind = Literal["number", "integer", "boolean", "text", "words", "charges", "object"]
-"""Kind of a value. `words` is a list of texts, `charges` has a number for each electrode, and `object` has fields."""
-
 Charges = dict[str, float | None]
 """Charges by the name of the electrode, pC; None if the device sent no number."""
 
-KINDS: dict[Any, Kind] = {
+JSON_TYPES: dict[Any, str] = {
     float: "number",
     int: "integer",
     bool: "boolean",
-    str: "text",
-    tuple[str, ...]: "words",
-    Charges: "charges",
+    str: "string",
+    tuple[str, ...]: "array",
+    Charges: "object",
 }
-"""Kind of the values of each type. Any other type is a struct."""
+"""JSON type of the values of each type. Any other type is a struct, which is an object in JSON."""
 
 
 FLATTENED = ""
@@ -40,16 +37,16 @@ class Field(NamedTuple):
 
     Attributes:
         name: Key in JSON.
-        kind: Kind of the value.
+        json_type: Type of the value in JSON. An array contains texts. An object contains numbers.
         meaning: Description of the value, a sentence.
         may_be_null: Whether the value may be null, because it is unknown.
-        parts: Fields of the value, if its kind is `object`.
+        parts: Fields of a struct; empty for any other value, also for an object with a number for each electrode.
         group: Name of the attribute with the nested struct to which the field belongs. A record has the field only if
             it has this struct. Empty for a field that every record has.
     """
 
     name: str
-    kind: Kind
+    json_type: str
     meaning: str
     may_be_null: bool
     parts: tuple["Field", ...] = ()
@@ -60,8 +57,8 @@ def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
     """Return the fields of a struct in the order of their declaration.
 
     The annotation of each field contains a sentence that describes the value. If this sentence is `FLATTENED`, the
-    fields of the nested struct are returned instead. The group of a field of a nested struct, and of a field of the
-    kind `object`, is the name of the field that contains the struct.
+    fields of the nested struct are returned instead. The group of a field that is a struct, and of a field of a nested
+    struct, is the name of the field that contains the struct.
 
     Raises:
         TypeError: If the annotation of a field contains no sentence.
@@ -77,8 +74,8 @@ def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
         value_type = get_args(declared_type)[0] if may_be_null else declared_type
         if meaning == FLATTENED:
             fields += [nested_field._replace(group=name) for nested_field in fields_of(value_type)]
-        elif value_type in KINDS:
-            fields.append(Field(name, KINDS[value_type], meaning, may_be_null))
+        elif value_type in JSON_TYPES:
+            fields.append(Field(name, JSON_TYPES[value_type], meaning, may_be_null))
         else:
             fields.append(Field(name, "object", meaning, may_be_null, fields_of(value_type), group=name))
     return tuple(fields)

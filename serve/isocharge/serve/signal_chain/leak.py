@@ -33,7 +33,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.structs import Positive
 from isocharge.serve.flags import GAP
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.stage import LARGEST, Divisor, OffsetStage, Rule, Setting, Setup, SUM_TOLERANCE_s
+from isocharge.serve.signal_chain.stage import LARGEST, Divisor, Rule, Setting, Setup, Stage, SUM_TOLERANCE_s
 
 
 class LeakRule(Rule, frozen=True, kw_only=True):
@@ -131,7 +131,7 @@ class Inflow:
             self._candidate_age_s = 0.0
 
 
-class Leak(OffsetStage):
+class Leak(Stage):
     """Corrects the leak of the charge amplifiers, and estimates their inflow."""
 
     section = "leak"
@@ -140,7 +140,6 @@ class Leak(OffsetStage):
 
     def __init__(self, setup: Setup) -> None:
         """Store the settings. The state begins at the first frame after the tare."""
-        super().__init__(setup)
         self._rule = setup.device.rule(LeakRule) or LeakRule()
         self._tau_s = setup.for_each_electrode("leak.tau_s", self._rule.tau_s)
         self.reset()
@@ -189,6 +188,7 @@ class Leak(OffsetStage):
         dt_s = frame.dt_s
         innovation_pC = self._innovation_pC(output_pC, np.exp(-dt_s / self._tau_s))
         surplus_pC = innovation_pC - self._inflow.pC_per_s * dt_s  # new touch charge and noise
+        self._charge_pC = self._charge_pC - previous.warming_pC
         if previous.is_contact:
             self._inflow.pause()
         else:
@@ -249,10 +249,6 @@ class Leak(OffsetStage):
         error_pC = np.abs(surplus_pC) * (self._growth(frame) - 1.0) / 2.0
         limit_pC = np.maximum(frame.noise_pC, 0.01 * np.abs(self._charge_pC + surplus_pC))
         return bool((error_pC > limit_pC).any())
-
-    def add_warming(self, warming_pC: Array | float) -> None:
-        """Subtract the warming from the touch charge that the stage integrates."""
-        self._charge_pC = self._charge_pC - warming_pC
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:

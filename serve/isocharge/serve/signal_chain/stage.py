@@ -70,23 +70,31 @@ FrontEnd = Literal["charge", "current"]
 """What the values of a board are: charges, or currents. A current is the charge of one sampling interval."""
 
 
-class Device(Settings, frozen=True):
-    """Settings of a board, as its device file states them.
+class Board(Settings, frozen=True):
+    """The part of a device file that does not belong to a stage.
 
     Attributes:
         name: Name of the board.
         front_end: Whether the values of the board are charges or currents.
         frames: Format of the frames.
         channels: Name or number of the channel of each electrode; empty without the section `[channels]`.
-        rules: Settings of each stage that is switched on, by their class.
-        table: Content of the device file without any conversion, which is stored in recordings.
-        where: Name of the file, for messages.
     """
 
     name: str = "unnamed board"
     front_end: FrontEnd = "charge"
     frames: Frames = AutoFrames()
     channels: dict[str, str] = field(default_factory=dict)
+
+
+class Device(Board, frozen=True):
+    """Settings of a board, as its device file states them.
+
+    Attributes:
+        rules: Settings of each stage that is switched on, by their class.
+        table: Content of the device file without any conversion, which is stored in recordings.
+        where: Name of the file, for messages.
+    """
+
     rules: Mapping[type[Rule], Rule] = field(default_factory=dict)
     table: Mapping[str, Any] = field(default_factory=dict)
     where: str = "device"
@@ -126,7 +134,6 @@ class Setup:
         device: Settings of the board.
         predictor: The present model; None if a stream computes only touch charges.
         reader: Name of the program part that needs these electrodes, for messages, such as "model three/1".
-        offset_stage: Last stage that stores the charge at rest; None until a stage is created.
         has_any_sign: Whether the charges of a touch may have any sign. Otherwise, most of them are positive.
     """
 
@@ -134,7 +141,6 @@ class Setup:
     device: Device = NO_SETTINGS
     predictor: Predictor | None = None
     reader: str = "the sensor"
-    offset_stage: "OffsetStage | None" = None
     has_any_sign: bool = False
 
     def __post_init__(self) -> None:
@@ -238,24 +244,3 @@ class Stage(ABC):
         rule = setup.device.rule(cls.rule_class)
         settings = {} if rule is None else structs.asdict(rule)
         return {name: value for name, value in settings.items() if name != "on"}
-
-
-class OffsetStage(Stage):
-    """A stage that stores the charge at rest. The touch charge is measured relative to the charge at rest."""
-
-    def __init__(self, setup: Setup) -> None:
-        """Begin without any frame, as the last stage that stores the charge at rest.
-
-        Args:
-            setup: Settings of all stages, and objects that the stages share.
-        """
-        setup.offset_stage = self
-
-    @abstractmethod
-    def add_warming(self, warming_pC: Array | float) -> None:
-        """Assign a part of the touch charge of the present frame to the warming of the film.
-
-        Args:
-            warming_pC: Part of the touch charge that is warming, shape (n_electrode,) or one number for all electrodes,
-                pC.
-        """

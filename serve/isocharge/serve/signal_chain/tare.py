@@ -15,7 +15,8 @@ from isocharge.common.errors import DeviceError, TareError
 from isocharge.common.structs import WrongKey
 from isocharge.serve.flags import TARE
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.stage import LARGEST, Count, Divisor, OffsetStage, Rule, Setting, Setup
+from isocharge.serve.signal_chain.leak import LeakRule
+from isocharge.serve.signal_chain.stage import LARGEST, Count, Divisor, Rule, Setting, Setup, Stage
 
 MAX_TARE_FRAMES_IN_C = 10_000
 """Largest number of frames of a tare in C, which limits the memory that the C program needs."""
@@ -51,7 +52,7 @@ class TareRule(Rule, frozen=True, kw_only=True):
             raise WrongKey("patience", f"at least the {self.frames} frames of a tare, or 0 for no limit", self.patience)
 
 
-class Tare(OffsetStage):
+class Tare(Stage):
     """Measures the charge at rest in quiet frames, and subtracts this charge from all later frames.
 
     Without a later stage that estimates the drift, the tare follows a slow drift while nothing touches the film. It
@@ -68,14 +69,15 @@ class Tare(OffsetStage):
 
     def __init__(self, setup: Setup) -> None:
         """Begin without a tare."""
-        super().__init__(setup)
         self._rule = setup.device.rule(TareRule)
         if self._rule is not None and setup.device.has_currents:  # at rest, a current of any size is an offset
             self._rule = structs.replace(self._rule, offset_limit_pC=math.inf)
-        self._setup = setup
+        self._electrodes = setup.electrodes
+        # Whether the tare follows the drift and the warming, because no later stage does
+        self._follows = LeakRule not in setup.device.rules and not setup.device.has_currents
         self._tare_pC: Array | None = None  # charge at rest
         self._noise_pC = np.zeros(len(setup.electrodes))  # standard deviation of the charge at rest
-        self._previous: tuple[Frame, Array] | None = None  # previous frame, and its charges before this stage, pC
+        self._previous: Frame | None = None  # previous frame
         self._latest_pC = np.empty((0, len(setup.electrodes)))  # charges from which the tare is measured
         self._searched_frames = 0  # number of frames since the beginning of the search
         self._is_search_limited = True  # whether the search ends with an error after too many frames
@@ -93,16 +95,14 @@ class Tare(OffsetStage):
             frame.charge_pC = None
             frame.flags.append(TARE)
             return
-        # Without a later stage that stores the charge at rest, the tare follows the drift.
-        if self._rule is not None and self._setup.offset_stage is self:
+        if self._follows:
             if self._previous is not None:
-                previous_frame, previous_pC = self._previous
-                if not previous_frame.is_contact:
-                    self._tare_pC = follow_drift(self._rule, self._tare_pC, previous_pC, previous_frame.dt_s)
+                self._tare_pC = self._tare_pC + self._change_pC(self._previous)
             # The charge out of contact decays, but the charge of a finger that is leaving the film does not.
-            frame.base_relax_s = self._rule.relax_s
             frame.is_base_held = True
-        self._previous = (frame, frame.charge_pC)
+            if self._rule is not None:
+                frame.base_relax_s = self._rule.relax_s
+        self._previous = frame
         frame.tare_pC = self._tare_pC
         frame.noise_pC = self._noise_pC
         frame.charge_pC = frame.charge_pC - self._tare_pC
@@ -118,13 +118,16 @@ class Tare(OffsetStage):
         self._searched_frames = 0
         self._is_search_limited = False
 
-    def add_warming(self, warming_pC: Array | float) -> None:
-        """Add the warming to the tare."""
-        assert self._tare_pC is not None
-        assert self._previous is not None
-        self._tare_pC = self._tare_pC + warming_pC
-        present_frame, _ = self._previous
-        present_frame.tare_pC = self._tare_pC
+    def _change_pC(self, frame: Frame) -> Array | float:
+        """Return the change of the tare because of a frame, shape (n_electrode,) or one number, pC.
+
+        In contact, the change is the warming. Otherwise, the tare approaches the charge of the frame.
+        """
+        rule = self._rule
+        if frame.is_contact or rule is None or frame.charge_pC is None:
+            return frame.warming_pC
+        difference_pC = np.minimum(np.maximum(frame.charge_pC, -rule.noise_limit_pC), rule.noise_limit_pC)
+        return difference_pC * -math.expm1(-frame.dt_s / rule.relax_s)
 
     def _search(self, frame: Frame) -> None:
         """Add a frame to the latest frames, and measure the tare if these frames are enough and quiet.
@@ -137,7 +140,7 @@ class Tare(OffsetStage):
         rule = self._rule
         assert frame.charge_pC is not None
         if rule is None:
-            self._tare_pC = np.zeros(len(self._setup.electrodes))
+            self._tare_pC = np.zeros(len(self._electrodes))
             return
         stored_pC = np.vstack([self._latest_pC, frame.charge_pC])
         self._latest_pC = stored_pC[-rule.frames :]  # at most as many frames as a tare needs
@@ -160,7 +163,7 @@ class Tare(OffsetStage):
         The search may have failed because the film is touched, or because the board has large offsets. In the second
         case, the present values are the offsets.
         """
-        value_of_electrode = zip(self._setup.electrodes, frame.sent.tolist(), strict=True)
+        value_of_electrode = zip(self._electrodes, frame.sent.tolist(), strict=True)
         offsets = ", ".join(f"{name} = {value:.10g}" for name, value in value_of_electrode)
         setting = "[gain] offset = {" + offsets + "}"
         return TareError(f"{error}; if the board rests there without a touch, say so in a device file: {setting}")
@@ -212,18 +215,3 @@ def measure_tare(rule: TareRule, raw_pC: Array) -> tuple[Array, Array]:
             "rests there"
         )
     return tare_pC, noise_pC
-
-
-def follow_drift(rule: TareRule, tare_pC: Array, charge_pC: Array, dt_s: float) -> Array:
-    """Return the tare, shape (n_electrode,), pC, after a frame in which nothing touches the film.
-
-    Args:
-        rule: Time constant, and the limit of the difference between the charge and the tare.
-        tare_pC: The tare before the frame, shape (n_electrode,), pC.
-        charge_pC: Charges of the frame, shape (n_electrode,), pC.
-        dt_s: Time since the previous frame, s.
-    """
-    limit_pC = rule.noise_limit_pC
-    difference_pC = np.minimum(np.maximum(charge_pC - tare_pC, -limit_pC), limit_pC)
-    share = -math.expm1(-dt_s / rule.relax_s)
-    return np.asarray(tare_pC + share * difference_pC)

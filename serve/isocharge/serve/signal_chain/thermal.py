@@ -94,8 +94,8 @@ class Warming(Stage):
     def step(self, frame: Frame) -> None:
         """Estimate the warming of a frame in contact, subtract its change from the charges, and add the flags.
 
-        The stage that stores the charge at rest has already subtracted the earlier changes of the warming. It also
-        receives the present change. While an amplifier is saturated, the warming is not estimated, because the charges
+        The stage that stores the charge at rest has already subtracted the earlier changes of the warming. It reads the
+        present change from the frame. While an amplifier is saturated, the warming is not estimated, because the charges
         then fit no contact for any value of the warming.
         """
         if frame.charge_pC is None:
@@ -106,9 +106,10 @@ class Warming(Stage):
         if SATURATED in frame.flags:
             return
         change_pC = self._estimate(frame.charge_pC, frame.dt_s) * self._ratios
-        if self._setup.offset_stage is not None:
-            frame.charge_pC = frame.charge_pC - change_pC
-            self._setup.offset_stage.add_warming(change_pC)
+        frame.charge_pC = frame.charge_pC - change_pC
+        frame.warming_pC = change_pC
+        if frame.is_base_held and frame.tare_pC is not None:  # the warming is a part of the tare
+            frame.tare_pC = frame.tare_pC + change_pC
         if abs(self._charge_pC) >= self._rule.tell_pC:
             frame.flags.append(THERMAL)
         if self._is_blind:
@@ -167,29 +168,25 @@ class Warming(Stage):
         return settings
 
 
-def warming_ratios(setup: Setup) -> Array | float:
+def warming_ratios(setup: Setup) -> Array:
     """Return the charge that warming adds to each electrode, relative to the mean magnitude over all electrodes.
 
     Returns:
-        Ratios, shape (n_electrode,), dimensionless; the number 1.0, for equal charges on all electrodes, if the device
-        file does not state `common_mode.pC_per_K`.
+        Ratios, shape (n_electrode,), dimensionless. All ratios are 1 if the device file does not state
+        `common_mode.pC_per_K`.
 
     Raises:
         DeviceError: If there are too few electrodes, if the charges of all electrodes are 0, or if the setting states
             numbers for other electrodes.
     """
-    rule = setup.device.rule(ThermalRule)
-    if rule is None:
-        return 1.0
+    rule = setup.device.rule(ThermalRule) or ThermalRule()
     if len(setup.electrodes) < MIN_ELECTRODES:
         raise DeviceError(
             f"{setup.device.where}: common_mode: expected four electrodes or more, the model has {setup.electrodes}; "
             "with three every set of charges fits some contact, and warming cannot be separated from force: remove the "
             "section"
         )
-    if rule.pC_per_K is None:
-        return 1.0
-    charge_pC_per_K = setup.for_each_electrode("common_mode.pC_per_K", rule.pC_per_K)
+    charge_pC_per_K = setup.for_each_electrode("common_mode.pC_per_K", 1.0 if rule.pC_per_K is None else rule.pC_per_K)
     mean_magnitude_pC_per_K = float(np.abs(charge_pC_per_K).mean())
     if mean_magnitude_pC_per_K == 0.0:
         raise DeviceError(

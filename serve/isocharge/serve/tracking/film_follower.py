@@ -211,7 +211,7 @@ class FilmFollower(Stage):
         self._rule = setup.device.rule(FollowRule) or FollowRule()
         self._series = series
         # Charge that warmth adds to each electrode, relative to the common offset, shape (n_electrode,)
-        self._offset_ratio = np.broadcast_to(np.asarray(warming_ratios(setup), dtype=float), (len(electrodes),))
+        self._offset_ratio = warming_ratios(setup)
         self._offset_std_pC = RELATIVE_OFFSET_STD * self._rule.largest_offset_pC
 
         # The state consists of the state of the charge map, the logarithms of the gains and the common offset.
