@@ -12,6 +12,7 @@ import math
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import DRIFT, NEGATIVE
@@ -121,8 +122,7 @@ class Touch(Stage):
         n_electrode = len(self._setup.electrodes)
         self._touch_direction: Array | None = None  # sum of the directions of the frames of the latest touch
         self._base = np.zeros(n_electrode)  # charges that are no touch
-        self._last = np.zeros(n_electrode)  # charges of the latest frame
-        self._last_size = 0.0
+        self._previous = np.zeros(n_electrode)  # charges of the previous frame
         self._mean = np.zeros(n_electrode)  # exponential mean of the charges out of contact
         self._has_drifted = False  # whether the charges rose too slowly at the beginning of this touch
         self._is_contact = False
@@ -144,50 +144,60 @@ class Touch(Stage):
             if frame.noise_pC is not self._noise_pC:  # the film was tared
                 self._noise_pC = frame.noise_pC
                 self._threshold_pC = self._rule.threshold_pC(frame.noise_pC)
-            self._detect(self._rule, frame, frame.charge_pC / self._threshold_pC)
+            charge = frame.charge_pC / self._threshold_pC
+            direction = self._rest_direction if self._touch_direction is None else self._touch_direction
+            if self._is_contact:
+                self._continue(self._rule, charge, direction)
+            else:
+                self._await(frame, charge, direction)
+            self._previous = charge
         frame.is_contact = self._is_contact
         if self._is_contact and self._has_drifted:
             frame.flags.append(DRIFT)
 
-    def _detect(self, rule: TouchRule, frame: Frame, charge: Array) -> None:
-        """Update the state with the charges of a frame.
+    def _continue(self, rule: TouchRule, charge: Array, direction: Array) -> None:
+        """Update the present touch with the charges of a frame, or end the touch.
 
         Args:
             rule: Thresholds.
-            frame: The frame.
             charge: Charges relative to the touch thresholds, shape (n_electrode,), dimensionless.
+            direction: Sum of the directions of the earlier frames of the touch, shape (n_electrode,), dimensionless.
         """
         size = _norm(charge)
-        two_frame_peak = min(size, self._last_size)  # a spike of a single frame is not a peak
-        self._last_size = size
-        reference = self._last if self._setup.has_any_sign else self._rest_direction
+        self._peak = max(self._peak, min(size, _norm(self._previous)))  # a spike of a single frame is not a peak
+        release_size = max((rule.release_share or 0.0) * self._peak, 0.5)
+        reference = self._previous if self._setup.has_any_sign else self._rest_direction
         is_reversed = float(charge @ reference) < 0.0
-        self._last = charge
-        direction = self._rest_direction if self._touch_direction is None else self._touch_direction
-        if self._is_contact:
-            self._peak = max(self._peak, two_frame_peak)
-            release_size = max((rule.release_share or 0.0) * self._peak, 0.5)
-            if size < release_size or is_reversed:
-                self._is_contact = False
-                self._base = charge
-                self._mean = charge
-                self._rest_s = 0.0
-            else:
-                self._touch_direction = direction + charge / size
-            return
+        if size < release_size or is_reversed:
+            self._is_contact = False
+            self._base = charge
+            self._mean = charge
+            self._rest_s = 0.0
+        else:
+            self._touch_direction = direction + charge / size
 
+    def _await(self, frame: Frame, charge: Array, direction: Array) -> None:
+        """Update the base with the charges of a frame without a touch, or begin a touch.
+
+        Args:
+            frame: The frame.
+            charge: Charges relative to the touch thresholds, shape (n_electrode,), dimensionless.
+            direction: Direction of the latest touch, or of any touch if the latest touch no longer matters, shape
+                (n_electrode,), dimensionless. It is zero if a touch may have any direction.
+        """
         # While a finger leaves the film, a remaining base must not decay, because this charge still belongs to the
         # finger.
         is_remainder = float(self._base @ direction) > 0.0
         if not (frame.is_base_held and is_remainder):
             self._base = self._base * math.exp(-frame.dt_s / frame.base_relax_s)
+        size = _norm(charge)
         change = charge - self._base
         change_size = _norm(change)
         if float(change @ direction) < OPPOSING_COSINE * change_size * _norm(direction):
             self._base = charge
         elif change_size > 1.0:
             self._is_contact = True
-            self._peak = two_frame_peak
+            self._peak = min(size, _norm(self._previous))
             self._touch_direction = charge / max(size, 1.0)
             self._has_drifted = _norm(self._mean - self._base) > 0.5
             return
@@ -204,11 +214,8 @@ class Touch(Stage):
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:
         """Return the settings, whether the charges of a touch may have any sign, and the time constant of the mean."""
-        rule = setup.device.rule(TouchRule)
-        settings = super().c_settings(setup)
-        if rule is not None:
-            resolved = rule.resolved(has_currents=setup.device.has_currents)
-            settings |= {"floor_pC": resolved.floor_pC, "release_share": resolved.release_share}
+        rule = cls(setup)._rule
+        settings = {} if rule is None else structs.asdict(rule)
         return settings | {"any_sign": setup.has_any_sign, "rise_s": RISE_S}
 
 
