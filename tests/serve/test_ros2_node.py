@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from isocharge.serve.flags import MEANINGS
 from isocharge.serve.outputs.ros_messages import pose_stamped, ros_time_ns, with_tracked_contact, wrench_stamped
-from isocharge.serve.record.record import TrackedContact, Tracking
+from isocharge.serve.record.record import TrackedContact
 
 NODE = Path(__file__).parents[2] / "serve/deploy/ros2/isocharge_ros/isocharge_ros/node.py"
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -144,8 +144,12 @@ def test_the_node_publishes_what_an_mcap_file_holds(run_node, record):
         "force_std_N": 0.01,
         "xy_correlation": 0.25,
     }
-    tracking = Tracking(TrackedContact(1.0, -3.0, 0.5, 0.01, 0.02, 0.001, 0.0, 0.0, 0.1))
-    records = [record(**press, tracking=tracking), record(**press, contact=False), record(contact=False)]
+    tracked = TrackedContact(1.0, -3.0, 0.5, 0.01, 0.02, 0.001, 0.0, 0.0, 0.1)
+    records = [
+        record(**press, has_tracking=True, tracked=tracked),
+        record(**press, contact=False),
+        record(contact=False),
+    ]
     sent = [one for one in run_node(records) if one[0] in ("/isocharge/wrench", "/isocharge/pose")]
     expected = []
     for one in records[:2]:

@@ -33,7 +33,7 @@ from isocharge.serve.outputs.output import OutputContext
 from isocharge.serve.outputs.ros_messages import DEFINITIONS, STRING
 from isocharge.serve.outputs.targets import Outputs
 from isocharge.serve.record.formats import record_schema
-from isocharge.serve.record.record import TrackedContact, Tracking
+from isocharge.serve.record.record import TrackedContact
 
 ELECTRODES = ("A", "B", "C")
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -208,8 +208,8 @@ def test_every_record_is_valid_under_its_schema(record):
 def test_wrench_and_pose_describe_the_tracked_contact(tmp_path, press):
     tracked = TrackedContact(1.0, -4.0, 0.25, 0.01, 0.02, 0.001, 5.0, 0.0, 0.9)
     records = [
-        press(0, tracking=Tracking(tracked, "slide"), xy_correlation=0.5),
-        press(1, tracking=Tracking(tracked), x_mm=None, force_N=None, flags=("invalid",)),
+        press(0, has_tracking=True, tracked=tracked, event="slide", xy_correlation=0.5),
+        press(1, has_tracking=True, tracked=tracked, x_mm=None, force_N=None, flags=("invalid",)),
     ]
     topics = read_with_rosbags(write(tmp_path / "a.mcap", records, is_ros2=True))
     ((_, wrench),), ((_, pose),) = topics["/isocharge/wrench"], topics["/isocharge/pose"]

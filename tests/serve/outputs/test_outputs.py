@@ -13,7 +13,7 @@ from isocharge.common.errors import InputError
 from isocharge.serve.outputs.output import WriterQueue
 from isocharge.serve.outputs.text_outputs import UdpOutput
 from isocharge.serve.record.formats import csv_header, csv_row
-from isocharge.serve.record.record import FollowedFilm, TrackedContact, Tracking, selected_fields
+from isocharge.serve.record.record import FollowedFilm, TrackedContact, selected_fields
 
 ELECTRODES = ("A", "B")
 
@@ -41,9 +41,9 @@ def test_csv_quotes_electrode_names(name, record):
 def test_tracked_contact_and_followed_film_are_the_last_columns(record):
     header = csv_header(ELECTRODES, selected_fields(with_tracking=True, with_film=True))
     assert header.removeprefix(csv_header(ELECTRODES, selected_fields())).startswith(",tracked.x_mm,tracked.y_mm,")
-    film = FollowedFilm(0.7, 0.05, 12)
-    touched = Tracking(TrackedContact(*map(float, range(9))), "tap")
-    lines = [csv_row(record(tracking=tracking, film=film), ELECTRODES) for tracking in (touched, Tracking())]
+    options = {"has_tracking": True, "film": FollowedFilm(0.7, 0.05, 12)}
+    touched = record(tracked=TrackedContact(*map(float, range(9))), event="tap", **options)
+    lines = [csv_row(each, ELECTRODES) for each in (touched, record(**options))]
     names = ("tracked.x_mm", "tracked.vy_mm_s", "tracked.moving", "event", "film.pretension_MPa", "film.touches")
     rows = csv.DictReader([header, *lines], strict=True)
     assert [[row[name] for name in names] for row in rows] == [

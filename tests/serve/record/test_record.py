@@ -12,29 +12,20 @@ from isocharge.serve.record.record import (
     RECORD_FIELDS,
     FollowedFilm,
     OtherContact,
-    PredictionRecord,
     TrackedContact,
-    Tracking,
-    fields_of,
 )
 
 TRACKED = TrackedContact(1.0, 2.0, 0.5, 0.01, 0.02, 0.001, 3.0, 0.0, 0.25)
 
 
-def test_field_without_a_meaning_is_refused():
-    class Undocumented(PredictionRecord, frozen=True, kw_only=True, dict=True):
-        speed: float
-
-    with pytest.raises(TypeError, match=r"Undocumented\.speed: expected Annotated"):
-        fields_of(Undocumented)
-
-
 def test_json_has_the_fields_of_tracking_and_film_after_the_others(contract, record):
-    tracking = Tracking(TRACKED, "slide", OtherContact(5.0, -1.0, 1.0, 0.25))
-    written = json.loads(record(tracking=tracking, film=FollowedFilm(0.71234567, 0.05, 12)).to_json())
+    film = FollowedFilm(0.71234567, 0.05, 12)
+    other = OtherContact(5.0, -1.0, 1.0, 0.25)
+    tracked_record = record(has_tracking=True, tracked=TRACKED, event="slide", other=other, film=film)
+    written = json.loads(tracked_record.to_json())
     assert [*written] == [*contract, "tracked", "event", "other", "film"]
     assert (written["tracked"], written["event"]) == (structs.asdict(TRACKED), "slide")
-    assert written["other"] == structs.asdict(tracking.other)
+    assert written["other"] == structs.asdict(other)
     assert written["film"] == {"pretension_MPa": 0.712346, "pretension_std_MPa": 0.05, "touches": 12}
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from isocharge.serve.record.record import OtherContact, TrackedContact, Tracking
+from isocharge.serve.record.record import OtherContact, TrackedContact
 from isocharge.serve.viewer.tape import (
     FLAG_BITS,
     MAX_DRAWN_SAMPLES,
@@ -39,8 +39,8 @@ def test_unknown_numbers_of_a_record_are_nan(record):
 
 def test_sample_contains_the_tracked_contact(record):
     tracked = TrackedContact(2.0, 3.0, 0.4, 0.01, 0.02, 0.001, 0.0, 0.0, 0.1)
-    tracking = Tracking(tracked, None, OtherContact(5.0, -1.0, 1.0, 0.25))
-    sample = sample_of(record(x_mm=1.0, misfit=0.5, xy_correlation=0.25, tracking=tracking))
+    other = OtherContact(5.0, -1.0, 1.0, 0.25)
+    sample = sample_of(record(x_mm=1.0, misfit=0.5, xy_correlation=0.25, tracked=tracked, other=other))
     assert (sample["x_mm"], sample["misfit"], sample["xy_correlation"], sample["x_std_mm"]) == (2.0, 0.5, 0.25, 0.01)
     assert (sample["other_x_mm"], sample["other_y_mm"]) == (5.0, -1.0)
 

@@ -17,7 +17,7 @@ from isocharge.serve.frames.frame import Frame, FrameCounts
 from isocharge.serve.live.device import ANY_BOARD, create_stages
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.file_source import Chunk
-from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, Charges, PredictionRecord
+from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, Charges, PredictionRecord, Tracking
 from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.tracker import TrackRule
@@ -306,8 +306,9 @@ class TouchStream(ReadingStream):
             latency_us=(time.perf_counter_ns() - chunk.clock_ns) / 1e3,  # includes the time that the stages have taken
             model=self._label,
             frame_id=self.frame_id,
-            tracking=frame.tracking,
+            **(frame.tracking or Tracking())._asdict(),
             film=frame.film,
+            has_tracking=frame.tracking is not None,
         )
 
     def _by_electrode(self, charge_pC: Array | None) -> Charges | None:

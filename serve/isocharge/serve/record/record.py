@@ -28,10 +28,6 @@ JSON_TYPES: dict[Any, str] = {
 """JSON type of the values of each type. Any other type is a struct, which is an object in JSON."""
 
 
-FLATTENED = ""
-"""Description of a nested struct whose fields are fields of the record instead of fields of an object."""
-
-
 class Field(NamedTuple):
     """One field of a record in JSON.
 
@@ -41,8 +37,7 @@ class Field(NamedTuple):
         meaning: Description of the value, a sentence.
         may_be_null: Whether the value may be null, because it is unknown.
         parts: Fields of a struct; empty for any other value, also for an object with a number for each electrode.
-        group: Name of the attribute with the nested struct to which the field belongs. A record has the field only if
-            it has this struct. Empty for a field that every record has.
+        group: Group of optional fields to which the field belongs; empty for a field that every record has.
     """
 
     name: str
@@ -56,28 +51,19 @@ class Field(NamedTuple):
 def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
     """Return the fields of a struct in the order of their declaration.
 
-    The annotation of each field contains a sentence that describes the value. If this sentence is `FLATTENED`, the
-    fields of the nested struct are returned instead. The group of a field that is a struct, and of a field of a nested
-    struct, is the name of the field that contains the struct.
-
-    Raises:
-        TypeError: If the annotation of a field contains no sentence.
+    The annotation of each field contains a sentence that describes the value, and the group of an optional field. An
+    attribute without such an annotation is no field of the JSON object.
     """
     fields: list[Field] = []
-    annotations = get_type_hints(struct, include_extras=True)  # with the metadata of `Annotated`
-    for name in struct.__struct_fields__:
-        annotation = annotations[name]
+    for name, annotation in get_type_hints(struct, include_extras=True).items():  # with the metadata of `Annotated`
         if get_origin(annotation) is not Annotated:
-            raise TypeError(f"{struct.__name__}.{name}: expected Annotated[type, description]")
-        declared_type, meaning = get_args(annotation)
+            continue
+        declared_type, meaning, *group = get_args(annotation)
         may_be_null = isinstance(declared_type, UnionType)  # the other alternative is None
         value_type = get_args(declared_type)[0] if may_be_null else declared_type
-        if meaning == FLATTENED:
-            fields += [nested_field._replace(group=name) for nested_field in fields_of(value_type)]
-        elif value_type in JSON_TYPES:
-            fields.append(Field(name, JSON_TYPES[value_type], meaning, may_be_null))
-        else:
-            fields.append(Field(name, "object", meaning, may_be_null, fields_of(value_type), group=name))
+        parts = () if value_type in JSON_TYPES else fields_of(value_type)
+        json_type = JSON_TYPES.get(value_type, "object")
+        fields.append(Field(name, json_type, meaning, may_be_null, parts, "".join(group)))
     return tuple(fields)
 
 
@@ -122,25 +108,21 @@ class FollowedFilm(Struct, frozen=True):
     touches: Annotated[int, "Number of touches from which the pretension was estimated."]
 
 
-class Tracking(Struct, frozen=True):
-    """Fields that the tracking of contacts adds to a record."""
+class Tracking(NamedTuple):
+    """Values that the tracking of contacts adds to a record, which describes them."""
 
-    tracked: Annotated[
-        TrackedContact | None, "Contact that was estimated from all frames of the touch up to now; null out of contact."
-    ] = None
-    event: Annotated[
-        str | None, "Event that begins with this record: press, hold, slide, tap or release; null if none begins."
-    ] = None
-    other: Annotated[
-        OtherContact | None,
-        "Second possible contact with the same charges, on a film with folds; null if there is none.",
-    ] = None
+    tracked: TrackedContact | None = None
+    event: str | None = None
+    other: OtherContact | None = None
 
 
 class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     """One reading of a sensor and the contact that a model computed from the reading.
 
     The annotations of the fields describe the values. The page `serve/docs/record.md` contains a table of all fields.
+
+    Attributes:
+        has_tracking: Whether contacts are tracked. Otherwise, JSON and CSV do not contain the fields of the tracking.
     """
 
     timestamp: Annotated[float | None, "Time of the reading, unix seconds."]
@@ -168,28 +150,28 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     latency_us: Annotated[float | None, "Time since the program read the last byte of the frame, us."]
     model: Annotated[str, "The model, name/version."]
     frame_id: Annotated[str, "Name of the sensor, the frame of x and y."]
-    tracking: Annotated[Tracking | None, FLATTENED] = None
-    film: Annotated[FollowedFilm | None, "Estimated film for which the model answered."] = None
-
-    @property
-    def tracked(self) -> TrackedContact | None:
-        """The tracked contact; None if contacts are not tracked or if nothing touches the film."""
-        return None if self.tracking is None else self.tracking.tracked
-
-    @property
-    def event(self) -> str | None:
-        """Event that begins with this record; None if contacts are not tracked or if no event begins."""
-        return None if self.tracking is None else self.tracking.event
-
-    @property
-    def other(self) -> OtherContact | None:
-        """Another contact with the same charges. None if no other contact with the same charges is known."""
-        return None if self.tracking is None else self.tracking.other
+    tracked: Annotated[
+        TrackedContact | None,
+        "Contact that was estimated from all frames of the touch up to now; null out of contact.",
+        "tracking",
+    ] = None
+    event: Annotated[
+        str | None,
+        "Event that begins with this record: press, hold, slide, tap or release; null if none begins.",
+        "tracking",
+    ] = None
+    other: Annotated[
+        OtherContact | None,
+        "Second possible contact with the same charges, on a film with folds; null if there is none.",
+        "tracking",
+    ] = None
+    film: Annotated[FollowedFilm | None, "Estimated film for which the model answered.", "film"] = None
+    has_tracking: bool = False
 
     @property
     def fields(self) -> tuple[Field, ...]:
         """The fields that this record has, in their order."""
-        return selected_fields(with_tracking=self.tracking is not None, with_film=self.film is not None)
+        return selected_fields(with_tracking=self.has_tracking, with_film=self.film is not None)
 
     @property
     def json_values(self) -> dict[str, Any]:
