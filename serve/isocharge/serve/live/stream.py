@@ -8,6 +8,7 @@ on a model of the film, unless warming is estimated.
 import math
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, NoFramesError, shown
@@ -222,15 +223,12 @@ class TouchStream(ReadingStream):
         Raises:
             ModelError: If a stage cannot use the model. The present stages and their model then remain in use.
         """
-        present_predictor = self._setup.model
+        new_setup = replace(self._setup)
+        new_setup.use(predictor)
+        contact_stages = create_stages(new_setup, needs_contact=True)
+        self._setup.use(new_setup.model)
         charge_stages = [stage for stage in self._stages if not stage.needs_contact]
         previous_stages = {type(stage): stage for stage in self._stages}
-        self._setup.use(predictor)
-        try:
-            contact_stages = create_stages(self._setup, needs_contact=True)
-        except ModelError:
-            self._setup.use(present_predictor)
-            raise
         for stage in contact_stages:
             stage.continue_touch(previous_stages.get(type(stage), stage))
         self._stages = charge_stages + contact_stages

@@ -51,6 +51,27 @@ class TareRule(Rule, frozen=True, kw_only=True):
         if 0 < self.patience < self.frames:
             raise WrongKey("patience", f"at least the {self.frames} frames of a tare, or 0 for no limit", self.patience)
 
+    def unrest(self, mean_pC: Array, noise_pC: Array) -> str:
+        """Return why something seems to touch the film in some frames; empty if nothing touches it.
+
+        Args:
+            mean_pC: Mean charge of each electrode in the frames, shape (n_electrode,), pC.
+            noise_pC: Standard deviation of each charge, shape (n_electrode,), pC.
+        """
+        largest_noise_pC = float(noise_pC.max())
+        if largest_noise_pC > self.noise_limit_pC:
+            return (
+                f"the charge of an electrode varies by {largest_noise_pC:.3g} pC rms, expected at most "
+                f"{self.noise_limit_pC:g} pC; leave the film alone and start again"
+            )
+        largest_offset_pC = float(np.abs(mean_pC).max())
+        if largest_offset_pC > self.offset_limit_pC:
+            return (
+                f"an electrode rests at {largest_offset_pC:.4g} pC, expected at most {self.offset_limit_pC:g} pC; take "
+                "off what lies on the film, or raise the limit if the amplifier rests there"
+            )
+        return ""
+
 
 class Tare(Stage):
     """Measures the charge at rest in quiet frames, and subtracts this charge from all later frames.
@@ -148,25 +169,33 @@ class Tare(Stage):
             self._searched_frames += 1
         if len(self._latest_pC) < rule.frames:
             return
-        try:
-            self._tare_pC, self._noise_pC = measure_tare(rule, self._latest_pC)
-        except TareError as error:
-            has_time_limit = rule.patience > 0
-            if has_time_limit and self._searched_frames >= rule.patience:
-                raise self._with_offsets(error, frame) from error
-            return  # search again with the next frame
-        self._latest_pC = self._latest_pC[:0]  # the frames are not needed any more
+        mean_pC = self._latest_pC.mean(axis=0)
+        noise_pC = self._latest_pC.std(axis=0)
+        reason = rule.unrest(mean_pC, noise_pC)
+        if not reason:
+            self._tare_pC = mean_pC
+            self._noise_pC = noise_pC
+            self._latest_pC = self._latest_pC[:0]  # the frames are not needed any more
+        elif 0 < rule.patience <= self._searched_frames:
+            raise self._search_error(reason, frame)
 
-    def _with_offsets(self, error: TareError, frame: Frame) -> TareError:
-        """Return the error with the present values of the board as settings.
+    def _search_error(self, reason: str, frame: Frame) -> TareError:
+        """Return the error for a search without a result, with the present values of the board as settings.
 
         The search may have failed because the film is touched, or because the board has large offsets. In the second
         case, the present values are the offsets.
+
+        Args:
+            reason: Reason why the last frames were not quiet.
+            frame: The last frame.
         """
         value_of_electrode = zip(self._electrodes, frame.sent.tolist(), strict=True)
         offsets = ", ".join(f"{name} = {value:.10g}" for name, value in value_of_electrode)
         setting = "[gain] offset = {" + offsets + "}"
-        return TareError(f"{error}; if the board rests there without a touch, say so in a device file: {setting}")
+        return TareError(
+            f"cannot tare on the last {len(self._latest_pC)} frames: {reason}; if the board rests there without a "
+            f"touch, say so in a device file: {setting}"
+        )
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:
@@ -182,36 +211,3 @@ class Tare(Stage):
                 f"signal chain in C, which stores all frames of the tare, got {rule.frames}"
             )
         return super().c_settings(setup)
-
-
-def measure_tare(rule: TareRule, raw_pC: Array) -> tuple[Array, Array]:
-    """Measure the mean and the noise of each electrode in frames in which nothing touches the film.
-
-    Args:
-        rule: Limits of noise and offset of quiet frames.
-        raw_pC: Charges of the frames, shape (n, n_electrode), pC.
-
-    Returns:
-        The mean charges, and their standard deviations, both of the shape (n_electrode,), pC.
-
-    Raises:
-        TareError: If the noise of an electrode or the magnitude of its mean charge exceeds the limit. Something then
-            touches the film.
-    """
-    tare_pC = raw_pC.mean(axis=0)
-    noise_pC = raw_pC.std(axis=0)
-    largest_noise_pC = float(noise_pC.max())
-    largest_offset_pC = float(np.abs(tare_pC).max())
-    if largest_noise_pC > rule.noise_limit_pC:
-        raise TareError(
-            f"cannot tare on the last {len(raw_pC)} frames: the charge of an electrode varies by "
-            f"{largest_noise_pC:.3g} pC rms, expected at most {rule.noise_limit_pC:g} pC; leave the film alone and "
-            "start again"
-        )
-    if largest_offset_pC > rule.offset_limit_pC:
-        raise TareError(
-            f"cannot tare on the last {len(raw_pC)} frames: an electrode rests at {largest_offset_pC:.4g} pC, expected "
-            f"at most {rule.offset_limit_pC:g} pC; take off what lies on the film, or raise the limit if the amplifier "
-            "rests there"
-        )
-    return tare_pC, noise_pC

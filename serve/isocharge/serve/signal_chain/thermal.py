@@ -95,8 +95,8 @@ class Warming(Stage):
         """Estimate the warming of a frame in contact, subtract its change from the charges, and add the flags.
 
         The stage that stores the charge at rest has already subtracted the earlier changes of the warming. It reads the
-        present change from the frame. While an amplifier is saturated, the warming is not estimated, because the charges
-        then fit no contact for any value of the warming.
+        present change from the frame. While an amplifier is saturated, the warming is not estimated, because then the
+        charges fit no contact for any value of the warming.
         """
         if frame.charge_pC is None:
             return
@@ -161,8 +161,9 @@ class Warming(Stage):
         Raises:
             DeviceError: If the settings contain charges for each electrode, or there are too few electrodes.
         """
-        warming_ratios(setup)  # raises an error for too few electrodes
         settings = super().c_settings(setup)
+        if settings:
+            warming_ratios(setup)  # raises an error for too few electrodes
         if settings.pop("pC_per_K", None) is not None:
             raise DeviceError(f"{setup.device.where}: common_mode.pC_per_K: {NOT_IN_C}")
         return settings

@@ -207,11 +207,9 @@ class RecordedTape(Tape):
         """Append a sample. If the mapped file is full, its capacity is doubled."""
         if self.total == len(self._ring):
             self._map_file(2 * len(self._ring))
-        number = self.total
-        previous_time_s = self.timestamp(number - 1) if number else 0.0
-        self._ring[number] = values
-        self._ring["timestamp"][number] = np.fmax(self._ring["timestamp"][number], previous_time_s)
-        self.total += 1
+        time_s, *others = values
+        _, latest_time_s = self.span()
+        super().append((max(latest_time_s, time_s or 0.0), *others))
 
     def close(self) -> None:
         """Close the temporary file, so that the operating system removes it."""
