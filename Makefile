@@ -75,12 +75,11 @@ docs: $(VENV)/installed
 bench: $(VENV)/installed
 	$(BIN)/python tests/benchmarks/bench_solve.py
 	$(BIN)/python tests/benchmarks/bench_model.py
-	$(BIN)/python tests/benchmarks/bench_whole_film.py
+	$(BIN)/python tests/benchmarks/bench_faults.py --whole-film
 	$(BIN)/python tests/benchmarks/bench_predictor.py
 	$(BIN)/python tests/benchmarks/bench_stream.py
 	$(BIN)/python tests/benchmarks/bench_touch.py
 	$(BIN)/python tests/benchmarks/bench_http.py
-	$(BIN)/python tests/benchmarks/bench_live.py
 
 # The source distribution and the wheel, in dist. Both are built again, in another folder, from the source distribution;
 # the command fails if a byte differs.

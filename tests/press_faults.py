@@ -63,11 +63,15 @@ def film_map(probe_radius_mm: float = 1.0, **changes: float) -> ForwardMap:
 
 def film_variants() -> dict[str, ForwardMap]:
     """Build the forward maps of another probe or film, by the name of the fault."""
+    film = load_sensor(FILM_SENSOR).film
+    area = math.pi * film.radius**2
     return {
         "probe of 2 mm radius": film_map(2.0),
         "probe of 4 mm radius": film_map(4.0),
-        "film 10 % thicker": film_map(thickness=1.1 * load_sensor(FILM_SENSOR).film.thickness),
+        "film 10 % thicker": film_map(thickness=1.1 * film.thickness),
         "pretension of 0.5 MPa": film_map(pretension=0.5),
+        "closed cavity of 20 mm": film_map(back_volume=20.0 * area),
+        "closed cavity of 2000 mm": film_map(back_volume=2000.0 * area),
     }
 
 

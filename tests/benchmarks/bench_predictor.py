@@ -1,18 +1,17 @@
 """One press: `Predictor` and the exported C against a bare `session.run` of the same model, in turns in one process.
 
-    python tests/benchmarks/bench_predictor.py [--model NAME|PATH] [--seconds 10] [--calls 2000] [--json]
+    python tests/benchmarks/bench_predictor.py [--model NAME|PATH] [--seconds 10] [--json]
 
-The bare session has the same options as ours (one thread, no spinning) and gets its input array ready-made. The C is
-compiled as a library, once for each set of options, and loaded with ctypes; the loop over presses is in C, as in a host
-program without Python. Beside its times stands how far its answers are from the model's, relative to max(|b|, 1 mm or
-0.1 N).
+The bare session has the options of the predictor (one thread, no spinning) and gets its input array ready-made. The C
+is compiled as a library, once for each set of options, and called through ctypes; the loop over presses is in C, as in
+a host program without Python. The largest difference of its contacts from those of the model is relative to max(|b|,
+1 mm or 0.1 N).
 """
 
 import ctypes
-import shutil
 import subprocess
-import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,66 +22,56 @@ from isocharge.serve.benchmark import Contender
 from isocharge.serve.model.session import open_session
 from isocharge.train.export_c.folder import export_c
 
-FLAGS = ("-O2", "-O3 -march=native", "-O3 -march=native -ffp-contract=fast")
+OPTIONS = ("-O2", "-O3 -march=native -ffp-contract=fast")
+"""Options of the compiler."""
 
-PRESSES = 512
-"""Different presses that the loops in C go through."""
+PRESSES = 2000
+"""Number of presses of a loop in C."""
 
 FLOORS = np.array([1.0, 1.0, 0.1, 1.0, 1.0, 0.1, 20.0])
-"""Floors of golden vectors: mm, mm, N, their deviations, and the misfit."""
+"""Smallest divisors of differences: mm, mm, N, their standard deviations, and the misfit."""
 
 LOOP = """
 #include "isocharge_model.h"
 
-void loop(const float *charge_pC, int presses, int calls, float *contact)
+void loop(const float *charge_pC, int presses, float *contact)
 {
-    for (int k = 0; k < calls; ++k)
-        isocharge_predict(charge_pC + (k % presses) * ISOCHARGE_ELECTRODES, contact + 7 * (k % presses));
+    for (int k = 0; k < presses; ++k)
+        isocharge_predict(charge_pC + k * ISOCHARGE_ELECTRODES, contact + 7 * k);
 }
 """
 
 
-def in_process(predictor: Predictor, charge_pC: np.ndarray) -> list[Contender]:
-    """The session and every way of the predictor, with one press."""
-    folder = predictor.folder
-    session = open_session((folder / "model.onnx").read_bytes(), str(folder))
-    feed, values, out = {"charge_pC": charge_pC[np.newaxis]}, charge_pC.tolist(), np.zeros(10, np.float32)
-    return [
-        Contender("session.run", 1, lambda: session.run(None, feed)),
-        Contender("predict_into", 1, lambda: predictor.predict_into(charge_pC, out)),
-        Contender("predict(list)", 1, lambda: predictor.predict(values)),
-        Contender("predict(array)", 1, lambda: predictor.predict(charge_pC)),
-    ]
-
-
-def in_c(export: Path, flags: str, calls: int, charge_pC: np.ndarray, contact: np.ndarray) -> Contender:
-    """The loop over presses, compiled with some options; a call leaves its answers in `contact`."""
-    (export / "loop.c").write_text(LOOP)
-    library = export / f"loop{FLAGS.index(flags)}.so"
-    words = ["gcc", "-std=c99", *flags.split(), "-fPIC", "-shared", "loop.c", "isocharge_model.c", "-lm"]
-    subprocess.run([*words, "-o", library], cwd=export, check=True)
-    loop, pointers = ctypes.CDLL(str(library)).loop, [ctypes.c_void_p(x.ctypes.data) for x in (charge_pC, contact)]
-    return Contender(f"C {flags}", calls, lambda: loop(pointers[0], PRESSES, calls, pointers[1]))
-
-
 def main() -> None:
-    asked = options(__doc__, seconds=10.0, calls=2000)
+    asked = options(__doc__, seconds=10.0)
     predictor = Predictor(find_model(asked.model))
-    shape = PRESSES, len(predictor.metadata.electrodes)
+    shape = (PRESSES, len(predictor.metadata.electrodes))
     charge_pC = np.random.default_rng(asked.seed).uniform(300.0, 1500.0, shape).astype(np.float32)
-    expected, contact = np.column_stack(predictor.predict_batch(charge_pC))[:, :7], np.zeros((PRESSES, 7), np.float32)
-    contenders, differences = in_process(predictor, charge_pC[0]), {}
+    expected = np.column_stack(predictor.predict_batch(charge_pC))[:, :7]
+    contact = np.zeros((PRESSES, 7), np.float32)
+
+    session = open_session((predictor.folder / "model.onnx").read_bytes(), str(predictor.folder))
+    feed = {"charge_pC": charge_pC[:1]}
+    first_charge_pC = charge_pC[0]
+    out = np.zeros(10, np.float32)
+    contenders = [
+        Contender("session.run", 1, lambda: session.run(None, feed)),
+        Contender("predict_into", 1, lambda: predictor.predict_into(first_charge_pC, out)),
+    ]
+    differences = {}
     with tempfile.TemporaryDirectory() as folder:
-        if shutil.which("gcc"):
-            export = export_c(predictor.folder, Path(folder) / "c")
-            contenders += [in_c(export, flags, max(asked.calls, PRESSES), charge_pC, contact) for flags in FLAGS]
-        else:
-            print("left out: C: there is no gcc", file=sys.stderr)
-        for contender in contenders[4:]:
-            contender.call()
-            differences[contender.name] = float(
-                np.max(np.abs(contact - expected) / np.maximum(np.abs(expected), FLOORS))
-            )
+        export = export_c(predictor.folder, Path(folder) / "c")
+        (export / "loop.c").write_text(LOOP)
+        arguments = ctypes.c_void_p(charge_pC.ctypes.data), PRESSES, ctypes.c_void_p(contact.ctypes.data)
+        for number, words in enumerate(OPTIONS):
+            library = export / f"loop{number}.so"
+            command = f"gcc -std=c99 {words} -fPIC -shared loop.c isocharge_model.c -lm -o {library}"
+            subprocess.run(command.split(), cwd=export, check=True)
+            loop = partial(ctypes.CDLL(str(library)).loop, *arguments)
+            loop()
+            difference = np.abs(contact - expected) / np.maximum(np.abs(expected), FLOORS)
+            differences[words] = float(difference.max())
+            contenders.append(Contender(f"C {words}", PRESSES, loop))
         results = {"one press": in_turns(contenders, asked.seconds), "largest difference": differences}
     print_results("predictor", asked, results)
 

@@ -13,9 +13,8 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve import Predictor
 from isocharge.serve.benchmark import Contender, machine, take_turns
-from isocharge.simulate import Circle, ForwardMap, Sweep
+from isocharge.simulate import Circle, ForwardMap
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
-from isocharge.train import LabelledPresses, TrainingData
 from isocharge.train.data.contact_errors import contact_error_statistics
 
 
@@ -84,15 +83,6 @@ def inner_radius_mm(predictor: Predictor) -> float:
     return math.sqrt(predictor.validity.inscribed_radius_squared_mm2)
 
 
-def training_data(charge_map: ForwardMap, count: int) -> TrainingData:
-    """Simulate a number of presses over the domain of a forward map for a training."""
-    domain = charge_map.domain
-    contact = Sweep(domain.radius, domain.force_range, count, 0).contacts()
-    presses = LabelledPresses(contact, charge_map.charges(contact))
-    notations = (charge_map.probe.notation,)
-    return TrainingData(sensor=charge_map.sensor, probes=notations, domain=domain, presses=presses, sha256="-")
-
-
 def errors_over_limit(contact: Array, limit: Array, truth: Array) -> dict[str, float]:
     """Return the rms errors of contacts, and their ratios to those of the posterior means of the same presses.
 
@@ -107,36 +97,6 @@ def errors_over_limit(contact: Array, limit: Array, truth: Array) -> dict[str, f
     for name in ("position_rms_mm", "force_rms_percent"):
         ratios |= {name: errors[name], f"{name}_over_limit": round(errors[name] / limits[name], 3)}
     return ratios
-
-
-def print_shares(
-    name: str, asked: argparse.Namespace, corner: str, shares: dict[str, dict[str, Any]], empty: str = ""
-) -> None:
-    """Print shares as a Markdown table with a column for each model, or as one JSON object with the option `--json`.
-
-    Args:
-        name: Name of the benchmark.
-        asked: Options of the benchmark.
-        corner: Title of the first column.
-        shares: Dataclasses of shares in %, by the name of the model and the name of the row. The rows have the
-            order of the model with the most rows.
-        empty: Cell of a model that has no shares in a row.
-    """
-    if asked.json:
-        print_results(name, asked, {model: {row: vars(rows[row]) for row in rows} for model, rows in shares.items()})
-        return
-    titles = [f"`{model}`" for model in shares]
-    lines = [f"| {corner} | {' | '.join(titles)} |", "|---" * (len(shares) + 1) + "|"]
-    for row in max(shares.values(), key=len):
-        cells = [rows.get(row) for rows in shares.values()]
-        texts = [", ".join(map(percent, vars(cell).values())) if cell else empty for cell in cells]
-        lines.append(f"| {row} | {' | '.join(texts)} |")
-    print_results(name, asked, {name: lines})
-
-
-def percent(share: float) -> str:
-    """Return a share in percent as text, with a decimal where it is below one percent."""
-    return f"{share:.1f}" if share < 1.0 else f"{share:.0f}"
 
 
 def whitened_errors(contact: Array, truth: Array, std: Array, correlation: Array) -> Array:
