@@ -1,4 +1,4 @@
-"""Ten lines that give the same answer: a route in raw ASGI with a Predictor. `python bare_app.py PORT MODEL.onnx`"""
+"""Ten lines that give the same answer: a route in raw ASGI with a Predictor. `python bare_app.py MODEL.onnx PORT`"""
 
 import sys
 from pathlib import Path
@@ -8,7 +8,7 @@ import uvicorn
 
 from isocharge.serve import Predictor
 
-touch = Predictor(Path(sys.argv[2]).parent)
+touch = Predictor(Path(sys.argv[1]).parent)
 OUTPUTS = {"contact": (0, 3), "contact_std": (3, 6), "contact_correlation": (7, 10), "misfit": (6, 7)}
 
 
@@ -23,4 +23,4 @@ async def app(_, receive, send):
 
 
 if __name__ == "__main__":
-    uvicorn.run(app, port=int(sys.argv[1]), http="httptools", lifespan="off", access_log=False, log_level="critical")
+    uvicorn.run(app, port=int(sys.argv[2]), http="httptools", lifespan="off", access_log=False, log_level="critical")
