@@ -2,26 +2,26 @@
 
     isocharge simulate sweep three-25um-uniaxial --radius 6.5 -o presses
     isocharge train fit presses -o three-25um-uniaxial
-    python tests/benchmarks/bench_folds.py --model ./three-25um-uniaxial [--slides 1000] [--rate-hz 1000]
-        [--noise reference] [--force 1] [--gain 0] [--json]
+    python tests/benchmarks/bench_folds.py --model ./three-25um-uniaxial [--slides 1000] [--rate-hz 1000] [--force 1]
+        [--gain 0] [--json]
 
 In each slide, the force rises for 30 ms, and the contact is at rest for 0.2 s. The contact then moves along a straight
 line to a position beyond a fold, with a speed of 5 to 200 mm/s (uniform in the logarithm), and is at rest for another
-0.2 s. The charges are simulated with noise. The gains have random errors with the standard deviation `--gain`.
+0.2 s. The charges are simulated with `reference` noise. The gains have random errors with the standard deviation
+`--gain`.
 
 The frames after the first crossing of a fold are counted, except for the first 20 ms after each crossing. A contact is
 known if the tracker reports no other possible contact.
 """
 
 import argparse
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
-from shared import model_film, options, print_results
+from shared import model_film, options, print_results, track_contacts
 
 from isocharge.common.contact_domain import into_unit_domain
-from isocharge.serve import Contact, Predictor
-from isocharge.serve.frames.frame import Frame
+from isocharge.serve import Predictor
 from isocharge.serve.model.charge_file import read_charge_map
 from isocharge.serve.record.record import OtherContact, TrackedContact
 from isocharge.serve.signal_chain.stage import Device, Setup
@@ -29,6 +29,7 @@ from isocharge.serve.tracking.tracker import Tracker, TrackRule
 from isocharge.simulate import noise_model
 from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.charge_spline import with_fast_derivatives
+from isocharge.train.data.contact_errors import position_error
 
 RISE_TIME_s = 0.03
 """Time in which the force rises, s."""
@@ -39,8 +40,9 @@ REST_s = 0.2
 WAIT_s = 0.02
 """Time after a crossing in which frames are not counted, s."""
 
-MIN_SPEED_mm_per_s = 5.0
-MAX_SPEED_mm_per_s = 200.0
+SPEEDS_mm_per_s = (5.0, 200.0)
+"""Smallest and largest speed."""
+
 MAX_MOVEMENT_s = 1.0
 """Longest duration of a movement, s."""
 
@@ -51,29 +53,18 @@ MAP_MARGIN_mm = 2.0
 """Distance beyond the domain of the tracker up to which charges are simulated, mm."""
 
 
-class Slide(NamedTuple):
-    """A simulated slide.
-
-    Attributes:
-        t_s: Time of each frame, shape (n,), s.
-        contact: True contacts (x, y, F), shape (n, 3), mm and N.
-        side: Side of the folds, -1 or 1, shape (n,).
-    """
-
-    t_s: np.ndarray
-    contact: np.ndarray
-    side: np.ndarray
-
-
 def sides(film: ChargeMap, contact: np.ndarray) -> np.ndarray:
-    """Return the sides of the folds on which contacts lie, shape (n,).
+    """Return the sides of the folds on which contacts (x, y, F) lie, shape (n,).
 
     The determinant of the derivatives changes its sign at a fold.
     """
-    return np.sign(np.linalg.det(film.derivatives(contact)))
+    in_map = film.domain.to_contact(into_unit_domain(film.domain.to_unit(contact)))
+    return np.sign(np.linalg.det(film.derivatives(in_map)))
 
 
-def draw_slide(film: ChargeMap, radius: float, asked: argparse.Namespace, rng: np.random.Generator) -> Slide:
+def draw_slide(
+    film: ChargeMap, radius: float, asked: argparse.Namespace, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Draw slides until one crosses a fold.
 
     Args:
@@ -81,61 +72,47 @@ def draw_slide(film: ChargeMap, radius: float, asked: argparse.Namespace, rng: n
         radius: Largest distance of the ends from the centre, mm.
         asked: Options of the benchmark.
         rng: Random number generator.
+
+    Returns:
+        Time of each frame, shape (n,), s, and the true contacts (x, y, F), shape (n, 3), mm and N.
     """
     min_force, _ = film.domain.force_range
     while True:
         start, end = radius * np.sqrt(rng.random(2)) * np.exp(2j * np.pi * rng.random(2))
         distance = abs(end - start)
-        speed = np.exp(rng.uniform(np.log(MIN_SPEED_mm_per_s), np.log(MAX_SPEED_mm_per_s)))
-        duration_s = distance / speed
+        duration_s = distance / np.exp(rng.uniform(*np.log(SPEEDS_mm_per_s)))
         t_s = np.arange(0.0, RISE_TIME_s + 2.0 * REST_s + duration_s, 1.0 / asked.rate_hz)
         position = start + (end - start) * np.clip((t_s - RISE_TIME_s - REST_s) / duration_s, 0.0, 1.0)
         relative_force = np.minimum((t_s + 0.002) / RISE_TIME_s, 1.0) ** 1.5
         force = np.maximum(asked.force * relative_force, min_force)
         contact = np.column_stack([position.real, position.imag, force])
-        side = sides(film, contact)
-        if distance > MIN_MOVEMENT_mm and duration_s < MAX_MOVEMENT_s and (side != side[0]).any():
-            return Slide(t_s, contact, side)
+        is_allowed = distance > MIN_MOVEMENT_mm and duration_s < MAX_MOVEMENT_s
+        if is_allowed and np.ptp(sides(film, contact)) > 0.0:
+            return t_s, contact
 
 
-def is_counted(slide: Slide) -> np.ndarray:
-    """Return which frames of a slide are counted, shape (n,)."""
-    t_s = slide.t_s
-    crossing_s = t_s[1:][np.diff(slide.side) != 0]
+def is_counted(t_s: np.ndarray, side: np.ndarray) -> np.ndarray:
+    """Return which frames of a slide are counted, shape (n,).
+
+    Args:
+        t_s: Time of each frame, shape (n,), s.
+        side: Side of the folds in each frame, shape (n,).
+    """
+    crossing_s = t_s[1:][np.diff(side) != 0]
     is_after_crossing = (t_s[:, None] >= crossing_s) & (t_s[:, None] < crossing_s + WAIT_s)
     return (t_s >= crossing_s[0]) & ~is_after_crossing.any(axis=1)
 
 
-def examine_frame(
-    film: ChargeMap, tracked: TrackedContact, other: OtherContact | None, truth: np.ndarray, side: float
-) -> tuple[bool, bool, bool, float]:
-    """Compare the contacts that the tracker reports with the true contact.
-
-    Args:
-        film: Map from contacts to charges.
-        tracked: The tracked contact.
-        other: The other possible contact; None if there is none.
-        truth: The true contact (x, y, F), shape (3,), mm and N.
-        side: Side of the folds of the true contact.
-
-    Returns:
-        Whether the tracker reports a single contact; whether the tracked contact is on the right side of the folds;
-        whether it or the other contact is on the right side; and the distance of the tracked contact from the true one,
-        mm.
-    """
-    contacts = [contact for contact in (tracked, other) if contact is not None]
-    reported = np.array([(contact.x_mm, contact.y_mm, contact.force_N) for contact in contacts])
-    in_map = film.domain.to_contact(into_unit_domain(film.domain.to_unit(reported)))
-    is_right_side = sides(film, in_map) == side
-    error_mm = float(np.hypot(*(reported[0] - truth)[:2]))
-    return other is None, bool(is_right_side[0]), bool(is_right_side.any()), error_mm
+def contact_array(contacts: Sequence[TrackedContact | OtherContact]) -> np.ndarray:
+    """Return contacts as an array (x, y, F), shape (n, 3), mm and N."""
+    return np.array([(contact.x_mm, contact.y_mm, contact.force_N) for contact in contacts])
 
 
 def main() -> None:
-    asked = options(__doc__, slides=1000, rate_hz=1000.0, force=1.0, noise="reference", gain=0.0)
+    asked = options(__doc__, slides=1000, rate_hz=1000.0, force=1.0, gain=0.0)
     predictor = Predictor(asked.model)
     rng = np.random.default_rng(asked.seed)
-    noise = noise_model(asked.noise)
+    noise = noise_model("reference")
     metadata = predictor.metadata
     charges = read_charge_map(predictor.folder, metadata.electrodes)
     if charges is None or not charges.is_folded:
@@ -144,31 +121,31 @@ def main() -> None:
     radius = charges.domain.radius
     film = with_fast_derivatives(model_film(predictor, radius + MAP_MARGIN_mm))
 
-    counted_frames = []
+    slides = []
     for _ in range(asked.slides):
-        slide = draw_slide(film, radius, asked, rng)
+        t_s, truth = draw_slide(film, radius, asked, rng)
         gains = np.exp(asked.gain * rng.standard_normal(len(metadata.electrodes)))
-        charge = noise.add(film.charges(slide.contact) * gains, rng)
-        contacts = [Contact(*row) for row in np.asarray(predictor.predict_batch(charge)).tolist()]
-        tracker.reset()
-        reports = []
-        for contact, t_s, frame_charge in zip(contacts, slide.t_s.tolist(), charge, strict=True):
-            frame = Frame(None, None, (), clock_s=t_s, charge_pC=frame_charge, contact=contact)
-            tracker.step(frame)
-            reports.append((frame.tracking.tracked, frame.tracking.other))
-        for number in np.flatnonzero(is_counted(slide)):
-            tracked, other = reports[number]
-            counted_frames.append(examine_frame(film, tracked, other, slide.contact[number], slide.side[number]))
+        charge = noise.add(film.charges(truth) * gains, rng)
+        tracking = track_contacts(tracker, t_s, np.stack(predictor.predict_batch(charge), axis=1), charge)
+        tracked = contact_array([frame.tracked for frame in tracking])
+        other = contact_array([frame.other or frame.tracked for frame in tracking])
+        side = sides(film, truth)
+        is_known = [frame.other is None for frame in tracking]
+        is_right = sides(film, tracked) == side
+        is_one_right = is_right | (sides(film, other) == side)
+        columns = np.stack([is_known, is_right, is_one_right, position_error(tracked, truth)])
+        slides.append(columns[:, is_counted(t_s, side)])
 
-    is_known, is_right, is_one_right, error_mm = map(np.array, zip(*counted_frames, strict=True))
+    is_known, is_right, is_one_right, error_mm = np.concatenate(slides, axis=1)
+    known = is_known > 0.0
     results = {
         "known_percent": 100.0 * is_known.mean(),
-        "right_of_known_percent": 100.0 * is_right[is_known].mean(),
-        "right_or_said_percent": 100.0 * is_one_right.mean(),
-        "error_of_known_median_mm": float(np.median(error_mm[is_known])),
-        "error_of_known_95_percent_mm": float(np.quantile(error_mm[is_known], 0.95)),
+        "right_of_known_percent": 100.0 * is_right[known].mean(),
+        "right_or_listed_percent": 100.0 * is_one_right.mean(),
+        "error_of_known_median_mm": float(np.median(error_mm[known])),
+        "error_of_known_95_percent_mm": float(np.quantile(error_mm[known], 0.95)),
     }
-    print_results("folds", asked, {"frames": len(counted_frames), "slides": results})
+    print_results("folds", asked, {"frames": len(known), "slides": results})
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ With `--hand`, a hand that is 2 K warmer than the film comes during a press.
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,6 +38,9 @@ GAIN_ERROR = 0.002
 LEAK_ERROR = 0.005
 """Largest relative error of the time constants of the leak in the device file."""
 
+WINDOW = 20
+"""Number of frames over which errors are averaged."""
+
 
 class Press(NamedTuple):
     """A press of 1 N.
@@ -57,21 +61,18 @@ class Press(NamedTuple):
         return [(time_s, self.position.real, self.position.imag, force_N) for time_s, force_N in corners]
 
 
-def script_of(presses: Sequence[Press], end_s: float) -> Script:
-    """Return the script of presses that do not overlap, which ends at a given time, s."""
+def press_film(film: ForwardMap, presses: Sequence[Press], end_s: float) -> tuple[Script, Array]:
+    """Return the script of presses that do not overlap, which ends at a given time, s, and its touch charges.
+
+    The charges have the shape (n_frame, n_electrode), pC.
+    """
     nothing = (0.0, 0.0, 0.0)
     rows = [(0.0, *nothing), *(row for press in presses for row in press.rows()), (end_s, *nothing)]
     script = VirtualScript(presses=tuple(rows)).script(RATE_Hz)
-    assert script is not None
-    return script
-
-
-def touch_charges(film: ForwardMap, script: Script) -> Array:
-    """Return the touch charges of a script, shape (n_frame, n_electrode), pC."""
     charge = np.zeros((len(script), len(film.electrodes)))
     contact = np.column_stack([script.x_mm, script.y_mm, script.force_N])
     charge[script.touching] = film_charges(film)(contact[script.touching])
-    return charge
+    return script, charge
 
 
 def stream_records(
@@ -103,14 +104,16 @@ def stream_records(
     if gain_error:
         gain = process.gain * (1.0 + gain_error * rng.uniform(-1.0, 1.0, len(names)))
 
-    table: dict[str, Any] = {"gain": {"pC_per_unit": dict(zip(names, (1.0 / gain).tolist(), strict=True))}}
+    def by_electrode(values: Array) -> dict[str, float]:
+        return dict(zip(names, values.tolist(), strict=True))
+
+    table: dict[str, Any] = {"gain": {"pC_per_unit": by_electrode(1.0 / gain)}}
     if np.isfinite(tau_s).all():
-        table["leak"] = {"tau_s": dict(zip(names, tau_s.tolist(), strict=True))}
-        table["hum"] = {"frequency_Hz": 50.0}
+        table |= {"leak": {"tau_s": by_electrode(tau_s)}, "hum": {"frequency_Hz": 50.0}}
     if np.isfinite(amplifier.limit):
         table["saturation"] = {"limit_pC": amplifier.limit - 0.1}
     if has_common_mode:
-        table["common_mode"] = {"pC_per_K": dict(zip(names, process.pyro_charge_per_K.tolist(), strict=True))}
+        table["common_mode"] = {"pC_per_K": by_electrode(process.pyro_charge_per_K)}
 
     stream = TouchStream(predictor, device_from_table(table, "bench"))
     records: list[PredictionRecord] = []
@@ -121,30 +124,35 @@ def stream_records(
     return records
 
 
+def contact_errors(script: Script, records: list[PredictionRecord]) -> Array:
+    """Return the errors (x, y, F) in the frames with full force, shape (n, 3), mm and N; NaN without a contact."""
+    answers = np.array([(record.x_mm, record.y_mm, record.force_N) for record in records], dtype=float)
+    truth = np.column_stack([script.x_mm, script.y_mm, script.force_N])
+    return (answers - truth)[script.force_N >= 1.0]
+
+
 def held_presses(predictor: Predictor, amplifier: Amplifier, seed: int) -> dict[str, Any]:
     """Measure the error of the charges at the end of held presses.
 
     All electrodes have 400 pC for 8 s and later 300 pC for 10 s. The result has percentiles of the largest error of an
     electrode over both presses and eight boards, pC, for each leak, with and without thermal drift.
     """
-    presses = [Press(0.0, 6.0, 14.0), Press(0.0, 20.0, 30.0)]
-    charges_pC = (400.0, 300.0)
-    scripts = [script_of([press], 36.0) for press in presses]
-    total = sum(charge_pC * script.force_N for charge_pC, script in zip(charges_pC, scripts, strict=True))
+    charge_at_end = {14.0: 400.0, 30.0: 300.0}
+    corners_s = (6.0, 6.1, 13.9, 14.0, 20.0, 20.1, 29.9, 30.0)
+    t_s = np.arange(0.0, 36.0, 1.0 / RATE_Hz)
+    total = np.interp(t_s, corners_s, (0.0, 400.0, 400.0, 0.0, 0.0, 300.0, 300.0, 0.0))
     charge = np.repeat(total[:, None], len(predictor.metadata.electrodes), axis=1)
     results = {}
-    for tau_s in (10.0, 1.0):
-        for name, temperature_rms in (("no thermal drift", 0.0), ("with it", amplifier.temperature_rms)):
-            board = replace(amplifier, tau=tau_s, temperature_rms=temperature_rms)
-            errors_pC = []
-            for number in range(8):
-                records = stream_records(predictor, charge, board, GAIN_ERROR, seed + number)
-                for press, charge_pC in zip(presses, charges_pC, strict=True):
-                    end = round((press.end_s - 0.2) * RATE_Hz)
-                    last_charges = [list(record.charge_pC.values()) for record in records[end - 20 : end]]
-                    errors_pC.append(np.abs(np.mean(last_charges, axis=0) - charge_pC).max())
-                assert not records[-1].contact
-            results[f"tau {tau_s:g} s, {name}, pC"] = percentiles(errors_pC, PERCENTILES, 3)
+    for tau_s, temperature_rms in product((10.0, 1.0), (0.0, amplifier.temperature_rms)):
+        board = replace(amplifier, tau=tau_s, temperature_rms=temperature_rms)
+        errors_pC = []
+        for number in range(8):
+            records = stream_records(predictor, charge, board, GAIN_ERROR, seed + number)
+            for end_s, charge_pC in charge_at_end.items():
+                end = round((end_s - 0.2) * RATE_Hz)
+                last_charges = [list(record.charge_pC.values()) for record in records[end - WINDOW : end]]
+                errors_pC.append(np.abs(np.mean(last_charges, axis=0) - charge_pC).max())
+        results[f"tau {tau_s:g} s, warming {temperature_rms:g} K, pC"] = percentiles(errors_pC, PERCENTILES, 3)
     return results
 
 
@@ -166,22 +174,18 @@ def accuracy(
     position = film.domain.radius * np.sqrt(rng.uniform(size=count)) * np.exp(phase)
     *begins_s, end_s = REST_s + (PRESS_s + PAUSE_s) * np.arange(count + 1)
     presses = [Press(place, begin_s, begin_s + PRESS_s) for place, begin_s in zip(position, begins_s, strict=True)]
-    script = script_of(presses, end_s)
-    records = stream_records(predictor, touch_charges(film, script), amplifier, gain_error, seed)
+    script, charge = press_film(film, presses, end_s)
+    records = stream_records(predictor, charge, amplifier, gain_error, seed)
 
-    full_force_frames = np.flatnonzero(script.force_N >= 1.0)
     is_contact = np.array([record.contact for record in records])
-    contact_frames = full_force_frames[is_contact[full_force_frames]]
-    contact_records = [records[frame] for frame in contact_frames]
-    x_mm, y_mm = np.transpose([(record.x_mm, record.y_mm) for record in contact_records])
-    error_mm = np.hypot(x_mm - script.x_mm[contact_frames], y_mm - script.y_mm[contact_frames])
-    is_saturated = np.array(["saturated" in record.flags for record in contact_records])
-
+    is_saturated = np.array(["saturated" in record.flags for record in records])
+    x_error_mm, y_error_mm, _ = contact_errors(script, records).T
+    error_mm = np.hypot(x_error_mm, y_error_mm)
     first_frames = np.flatnonzero(np.diff(script.touching.astype(int)) == 1) + 1
     delays_ms = [1e3 / RATE_Hz * int(is_contact[first:].argmax()) for first in first_frames]
     return {
-        "position_mm": percentiles(error_mm, PERCENTILES, 3),
-        "saturated_share": round(float(is_saturated.mean()), 4),
+        "position_mm": percentiles(error_mm[~np.isnan(error_mm)], PERCENTILES, 3),
+        "saturated_share": round(float(is_saturated[is_contact & (script.force_N >= 1.0)].mean()), 4),
         "first_reading_ms": percentiles(delays_ms, PERCENTILES, 3),
     }
 
@@ -193,33 +197,10 @@ def false_contacts_at_rest(predictor: Predictor, film: ForwardMap, amplifier: Am
     return {"false_contacts": sum(record.contact for record in records)}
 
 
-HAND_PRESS_s = (7.0, 17.0)
-"""Begin and end of a press during which a warm hand comes after 10 s, s."""
-
-
-def largest_errors(script: Script, records: list[PredictionRecord], begin_s: float, end_s: float) -> dict[str, float]:
-    """Return the largest errors of force and position over means of 20 frames, without the ramps of the press.
-
-    Args:
-        script: Script with one position between both times.
-        records: Records of the script.
-        begin_s: Begin of the press, s.
-        end_s: End of the press, s.
-    """
-    first_frame = round((begin_s + 0.12) * RATE_Hz)
-    last_frame = round((end_s - 0.12) * RATE_Hz)
-    answers = np.array([(record.force_N or np.nan, record.x_mm or np.nan, record.y_mm or np.nan) for record in records])
-    truth = (1.0, script.x_mm[first_frame], script.y_mm[first_frame])
-    starts = range(first_frame, last_frame, 20)
-    error = np.abs([answers[start : start + 20].mean(axis=0) - truth for start in starts])
-    return {
-        "force_percent": round(100 * float(error[:, 0].max()), 1),
-        "mm": round(float(np.hypot(error[:, 1], error[:, 2]).max()), 2),
-    }
-
-
 def warm_hand(predictor: Predictor, film: ForwardMap, seed: int) -> dict[str, Any]:
     """Measure the largest errors of presses during which a hand comes over the film, with and without the estimate.
+
+    The hand comes 3 s after the press begins. The errors are those of means over 20 frames.
 
     Args:
         predictor: The model.
@@ -228,17 +209,17 @@ def warm_hand(predictor: Predictor, film: ForwardMap, seed: int) -> dict[str, An
     """
     results: dict[str, Any] = {}
     hand = {"step": 2.0, "step_at": 10.0, "step_for": 10.0, "pyro_mismatch": 0.2, "limit": 3000.0}
-    for level in ("reference", "bench"):
+    for level, position, has_common_mode in product(("reference", "bench"), (0.5 + 0.3j, 4.0 - 2.0j), (False, True)):
         amplifier = replace(load_amplifier(level), **hand)
-        for position in (0.5 + 0.3j, 4.0 - 2.0j):
-            script = script_of([Press(position, *HAND_PRESS_s)], 20.0)
-            charge = touch_charges(film, script)
-            for has_common_mode in (False, True):
-                records = stream_records(
-                    predictor, charge, amplifier, GAIN_ERROR, seed, has_common_mode=has_common_mode
-                )
-                key = f"{level}, {position} mm, {'[common_mode]' if has_common_mode else 'no section'}"
-                results[key] = largest_errors(script, records, *HAND_PRESS_s)
+        script, charge = press_film(film, [Press(position, 7.0, 17.0)], 20.0)
+        records = stream_records(predictor, charge, amplifier, GAIN_ERROR, seed, has_common_mode=has_common_mode)
+        errors = contact_errors(script, records)
+        windows = np.array([part.mean(axis=0) for part in np.array_split(errors, len(errors) // WINDOW)])
+        section = "[common_mode]" if has_common_mode else "no section"
+        results[f"{level}, {position} mm, {section}"] = {
+            "force_percent": round(100.0 * float(np.abs(windows[:, 2]).max()), 1),
+            "mm": round(float(np.hypot(windows[:, 0], windows[:, 1]).max()), 2),
+        }
     return results
 
 

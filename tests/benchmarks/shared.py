@@ -11,8 +11,11 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.serve import Predictor
+from isocharge.serve import Contact, Predictor
 from isocharge.serve.benchmark import Contender, machine, take_turns
+from isocharge.serve.frames.frame import Frame
+from isocharge.serve.record.record import Tracking
+from isocharge.serve.tracking.tracker import Tracker
 from isocharge.simulate import Circle, ForwardMap
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 from isocharge.train.data.contact_errors import contact_error_statistics
@@ -116,6 +119,24 @@ def whitened_errors(contact: Array, truth: Array, std: Array, correlation: Array
     one = np.full(len(xy), 1.0 + 1e-6)  # a correlation that float32 rounds to 1 would give a singular matrix
     matrix = np.moveaxis(np.array([[one, xy, xf], [xy, one, yf], [xf, yf, one]]), 2, 0)
     return np.linalg.solve(np.linalg.cholesky(matrix), ((contact - truth) / std)[..., None])[..., 0]
+
+
+def track_contacts(tracker: Tracker, t_s: Array, contacts: Array, charge: Array) -> list[Tracking]:
+    """Follow the contacts of one path, from its first frame.
+
+    Args:
+        tracker: The tracker.
+        t_s: Time of each frame, shape (n,), s.
+        contacts: Outputs of the model for each frame, shape (n, 10).
+        charge: Charges of each frame, shape (n, n_electrode), pC.
+    """
+    tracker.reset()
+    tracking = []
+    for time_s, contact, charge_pC in zip(t_s.tolist(), contacts.tolist(), charge, strict=True):
+        frame = Frame(None, None, (), clock_s=time_s, charge_pC=charge_pC, contact=Contact(*contact))
+        tracker.step(frame)
+        tracking.append(frame.tracking)
+    return tracking
 
 
 def report_progress(title: str, result: dict[str, float]) -> None:
