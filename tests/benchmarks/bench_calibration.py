@@ -22,12 +22,11 @@ reported standard deviations, and the shares within the reported 95 % ellipse (x
 The errors of followed contacts are means over four draws of the noise.
 
 `--gain-noise` is the true noise relative to the charge, which the calibration does not know. Solved charges are stored
-in build/solved_films. Solving a film takes some minutes. `--cases calibrated` leaves all rows out but the first.
+in the folder build. Solving a film takes some minutes. `--cases calibrated` leaves all rows out but the first.
 """
 
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 
@@ -35,7 +34,7 @@ import numpy as np
 from measured_films import measured_presses, with_rig_errors
 from scipy.special import chdtri
 from shared import arguments, print_results, report_progress, whitened_errors
-from solved_films import FILMS, SolvedFilm, solved_film
+from solved_films import FILMS, Unevenness, draw_film, solve_charges
 
 from isocharge.serve import Contact, Frame, Predictor
 from isocharge.serve.signal_chain.stage import Setup
@@ -43,9 +42,7 @@ from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.simulate import Circle, NoiseModel, load_sensor, local_workers
 from isocharge.train import CalibrationProblem, calibrate, write_calibration
 from isocharge.train.data.contact_errors import position_error, rms
-
-FOLDER = Path("build/solved_films")
-"""Folder in which the charges of solved films are stored."""
+from isocharge.train.data.presses import draw_contacts
 
 FRAMES = 10
 """Number of frames of a touch."""
@@ -57,6 +54,9 @@ CONTACTS = 60
 PRESSES = 20
 OFFSET_pC = 10.0
 HYSTERESIS = 0.01
+LARGEST_FORCE_N = 1.6
+"""Largest force of a press and of a touch."""
+
 GAINS = np.array([1.03, 1.0, 1.0, 1.0])
 
 
@@ -74,53 +74,73 @@ def errors(answers: list[Contact], truth: np.ndarray) -> dict[str, float]:
 
 
 class Bench:
-    """One film, from its presses to the errors of its models."""
+    """One film, from its presses to the errors of its models.
+
+    Attributes:
+        problem: The calibration problem.
+        contact: Measured contacts (x, y, F) of the presses, shape (PRESSES, 3), mm and N.
+        charge: Their charges with noise, shape (PRESSES, n_electrode), pC.
+        later_contact: True contacts of the touches and of the contacts whose errors are measured, shape
+            (TOUCHES + CONTACTS, 3).
+        later_charge: Their charges without noise by the change of the pretension, MPa.
+        rng: Random number generator of the errors and of the noise.
+    """
 
     def __init__(
         self,
         problem: CalibrationProblem,
-        noise: NoiseModel,
-        films: dict[float, SolvedFilm],
+        kind: Unevenness,
+        changes: list[float],
+        gain_noise: float,
         seed: int,
-        executor,
+        executor: Executor,
         folder: str,
     ) -> None:
-        """Measure the presses of a film.
+        """Draw a film, solve its presses, and measure them.
 
         Args:
             problem: The calibration problem.
-            noise: True noise of the charges, which the calibration does not know.
-            films: The film after each change of its pretension.
-            seed: Seed of the errors of the presses and of the noise.
-            executor: Executor that runs the solves of the calibrations.
+            kind: Kind of the film.
+            changes: Changes of the pretension, MPa.
+            gain_noise: True noise relative to the charge, which the calibration does not know.
+            seed: Seed of the film, of the errors of the presses and of the noise.
+            executor: Executor that runs the solves.
             folder: Folder in which the models are written.
         """
         self.problem = problem
-        self.noise = noise
-        self.films = films
         self.executor = executor
-        self.folder = folder
+        self._noise = NoiseModel("bench", problem.noise.white, gain_noise)
+        self._folder = folder
         self.rng = np.random.default_rng([seed, 51])
-        first = next(iter(films.values()))
-        self.contact = with_rig_errors(first.contact, self.rng)
-        self.charge = noise.add(first.charge, self.rng)
+        sensor, probe = draw_film(problem, kind, seed)
+        contact_rng = np.random.default_rng([seed, 50])
+        contact, self.later_contact = (
+            np.minimum(draw_contacts(contact_rng, problem.domain, count), (np.inf, np.inf, LARGEST_FORCE_N))
+            for count in (PRESSES, TOUCHES + CONTACTS)
+        )
+        self.later_charge = {}
+        for change in changes:
+            later = replace(sensor, film=replace(sensor.film, pretension=sensor.film.pretension + change))
+            self.later_charge[change] = solve_charges(later, probe, self.later_contact, executor)
+        self.contact = with_rig_errors(contact, self.rng)
+        self.charge = self._noise.add(solve_charges(sensor, probe, contact, executor), self.rng)
 
     def calibrated(self, contact: np.ndarray, charge: np.ndarray, problem: CalibrationProblem | None = None):
         """Calibrate a film by presses, and return the result and its model."""
         problem = problem or self.problem
         result = calibrate(measured_presses(problem, contact, charge), problem, executor=self.executor)
-        folder = Path(mkdtemp(dir=self.folder)) / "film"
+        folder = Path(mkdtemp(dir=self._folder)) / "film"
         return result, Predictor(write_calibration(result, folder, executor=self.executor))
 
     def later(self, change: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the later contacts on the film after a change, and their charges with noise."""
-        film = self.films[change]
-        return film.later_contact[TOUCHES:], self.noise.add(film.later_charge[TOUCHES:], self.rng)
+        charge = self.later_charge[change][TOUCHES:]
+        return self.later_contact[TOUCHES:], self._noise.add(charge, self.rng)
 
     def touches(self, change: float) -> np.ndarray:
         """Return the charges of the frames of each touch, with noise, shape (n_touch, n_frame, n_electrode)."""
-        charge = self.films[change].later_charge[:TOUCHES]
-        return self.noise.add(np.repeat(charge[:, None], FRAMES, axis=1), self.rng)
+        charge = self.later_charge[change][:TOUCHES]
+        return self._noise.add(np.repeat(charge[:, None], FRAMES, axis=1), self.rng)
 
 
 def follower_after(predictor: Predictor, touches: np.ndarray) -> FilmFollower:
@@ -182,7 +202,7 @@ def film_results(bench: Bench, counts: list[int], *, has_all_cases: bool) -> dic
     _, hysteresis_predictor = bench.calibrated(contact, bench.charge)
     results["hysteresis"] = errors([hysteresis_predictor.predict(row) for row in charge], truth)
 
-    cases = [(f"{change:+g} MPa", change, np.ones(len(GAINS))) for change in bench.films]
+    cases = [(f"{change:+g} MPa", change, np.ones(len(GAINS))) for change in bench.later_charge]
     for name, change, gains in (*cases, ("gain", 0.0, GAINS)):
         draws = [followed_errors(bench, predictor, change, gains) for _ in range(DRAWS)]
         for way in draws[0]:
@@ -209,23 +229,14 @@ def main() -> None:
         gain_noise=0.002,
     )
     problem = CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))
-    noise = NoiseModel("bench", problem.noise.white, asked.gain_noise)
     changes = [float(change) for change in asked.changes.split(",")]
     counts = [int(count) for count in asked.presses.split(",")]
-    counts_of_solves = (PRESSES, TOUCHES + CONTACTS)
     all_results = []
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool, local_workers(2) as executor:
+    with local_workers(2) as executor, TemporaryDirectory() as folder:
         for seed in (int(text) for text in asked.seeds.split(",")):
-            films = {
-                change: solved_film(
-                    problem, FILMS[asked.films], seed, change, counts_of_solves, FOLDER / asked.films, pool
-                )
-                for change in changes
-            }
+            bench = Bench(problem, FILMS[asked.films], changes, asked.gain_noise, seed, executor, folder)
             report_progress("film", {"seed": float(seed)})
-            with TemporaryDirectory() as folder:
-                bench = Bench(problem, noise, films, seed, executor, folder)
-                all_results.append(film_results(bench, counts, has_all_cases=asked.cases == "all"))
+            all_results.append(film_results(bench, counts, has_all_cases=asked.cases == "all"))
     summary = {}
     for name in all_results[0]:
         rows = [results[name] for results in all_results]

@@ -8,7 +8,6 @@ presses with noise. The time is CPU time of one thread, because a busy machine d
 Bayes limit takes about 15 ms for each press. It is not accurate for noise that is far below `reference`.
 """
 
-import sys
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -17,8 +16,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
-from bayes.posterior import Posterior
-from shared import arguments, print_results
+from shared import LimitedPresses, arguments, print_results, report_progress
 from sklearn.compose import TransformedTargetRegressor
 from sklearn.decomposition import PCA
 from sklearn.ensemble import HistGradientBoostingRegressor
@@ -30,18 +28,8 @@ from sklearn.preprocessing import FunctionTransformer
 
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
-from isocharge.simulate import (
-    ChargeSpline,
-    Circle,
-    Domain,
-    ForwardMap,
-    NoiseModel,
-    Sweep,
-    load_sensor,
-    noise_model,
-)
+from isocharge.simulate import Circle, Domain, ForwardMap, NoiseModel, Sweep, load_sensor, noise_model
 from isocharge.train import LabelledPresses, NetworkConfig, TrainingConfig
-from isocharge.train.data.contact_errors import contact_error_statistics
 from isocharge.train.data.presses import LOWEST_CHARGE
 from isocharge.train.training.contact_training import contact_stage
 from isocharge.train.training.fit import threads_and_seed
@@ -63,9 +51,7 @@ class Case:
         charge_map: Map from contacts to charges.
         train: Presses for training without noise.
         noisy_train: Copies of these presses with noise.
-        truth: Contacts on which errors are measured, shape (n, 3), mm and N.
-        charge: Their charges with noise, shape (n, n_electrode), pC.
-        estimate: Posterior means of the contacts from these charges, shape (n, 3).
+        test: Presses on which errors are measured.
     """
 
     def __init__(self, sensor_name: str, radius: float, n_sample: int, n_press: int, noise: NoiseModel) -> None:
@@ -77,31 +63,14 @@ class Case:
         self.train = LabelledPresses(contact, self.charge_map.charges(contact))
         noisy_charges = [self.train.noisy(noise, seed) for seed in range(N_COPIES)]
         self.noisy_train = LabelledPresses(np.tile(contact, (N_COPIES, 1)), np.concatenate(noisy_charges))
-        self.truth = Sweep(radius, DEFAULT_FORCE_RANGE, n_press, 1).contacts()
-        self.charge = noise.add(self.charge_map.charges(self.truth), np.random.default_rng(2))
-        self.estimate, _ = Posterior(ChargeSpline.of(self.charge_map), noise, radius).mean_and_std(self.charge)
+        self.test = LimitedPresses.draw(self.charge_map, radius, n_press, noise)
 
     def measure(self, fit: Callable[[], Predict]) -> dict[str, float]:
-        """Return the CPU time of a fit, its position error, and the errors over the limit.
-
-        The posterior mean has the smallest mean square error, so the mean square error of another estimate is larger by
-        the mean square difference from the posterior mean. The difference scatters much less from press to press than
-        the error.
-        """
+        """Return the CPU time of a fit, its errors, and their ratios to the limit."""
         started = time.process_time()
         predict = fit()
         seconds = time.process_time() - started
-        limit = contact_error_statistics(self.estimate, self.truth)
-        contact = predict(self.charge)
-        difference = contact - self.estimate
-        position_mm = np.sqrt(np.mean(np.sum(difference[:, :2] ** 2, axis=1)))
-        force_percent = 100.0 * np.sqrt(np.mean((difference[:, 2] / self.truth[:, 2]) ** 2))
-        return {
-            "cpu_s": round(seconds, 2),
-            "position_rms_mm": round(contact_error_statistics(contact, self.truth)["position_rms_mm"], 4),
-            "position_over_limit": round(float(np.hypot(1.0, position_mm / limit["position_rms_mm"])), 4),
-            "force_over_limit": round(float(np.hypot(1.0, force_percent / limit["force_rms_percent"])), 4),
-        }
+        return {"cpu_s": round(seconds, 2), **self.test.errors(predict(self.test.charge))}
 
     def network(self) -> InverseNetwork:
         """Return an untrained network of the default size."""
@@ -190,7 +159,7 @@ def main() -> None:
     rows = {}
     for name, fit in fits.items():
         rows[name] = case.measure(fit)
-        print(name, rows[name], file=sys.stderr, flush=True)
+        report_progress(name, rows[name])
     print_results("fit", asked, rows)
 
 

@@ -14,13 +14,11 @@ import time
 from typing import Any
 
 import numpy as np
-from bayes.posterior import Posterior
-from shared import arguments, errors_over_limit, print_results, training_data
+from shared import LimitedPresses, arguments, print_results
 
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import IsochargeError
 from isocharge.simulate import (
-    ChargeSpline,
     Circle,
     Electrode,
     Film,
@@ -31,7 +29,7 @@ from isocharge.simulate import (
     load_sensor,
     noise_model,
 )
-from isocharge.train import fit
+from isocharge.train import LabelledPresses, TrainingData, fit
 
 NOISE = noise_model("reference")
 
@@ -83,19 +81,19 @@ def measure(sensor: Sensor, probe: Circle) -> dict[str, Any]:
         IsochargeError: If the sensor is refused.
     """
     charge_map = ForwardMap.build(sensor, probe, DEFAULT_RADIUS, DEFAULT_FORCE_RANGE)
-    data = training_data(charge_map, 24_000)
+    domain = charge_map.domain
+    contact = Sweep(domain.radius, domain.force_range, 24_000, 0).contacts()
+    presses = LabelledPresses(contact, charge_map.charges(contact))
     started = time.process_time()
-    fitted = fit(data)
+    fitted = fit(TrainingData(sensor=sensor, probes=(probe.notation,), domain=domain, presses=presses, sha256="-"))
     seconds = time.process_time() - started
 
     radius = fitted.domain.radius
-    truth = Sweep(radius, DEFAULT_FORCE_RANGE, 600, 1).contacts()
-    charge = NOISE.add(charge_map.charges(truth), np.random.default_rng(2))
-    estimate, _, _ = fitted.predict(charge)
-    limit_estimate, _ = Posterior(ChargeSpline.of(charge_map), NOISE, radius).mean_and_std(charge)
+    limited = LimitedPresses.draw(charge_map, radius, 600, NOISE)
+    estimate, _, _ = fitted.predict(limited.charge)
     return {
         "radius_mm": radius,
-        **errors_over_limit(estimate, limit_estimate, truth),
+        **limited.errors(estimate),
         "training_cpu_s": round(seconds, 1),
     }
 

@@ -12,19 +12,15 @@ but not the effects that a theory neglects.
 """
 
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from shared import arguments, print_results
 
 from isocharge.simulate import (
     Circle,
     Equilibrium,
-    Polygon,
-    Probe,
     Resolution,
     SolveSettings,
     Theory,
@@ -34,6 +30,7 @@ from isocharge.simulate import (
 )
 from isocharge.simulate.forward.readout import stress_charge
 from isocharge.simulate.mesh.template import template_for
+from isocharge.simulate.plots.figure import new_figure
 
 SENSORS = [load_sensor(f"{layout}-25um-{kind}") for layout in ("three", "four") for kind in ("biaxial", "uniaxial")]
 FILM = SENSORS[0].film
@@ -48,12 +45,6 @@ MESHES = {
     WITH_BENDING: ((3, 8, 4, 2), (4, 8, 6, 2), (5, 8, 6, 2), (6, 8, 6, 2), (7, 8, 6, 3)),
 }
 """Meshes that are measured, as the arguments of `Resolution`. The first number is the order of the elements."""
-
-PROBES = (PROBE, Polygon.triangle(4.0, 0.5), Polygon.rectangle(4.0, 2.0, 0.5))
-"""Probes for which the mesh that `press` chooses is measured."""
-
-References = dict[tuple[Theory, str, int], Equilibrium]
-"""Reference solves by the theory, the name of the group of presses, and the number of the press."""
 
 
 def draw_contacts(count: int, seed: int, *, on_electrode: bool) -> np.ndarray:
@@ -80,28 +71,27 @@ def draw_contacts(count: int, seed: int, *, on_electrode: bool) -> np.ndarray:
     return np.stack([chosen.real, chosen.imag, force], axis=1)
 
 
-def solve(
-    contact: np.ndarray, settings: SolveSettings, probe: Probe = PROBE, start: Equilibrium | None = None
-) -> tuple[Equilibrium, float]:
+def solve(contact: np.ndarray, settings: SolveSettings, start: Equilibrium | None = None) -> tuple[Equilibrium, float]:
     """Solve a press, and return the equilibrium and the CPU time of solve and readout, ms."""
     x, y, force = contact.tolist()
     start_s = time.process_time()
-    solved = press(FILM, probe, (x, y), force, settings, start=start)
+    solved = press(FILM, PROBE, (x, y), force, settings, start=start)
     touch_charge(SENSORS[0], solved)
     return solved, 1e3 * (time.process_time() - start_s)
 
 
-def relative_errors(solved: Equilibrium, reference: Equilibrium) -> list[float]:
-    """Return the relative errors of all charges of all sensors."""
-    errors = []
-    for sensor in SENSORS:
-        exact = stress_charge(sensor, reference, (60, 60))
-        errors += np.abs(touch_charge(sensor, solved) / exact - 1.0).tolist()
-    return errors
+def reference_charges(theory: Theory, contacts: np.ndarray) -> np.ndarray:
+    """Return the charges of all sensors on the finest mesh, shape (n, n_charge), pC, for contacts of shape (n, 3)."""
+    settings = SolveSettings(theory=theory, resolution=REFERENCE_MESHES[theory])
+    rows = []
+    for contact in contacts:
+        reference, _ = solve(contact, settings)
+        rows.append(np.concatenate([stress_charge(sensor, reference, (60, 60)) for sensor in SENSORS]))
+    return np.array(rows)
 
 
 def measure_mesh(
-    theory: Theory, mesh: tuple[int, ...], groups: dict[str, np.ndarray], references: References
+    theory: Theory, mesh: tuple[int, ...], groups: dict[str, np.ndarray], references: dict[str, np.ndarray]
 ) -> dict[str, Any]:
     """Measure times and errors of a mesh.
 
@@ -109,21 +99,22 @@ def measure_mesh(
         theory: Theory of the film.
         mesh: Arguments of `Resolution`.
         groups: Presses, shape (n, 3) each, by the name of the group.
-        references: Reference solves of these presses.
+        references: Reference charges of these presses, shape (n, n_charge) each, by the name of the group.
     """
     settings = SolveSettings(theory=theory, resolution=Resolution(*mesh))
     cold_ms = []
     warm_ms = []
     errors: dict[str, list[float]] = {name: [] for name in groups}
-    for name, group in groups.items():
-        for number, contact in enumerate(group):
+    for name, contacts in groups.items():
+        for contact, reference in zip(contacts, references[name], strict=True):
             neighbour_contact = contact * [1.0, 1.0, 1.1] + [0.3, -0.4, 0.0]
             neighbour, _ = solve(neighbour_contact, settings)
             solved, cold_time_ms = solve(contact, settings)
             _, warm_time_ms = solve(contact, settings, start=neighbour)
             cold_ms.append(cold_time_ms)
             warm_ms.append(warm_time_ms)
-            errors[name] += relative_errors(solved, references[theory, name, number])
+            charge = np.concatenate([touch_charge(sensor, solved) for sensor in SENSORS])
+            errors[name] += np.abs(charge / reference - 1.0).tolist()
     return {
         "theory": theory.name,
         "mesh": mesh,
@@ -134,72 +125,39 @@ def measure_mesh(
     }
 
 
-def measure_chosen_mesh(theory: Theory, probe: Probe, contacts: np.ndarray) -> dict[str, Any]:
-    """Measure the time of the mesh that `press` chooses for a probe."""
-    settings = SolveSettings(theory=theory)
-    solve(contacts[0], settings, probe)  # computes the template
-    cold_ms = []
-    for contact in contacts:
-        solved, time_ms = solve(contact, settings, probe)
-        cold_ms.append(time_ms)
-    return {
-        "theory": theory.name,
-        "probe": probe.notation,
-        "mesh": list(asdict(solved.mesh.resolution).values()),
-        "cold_ms": float(np.median(cold_ms)),
-    }
-
-
-def measure_all(positions: int, seed: int) -> dict[str, Any]:
-    """Measure all meshes.
-
-    Args:
-        positions: Number of presses of each group.
-        seed: Seed of the presses.
-    """
-    groups = {
-        "away": draw_contacts(positions, seed, on_electrode=False),
-        "on": draw_contacts(positions, seed, on_electrode=True),
-    }
-    references: References = {}
-    for theory, resolution in REFERENCE_MESHES.items():
-        settings = SolveSettings(theory=theory, resolution=resolution)
-        for name, group in groups.items():
-            for number, contact in enumerate(group):
-                references[theory, name, number], _ = solve(contact, settings)
-    return {
-        "meshes": [
-            measure_mesh(theory, mesh, groups, references) for theory, meshes in MESHES.items() for mesh in meshes
-        ],
-        "chosen": [measure_chosen_mesh(theory, probe, groups["away"][:3]) for probe in PROBES for theory in MESHES],
-    }
-
-
-def plot(result: dict[str, Any], path: Path) -> None:
+def plot(rows: list[dict[str, Any]], path: Path) -> None:
     """Draw the largest error against the CPU time, with the order of the elements beside each point."""
-    figure = Figure(figsize=(7.2, 4.4), layout="constrained")
-    axes = figure.subplots()
+    axes = new_figure(7.2, 4.4).subplots()
     for theory in MESHES:
-        rows = [row for row in result["meshes"] if row["theory"] == theory.name]
         for group, where, marker in (("away", "away from electrodes", "o"), ("on", "on electrodes", "s")):
-            times_ms = [row["cold_ms"][0] for row in rows]
-            errors = [row[f"error_{group}"][1] for row in rows]
+            points = [
+                (row["cold_ms"][0], row[f"error_{group}"][1], row["mesh"][0])
+                for row in rows
+                if row["theory"] == theory.name
+            ]
+            times_ms, errors, _ = zip(*points, strict=True)
             axes.loglog(times_ms, errors, marker, ms=5, label=f"{theory.name}, {where}")
-            for row, time_ms, error in zip(rows, times_ms, errors, strict=True):
-                order = row["mesh"][0]
+            for time_ms, error, order in points:
                 axes.annotate(order, (time_ms, error), xytext=(4, 4), textcoords="offset points", fontsize=7)
     axes.set(xlabel="CPU time of one press, ms", ylabel="worst error of a charge", title="Numbers: order of elements")
     axes.grid(True, color="0.9")
     axes.legend(fontsize=7)
-    figure.savefig(path, dpi=130)
+    axes.figure.savefig(path, dpi=130)
 
 
 def main() -> None:
     asked = arguments(__doc__, positions=20, seed=1, plot=None)
-    result = measure_all(asked.positions, asked.seed)
+    groups = {
+        "away": draw_contacts(asked.positions, asked.seed, on_electrode=False),
+        "on": draw_contacts(asked.positions, asked.seed, on_electrode=True),
+    }
+    rows = []
+    for theory, meshes in MESHES.items():
+        references = {name: reference_charges(theory, contacts) for name, contacts in groups.items()}
+        rows += [measure_mesh(theory, mesh, groups, references) for mesh in meshes]
     if asked.plot:
-        plot(result, asked.plot)
-    print_results("solve", asked, result)
+        plot(rows, asked.plot)
+    print_results("solve", asked, {"meshes": rows})
 
 
 if __name__ == "__main__":

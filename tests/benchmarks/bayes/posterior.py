@@ -17,6 +17,7 @@ of a standard deviation of the posterior, which changes root-mean-square errors 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import softmax
 
 from isocharge.common.arrays import Array
 from isocharge.common.progress import track
@@ -149,7 +150,7 @@ class Posterior:
 
 
 def _resample(point: Array, level: Array, log_weight: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Draw contacts with probabilities proportional to their weights, by systematic resampling.
+    """Draw contacts with probabilities proportional to their weights.
 
     Args:
         point: Contacts, shape (n, population, 3).
@@ -158,12 +159,8 @@ def _resample(point: Array, level: Array, log_weight: Array, rng: np.random.Gene
         rng: Random number generator.
 
     Returns:
-        The drawn contacts in random order, and the logarithms of their likelihoods.
+        The drawn contacts, and the logarithms of their likelihoods.
     """
-    n_press, population = level.shape
-    weight = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
-    cumulative = np.cumsum(weight, axis=1) / weight.sum(axis=1, keepdims=True)
-    quantile = (np.arange(population) + rng.random((n_press, 1))) / population
-    drawn = np.stack([np.searchsorted(row, values) for row, values in zip(cumulative, quantile, strict=True)])
-    drawn = rng.permuted(np.minimum(drawn, population - 1), axis=1)
+    population = level.shape[1]
+    drawn = np.stack([rng.choice(population, population, p=weight) for weight in softmax(log_weight, axis=1)])
     return np.take_along_axis(point, drawn[:, :, None], axis=1), np.take_along_axis(level, drawn, axis=1)

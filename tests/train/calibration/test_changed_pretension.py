@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.benchmarks.solved_films import solve_charges
 from tests.train.calibration.conftest import rig, uneven_film
 
 from isocharge.train import calibrate
 from isocharge.train.calibration import film_network
 from isocharge.train.calibration.calibrate import solve_even
 from isocharge.train.calibration.film_network import _nodes, _tension_factors
-from solved_charges import with_film
+from solved_charges import solved_charges, with_film
 
 
 @pytest.mark.slow
@@ -20,9 +19,9 @@ def test_charges_of_an_uneven_film_after_warming_agree_with_full_solves(problem)
     film = uneven_film(problem)
     sensor, probe = film.layout.prior.film(film.film_values)
     contact = np.array([[0.0, 0.0, 0.5], [5.0, 1.0, 0.3], [-3.0, 4.0, 1.0], [2.0, -6.0, 0.5], [-6.0, -2.0, 1.5]])
-    before = solve_charges(sensor, probe, contact)
+    before = solved_charges(sensor, probe, contact)
     later = with_film(sensor, pretension=sensor.film.pretension - 0.4)
-    after = solve_charges(later, probe, contact)
+    after = solved_charges(later, probe, contact)
 
     charges = solve_even(problem, values=film.film_values)
     uneven_map = replace(charges.film, sensor=replace(charges.film.sensor, film=sensor.film))
