@@ -1,7 +1,7 @@
 """Errors of calibrated, faulty and changed films with imperfections, whose presses are solved one by one.
 
     python tests/benchmarks/bench_calibration.py [--films typical] [--seeds 0,1,2,3] [--presses 1,5,8,20]
-        [--changes 0,0.3,-0.4] [--cases all] [--gain-noise 0.002] [--json]
+        [--changes 0,0.3,-0.4] [--cases all] [--gain-noise 0.002]
 
 The films are those of `solved_films.py`: orthotropic, unevenly stretched, with an oval clamp and wrong gains. With
 `--films moduli`, E1 / E2 is 1.6; with `--films tension`, the ratio of the pretensions along two axes is 3. The presses

@@ -1,6 +1,6 @@
 """An export on emulated Cortex-M boards: answers, instructions per prediction, flash, RAM; no times without a chip.
 
-    python tests/benchmarks/bench_cortex_m.py --export c [--json]
+    python tests/benchmarks/bench_cortex_m.py --export c
 
 The export is a folder of `isocharge train export-c`. QEMU emulates Arm's MPS2 boards with a Cortex-M4F (AN386) and a
 Cortex-M7 (AN500) and counts instructions (`-icount shift=0`). Flash and RAM are those of the smallest program that

@@ -1,6 +1,6 @@
 """Which faulty presses the released models flag, and which they answer wrongly: the tables of serve/docs/unnoticed.md.
 
-    python tests/benchmarks/bench_faults.py [--models NAME,...] [--presses 4000] [--whole-film] [--seed 1] [--json]
+    python tests/benchmarks/bench_faults.py [--models NAME,...] [--presses 4000] [--whole-film] [--seed 1]
 
 Presses of a circle of 1 mm over the whole range of forces, 0.05 to 2 N, inside the working area, with `reference`
 noise. Each cell gives the share of presses with a flag other than `stress`, and the share that is wrong by more than

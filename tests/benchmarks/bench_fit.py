@@ -1,7 +1,7 @@
 """Training time against error over the Bayes limit: the training, the training without its parts, and scikit-learn.
 
     python tests/benchmarks/bench_fit.py [--sensor three-25um-biaxial] [--radius 8] [--samples 24000] [--presses 1500]
-        [--steps 250,600,1500,2000] [--noise reference] [--json]
+        [--steps 250,600,1500,2000] [--noise reference]
 
 Only the contact network is trained. All methods learn from the same simulated presses and estimate the same fresh
 presses with noise. The time is CPU time of one thread, because a busy machine does not change it much. The

@@ -3,7 +3,7 @@
     isocharge simulate sweep three-25um-uniaxial --radius 6.5 -o presses
     isocharge train fit presses -o three-25um-uniaxial
     python tests/benchmarks/bench_folds.py --model ./three-25um-uniaxial [--slides 1000] [--rate-hz 1000] [--force 1]
-        [--gain 0] [--json]
+        [--gain 0]
 
 In each slide, the force rises for 30 ms, and the contact is at rest for 0.2 s. The contact then moves along a straight
 line to a position beyond a fold, with a speed of 5 to 200 mm/s (uniform in the logarithm), and is at rest for another

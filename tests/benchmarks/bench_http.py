@@ -1,6 +1,6 @@
 """HTTP: `isocharge serve http` against ten lines of uvicorn, which serve the same model file.
 
-    python tests/benchmarks/bench_http.py [--model NAME|PATH] [--seconds 10] [--json]
+    python tests/benchmarks/bench_http.py [--model NAME|PATH] [--seconds 10]
 
 The ten lines (`bare_app.py`) give the same answer with a `Predictor`. The client and the servers share the cores. The
 client of single presses is a plain socket, the same for both servers. Latency: one request at a time over one open

@@ -1,6 +1,6 @@
 """Released models against the Bayes limit, and their intervals: the table of train/docs/accuracy.md.
 
-    python tests/benchmarks/bench_model.py [--models NAME,...] [--presses 6000] [--draws 40000] [--seed 1] [--json]
+    python tests/benchmarks/bench_model.py [--models NAME,...] [--presses 6000] [--draws 40000] [--seed 1]
 
 The presses of a circle of 1 mm are simulated separately and were not in the training data. They have `reference` noise
 and the forces of the model. Computing the Bayes limit takes half a minute for a thousand presses.

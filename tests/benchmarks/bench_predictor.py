@@ -1,6 +1,6 @@
 """One press: `Predictor` and the exported C against a bare `session.run` of the same model, in turns in one process.
 
-    python tests/benchmarks/bench_predictor.py [--model NAME|PATH] [--seconds 10] [--json]
+    python tests/benchmarks/bench_predictor.py [--model NAME|PATH] [--seconds 10]
 
 The bare session has the options of the predictor (one thread, no spinning) and gets its input array ready-made. The C
 is compiled as a library, once for each set of options, and called through ctypes; the loop over presses is in C, as in

@@ -1,6 +1,6 @@
 """CPU time and error of a solve for several meshes, without and with bending.
 
-    python tests/benchmarks/bench_solve.py [--positions 20] [--seed 1] [--plot FILE.png] [--json]       (ten minutes)
+    python tests/benchmarks/bench_solve.py [--positions 20] [--seed 1] [--plot FILE.png]       (ten minutes)
 
 The time is the CPU time of `press` (mesh and Newton's method) and `touch_charge` (readout). Imports, templates and the
 symbolic factorisation are done before. A solve starts from the flat film ("cold"), or from a press 0.5 mm away with 1.1

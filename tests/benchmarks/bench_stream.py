@@ -1,6 +1,6 @@
 """The live path over a pseudo-terminal: frames lost and repeated, how long a record takes, and how much of a core.
 
-    python tests/benchmarks/bench_stream.py [--model NAME|PATH] [--seconds 60] [--rate-hz 1000] [--json]
+    python tests/benchmarks/bench_stream.py [--model NAME|PATH] [--seconds 60] [--rate-hz 1000]
 
 The virtual sensor plays in a process of its own; the reader's processor time is its own alone, all stages of the signal
 chain on, each record turned into a line of JSON. The latency is that of the record itself: from the arrival of the last

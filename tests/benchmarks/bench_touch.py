@@ -1,6 +1,6 @@
 """Accuracy of the live path behind the simulator's amplifier, which has noise, leak, hum, drift and gain errors.
 
-    python tests/benchmarks/bench_touch.py [--model NAME|PATH] [--presses 100] [--hand] [--json]
+    python tests/benchmarks/bench_touch.py [--model NAME|PATH] [--presses 100] [--hand]
 
 The sensor of the model is pressed with a circle of 1 mm and a force of 1 N at random positions of its working area. The
 frames of the amplifier `bench` pass through the whole path from bytes to records, without a port. The time constants in
@@ -131,31 +131,6 @@ def contact_errors(script: Script, records: list[PredictionRecord]) -> Array:
     return (answers - truth)[script.force_N >= 1.0]
 
 
-def held_presses(predictor: Predictor, amplifier: Amplifier, seed: int) -> dict[str, Any]:
-    """Measure the error of the charges at the end of held presses.
-
-    All electrodes have 400 pC for 8 s and later 300 pC for 10 s. The result has percentiles of the largest error of an
-    electrode over both presses and eight boards, pC, for each leak, with and without thermal drift.
-    """
-    charge_at_end = {14.0: 400.0, 30.0: 300.0}
-    corners_s = (6.0, 6.1, 13.9, 14.0, 20.0, 20.1, 29.9, 30.0)
-    t_s = np.arange(0.0, 36.0, 1.0 / RATE_Hz)
-    total = np.interp(t_s, corners_s, (0.0, 400.0, 400.0, 0.0, 0.0, 300.0, 300.0, 0.0))
-    charge = np.repeat(total[:, None], len(predictor.metadata.electrodes), axis=1)
-    results = {}
-    for tau_s, temperature_rms in product((10.0, 1.0), (0.0, amplifier.temperature_rms)):
-        board = replace(amplifier, tau=tau_s, temperature_rms=temperature_rms)
-        errors_pC = []
-        for number in range(8):
-            records = stream_records(predictor, charge, board, GAIN_ERROR, seed + number)
-            for end_s, charge_pC in charge_at_end.items():
-                end = round((end_s - 0.2) * RATE_Hz)
-                last_charges = [list(record.charge_pC.values()) for record in records[end - WINDOW : end]]
-                errors_pC.append(np.abs(np.mean(last_charges, axis=0) - charge_pC).max())
-        results[f"tau {tau_s:g} s, warming {temperature_rms:g} K, pC"] = percentiles(errors_pC, PERCENTILES, 3)
-    return results
-
-
 def accuracy(
     predictor: Predictor, film: ForwardMap, amplifier: Amplifier, count: int, gain_error: float, seed: int
 ) -> dict[str, Any]:
@@ -235,7 +210,6 @@ def main() -> None:
         "gains to 0.2 %": accuracy(predictor, film, amplifier, asked.presses, GAIN_ERROR, asked.seed),
         "gains off by 1 % rms": accuracy(predictor, film, amplifier, asked.presses, 0.0, asked.seed),
         "nothing for 600 s": false_contacts_at_rest(predictor, film, amplifier, asked.seed),
-        "held": held_presses(predictor, amplifier, asked.seed),
     }
     print_results("touch", asked, results)
 

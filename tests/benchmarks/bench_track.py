@@ -1,6 +1,6 @@
 """Contacts followed in time, by isocharge and by other filters: the table of serve/docs/tracking_results.md.
 
-    python tests/benchmarks/bench_track.py [--model NAME|PATH] [--paths 40] [--noise reference] [--json]
+    python tests/benchmarks/bench_track.py [--model NAME|PATH] [--paths 40] [--noise reference]
 
 A contact of 1 N is at rest, then moves at a constant speed for 0.3 s or 8 mm, and is at rest again. The paths lie at
 random positions of the inner working area. The charges of 1000 frames per second are simulated with noise, and the

@@ -5,7 +5,7 @@ and compares some of them with direct solves. The error of a charge is relative 
 tenth of the largest charge of the press if this is larger. A probe that is not round either keeps its orientation or
 has random orientations.
 
-    python tests/benchmarks/bench_uneven_films.py [--presses 20] [--json]
+    python tests/benchmarks/bench_uneven_films.py [--presses 20]
 """
 
 import time

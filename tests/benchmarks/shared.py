@@ -35,7 +35,7 @@ def options(page: str, model: str = "three-25um-biaxial", **more: Any) -> argpar
 
 
 def arguments(page: str, **defaults: Any) -> argparse.Namespace:
-    """Parse the options of a benchmark, one of which is the switch `--json`.
+    """Parse the options of a benchmark.
 
     Args:
         page: Description of the benchmark for `--help`.
@@ -43,7 +43,7 @@ def arguments(page: str, **defaults: Any) -> argparse.Namespace:
             default False is a switch, and an option with the default None is a path.
     """
     parser = argparse.ArgumentParser(description=page, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name, default in {**defaults, "json": False}.items():
+    for name, default in defaults.items():
         option = "--" + name.replace("_", "-").lower()
         if default is False:
             parser.add_argument(option, dest=name, action="store_true")
@@ -54,26 +54,15 @@ def arguments(page: str, **defaults: Any) -> argparse.Namespace:
 
 
 def print_results(name: str, asked: argparse.Namespace, results: dict[str, Any]) -> None:
-    """Print results as text, or as one JSON object with the option `--json`.
+    """Print the options of a benchmark, the machine, and the results by title as one JSON object.
 
     Args:
         name: Name of the benchmark.
         asked: Options of the benchmark.
         results: Results by title: a value, a list of rows, or a dictionary of values.
     """
-    if asked.json:
-        about = {"benchmark": name, **vars(asked), "machine": machine()}
-        print(json.dumps(about | {"results": results}, default=str))
-        return
-    print(", ".join(f"{key} {value}" for key, value in machine().items()))
-    for title, result in results.items():
-        rows = result
-        if isinstance(result, dict):
-            rows = [f"{key}: {value}" for key, value in result.items()]
-        if isinstance(rows, list):
-            print(title, *rows, sep="\n    ")
-        else:
-            print(f"{title}: {rows}")
+    about = {"benchmark": name, **vars(asked), "machine": machine()}
+    print(json.dumps(about | {"results": results}, indent=1, default=str))
 
 
 def model_film(predictor: Predictor, radius_mm: float) -> ForwardMap:
