@@ -149,11 +149,6 @@ def test_every_page_is_in_the_contents_of_the_site(page):
     assert page == "README.md" or page.removesuffix(".md") in SITE_CONTENTS.split()
 
 
-@pytest.mark.parametrize("word", ["Excel", "Teensy"])
-def test_a_search_for_a_program_or_a_board_finds_a_page(word):
-    assert any(word in text for text in PAGES.values())
-
-
 def test_figures_of_the_readme_are_on_the_pages_that_it_links_to():
     links = re.findall(r"\[(\d[^\]]*)\]\(([^)#]+\.md)\)", PAGES["README.md"])
     assert len(links) >= 5

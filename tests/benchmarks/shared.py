@@ -183,16 +183,11 @@ def in_turns(contenders: Sequence[Contender], seconds: float) -> list[dict[str, 
         seconds: Duration of the measurement, s.
 
     Returns:
-        For each function the percentiles of its time, and the ratio of its median to that of the first function.
+        For each function its timing, the median of its time for one press, and the ratio to that of the first function.
     """
     timings = take_turns(contenders, seconds)
     medians_us = [timing.p50_us / timing.presses for timing in timings]
     return [
-        {
-            "call": timing.name,
-            "p50_us": round(median_us, 3),
-            "p99_us": round(timing.p99_us / timing.presses, 3),
-            "ratio_p50": round(median_us / medians_us[0], 3),
-        }
+        timing._asdict() | {"p50_us_per_press": median_us, "ratio_p50": median_us / medians_us[0]}
         for timing, median_us in zip(timings, medians_us, strict=True)
     ]

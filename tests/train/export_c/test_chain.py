@@ -51,6 +51,8 @@ BOARDS = {
     "warming and leak": {"common_mode": {"every_s": 0.02, "tell_pC": 3.0}, "leak": {"tau_s": 5.0}, "hum": {}},
 }
 
+SINGLE_PRECISION = ("-DISOCHARGE_CHAIN_FLOAT", "-Wdouble-promotion")
+"""Options of the compiler, of which the second refuses double precision, which small processors would emulate."""
 
 ELECTRODES = ("A", "B", "C", "D")
 RATE_Hz = 200.0
