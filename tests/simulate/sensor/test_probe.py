@@ -26,9 +26,7 @@ def test_parse_probe_reads_circles(text, radius):
 @pytest.mark.parametrize(
     ("text", "outline"),
     [
-        ("rectangle:4.0x2.0", [2 + 1j, -2 + 1j, -2 - 1j, 2 - 1j]),
         ("triangle:3", [np.sqrt(3) * 1j, -1.5 - np.sqrt(3) / 2 * 1j, 1.5 - np.sqrt(3) / 2 * 1j]),
-        ("polygon:0,0;3,0;0,3", [-1 - 1j, 2 - 1j, -1 + 2j]),
         ("polygon:-1,-1;1,-1;1,1;-1,1@45", np.sqrt(2) * np.array([-1j, 1, 1j, -1])),
     ],
 )

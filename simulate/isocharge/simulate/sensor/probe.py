@@ -323,16 +323,15 @@ class Polygon(Probe):
     @property
     def period(self) -> float:
         """Smallest rotation that maps the polygon onto itself, rad."""
-        # A rotation that maps the polygon onto itself maps each corner to another corner, which is a fixed number of
-        # corners ahead (`corner_shift`). The smallest possible shift divides the number of corners.
+        # If a rotation by an n-th part of a turn maps the polygon onto itself, it maps each corner to another corner,
+        # which is an n-th part of all corners ahead.
         corners = to_complex(np.array(self.corners))
-        for corner_shift in range(1, corners.size):
-            if corners.size % corner_shift != 0:
-                continue
-            rotation = np.exp(2j * np.pi * corner_shift / corners.size)
-            corners_ahead = np.roll(corners, -corner_shift)
-            if np.allclose(corners_ahead, corners * rotation, rtol=0.0, atol=1e-9 * self.reach):
-                return float(math.tau * corner_shift / corners.size)
+        for order in range(corners.size, 1, -1):
+            corners_ahead = np.roll(corners, -(corners.size // order))
+            rotated_corners = corners * np.exp(2j * np.pi / order)
+            is_same = np.allclose(corners_ahead, rotated_corners, rtol=0.0, atol=1e-9 * self.reach)
+            if corners.size % order == 0 and is_same:
+                return math.tau / order
         return math.tau  # only a full turn maps the polygon onto itself
 
     @property
@@ -354,64 +353,20 @@ NUMBER_PATTERN = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 """Regular expression of a decimal number in the notation of a probe."""
 
 
-@dataclass(frozen=True)
-class ProbeNotation:
-    """One notation of a probe shape on the command line and in files, such as `rectangle:WIDTHxHEIGHT`.
+PROBE_SHAPES: dict[str, Callable[..., Probe]] = {
+    "circle:RADIUS": Circle,
+    "rectangle:WIDTHxHEIGHT": Polygon.rectangle,
+    "triangle:SIDE": Polygon.triangle,
+    "polygon:X,Y;X,Y;X,Y": lambda *coordinates: Polygon.of(np.reshape(coordinates, (-1, 2))),
+    "ellipse:WIDTHxHEIGHT": Ellipse,
+    "finger:RADIUS": Finger,
+    "growing-finger:RADIUS": GrowingFinger,
+}
+"""Notations of all probe shapes, and the functions that create the probes without a rotation from the numbers (mm).
 
-    Attributes:
-        name: Word before the colon.
-        parameters: Text after the colon. Each word of capital letters stands for a number (mm).
-        build: Function that creates the probe without a rotation from the numbers.
-        pattern: Regular expression of the text after the colon. If it is empty, it is derived from `parameters`.
-    """
-
-    name: str
-    parameters: str
-    build: Callable[..., "Probe"]
-    pattern: str = ""
-
-    @property
-    def form(self) -> str:
-        """Notation with placeholders for the numbers, for help texts and error messages."""
-        return f"{self.name}:{self.parameters}"
-
-    def parse(self, text: str) -> "Probe | None":
-        """Create the probe that a text in this notation describes.
-
-        Args:
-            text: Notation of a probe, such as "rectangle:4.0x2.0@30".
-
-        Returns:
-            The probe; None if the text is in another notation.
-
-        Raises:
-            SceneError: If the text is in this notation, but no such footprint can exist.
-        """
-        # Each word of capital letters in `parameters`, such as "WIDTHxHEIGHT", is replaced by the pattern of a number.
-        pattern = self.pattern or re.sub("[A-Z]+", lambda _: NUMBER_PATTERN, self.parameters)
-        match = re.fullmatch(rf"{self.name}:(?P<parameters>{pattern})(?:@(?P<degrees>{NUMBER_PATTERN}))?", text)
-        if match is None:
-            return None
-        numbers = [float(number) for number in re.findall(NUMBER_PATTERN, match["parameters"])]
-        degrees = float(match["degrees"] or 0.0)
-        return self.build(*numbers).rotated(float(np.deg2rad(degrees)))
-
-
-PROBE_SHAPES = (
-    ProbeNotation("circle", "RADIUS", Circle),
-    ProbeNotation("rectangle", "WIDTHxHEIGHT", Polygon.rectangle),
-    ProbeNotation("triangle", "SIDE", Polygon.triangle),
-    ProbeNotation(
-        "polygon",
-        "X,Y;X,Y;X,Y",
-        lambda *coordinates: Polygon.of(np.reshape(coordinates, (-1, 2))),
-        pattern=rf"{NUMBER_PATTERN},{NUMBER_PATTERN}(?:;{NUMBER_PATTERN},{NUMBER_PATTERN})+",
-    ),
-    ProbeNotation("ellipse", "WIDTHxHEIGHT", Ellipse),
-    ProbeNotation("finger", "RADIUS", Finger),
-    ProbeNotation("growing-finger", "RADIUS", GrowingFinger),
-)
-"""Notations of all probe shapes. The parser, the help text and the error messages are derived from this list."""
+Each word of capital letters stands for a number, and a polygon may have more corners. The parser, the help text and the
+error messages are derived from this table.
+"""
 
 
 def _join_with_or(forms: list[str]) -> str:
@@ -420,8 +375,7 @@ def _join_with_or(forms: list[str]) -> str:
 
 
 PROBE_HELP = (
-    f"Footprint, mm: {_join_with_or([notation.form for notation in PROBE_SHAPES])}; @DEGREES at the end rotates the "
-    "footprint anticlockwise."
+    f"Footprint, mm: {_join_with_or(list(PROBE_SHAPES))}; @DEGREES at the end rotates the footprint anticlockwise."
 )
 """Help text of command-line options whose value is the notation of a probe."""
 
@@ -435,11 +389,15 @@ def parse_probe(text: str) -> Probe:
     Raises:
         SceneError: If the text is not the notation of a probe, or no such footprint can exist.
     """
-    for notation in PROBE_SHAPES:
-        probe = notation.parse(text.strip())
-        if probe is not None:
-            return probe
-    forms = [f"'{notation.form}'" for notation in PROBE_SHAPES]
+    for notation, create in PROBE_SHAPES.items():
+        with_corners = notation.replace(";X,Y;X,Y", "(?:;X,Y)+")
+        pattern = re.sub("[A-Z]+", lambda _: NUMBER_PATTERN, with_corners)
+        match = re.fullmatch(f"({pattern})(?:@({NUMBER_PATTERN}))?", text.strip())
+        if match is not None:
+            lengths = [float(number) for number in re.findall(NUMBER_PATTERN, match[1])]
+            degrees = float(match[2] or 0.0)
+            return create(*lengths).rotated(float(np.deg2rad(degrees)))
+    forms = [f"'{notation}'" for notation in PROBE_SHAPES]
     raise SceneError(
         f"probe {cut(text)!r}: expected {_join_with_or(forms)} in mm, each optionally rotated as in 'triangle:4.0@30' "
         "(degrees)"
