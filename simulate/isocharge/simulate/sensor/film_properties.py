@@ -13,6 +13,7 @@ sine of twice the angle of its axis.
 
 import cmath
 import math
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -127,15 +128,14 @@ def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> t
     Raises:
         SensorError: If no such sensor can exist, for example because an electrode lies over the rim.
     """
-    value = dict.fromkeys((one.name for one in FILM_PROPERTIES), 0.0)
-    value |= {PRETENSION.name: sensor.film.pretension, **values}
+    value = defaultdict(float, {PRETENSION.name: sensor.film.pretension, **values})
     piezo = sensor.piezo
     calibration = sensor.calibration
     shift_x, shift_y = calibration.shift
     gains = {
         name: calibration.gain.get(name, 1.0) * math.exp(value[f"gain {name}"])
         for name in sensor.electrode_names
-        if value.get(f"gain {name}")
+        if value[f"gain {name}"]
     }
     changed_sensor = replace(
         sensor,
@@ -154,7 +154,7 @@ def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> t
         ),
     )
     if isinstance(probe, Circle):
-        probe = replace(probe, radius=probe.radius + value.get("probe_radius", 0.0))
+        probe = replace(probe, radius=probe.radius + value["probe_radius"])
     return changed_sensor, probe
 
 
@@ -283,20 +283,12 @@ class FilmPrior:
 
         The other properties are those of the electrodes and of the piezoelectric coefficients.
         """
+        mean_sensor, mean_probe = self.film(self.mean)
         changes = []
-        taut, _ = changed_film(self.sensor, self.probe, {PRETENSION.name: PRETENSION.mean})
-        for one in self.properties:
-            sensors = [changed_film(taut, self.probe, {one.name: value}) for value in (one.mean, one.mean + one.std)]
-            first, second = ((sensor.film, probe) for sensor, probe in sensors)
-            changes.append(first != second)
+        for values in self.mean + np.diag(self.std):  # one property differs from its mean
+            sensor, probe = self.film(values)
+            changes.append(sensor.film != mean_sensor.film or probe != mean_probe)
         return np.array(changes)
-
-    @property
-    def described(self) -> Array:
-        """Values of the film that the sensor file describes: its pretension, and zeros, shape (n_property,)."""
-        values = np.zeros(len(self.properties))
-        values[self.index(PRETENSION.name)] = self.sensor.film.pretension
-        return values
 
     def even(self, values: Array) -> Array:
         """Return the values of the film with the same mean properties and no imperfections, shape (n_property,).
