@@ -37,15 +37,10 @@ def test_information_of_a_reading_agrees_with_numerical_integration():
     assert model.information(charge) == pytest.approx(expected, rel=1e-5)
 
 
-def test_linear_charges_give_the_covariance_of_least_squares():
-    jacobian = np.random.default_rng(0).normal(size=(5, 4, 3))
-    white = 2.0
-    limits = cramer_rao(np.zeros((5, 4)), jacobian, NoiseModel("white", white, 0.0))
-    for each, covariance in zip(jacobian, limits.covariance, strict=True):
-        np.testing.assert_allclose(covariance, white**2 * np.linalg.inv(each.T @ each), rtol=1e-8)
-    by_hand = cramer_rao(np.zeros((1, 3)), np.diag([2.0, 1.0, 5.0])[None], NoiseModel("white", 1.0, 0.0))
-    assert by_hand.position[0] == pytest.approx(np.hypot(0.5, 1.0))
-    assert by_hand.force[0] == pytest.approx(0.2)
+def test_limits_of_charges_that_each_depend_on_one_parameter():
+    limits = cramer_rao(np.zeros((1, 3)), np.diag([2.0, 1.0, 5.0])[None], NoiseModel("white", 1.0, 0.0))
+    assert limits.position[0] == pytest.approx(np.hypot(0.5, 1.0))
+    assert limits.force[0] == pytest.approx(0.2)
 
 
 def test_nuisances_are_equivalent_to_correlated_noise():

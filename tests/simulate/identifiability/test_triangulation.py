@@ -10,7 +10,6 @@ from function_map import round_map
 from isocharge.common.errors import ChargeError, SceneError
 from isocharge.simulate import (
     ChargeSpline,
-    Circle,
     Domain,
     ForwardMap,
     Polygon,
@@ -87,16 +86,6 @@ def test_contours_that_meet_twice_have_no_contact():
     fix = Triangulation(charge_map).locate(charge_map.charges(np.array([[1.0, 3.0, 1.0]])))
     assert np.isnan(fix.contact).all()
     assert fix.spread[0] < 1e-3
-
-
-def test_charge_map_with_folds_has_two_positions():
-    """On a uniaxial film with three electrodes, two contacts with different forces may have the same charges."""
-    charge_map = kept(ForwardMap.build, load_sensor("three-25um-uniaxial"), Circle(1.0), 8.0, FORCES, COARSE)
-    contact = draw_contacts(8, 100, 7.0, FORCES)
-    triangulation = Triangulation(ChargeSpline.of(charge_map, spacing=0.5))
-    fix = triangulation.locate(charge_map.charges(contact))
-    assert (~fix.found & (fix.spread < 1e-3)).sum() > 5
-    assert np.quantile(errors(fix, contact), 0.95) < 0.05
 
 
 @pytest.mark.parametrize(

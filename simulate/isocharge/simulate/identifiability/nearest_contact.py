@@ -211,8 +211,7 @@ def search(
 ) -> tuple[Array, Array]:
     """Find the contacts whose charges are nearest to given charges, without given starting points.
 
-    For each row of charges, least-squares descents start from the contacts of `starting_contacts`. All descents run
-    together, because the charge map is faster for many contacts at once.
+    For each row of charges, the result is the best of several descents; see `local_minima`.
 
     Args:
         charge_map: Map that computes the charges of contacts.
@@ -222,23 +221,48 @@ def search(
         candidates: Number of candidates for the starting points.
 
     Returns:
-        Contacts (x, y, F), shape (n, 3), mm and N, and residuals, shape (n, n_electrode), of the best descent for each
-        row; see `explain`.
+        Contacts (x, y, F), shape (n, 3), mm and N, and residuals, shape (n, n_electrode); see `explain`.
+    """
+    contact, residual = local_minima(charge_map, charge, sigma, starts=starts, candidates=candidates)
+    best_start = (residual**2).sum(axis=2).argmin(axis=1)  # shape (n,)
+    row = np.arange(len(charge))
+    return contact[row, best_start], residual[row, best_start]
+
+
+def local_minima(
+    charge_map: ChargeMap,
+    charge: Array,
+    sigma: Array,
+    *,
+    starts: int,
+    candidates: int = CANDIDATES,
+    min_change: float = MIN_CHANGE,
+) -> tuple[Array, Array]:
+    """Descend from each of the contacts of `starting_contacts`, and return all results.
+
+    All descents run together, because the charge map is faster for many contacts at once.
+
+    Args:
+        charge_map: Map that computes the charges of contacts.
+        charge: Given charges, shape (n, n_electrode), pC.
+        sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
+        starts: Number of descents for each row of charges.
+        candidates: Number of candidates for the starting points.
+        min_change: See `explain`.
+
+    Returns:
+        Contacts (x, y, F), shape (n, starts, 3), mm and N, and residuals, shape (n, starts, n_electrode), of each
+        descent; see `explain`.
     """
     start = starting_contacts(charge_map, charge, sigma, starts=starts, candidates=candidates)
-    contact_of_descent, residual_of_descent = explain(
+    contact, residual = explain(
         charge_map,
         np.repeat(charge, starts, axis=0),
         np.repeat(sigma, starts, axis=0),
         start.reshape(-1, 3),
+        min_change=min_change,
     )
-
-    # Choose the descent with the smallest residual for each row of charges. The axes are (row, start, component).
-    contact_by_start = contact_of_descent.reshape(len(charge), starts, 3)
-    residual_by_start = residual_of_descent.reshape(len(charge), starts, charge.shape[1])
-    best_start = (residual_by_start**2).sum(axis=2).argmin(axis=1)  # shape (n,)
-    row = np.arange(len(charge))
-    return contact_by_start[row, best_start], residual_by_start[row, best_start]
+    return contact.reshape(start.shape), residual.reshape(*start.shape[:2], -1)
 
 
 def starting_contacts(

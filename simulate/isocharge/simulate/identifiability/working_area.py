@@ -25,10 +25,10 @@ from typing import Literal
 import numpy as np
 import scipy  # loads each of its subpackages on first use
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Array
 from isocharge.simulate.forward.charge_map import ChargeMap, LinearisedMap, check_electrode_count, linearised
 from isocharge.simulate.identifiability.cramer_rao import limits_at
-from isocharge.simulate.identifiability.nearest_contact import explain, starting_contacts
+from isocharge.simulate.identifiability.nearest_contact import local_minima
 from isocharge.simulate.noise import NoiseModel
 from isocharge.simulate.numerics.disk import INNER_RADIUS, Rings, contacts_at, onto_disk, sunflower
 
@@ -38,36 +38,6 @@ FOLD_WIDTH = 0.02
 Beside an electrode, the orientation may be reversed within 0.1 mm without a fold. At a true fold, such as that on a
 circle of four electrodes, the orientation is reversed within about 0.01 mm.
 """
-
-
-def has_reversed_orientation(first: Array, second: Array) -> Booleans:
-    """Return whether the charge map reverses its orientation between the two contacts of each pair.
-
-    Args:
-        first: Derivatives of the charges with respect to (x, y, ln F) at the first contact of each pair, divided by the
-            standard deviations of the charges, shape (..., n_electrode, 3).
-        second: Scaled derivatives at the second contact of each pair, shape (..., n_electrode, 3).
-
-    Returns:
-        Whether the orientation is reversed, shape (...).
-    """
-    products = np.einsum("...ei,...ej->...ij", first, second)  # sums over the electrodes (e)
-    return np.asarray(np.linalg.det(products) < 0.0)
-
-
-def scaled_derivatives(charge_map: ChargeMap, contact: Array, noise: NoiseModel) -> Array:
-    """Compute derivatives of charges, and divide the derivatives by the standard deviations of the charges.
-
-    Args:
-        charge_map: Map that computes the charges of contacts.
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        noise: Noise of the readings.
-
-    Returns:
-        Scaled derivatives with respect to x (1/mm), y (1/mm) and ln F (dimensionless), shape (n, n_electrode, 3).
-    """
-    charge, jacobian = linearised(charge_map, contact)
-    return jacobian / noise.sigma(charge)[..., None]
 
 
 def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseModel) -> Array:
@@ -104,12 +74,16 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
         trial = onto_disk(trial.reshape(-1, 2), radius).reshape(trial.shape)
         position = trial[np.arange(len(trial)), precision(trial).argmin(axis=1)]
 
-    # Compare the orientations at opposite points of a circle around each position.
+    # Compare the orientations at opposite points a and b of a circle around each position. The orientation is reversed
+    # if the determinant of the products is negative, which are sums over the electrodes (e).
     angle = np.pi * np.arange(4) / 4.0
     half_width = 0.5 * FOLD_WIDTH * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     sides = np.stack([position[:, None] + half_width, position[:, None] - half_width])
-    jacobian = scaled_derivatives(charge_map, contacts(sides), noise)
-    is_fold = has_reversed_orientation(*jacobian.reshape(*sides.shape[:3], -1, 3)).any(axis=1)
+    charge, jacobian = linearised(charge_map, contacts(sides))
+    scaled_jacobian = jacobian / noise.sigma(charge)[..., None]
+    first, second = scaled_jacobian.reshape(*sides.shape[:3], -1, 3)
+    products = np.einsum("...ei,...ej->...ij", first, second)
+    is_fold = (np.linalg.det(products) < 0.0).any(axis=1)
     folds = position[is_fold]
     return folds[np.argsort(np.hypot(*folds.T), kind="stable")]
 
@@ -234,27 +208,18 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
     smallest_distance = min(MIN_DISTANCE, MIN_RELATIVE_DISTANCE * charge_map.domain.radius)
     min_distance = np.maximum(smallest_distance, MIN_DISTANCE_SIGMAS * position_std)
     sigma = noise.sigma(charge)
-    start = starting_contacts(charge_map, charge, sigma, starts=STARTS)
 
     # Search for the second contacts. A search that finds the first contact again is discarded below. Then select the
-    # pairs whose contacts are still distant, and whose charges agree within the noise.
-    first_index = np.repeat(np.arange(len(charge)), start.shape[1])
-    first_contact = contact[first_index]
-    second_contact, residual = explain(
-        charge_map,
-        charge[first_index],
-        sigma[first_index],
-        start.reshape(-1, 3),
-        min_change=1e-4,  # one digit of the difference of the charges is sufficient
-    )
-    charge_difference = np.linalg.norm(residual, axis=1)
-    x_difference, y_difference, _ = (second_contact - first_contact).T
-    is_distant = np.hypot(x_difference, y_difference) > min_distance[first_index]
+    # pairs whose contacts are still distant, and whose charges agree within the noise. One digit of the difference of
+    # the charges is sufficient.
+    second, residual = local_minima(charge_map, charge, sigma, starts=STARTS, min_change=1e-4)  # shape (n, STARTS, 3)
+    first = np.broadcast_to(contact[:, None], second.shape)
+    charge_difference = np.linalg.norm(residual, axis=2)
+    is_distant = np.linalg.norm((second - first)[..., :2], axis=2) > min_distance[:, None]
     is_ambiguous = is_distant & (charge_difference < INDISTINGUISHABLE_SIGMAS)
-    pairs = AmbiguousPairs(first_contact, second_contact, charge_difference)
-    order = np.argsort(pairs.outer_radius, kind="stable")
-    ordered = order[is_ambiguous[order]]
-    return AmbiguousPairs(first_contact[ordered], second_contact[ordered], charge_difference[ordered])
+    columns = (first[is_ambiguous], second[is_ambiguous], charge_difference[is_ambiguous])
+    order = np.argsort(AmbiguousPairs(*columns).outer_radius, kind="stable")
+    return AmbiguousPairs(*(column[order] for column in columns))
 
 
 DEFAULT_ERROR = 1.0

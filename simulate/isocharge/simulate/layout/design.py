@@ -151,15 +151,6 @@ class Search:
         """
         return self.error_map(self.case.layout(positions)).with_nuisances
 
-    def minimised_error(self, positions: Array) -> float:
-        """Compute the largest error or the root mean square of the errors of the many presses, mm.
-
-        Args:
-            positions: Centres (x, y) of the new squares, shape (n_new, 2), mm.
-        """
-        errors = self.errors(positions)
-        return float(errors.max() if self.case.goal == "worst" else np.sqrt(np.mean(errors**2)))
-
     def optimum(self, start: Array) -> Layout:
         """Minimise the power mean of the errors of a few presses, from the positions of a layout.
 
@@ -181,9 +172,9 @@ class Search:
             layout: Layout for which the power mean of the errors of a few presses is small.
         """
         positions = layout.positions
-        if self.case.goal != "worst":
-            return Layout(positions, self.minimised_error(positions))
         smallest_errors = self.errors(positions)
+        if self.case.goal != "worst":
+            return Layout(positions, float(np.sqrt(np.mean(smallest_errors**2))))
         for round_number in range(1, ROUNDS + 1):
             largest = np.argsort(-smallest_errors)[: len(self.case.search_presses)]
             presses = np.concatenate([self.case.search_presses, self.case.fine_presses[largest]])
