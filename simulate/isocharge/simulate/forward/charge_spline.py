@@ -10,9 +10,7 @@ interpolates its stress fields between forces in the same way. The interpolation
 further error.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import scipy  # scipy.interpolate is imported when it is used
@@ -119,7 +117,7 @@ class ChargeSpline:
             film=sensor.film,
             domain=domain,
             force=force,
-            table=_fit_disk(partial(_scaled_charges, forward_map, force), domain.radius, spacing),
+            table=_fit_disk(forward_map, force, domain.radius, spacing),
             error=np.nan,
         )
         return replace(spline, error=_largest_error(spline, forward_map))
@@ -267,30 +265,28 @@ def _scaled_charges(forward_map: ForwardMap, force: Array, position: Array) -> A
     return sensor.calibration.read(scaled_charge)
 
 
-def _fit_disk(
-    charges_at: Callable[[Array], Array], radius: float, spacing: float, min_cells: int = 8
-) -> "scipy.interpolate.NdBSpline":
+def _fit_disk(forward_map: ForwardMap, force: Array, radius: float, spacing: float) -> "scipy.interpolate.NdBSpline":
     """Fit a cubic spline to the scaled charges of all electrodes over the disk.
 
     The fit is by least squares with a penalty on the third differences of the coefficients.
 
     Args:
-        charges_at: Function that computes the scaled charges, shape (n, n_force, n_electrode), at positions.
+        forward_map: Forward map that computes the charges.
+        force: Forces at which the splines are fitted, shape (n_force,), N.
         radius: Radius of the disk, mm.
         spacing: Largest distance between the knots, mm.
-        min_cells: Smallest number of cells of a spline along x or y.
 
     Returns:
         Spline in x and y that returns scaled charges, shape (n_force, n_electrode), pC.
     """
     # The ends of the interval occur four times among the knots, so that the spline is defined on the whole interval. A
     # cubic spline has 4 coefficients fewer than knots along each axis.
-    cells = int(np.clip(np.ceil(2.0 * radius / spacing), min_cells, MAX_CELLS))
+    cells = int(np.clip(np.ceil(2.0 * radius / spacing), 8, MAX_CELLS))
     line_knots = np.concatenate([[-radius] * 3, np.linspace(-radius, radius, cells + 1), [radius] * 3])
     knots = (line_knots, line_knots)
     count = line_knots.size - 4
     position = radius * _fit_positions(cells)
-    values = charges_at(position)
+    values = _scaled_charges(forward_map, force, position)  # shape (n, n_force, n_electrode)
 
     # The design matrix converts the coefficients into the values of the spline. The matrix of SciPy has no columns for
     # the last coefficients if they do not affect any position, so it is created again with its full shape.
@@ -309,26 +305,27 @@ def _fit_disk(
     return scipy.interpolate.NdBSpline(knots, coefficients, cubic_degree)
 
 
-def _fit_positions(cells: int, per_cell: float = 1.6, per_edge_cell: float = 2.0) -> Array:
+def _fit_positions(cells: int) -> Array:
     """Return the positions in the unit disk and on its edge to which a spline is fitted.
+
+    There are 1.6 positions per cell of the spline, and two additional positions on the edge of the disk per cell along
+    the edge.
 
     Args:
         cells: Number of cells of the spline along the diameter of the disk.
-        per_cell: Number of positions per cell.
-        per_edge_cell: Number of additional positions on the edge of the disk per cell along the edge.
 
     Returns:
         Positions (x, y), shape (n, 2), in radii of the disk.
     """
     # In units of the side of a cell, the diameter of the disk is `cells`. The constants 16 and 8 ensure that there are
     # enough positions if there are only a few cells.
-    inner_count = int(per_cell * np.pi * (0.5 * cells) ** 2) + 16
-    edge_count = int(per_edge_cell * np.pi * cells) + 8
+    inner_count = int(1.6 * np.pi * (0.5 * cells) ** 2) + 16
+    edge_count = int(2.0 * np.pi * cells) + 8
     edge_positions = to_corners(np.exp(2j * np.pi * np.arange(edge_count) / edge_count))
     return np.concatenate([sunflower(inner_count), edge_positions])
 
 
-def _largest_error(spline: ChargeSpline, forward_map: ForwardMap, count: int = 400) -> float:
+def _largest_error(spline: ChargeSpline, forward_map: ForwardMap) -> float:
     """Compute the largest relative error of a spline at evenly distributed presses.
 
     The presses differ from the presses to which the spline was fitted.
@@ -336,11 +333,11 @@ def _largest_error(spline: ChargeSpline, forward_map: ForwardMap, count: int = 4
     Args:
         spline: Finished spline whose error is computed.
         forward_map: Forward map that the spline approximates.
-        count: Number of presses at which the splines are compared with the forward map.
 
     Returns:
         The largest error of a charge, relative to the largest charge of the same press, dimensionless.
     """
+    count = 400
     position = spline.domain.radius * sunflower(count)
     # Multiples of the golden ratio, modulo 1, distribute the logarithms of the forces evenly.
     force = log_spaced_forces(np.arange(float(count)) * 0.618 % 1.0, spline.domain.force_range)

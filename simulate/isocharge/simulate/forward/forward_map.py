@@ -469,7 +469,6 @@ class ForwardMap:
             is_odd,
             pieces,
             rules,
-            self.sensor.film.radius,
         )
 
         # Multiply by the unit of the scaled stress in the table.
@@ -489,4 +488,4 @@ class ForwardMap:
         template = template_for(self.resolution, self.probe.topology, not film.is_axisymmetric)
         oval = film_oval(film, direction)
         placement = Placement.of(template, self.probe, np.abs(position), film.radius, self.layer, rotation, oval)
-        return PressMeshes(template, placement, direction)
+        return PressMeshes(template, placement, direction, film.radius)

@@ -169,20 +169,6 @@ class ElectrodePieces:
             line_area = np.tile(0.5 * line_area[is_halved], 2)
             corners = halve_quadrilaterals(corners[is_halved])
 
-    def charge(self, rule: PieceRule, stress: Array) -> Array:
-        """Compute the charge of each pair of a press and a piece.
-
-        Args:
-            rule: Integration points.
-            stress: Stress (s11, s22, s12) at the points, shape (n_pair, n_point, 3), MPa.
-
-        Returns:
-            Charge, shape (n_pair,), pC.
-        """
-        # Sum over the points (index p) and then over the stress components (c) of each pair (k).
-        integral = np.einsum("kpc,kp->kc", stress, rule.area)
-        return np.asarray(np.einsum("kc,kc->k", integral, self.charge_per_stress[rule.piece]))
-
 
 def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
     """Compute the touch charge of each electrode under a solved press.
@@ -225,8 +211,11 @@ def stress_charge(sensor: Sensor, equilibrium: Equilibrium, counts: tuple[int, i
     charge = np.zeros(len(sensor.electrodes))
     for rule in pieces.rules(equilibrium.probe, np.array([complex(*equilibrium.at)]), counts):
         # `touch_stress` expects one list of points.
-        stress = touch_stress(equilibrium, to_corners(rule.points.ravel()), sensor.surface)
-        pair_charge = pieces.charge(rule, stress.reshape(*rule.points.shape, 3))
+        stress_of_points = touch_stress(equilibrium, to_corners(rule.points.ravel()), sensor.surface)
+        stress = stress_of_points.reshape(*rule.points.shape, 3)
+        # Sum over the points (index p) and then over the stress components (c) of each pair of press and piece (k).
+        integral = np.einsum("kpc,kp->kc", stress, rule.area)
+        pair_charge = np.einsum("kc,kc->k", integral, pieces.charge_per_stress[rule.piece])
         np.add.at(charge, pieces.electrode[rule.piece], pair_charge)
     return charge
 
@@ -335,11 +324,13 @@ class PressMeshes:
         template: Template of the meshes.
         placement: Position of the template under each press, after the press has been rotated onto the x axis.
         direction: Direction from the centre of the film to each press, shape (n,), rad.
+        film_radius: Radius of the film, mm.
     """
 
     template: Template
     placement: Placement
     direction: Array
+    film_radius: float
 
     def locate(self, press_index: Integers, points: Complexes) -> tuple[Integers, Array, Booleans]:
         """Find the elements that contain integration points, and evaluate the basis functions at the points.
@@ -348,14 +339,15 @@ class PressMeshes:
 
         Args:
             press_index: For each pair of a press and a group of points, the index of the press, shape (n_pair,).
-            points: Integration points x + iy of each pair, shape (n_pair, n_point), in film radii.
+            points: Integration points x + iy of each pair, shape (n_pair, n_point), mm.
 
         Returns:
             Index of the element, shape (n_pair, n_point). Values of the basis functions, shape (n_pair, n_point,
             n_local). Whether each point was reflected, shape (n_pair, n_point).
         """
         mesh = self.template
-        rotated_points = points * np.exp(-1j * self.direction[press_index])[:, None]  # the press is on the x axis
+        # After the rotation, the press is on the x axis. The unit is the radius of the film.
+        rotated_points = points / self.film_radius * np.exp(-1j * self.direction[press_index])[:, None]
         element, xi, eta, is_mirrored = locate_points(self.placement[press_index], mesh, rotated_points)
         basis_values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel())
         return element, basis_values.reshape(*points.shape, mesh.xi.size), is_mirrored
@@ -368,7 +360,6 @@ def integrate_fields(
     is_odd: Booleans,
     pieces: ElectrodePieces,
     rules: Iterable[PieceRule],
-    film_radius: float,
 ) -> Array:
     """Integrate stress fields over the electrodes to obtain charges.
 
@@ -381,7 +372,6 @@ def integrate_fields(
             field unchanged, and changes the sign of an odd field.
         pieces: Pieces of the electrodes.
         rules: Integration points of the pairs of a press and a piece.
-        film_radius: Radius of the film, mm.
 
     Returns:
         Charges divided by the unit of the scaled stress, shape (n, n_electrode, n_field), pC/MPa.
@@ -391,7 +381,7 @@ def integrate_fields(
     nodal_fields = fields.reshape(len(fields), meshes.template.n_element, -1, changes_sign.size)
     charge = np.zeros((len(fields), pieces.electrode.max() + 1, is_odd.size))
     for rule in rules:
-        element, basis_values, is_mirrored = meshes.locate(rule.press, rule.points / film_radius)
+        element, basis_values, is_mirrored = meshes.locate(rule.press, rule.points)
         element_fields = nodal_fields[rule.press[:, None], element]  # shape (n_pair, n_point, n_local, n_field * 3)
         stress = (basis_values[..., None, :].astype(fields.dtype) @ element_fields)[..., 0, :]
 

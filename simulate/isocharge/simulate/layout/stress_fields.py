@@ -35,8 +35,8 @@ The columns are the charge (pC) and its derivatives with respect to x and y (pC/
 and the pretension (pC/MPa).
 """
 
-STEPS = {"x": 0.02, "y": 0.02, "ln force": 0.05, "probe radius": 0.02, "pretension": 0.1}
-"""Steps of the finite differences of the stress.
+STEPS = (0.02, 0.02, 0.05, 0.02, 0.1)
+"""Steps of the finite differences of the stress, in the order of the derivatives in `COLUMNS`.
 
 The steps of the position and of the probe radius are in units of the probe radius, and that of the pretension is in
 MPa.
@@ -99,7 +99,6 @@ class PressedFilm:
     Attributes:
         presses: Positions x + iy of the presses, shape (n,), mm.
         probe: Probe of the presses.
-        film_radius: Radius of the film, mm.
         meshes: Meshes under the presses.
         density: Charge per area (pC/mm^2) and its derivatives, with the columns `COLUMNS`, in the meshed half of the
             film and in its mirror image, shape (2, n, n_element, n_local, 6). The derivatives with respect to the
@@ -108,7 +107,6 @@ class PressedFilm:
 
     presses: Complexes
     probe: Probe
-    film_radius: float
     meshes: PressMeshes
     density: np.ndarray
 
@@ -138,7 +136,7 @@ class PressedFilm:
         density = density.reshape(2, len(presses), meshes.template.n_element, -1, len(COLUMNS))
         # The derivative with respect to the movement across the direction of the press is odd.
         density[1, ..., COLUMNS.index("y")] *= -1.0
-        return cls(position, fields.probe, fields.sensor.film.radius, meshes, density)
+        return cls(position, fields.probe, meshes, density)
 
     def rows(self, electrodes: Sequence[Electrode]) -> Array:
         """Compute the charges of electrodes and their derivatives for all presses; see `rows_of`."""
@@ -146,7 +144,7 @@ class PressedFilm:
         pieces = ElectrodePieces.covering(electrodes)
         for rule in pieces.rules(self.probe, self.presses):
             n_pair = len(rule.press)
-            element, basis_values, is_mirrored = self.meshes.locate(rule.press, rule.points / self.film_radius)
+            element, basis_values, is_mirrored = self.meshes.locate(rule.press, rule.points)
             density = self.density[is_mirrored.astype(np.intp), rule.press[:, None], element]
             node_weights = rule.area[..., None] * basis_values
             flat_weights = node_weights.reshape(n_pair, 1, -1).astype(np.float32)
@@ -186,14 +184,14 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
         stress = stress_unit * rotate_stress(nodal_stress(equilibrium, surface), equilibrium.direction)
         return stress, equilibrium.mesh.points * np.exp(1j * equilibrium.direction)
 
-    def changed(column: str, change: float) -> Equilibrium:
-        """Return the equilibrium if the quantity of one column changes."""
-        changes = dict.fromkeys(STEPS, 0.0) | {column: change}
+    def changed(changes: Array) -> Equilibrium:
+        """Return the equilibrium after changes of x, y, ln F, the probe radius and the pretension, shape (5,)."""
+        x, y, log_force, probe_radius, pretension = changes.tolist()
         return press(
-            replace(film, pretension=film.pretension + changes["pretension"]),
-            Circle(radius + changes["probe radius"]),
-            (distance + changes["x"], changes["y"]),
-            solved.force * math.exp(changes["ln force"]),
+            replace(film, pretension=film.pretension + pretension),
+            Circle(radius + probe_radius),
+            (distance + x, y),
+            solved.force * math.exp(log_force),
             settings,
             start=solved,
         )
@@ -202,14 +200,14 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
     points = film.radius * (1.0 - 1e-12) * mesh.points.ravel()  # on the film despite rounding errors
     nodes = to_corners(points)
     columns = [stress]
-    for column, relative_step in STEPS.items():
-        step = relative_step if column in ("ln force", "pretension") else relative_step * radius
-        last = changed(column, step)
+    steps = np.multiply(STEPS, [radius, radius, 1.0, radius, 1.0])
+    for column, step, changes in zip(COLUMNS[1:], steps, np.diag(steps), strict=True):
+        last = changed(changes)
         last_stress, last_points = stress_of(last)
         if column == "pretension":  # the pretension may be zero and must not become negative
             columns.append((last_stress - stress) / step)
             continue
-        first = changed(column, -step)
+        first = changed(-changes)
         first_stress, first_points = stress_of(first)
         # The nodes move with the press. Subtract the change of the stress that their movement causes.
         change = last_stress - first_stress - change_by_node_shift(mesh, stress, last_points - first_points)
