@@ -152,12 +152,10 @@ class Family:
         largest_coordinate = float(distance_coordinate(domain.radius / film.radius))
         distance = film.radius * np.tanh(chebyshev_nodes(count.distances, 0.0, largest_coordinate))
 
-        # The logarithms of the forces are Chebyshev nodes, unless the domain has a single force.
+        # The logarithms of the forces are Chebyshev nodes.
         min_log_force, max_log_force = np.log(domain.force_range)
-        if max_log_force > min_log_force:
-            force = np.exp(chebyshev_nodes(count.forces, min_log_force, max_log_force))
-        else:
-            force = np.array([domain.force_range[0]])
+        n_force = count.forces if max_log_force > min_log_force else 1
+        force = np.exp(chebyshev_nodes(n_force, min_log_force, max_log_force))
 
         period = probe.period
         is_oriented = orientation == "fixed" and not film.is_axisymmetric and not probe.is_axisymmetric

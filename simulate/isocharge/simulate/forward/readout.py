@@ -99,7 +99,7 @@ class ElectrodePieces:
         electrodes of a layout have no piezoelectric coefficients.
 
         Args:
-            electrodes: Electrodes of a layout, which may be empty.
+            electrodes: Electrodes of a layout, at least one.
             readout: "area" for a mean over the area of an electrode, "edge" for a mean over its edges.
             rotation: Angle by which the electrodes are turned later, rad. It decides which edges are the left ones.
         """
@@ -108,12 +108,8 @@ class ElectrodePieces:
             for index, electrode in enumerate(electrodes)
             for piece in (_edge_lines(electrode, rotation) if readout == "edge" else _area_pieces(electrode))
         ]
-        return cls(
-            corners=to_complex(np.array([corners for _, corners, _, _ in pieces]).reshape(-1, 4, 2)),
-            line_area=np.array([line_area for _, _, line_area, _ in pieces]),
-            electrode=np.array([index for index, _, _, _ in pieces], dtype=np.intp),
-            charge_per_stress=np.array([components for _, _, _, components in pieces]),
-        )
+        index_of_piece, corners, line_area, components = (np.array(column) for column in zip(*pieces, strict=True))
+        return cls(to_complex(corners), line_area, index_of_piece, components)
 
     @classmethod
     def of(cls, sensor: Sensor) -> "ElectrodePieces":
@@ -240,19 +236,20 @@ def contact_charges(sensor: Sensor, probe: Probe, contact: Array, orientation: A
     force_shares = np.zeros((len(contact), len(sensor.electrodes)))  # fraction of the force that acts on each electrode
     if sensor.piezo.d33 == 0.0 or not len(contact):
         return force_shares
-    position = to_complex(contact[:, :2])
+    position = contact[:, :2]
     force = contact[:, 2]
     rotation = np.broadcast_to(orientation, len(contact))
     largest_reach = probe.under(float(force.max())).reach
     for electrode_index, electrode in enumerate(sensor.electrodes):
         for part in electrode.parts:
             corners = sensor.calibration.place(part)
-            distance_from_part = np.abs(position - to_complex(corners.mean(axis=0)))
-            part_radius = np.linalg.norm(corners - corners.mean(axis=0), axis=1).max()
+            centre = corners.mean(axis=0)
+            part_radius = np.linalg.norm(corners - centre, axis=1).max()
             # Only presses whose footprint meets the circle around the part can contribute.
-            for press in np.flatnonzero(distance_from_part < part_radius + largest_reach):
+            is_near = np.linalg.norm(position - centre, axis=1) < part_radius + largest_reach
+            for press in np.flatnonzero(is_near):
                 pressed_probe = probe.under(float(force[press])).rotated(float(rotation[press]))
-                force_shares[press, electrode_index] += pressed_probe.force_share(corners, complex(position[press]))
+                force_shares[press, electrode_index] += pressed_probe.force_share(corners, complex(*position[press]))
     return -0.5 * sensor.piezo.d33 * force[:, None] * sensor.gains * force_shares
 
 

@@ -2,6 +2,7 @@
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -193,14 +194,14 @@ class Identification:
     def _listed_pairs(self) -> list[dict[str, Any]]:
         """Return the first `MAX_LISTED_PAIRS` ambiguous pairs as dictionaries for JSON."""
         pairs = self.area.pairs
-        columns = (values[:MAX_LISTED_PAIRS] for values in (pairs.first, pairs.second, pairs.distance))
+        contacts_and_distances = zip(pairs.first, pairs.second, pairs.distance, strict=True)
         return [
             {
                 "first": dict(zip(CONTACT_KEYS, first, strict=True)),
                 "second": dict(zip(CONTACT_KEYS, second, strict=True)),
                 "sigmas_apart": distance,
             }
-            for first, second, distance in zip(*columns, strict=True)
+            for first, second, distance in islice(contacts_and_distances, MAX_LISTED_PAIRS)
         ]
 
 

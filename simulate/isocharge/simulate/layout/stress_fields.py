@@ -141,6 +141,8 @@ class PressedFilm:
     def rows(self, electrodes: Sequence[Electrode]) -> Array:
         """Compute the charges of electrodes and their derivatives for all presses; see `rows_of`."""
         rows = np.zeros((len(self.presses), len(electrodes), len(COLUMNS)))
+        if not electrodes:
+            return rows
         pieces = ElectrodePieces.covering(electrodes)
         for rule in pieces.rules(self.probe, self.presses):
             n_pair = len(rule.press)

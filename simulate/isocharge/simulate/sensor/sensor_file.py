@@ -6,7 +6,6 @@ A sensor file is a TOML file whose keys contain the units of the values. Unknown
 import logging
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,6 +33,9 @@ from isocharge.simulate.sensor.sensor import Calibration, Electrode, Readout, Se
 
 MAX_COORDINATE_mm = 1e6
 """Largest accepted magnitude of a coordinate or a length in a sensor file, mm."""
+
+BUILT_IN_FOLDER = Path(__file__).parents[1] / "sensors"
+"""Folder of the sensor files that are part of the package."""
 
 log = logging.getLogger(__name__)
 
@@ -145,8 +147,7 @@ class SensorTable(Settings, frozen=True):
 
 def built_in_sensors() -> tuple[str, ...]:
     """Return the names of the sensors whose files are part of the package."""
-    folder = resources.files("isocharge.simulate") / "sensors"
-    return tuple(sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml")))
+    return tuple(sorted(path.stem for path in BUILT_IN_FOLDER.glob("*.toml")))
 
 
 def load_sensor(sensor: str | Path) -> Sensor:
@@ -164,13 +165,10 @@ def load_sensor(sensor: str | Path) -> Sensor:
     Raises:
         SensorError: If there is no such sensor, or its file is invalid. The message contains the file and the key.
     """
-    if str(sensor) in built_in_sensors():
-        text = (resources.files("isocharge.simulate") / "sensors" / f"{sensor}.toml").read_text("utf-8")
-        return sensor_from_dict(parse_toml(text, str(sensor), SensorError, dict[str, Any]), str(sensor))
-    path = Path(sensor)
+    names = built_in_sensors()
+    path = BUILT_IN_FOLDER / f"{sensor}.toml" if str(sensor) in names else Path(sensor)
     if not path.is_file():
-        names = ", ".join(built_in_sensors())
-        raise SensorError(f"no sensor {str(sensor)!r}: it is neither a built-in name ({names}) nor a file")
+        raise SensorError(f"no sensor {str(sensor)!r}: it is neither a built-in name ({', '.join(names)}) nor a file")
     loaded_sensor = sensor_from_dict(read_toml(path, "a sensor file", SensorError, dict[str, Any]), str(path))
     if len(loaded_sensor.electrodes) == 1:
         log.warning(
