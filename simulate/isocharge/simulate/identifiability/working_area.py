@@ -84,7 +84,7 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
     first, second = scaled_jacobian.reshape(*sides.shape[:3], -1, 3)
     products = np.einsum("...ei,...ej->...ij", first, second)
     is_fold = (np.linalg.det(products) < 0.0).any(axis=1)
-    folds = position[is_fold]
+    folds: Array = position[is_fold]
     return folds[np.argsort(np.hypot(*folds.T), kind="stable")]
 
 
