@@ -52,7 +52,7 @@ def test_holding_force_and_slip_are_reciprocal_to_the_deflection():
         """Return the mean displacement (u, v, w) of the film under the probe, mm."""
         solved = press(film, PROBE, at, force, FULL, side_force=(side_force, 0.0))
         mesh = solved.mesh
-        mean = mesh.template.copies * mesh.geometry.load @ solved.field
+        mean = mesh.template.copies * mesh.load @ solved.field
         return film.radius * mean * np.sqrt(solved.groups.squared_amplitude) ** [2, 2, 1]
 
     step = 0.01

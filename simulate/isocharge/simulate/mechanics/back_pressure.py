@@ -7,7 +7,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.mechanics.theory import DimensionlessGroups
-from isocharge.simulate.mesh.placed_mesh import Geometry
+from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 
 
 class BackPressure:
@@ -22,20 +22,19 @@ class BackPressure:
     deflection W over the film, multiplied by the dimensionless group `compression`.
 
     Attributes:
-        geometry: Elements of the mesh.
+        mesh: Mesh of the press.
         groups: Dimensionless groups of the press.
     """
 
-    def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
-        self.geometry = geometry
+    def __init__(self, mesh: PlacedMesh, groups: DimensionlessGroups) -> None:
+        self.mesh = mesh
         self.groups = groups
-        # The nodal loads add up to one divided by the number of copies of the mesh that cover the whole film.
-        self._copies = 1.0 / float(geometry.load.sum())
+        self._copies = mesh.template.copies
 
     @cached_property
     def weights(self) -> Array:
         """Weights with which nodal deflections are integrated over the meshed part of the film, shape (n_node,)."""
-        return self.geometry.gather(self.geometry.mass)
+        return self.mesh.gather(self.mesh.mass)
 
     def energy(self, deflection: Array) -> float:
         """Compute the energy of the static pressure and of the trapped air for the meshed part of the film.

@@ -30,27 +30,27 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.simulate.mechanics.back_pressure import BackPressure
 from isocharge.simulate.mechanics.theory import DimensionlessGroups, strain
-from isocharge.simulate.mesh.placed_mesh import Geometry
+from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 
 
 class ElasticFilm:
     """Discrete elastic model of the film for a given mesh and given dimensionless groups.
 
     Attributes:
-        geometry: Integration rules of the elements of the mesh.
+        mesh: Mesh of the press.
         groups: Dimensionless groups of the press.
         membrane: Stretching energy.
         bending: Bending energy; None if the theory omits bending.
         back: Energy of the pressure on the whole film; None without static pressure and trapped air.
     """
 
-    def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
-        self.geometry = geometry
+    def __init__(self, mesh: PlacedMesh, groups: DimensionlessGroups) -> None:
+        self.mesh = mesh
         self.groups = groups
-        self.membrane = Membrane(geometry, groups)
-        self.bending = Bending(geometry, groups.bending) if groups.bending > 0.0 else None
+        self.membrane = Membrane(mesh, groups)
+        self.bending = Bending(mesh, groups.bending) if groups.bending > 0.0 else None
         has_back_pressure = groups.static_pressure != 0.0 or groups.compression != 0.0
-        self.back = BackPressure(geometry, groups) if has_back_pressure else None
+        self.back = BackPressure(mesh, groups) if has_back_pressure else None
 
     @property
     def unknowns_per_node(self) -> int:
@@ -70,8 +70,8 @@ class ElasticFilm:
             stored_energy += self.bending.energy(deflection)
         if self.back is not None:
             stored_energy += self.back.energy(deflection)
-        work = self.groups.load * float(self.geometry.load @ deflection)
-        work += float(self.geometry.load @ in_plane @ np.array(self.groups.side_load))
+        work = self.groups.load * float(self.mesh.load @ deflection)
+        work += float(self.mesh.load @ in_plane @ np.array(self.groups.side_load))
         return stored_energy - work
 
     def residual(self, field: Array) -> Array:
@@ -87,11 +87,11 @@ class ElasticFilm:
         element_forces = self.membrane.forces(field)  # shape (n_element, n_local, 3)
         if self.bending is not None:
             element_forces[..., 2] += self.bending.forces(deflection)
-        residual = np.stack([self.geometry.gather(element_forces[..., i]) for i in range(3)], axis=1)
+        residual = np.stack([self.mesh.gather(element_forces[..., i]) for i in range(3)], axis=1)
 
         # Subtract the force of the probe perpendicular to the film, and its force in the plane of the film.
-        residual[:, 2] -= self.groups.load * self.geometry.load
-        residual[:, :2] -= np.outer(self.geometry.load, self.groups.side_load)
+        residual[:, 2] -= self.groups.load * self.mesh.load
+        residual[:, :2] -= np.outer(self.mesh.load, self.groups.side_load)
 
         # `back.forces` is the derivative of the energy, which is the negative force of the pressure on the whole film.
         # Therefore the derivative is added.
@@ -100,14 +100,14 @@ class ElasticFilm:
         return residual
 
     @property
-    def load(self) -> tuple[float, Array]:
-        """Magnitude of the load, and its share at each node, shape (n_node,).
+    def load(self) -> Array:
+        """Magnitude of the load at each node, shape (n_node,).
 
         The load is the force of the probe, or the static pressure if there is no probe.
         """
         if self.back is None or self.groups.load != 0.0:
-            return self.groups.load, self.geometry.load
-        return abs(self.groups.static_pressure), self.back.weights
+            return self.groups.load * self.mesh.load
+        return abs(self.groups.static_pressure) * self.back.weights
 
     def tangent(self, field: Array, added_tension: float = 0.0) -> Array:
         """Compute the tangent matrix of each element, without the stiffness of trapped air.
@@ -148,14 +148,14 @@ class Membrane:
     Bonet and Wood (2008, chapters 3 and 6) derive the strain and the stress. Schwerin (1929) derives the scaling.
     """
 
-    def __init__(self, geometry: Geometry, groups: DimensionlessGroups) -> None:
+    def __init__(self, mesh: PlacedMesh, groups: DimensionlessGroups) -> None:
         """Store the mesh and the dimensionless groups of the film.
 
         Args:
-            geometry: Integration rules of the elements.
+            mesh: Mesh of the press.
             groups: Dimensionless groups of the press.
         """
-        self.geometry = geometry
+        self.mesh = mesh
         self.groups = groups
         # Weights of the squared slopes of U1, U2 and W in the strain, shape (3,)
         self._slope_weights = np.array([groups.squared_amplitude, groups.squared_amplitude, 1.0])
@@ -173,8 +173,8 @@ class Membrane:
             Derivatives, shape (n_element, n_point, 2, 3). The last two axes are the coordinate and the displacement
             component.
         """
-        slopes = self.geometry.stacked @ field[self.geometry.nodes]  # shape (n_element, n_point * 2, 3)
-        return slopes.reshape(*self.geometry.gradient.shape[:3], 3)
+        slopes = self.mesh.stacked_gradient @ field[self.mesh.template.nodes]  # shape (n_element, n_point * 2, 3)
+        return slopes.reshape(*self.mesh.gauss_gradient.shape[:3], 3)
 
     def _deformation_gradient(self, slopes: Array) -> Array:
         """Compute the scaled deformation gradient F.
@@ -213,7 +213,7 @@ class Membrane:
         # slopes of U1 and U2, and 1 for the slopes of W, where A is the amplitude.
         pretension_products = slopes * (self._pretension_matrix @ slopes)
         energy_density += 0.5 * np.sum(pretension_products @ self._slope_weights, axis=-1)
-        return float(np.sum(energy_density * self.geometry.weights))
+        return float(np.sum(energy_density * self.mesh.weights))
 
     def forces(self, field: Array) -> Array:
         """Compute the internal forces of the elements, which are the gradient of the stretching energy.
@@ -224,7 +224,7 @@ class Membrane:
         Returns:
             Forces, shape (n_element, n_local, 3).
         """
-        geometry = self.geometry
+        mesh = self.mesh
         slopes = self._slopes(field)
         scaled_strain = strain(slopes, self.groups.squared_amplitude)
         elastic_stress = scaled_strain @ self.groups.elasticity
@@ -235,9 +235,9 @@ class Membrane:
         traction += self._slope_weights * (self._pretension_matrix @ slopes)
 
         # Integrate the product of the traction and the derivatives of the basis functions over each element.
-        weighted_traction = traction * geometry.weights[..., None, None]
+        weighted_traction = traction * mesh.weights[..., None, None]
         stacked_traction = weighted_traction.reshape(len(traction), -1, 3)  # shape (n_element, n_point * 2, 3)
-        transposed_gradient = geometry.stacked.transpose(0, 2, 1)  # shape (n_element, n_local, n_point * 2)
+        transposed_gradient = mesh.stacked_gradient.transpose(0, 2, 1)  # shape (n_element, n_local, n_point * 2)
         return transposed_gradient @ stacked_traction
 
     def tangent(self, field: Array, added_tension: float = 0.0) -> Array:
@@ -252,8 +252,8 @@ class Membrane:
             the component of the first derivative. The last two axes are the node and the component of the second
             derivative.
         """
-        geometry = self.geometry
-        gradient = geometry.gradient  # shape (n_element, n_point, 2, n_local)
+        mesh = self.mesh
+        gradient = mesh.gauss_gradient  # shape (n_element, n_point, 2, n_local)
         slopes = self._slopes(field)
         deformation = self._deformation_gradient(slopes)
 
@@ -261,14 +261,14 @@ class Membrane:
         # integration weights.
         elastic_stress = strain(slopes, self.groups.squared_amplitude) @ self.groups.elasticity
         total_stress = elastic_stress + self._pretension + added_tension * EQUAL_TENSION
-        weighted_stress = _symmetric_matrix(total_stress * geometry.weights[..., None])
-        weighted_stiffness = self._material_stiffness(deformation) * geometry.weights[..., None, None, None, None]
+        weighted_stress = _symmetric_matrix(total_stress * mesh.weights[..., None])
+        weighted_stiffness = self._material_stiffness(deformation) * mesh.weights[..., None, None, None, None]
 
         # Compute one block for each pair (i, j) of displacement components. A block consists of the material part and,
         # for i = j, of the part that is caused by the stress. The matrix is symmetric, so the blocks below the diagonal
         # are transposed copies of the blocks above the diagonal.
         n_element, _, _, n_local = gradient.shape
-        transposed_gradient = np.ascontiguousarray(geometry.stacked.transpose(0, 2, 1))
+        transposed_gradient = np.ascontiguousarray(mesh.stacked_gradient.transpose(0, 2, 1))
         matrix = np.empty((n_element, 3, n_local, 3, n_local))
         for i, j in combinations_with_replacement(range(3), 2):
             block = weighted_stiffness[..., i, :, j].copy()
@@ -344,25 +344,25 @@ class Bending:
     matrix is therefore quasi-definite, and can be factorised without pivoting (Vanderbei 1995).
     """
 
-    def __init__(self, geometry: Geometry, stiffness: float) -> None:
+    def __init__(self, mesh: PlacedMesh, stiffness: float) -> None:
         """Compute the matrices L and M of a mesh, from which the bending energy is computed.
 
         The matrix L contains the integrals of dot(grad p, grad q) for all pairs of basis functions p and q. The mass
         matrix M contains the integrals of p q. With the quadrature rule of the nodes, M is diagonal.
 
         Args:
-            geometry: Integration rules of the elements.
+            mesh: Mesh of the press.
             stiffness: Bending stiffness beta, dimensionless.
         """
-        self.geometry = geometry
+        self.mesh = mesh
         self.stiffness = stiffness
 
-        # Matrix L of each mesh element, shape (n_element, n_local, n_local). The array `stacked` contains both
+        # Matrix L of each mesh element, shape (n_element, n_local, n_local). The array `stacked_gradient` contains both
         # derivatives of the basis functions at each quadrature point, so the weight of each point is repeated.
-        weights = np.repeat(geometry.weights, 2, axis=1)[..., None]
-        self._laplace = geometry.stacked.transpose(0, 2, 1) @ (weights * geometry.stacked)
+        weights = np.repeat(mesh.weights, 2, axis=1)[..., None]
+        self._laplace = mesh.stacked_gradient.transpose(0, 2, 1) @ (weights * mesh.stacked_gradient)
 
-        self._mass = geometry.gather(geometry.mass)  # diagonal of M, shape (n_node,)
+        self._mass = mesh.gather(mesh.mass)  # diagonal of M, shape (n_node,)
 
     def laplacian(self, deflection: Array) -> Array:
         """Compute the Laplacian m = -M^-1 L W of the deflection W.
@@ -376,9 +376,9 @@ class Bending:
         Returns:
             Laplacian of W at the nodes, shape (n_node,).
         """
-        deflection_column = deflection[self.geometry.nodes][..., None]  # shape (n_element, n_local, 1)
+        deflection_column = deflection[self.mesh.template.nodes][..., None]  # shape (n_element, n_local, 1)
         element_values = (self._laplace @ deflection_column)[..., 0]
-        weak_laplacian = self.geometry.gather(element_values)  # L W, shape (n_node,)
+        weak_laplacian = self.mesh.gather(element_values)  # L W, shape (n_node,)
         return -weak_laplacian / self._mass
 
     def energy(self, deflection: Array) -> float:
@@ -401,7 +401,9 @@ class Bending:
         Returns:
             Forces, shape (n_element, n_local).
         """
-        laplacian_column = self.laplacian(deflection)[self.geometry.nodes][..., None]  # shape (n_element, n_local, 1)
+        laplacian_column = self.laplacian(deflection)[self.mesh.template.nodes][
+            ..., None
+        ]  # shape (n_element, n_local, 1)
         return -self.stiffness * (self._laplace @ laplacian_column)[..., 0]
 
     def extend(self, tangent: Array) -> Array:
@@ -422,8 +424,8 @@ class Bending:
         Returns:
             Matrices for (U1, U2, W, mu), shape (n_element, n_local, 4, n_local, 4).
         """
-        n_element, n_local = self.geometry.nodes.shape
-        mass = np.eye(n_local) * self.geometry.mass[:, None]  # M of each element, shape (n_element, n_local, n_local)
+        n_element, n_local = self.mesh.template.nodes.shape
+        mass = np.eye(n_local) * self.mesh.mass[:, None]  # M of each element, shape (n_element, n_local, n_local)
         coupling = np.sqrt(self.stiffness) * (self._laplace - BENDING_SHIFT * mass)  # symmetric
 
         # The indices of the unknowns of a node are 0 for U1, 1 for U2, 2 for W and 3 for mu. The array is created with

@@ -20,10 +20,10 @@ load.
 
 The scales of a press also show where a theory is valid. The bending length determines the error of a theory without
 bending (`error_estimate.modelling_error`), and the amplitude determines whether the strains are small enough for
-Saint-Venant-Kirchhoff elasticity (`load_case.check_strains`).
+Saint-Venant-Kirchhoff elasticity (`load_case.check_press`).
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -259,11 +259,6 @@ class DimensionlessGroups:
             ambient_pressure=AMBIENT_PRESSURE / pressure_unit,
             compression=compression,
         )
-
-    @property
-    def without_probe(self) -> "DimensionlessGroups":
-        """Groups of the same film when no probe presses it. The units remain those of the press."""
-        return replace(self, load=0.0, side_load=(0.0, 0.0))
 
     @property
     def induced_tension(self) -> float:

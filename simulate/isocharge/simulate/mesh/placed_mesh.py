@@ -1,6 +1,7 @@
 """Mesh of a press.
 
-The mesh consists of a template, the position of the template on the film, and integration rules for the elements.
+The mesh consists of a template and the position of the template on the film. The integration rules for the elements are
+computed when they are needed first.
 """
 
 from dataclasses import dataclass
@@ -26,47 +27,6 @@ from isocharge.simulate.sensor.footprint import Probe
 
 PRESSURE_POINTS = 32
 """Number of integration points in each direction of an element for a pressure that is not uniform."""
-
-
-@dataclass(frozen=True)
-class Geometry:
-    """Integration rules for the elements of a mesh on the film.
-
-    Attributes:
-        nodes: Number of each node of each element, shape (n_element, n_local).
-        gradient: Derivatives of the basis functions with respect to (X1, X2) at the quadrature points, shape
-            (n_element, n_point, 2, n_local).
-        weights: Integration weights of the quadrature points, shape (n_element, n_point). The sum of all weights is the
-            meshed area.
-        load: Share of the force of the probe that acts on each node, shape (n_node,). The sum of all shares is one over
-            the number of copies of the mesh that cover the film.
-        mass: Integration weights of the nodes of each element, shape (n_element, n_local).
-    """
-
-    nodes: Integers
-    gradient: Array
-    weights: Array
-    load: Array
-    mass: Array
-
-    @property
-    def stacked(self) -> Array:
-        """The array `gradient`, in which one axis contains all points and both derivatives at each point.
-
-        The shape is (n_element, n_point * 2, n_local).
-        """
-        return self.gradient.reshape(len(self.gradient), -1, self.gradient.shape[-1])
-
-    def gather(self, contributions: Array) -> Array:
-        """Sum the contributions of all elements at each node.
-
-        Args:
-            contributions: Contribution of each element at each of its nodes, shape (n_element, n_local).
-
-        Returns:
-            Sums at the nodes, shape (n_node,).
-        """
-        return np.bincount(self.nodes.ravel(), contributions.ravel(), self.load.size).astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,28 +59,44 @@ class PlacedMesh:
         return self.points.ravel()[self.template.first_occurrence]
 
     @cached_property
-    def geometry(self) -> Geometry:
-        """Integration rules of the elements."""
-        # The weights of the quadrature points on the film are the weights on the reference element multiplied by the
-        # determinant of the Jacobian.
-        order = self.resolution.order
-        rule = _gauss_rule(order, order + 1)
-        gradient, determinant = _film_gradient(rule.derivatives, self.points)
-        return Geometry(
-            nodes=self.template.nodes,
-            gradient=gradient,
-            weights=determinant * rule.weights,
-            load=self._load(),
-            mass=_lobatto_rule(order).film_weights(self.points),
-        )
+    def gauss_gradient(self) -> Array:
+        """Derivatives of the basis functions with respect to (X1, X2) at the quadrature points.
 
-    def _load(self) -> Array:
-        """Compute the share of the force of the probe that acts on each node, shape (n_node,)."""
+        The shape is (n_element, n_point, 2, n_local).
+        """
+        return _film_gradient(self._gauss_rule.derivatives, self.points)
+
+    @property
+    def stacked_gradient(self) -> Array:
+        """The array `gauss_gradient`, in which one axis contains all points and both derivatives at each point.
+
+        The shape is (n_element, n_point * 2, n_local).
+        """
+        gradient = self.gauss_gradient
+        return gradient.reshape(len(gradient), -1, gradient.shape[-1])
+
+    @cached_property
+    def weights(self) -> Array:
+        """Integration weights of the quadrature points, shape (n_element, n_point). Their sum is the meshed area."""
+        return self._gauss_rule.film_weights(self.points)
+
+    @cached_property
+    def mass(self) -> Array:
+        """Integration weights of the nodes of each element, shape (n_element, n_local)."""
+        return _lobatto_rule(self.resolution.order).film_weights(self.points)
+
+    @cached_property
+    def load(self) -> Array:
+        """Share of the force of the probe that acts on each node, shape (n_node,).
+
+        The sum of all shares is one over the number of copies of the mesh that cover the film.
+        """
         # Compute the pressure at the quadrature points of the elements of the footprint.
         template = self.template
         placement = self.placement
-        order = self.resolution.order
-        rule = _gauss_rule(order, order + 1 if placement.probe.has_uniform_pressure else PRESSURE_POINTS)
+        rule = self._gauss_rule
+        if not placement.probe.has_uniform_pressure:
+            rule = _gauss_rule(self.resolution.order, PRESSURE_POINTS)
         nodal_points = self.points[template.footprint]
         points = from_oval(nodal_points @ rule.values.T, placement.oval)  # on a circular film
         points_from_centroid_mm = (points - placement.corners[-1]) / placement.rotation_and_scale
@@ -135,6 +111,24 @@ class PlacedMesh:
         node_load = np.bincount(template.nodes[template.footprint].ravel(), element_load.ravel(), template.n_node)
         return np.asarray(node_load / (template.copies * element_load.sum()))
 
+    def gather(self, contributions: Array) -> Array:
+        """Sum the contributions of all elements at each node.
+
+        Args:
+            contributions: Contribution of each element at each of its nodes, shape (n_element, n_local).
+
+        Returns:
+            Sums at the nodes, shape (n_node,).
+        """
+        template = self.template
+        return np.bincount(template.nodes.ravel(), contributions.ravel(), template.n_node).astype(np.float64)
+
+    @property
+    def _gauss_rule(self) -> "_ElementRule":
+        """Integration rule on the reference element, whose points are the quadrature points."""
+        order = self.resolution.order
+        return _gauss_rule(order, order + 1)
+
     @property
     def shape_error(self) -> float:
         """Relative error of a charge, predicted from the shapes of the elements; infinite if an element is folded.
@@ -143,12 +137,11 @@ class PlacedMesh:
         area of the film. The predicted error is the square root of the relative difference between both areas. The
         largest error of a charge of random presses is about a third of the predicted error.
         """
-        geometry = self.geometry
-        is_folded = geometry.weights.min() <= 0.0 or geometry.mass.min() <= 0.0
+        is_folded = self.weights.min() <= 0.0 or self.mass.min() <= 0.0
         if is_folded:
             return np.inf
         film_area = np.pi * (1.0 + 0.5 * abs(self.placement.oval) ** 2)  # in squared film radii
-        mesh_area = self.template.copies * geometry.weights.sum()
+        mesh_area = self.template.copies * self.weights.sum()
         return float(np.sqrt(abs(mesh_area / film_area - 1.0)))
 
     def gradient(self, element: Integers, xi: Array, eta: Array) -> Array:
@@ -164,8 +157,7 @@ class PlacedMesh:
         """
         _, derivatives = tensor_basis(self.resolution.order, xi, eta)
         # The axis of length one is for the points of an element, of which there is one.
-        gradient, _ = _film_gradient(derivatives[:, :, None, :], self.points[element])
-        return gradient[:, 0]
+        return _film_gradient(derivatives[:, :, None, :], self.points[element])[:, 0]
 
     def node_derivatives(self, values: Array) -> Array:
         """Compute the derivatives of a field with respect to (X1, X2) at the nodes of every element.
@@ -188,8 +180,7 @@ class PlacedMesh:
 
         The shape is (n_element, n_local, 2, n_local).
         """
-        gradient, _ = _film_gradient(_lobatto_rule(self.resolution.order).derivatives, self.points)
-        return gradient
+        return _film_gradient(_lobatto_rule(self.resolution.order).derivatives, self.points)
 
 
 def place(
@@ -266,7 +257,7 @@ def _lobatto_rule(order: int) -> _ElementRule:
     return _ElementRule.of(order, *tensor_rule(lobatto_nodes(order), lobatto_quadrature(order)))
 
 
-def _film_gradient(derivatives: Array, points: Complexes) -> tuple[Array, Array]:
+def _film_gradient(derivatives: Array, points: Complexes) -> Array:
     """Compute the derivatives of the basis functions with respect to the film coordinates.
 
     Args:
@@ -276,8 +267,7 @@ def _film_gradient(derivatives: Array, points: Complexes) -> tuple[Array, Array]
         points: Film points x + iy of the nodes of every element, shape (n_element, n_local), in film radii.
 
     Returns:
-        Derivatives with respect to (X1, X2), shape (n_element, n_point, 2, n_local). Determinant of the Jacobian, shape
-        (n_element, n_point).
+        Derivatives with respect to (X1, X2), shape (n_element, n_point, 2, n_local).
     """
     # With the derivatives z_xi and z_eta of the film points z = x + iy, the determinant is the imaginary part of
     # conj(z_xi) z_eta. The derivatives of a function f are f_x + i f_y = i (z_xi f_eta - z_eta f_xi) / determinant.
@@ -285,7 +275,7 @@ def _film_gradient(derivatives: Array, points: Complexes) -> tuple[Array, Array]
     determinant = (np.conj(z_xi) * z_eta).imag
     f_xi, f_eta = derivatives
     complex_gradient = 1j * (z_xi[..., None] * f_eta - z_eta[..., None] * f_xi) / determinant[..., None]
-    return np.stack([complex_gradient.real, complex_gradient.imag], axis=2), determinant
+    return np.stack([complex_gradient.real, complex_gradient.imag], axis=2)
 
 
 def _point_derivatives(derivatives: Array, points: Complexes) -> Complexes:

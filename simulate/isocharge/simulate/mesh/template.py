@@ -43,8 +43,6 @@ class SampleProbe(RoundProbe):
     """
 
     other_topology: FootprintTopology
-    name = "sample"
-    period = 2.0 * np.pi
 
     @property
     def topology(self) -> FootprintTopology:

@@ -48,7 +48,6 @@ class Assembly:
 
     Attributes:
         unknowns_per_node: Number of unknowns per node.
-        odd: Whether the fields are odd about the line of symmetry.
         free: Whether each unknown is free, shape (n_node, unknowns_per_node).
         interior_unknowns: Indices of the interior unknowns of each element, shape (n_element, n_interior).
         side_unknowns: Indices of the unknowns on the sides of each element, shape (n_element, n_side).
@@ -67,7 +66,6 @@ class Assembly:
             odd: Whether the fields are odd about the line of symmetry.
         """
         self.unknowns_per_node = unknowns_per_node
-        self.odd = odd
         self.free = _free_unknowns(mesh, unknowns_per_node, odd)
 
         # Compute the local indices of the unknowns on the sides of an element and in its interior. Within an element,
@@ -257,7 +255,9 @@ assembly = lru_cache(maxsize=16)(Assembly)
 """Function that returns the linear solver for the mesh of a template. Linear solvers are cached."""
 
 
-def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, added_tension: float = 0.0) -> SolveTangent:
+def factor_tangent(
+    elastic: ElasticFilm, field: Array, added_tension: float = 0.0, *, odd: bool = False
+) -> SolveTangent:
     """Factorise the tangent of the film for given displacements, including the stiffness of trapped air.
 
     The tangent is K + c v v', where K is the matrix of the film, v contains the integration weights of the displaced
@@ -265,16 +265,17 @@ def factor_tangent(elastic: ElasticFilm, assembly: Assembly, field: Array, added
 
     Args:
         elastic: Discrete model of the film.
-        assembly: Linear solver for the mesh of the film.
         field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
         added_tension: Tension that is added to the pretension, in units of E_young A^2.
+        odd: Whether the right-hand sides are odd about the line of symmetry of a half mesh.
 
     Returns:
         Function that solves linear systems with the tangent.
     """
-    solve_film = assembly.factor(elastic.tangent(field, added_tension))
+    solver = assembly(elastic.mesh.template, elastic.unknowns_per_node, odd)
+    solve_film = solver.factor(elastic.tangent(field, added_tension))
     back = elastic.back
-    if back is None or elastic.groups.compression == 0.0 or assembly.odd:  # odd fields do not compress the air
+    if back is None or elastic.groups.compression == 0.0 or odd:  # odd fields do not compress the air
         return solve_film
 
     # The air changes a solution x by -c / (1 + c v . y) (v . x) y, where y = K^-1 v is the response of the film to a

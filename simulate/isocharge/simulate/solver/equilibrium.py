@@ -9,13 +9,13 @@ electrode layouts and all piezoelectric coefficients.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import SceneError
+from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.theory import (
     DimensionlessGroups,
     Theory,
@@ -29,16 +29,18 @@ from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.numerics.polygon import to_complex
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.footprint import Probe
+from isocharge.simulate.solver.newton import NewtonResult
 
 SURFACE_HEIGHT = {"middle": 0.0, "top": 1.0, "bottom": -1.0}
 """Height of each surface above the mid-surface in half thicknesses, positive towards the probe."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Equilibrium:
+class Equilibrium(NewtonResult):
     """Equilibrium of a film under a press.
 
     The functions `deflection`, `touch_stress` and `touch_charge` compute the results of a press from its equilibrium.
+    The class `NewtonResult` describes the attributes `field`, `status`, `message`, `iterations` and `residual`.
 
     Attributes:
         film: The film.
@@ -48,13 +50,7 @@ class Equilibrium:
         side_force: Force (Fx, Fy) of the probe on the film in the plane of the film, N.
         theory: Terms of the film theory that were modelled.
         mesh: Mesh under the press. The press is rotated onto the x axis.
-        field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3), dimensionless. The press is rotated
-            onto the x axis.
         groups: Dimensionless groups of the press.
-        status: "converged" or "failed".
-        message: Description of the outcome in one sentence.
-        iterations: Number of Newton steps with a new tangent.
-        residual: Out-of-balance force divided by the load.
         seconds: CPU time of the process for meshing and solving, s.
         proven_error: Relative difference of the charges between this mesh and a mesh whose order is lower by one; None
             if only one mesh was solved.
@@ -69,15 +65,15 @@ class Equilibrium:
     side_force: tuple[float, float] = (0.0, 0.0)
     theory: Theory
     mesh: PlacedMesh
-    field: Array
     groups: DimensionlessGroups
-    status: Literal["converged", "failed"]
-    message: str
-    iterations: int
-    residual: float
     seconds: float
     proven_error: float | None = None
     rest: "Equilibrium | None" = None
+
+    @property
+    def elastic(self) -> ElasticFilm:
+        """Discrete model of the film, in which the press is rotated onto the x axis."""
+        return ElasticFilm(self.mesh, self.groups)
 
     @property
     def direction(self) -> float:

@@ -81,7 +81,7 @@ def highest_mode_share(mesh: PlacedMesh, slope: Array) -> float:
     highest_power = total_power - lower_power
 
     # The share of an element is sqrt(highest power / total power), and its weight is area * total power.
-    area = mesh.geometry.weights.sum(axis=1)
+    area = mesh.weights.sum(axis=1)
     weighted_share = area * np.sqrt(np.maximum(highest_power, 0.0) * total_power)
     total_weight = max(np.sum(area * total_power), 1e-300)  # the limit avoids a division by zero
     return float(np.sum(weighted_share) / total_weight)

@@ -147,19 +147,7 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
             "press farther inside"
         )
 
-    check_strains(film, force)
-
-
-def check_strains(film: Film, force: float) -> None:
-    """Raise an error if a force is too large for Saint-Venant-Kirchhoff elasticity.
-
-    Args:
-        film: The film.
-        force: Force of the press, N.
-
-    Raises:
-        SceneError: If the squared amplitude exceeds `MAX_AMPLITUDE2` or is not finite.
-    """
+    # The squared amplitude is of the order of the strains.
     with np.errstate(over="ignore"):  # the amplitude of a huge force is infinite, and is refused
         squared_amplitude = amplitude_squared(film, force)
     if not squared_amplitude <= MAX_AMPLITUDE2:
@@ -184,24 +172,6 @@ def farthest_distance(film: Film, probe: Probe, at: tuple[float, float]) -> floa
         return probe.farthest_distance(at)
     centroid = film.radius * from_oval(np.array(complex(*at) / film.radius), film_oval(film, direction=0.0))
     return probe.farthest_distance((float(centroid.real), float(centroid.imag)))
-
-
-def check_side_force(side_force: tuple[float, float], force: float) -> None:
-    """Raise an error if a side force is not finite or exceeds the force of the press.
-
-    Args:
-        side_force: Force (Fx, Fy) in the plane of the film, N.
-        force: Force of the press, N.
-
-    Raises:
-        SceneError: If a component is not finite, or if the side force exceeds `MAX_SIDE_SHARE` times the force.
-    """
-    side_x, side_y = side_force
-    magnitude = float(np.hypot(side_x, side_y))
-    if not magnitude <= MAX_SIDE_SHARE * force:  # the condition is negated, so that NaN raises the error
-        raise SceneError(
-            f"side force: expected at most {MAX_SIDE_SHARE:g} times the force of {force:.4g} N, got {side_force} N"
-        )
 
 
 def layer_for(film: Film, force: float) -> float:
@@ -240,13 +210,19 @@ class LoadCase:
     began: float = field(default_factory=process_time)
 
     def __post_init__(self) -> None:
-        """Check the press.
+        """Check the press and its side force.
 
         Raises:
-            SceneError: If the press cannot exist.
+            SceneError: If the press cannot exist, or if the side force is not finite or exceeds `MAX_SIDE_SHARE` times
+                the force of the press.
         """
         check_press(self.film, self.probe, self.at, self.force)
-        check_side_force(self.side_force, self.force)
+        side_force = np.hypot(*self.side_force)
+        if not side_force <= MAX_SIDE_SHARE * self.force:  # the condition is negated, so that NaN raises the error
+            raise SceneError(
+                f"side force: expected at most {MAX_SIDE_SHARE:g} times the force of {self.force:.4g} N, got "
+                f"{self.side_force} N"
+            )
 
     @property
     def layer(self) -> float:

@@ -12,16 +12,14 @@ The iteration stops after `MAX_ITERATIONS` steps, or if the steps no longer beco
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.mechanics.energy import ElasticFilm
-from isocharge.simulate.mechanics.theory import DimensionlessGroups
 from isocharge.simulate.mesh.oval import from_oval
-from isocharge.simulate.mesh.placed_mesh import PlacedMesh
-from isocharge.simulate.solver.assembly import Assembly, SolveTangent, factor_tangent
+from isocharge.simulate.solver.assembly import SolveTangent, assembly, factor_tangent
 
 STABILISING_TENSION = 0.4
 """Stabilising tension at a relative residual of one.
@@ -48,27 +46,29 @@ The size of a step is its energy norm relative to the work of the load.
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NewtonResult:
     """Result of a solve.
 
     Attributes:
-        field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
-        converged: Whether the residual is below the tolerance or at the level of rounding errors.
-        iterations: Number of Newton steps.
+        field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3), dimensionless. The press is rotated
+            onto the x axis.
+        status: "converged" if the residual is below the tolerance or at the level of rounding errors, otherwise
+            "failed".
+        message: Description of the outcome in one sentence.
+        iterations: Number of Newton steps with a new tangent.
         residual: Larger of two ratios, namely of the transverse residual to the load, and of the in-plane residual to
             the in-plane forces.
-        message: Description of the outcome in one sentence.
     """
 
     field: Array
-    converged: bool
+    status: Literal["converged", "failed"]
+    message: str
     iterations: int
     residual: float
-    message: str
 
 
-def first_iterate(mesh: PlacedMesh, groups: DimensionlessGroups) -> Array:
+def first_iterate(elastic: ElasticFilm) -> Array:
     """Compute the first iterate of Newton's method: an approximate deflection under the probe and the static pressure.
 
     Schwerin's deflection of a membrane is W = (3 / pi)^(1/3) (1 - r^(2/3)), where r is the distance from the origin of
@@ -78,12 +78,13 @@ def first_iterate(mesh: PlacedMesh, groups: DimensionlessGroups) -> Array:
     that is missing has the height zero. The in-plane displacements are zero.
 
     Args:
-        mesh: Mesh of the press.
-        groups: Dimensionless groups of the press.
+        elastic: Discrete model of the film.
 
     Returns:
         Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
     """
+    mesh = elastic.mesh
+    groups = elastic.groups
     circular_points = from_oval(mesh.node_points, mesh.placement.oval)
     template_distance = np.abs(mesh.placement.to_template(circular_points))
     # The square of the radius of the innermost circle is added, which rounds the tip of the deflection under the probe.
@@ -97,11 +98,7 @@ def first_iterate(mesh: PlacedMesh, groups: DimensionlessGroups) -> Array:
 
 
 def solve_newton(
-    elastic: ElasticFilm,
-    assembly: Assembly,
-    first_field: Array,
-    tolerance: float,
-    full_steps_below: float = UNSTABILISED_BELOW,
+    elastic: ElasticFilm, first_field: Array, tolerance: float, full_steps_below: float = UNSTABILISED_BELOW
 ) -> NewtonResult:
     """Solve for the equilibrium of the film by Newton's method.
 
@@ -110,7 +107,6 @@ def solve_newton(
 
     Args:
         elastic: Discrete model of the film.
-        assembly: Linear solver for the mesh of the film.
         first_field: First iterate, shape (n_node, 3), which is zero where the film is fixed.
         tolerance: Relative residual at which the solve has converged.
         full_steps_below: Relative residual below which a full Newton step that halves the residual is accepted even if
@@ -119,32 +115,33 @@ def solve_newton(
     Returns:
         The result, which may not have converged.
     """
-    iterate = _Iterate(elastic, assembly.free[:, :3], first_field)
+    free = assembly(elastic.mesh.template, elastic.unknowns_per_node).free[:, :3]
+    iterate = _Iterate(elastic, free, first_field)
     step_sizes: list[float] = []
     for iteration in range(MAX_ITERATIONS + 1):
         relative_residual = iterate.relative_residual
         if not np.isfinite(relative_residual):
-            return iterate.result(iteration, converged=False, message="the residual is not a finite number")
+            return iterate.result(iteration, "failed", "the residual is not a finite number")
         if relative_residual <= tolerance:
-            return iterate.result(iteration, converged=True, message=f"converged in {iteration} steps")
+            return iterate.result(iteration, "converged", f"converged in {iteration} steps")
         if iteration == MAX_ITERATIONS or _has_stalled(step_sizes):
-            return iterate.result(iteration, converged=False, message=f"no progress any more after {iteration} steps")
+            return iterate.result(iteration, "failed", f"no progress any more after {iteration} steps")
 
         # Compute the Newton step.
         stabilising_tension = _stabilising_tension(elastic, relative_residual)
-        solve = factor_tangent(elastic, assembly, iterate.field, stabilising_tension)
+        solve = factor_tangent(elastic, iterate.field, stabilising_tension)
         step = solve(-iterate.residual)
         step_size = iterate.size_of(step)
         step_sizes.append(step_size)
         if step_size <= ROUND_OFF:
-            return iterate.result(iteration, converged=True, message=f"converged to round-off in {iteration} steps")
+            return iterate.result(iteration, "converged", f"converged to round-off in {iteration} steps")
 
         # Close to the equilibrium, take the full step if it halves the residual. Otherwise search for the step length.
         next_iterate = _take_full_step(iterate, step) if relative_residual <= full_steps_below else None
         if next_iterate is None:
-            next_iterate = _line_search(iterate, _descent_step(iterate, assembly, step))
+            next_iterate = _line_search(iterate, _descent_step(iterate, step))
         if next_iterate is None:
-            return iterate.result(iteration, converged=False, message="no step lowers the energy any more")
+            return iterate.result(iteration, "failed", "no step lowers the energy any more")
         iterate = _chord_steps(next_iterate, solve, relative_residual, tolerance)
     raise AssertionError("the loop returns")  # the last iteration returns in every case
 
@@ -180,10 +177,8 @@ class _Iterate:
         in-plane forces of the elements.
         """
         free_residual = self.residual * self.free  # without the reactions at fixed nodes
-        magnitude, shares = self.elastic.load
-        load = magnitude * np.linalg.norm(shares)
         in_plane_force = float(np.linalg.norm(self.elastic.membrane.forces(self.field)[..., :2]))
-        transverse_ratio = np.linalg.norm(free_residual[:, 2]) / load
+        transverse_ratio = np.linalg.norm(free_residual[:, 2]) / np.linalg.norm(self.elastic.load)
         in_plane_ratio = np.linalg.norm(free_residual[:, :2]) / max(in_plane_force, 1e-300)  # avoids a division by zero
         return float(max(transverse_ratio, in_plane_ratio))
 
@@ -194,13 +189,14 @@ class _Iterate:
             step: Change of the displacements, shape (n_node, 3).
         """
         step_energy = abs(float(np.sum(step * self.residual)))
-        magnitude, shares = self.elastic.load
-        work = max(magnitude * abs(float(shares @ self.field[:, 2])), 1e-300)  # the limit avoids a division by zero
+        work = max(abs(float(self.elastic.load @ self.field[:, 2])), 1e-300)  # the limit avoids a division by zero
         return float(np.sqrt(step_energy / work))
 
-    def result(self, iterations: int, *, converged: bool, message: str) -> NewtonResult:
+    def result(self, iterations: int, status: Literal["converged", "failed"], message: str) -> NewtonResult:
         """Return the result of a solve whose last iterate is this object."""
-        return NewtonResult(self.field, converged, iterations, self.relative_residual, message)
+        return NewtonResult(
+            field=self.field, status=status, message=message, iterations=iterations, residual=self.relative_residual
+        )
 
 
 def _has_stalled(step_sizes: list[float]) -> bool:
@@ -292,9 +288,7 @@ def _chord_steps(
     return iterate
 
 
-def _descent_step(
-    iterate: _Iterate, assembly: Assembly, step: Array, max_trials: int = 12, first_tension: float = 0.05
-) -> Array:
+def _descent_step(iterate: _Iterate, step: Array, max_trials: int = 12, first_tension: float = 0.05) -> Array:
     """Return the Newton step if it is a descent direction of the energy, and a modified step otherwise.
 
     The residual is the gradient of the energy. A step is therefore a descent direction if its scalar product with the
@@ -303,7 +297,6 @@ def _descent_step(
 
     Args:
         iterate: Present iterate.
-        assembly: Linear solver for the mesh.
         step: Newton step, shape (n_node, 3).
         max_trials: Largest number of tensions that are tried to obtain a descent direction. Each tension is twice the
             previous tension.
@@ -320,7 +313,7 @@ def _descent_step(
         is_descent_direction = np.isfinite(step).all() and energy_slope < 0.0
         if is_descent_direction:
             break
-        solve_stiffer = factor_tangent(elastic, assembly, iterate.field, added_tension)
+        solve_stiffer = factor_tangent(elastic, iterate.field, added_tension)
         step = solve_stiffer(-iterate.residual)
         added_tension *= 2.0
     return step

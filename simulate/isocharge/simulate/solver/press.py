@@ -14,12 +14,11 @@ from isocharge.common.errors import SolveError
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.theory import DimensionlessGroups
 from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.mesh.placed_mesh import Geometry, PlacedMesh
-from isocharge.simulate.mesh.template import Template
+from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.footprint import Probe
-from isocharge.simulate.solver.assembly import Assembly, assembly, single_threaded_blas
+from isocharge.simulate.solver.assembly import single_threaded_blas
 from isocharge.simulate.solver.equilibrium import Equilibrium, principal_stress
 from isocharge.simulate.solver.error_estimate import relative_difference
 from isocharge.simulate.solver.load_case import (
@@ -183,19 +182,15 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
     has_folded_element = np.isinf(mesh.shape_error)
     if has_folded_element:
         raise too_near_the_rim(case, mesh.resolution)
-    elastic = _elastic_film(case, mesh.geometry, case.force)
-    solver = assembly(mesh.template, elastic.unknowns_per_node)
+    elastic = _elastic_film(case, mesh, case.force)
 
-    # The first iterate is an approximate deflection under the probe and the static pressure, or the field of the
-    # starting equilibrium. If Newton's method fails, the load is applied in steps.
-    default_field = first_iterate(mesh, elastic.groups)
-    first_field = _first_field(start, mesh.template, default_field)
-    result = solve_newton(elastic, solver, first_field, case.settings.tolerance)
-    if not result.converged:
-        result = _solve_by_load_steps(case, result, mesh.geometry, solver, default_field)
-    deflection_under_probe = mesh.geometry.load @ result.field[:, 2]  # mean, weighted with the pressure
+    # If Newton's method fails, the load is applied in steps.
+    result = solve_newton(elastic, _first_field(start, elastic), case.settings.tolerance)
+    if result.status == "failed":
+        result = _solve_by_load_steps(case, result, elastic)
+    deflection_under_probe = mesh.load @ result.field[:, 2]  # mean, weighted with the pressure
     if deflection_under_probe < 0.0 and case.film.static_pressure == 0.0:  # a compressed film can bulge to either side
-        result = replace(result, converged=False, message="the film bulges against the push")
+        result = replace(result, status="failed", message="the film bulges against the push")
 
     equilibrium = Equilibrium(
         film=case.film,
@@ -205,13 +200,9 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
         side_force=case.side_force,
         theory=case.settings.theory,
         mesh=mesh,
-        field=result.field,
         groups=elastic.groups,
-        status="converged" if result.converged else "failed",
-        message=result.message,
-        iterations=result.iterations,
-        residual=result.residual,
         seconds=process_time() - case.began,
+        **vars(result),
     )
     if case.film.static_pressure == 0.0:
         return equilibrium
@@ -231,29 +222,28 @@ def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
         Equilibrium of the press with the attribute `rest`. Its status is "failed" if the solve before the contact
         fails.
     """
-    mesh = equilibrium.mesh
-    elastic = ElasticFilm(mesh.geometry, equilibrium.groups.without_probe)
-    solver = assembly(mesh.template, elastic.unknowns_per_node)
-    result = solve_newton(elastic, solver, first_iterate(mesh, elastic.groups), tolerance)
+    groups = replace(equilibrium.groups, load=0.0, side_load=(0.0, 0.0))  # the units remain those of the press
+    elastic = ElasticFilm(equilibrium.mesh, groups)
+    result = solve_newton(elastic, first_iterate(elastic), tolerance)
 
     # The number of iterations is the sum of both solves.
-    rest = replace(equilibrium, groups=elastic.groups, field=result.field, force=0.0, side_force=(0.0, 0.0))
+    rest = replace(equilibrium, groups=groups, field=result.field, force=0.0, side_force=(0.0, 0.0))
     iterations = equilibrium.iterations + result.iterations
     equilibrium_with_rest = replace(equilibrium, rest=rest, iterations=iterations)
-    if result.converged:
+    if result.status == "converged":
         return equilibrium_with_rest
     message = f"under the static pressure without a contact, {result.message}"
     return replace(equilibrium_with_rest, status="failed", message=message)
 
 
-def _elastic_film(case: LoadCase, geometry: Geometry, force: float) -> ElasticFilm:
+def _elastic_film(case: LoadCase, mesh: PlacedMesh, force: float) -> ElasticFilm:
     """Create the discrete model of the film for a press whose force is replaced by another force.
 
     The side force is changed in proportion to the force.
 
     Args:
         case: The press.
-        geometry: Integration rules of the elements.
+        mesh: Mesh of the press.
         force: The other force, N.
     """
     x, y = case.at
@@ -267,15 +257,13 @@ def _elastic_film(case: LoadCase, geometry: Geometry, force: float) -> ElasticFi
         angle=direction,
         side_force=(force_factor * side_x, force_factor * side_y),
     )
-    return ElasticFilm(geometry, groups)
+    return ElasticFilm(mesh, groups)
 
 
 def _solve_by_load_steps(
     case: LoadCase,
     failed: NewtonResult,
-    geometry: Geometry,
-    solver: Assembly,
-    first_field: Array,
+    full_load: ElasticFilm,
     first_load_share: float = 0.0625,
     max_load_steps: int = 12,
 ) -> NewtonResult:
@@ -288,9 +276,7 @@ def _solve_by_load_steps(
     Args:
         case: The press.
         failed: Result of the failed solve with the full force.
-        geometry: Integration rules of the elements.
-        solver: Linear solver for the mesh.
-        first_field: First iterate of the solve with the first force, shape (n_node, 3).
+        full_load: Discrete model of the film under the full force.
         first_load_share: Share of the full load in the first load step, if the solve with the full load fails.
         max_load_steps: Largest number of load steps.
 
@@ -301,20 +287,20 @@ def _solve_by_load_steps(
     solved_force = 0.0  # largest force with an equilibrium; 0 if there is none
     force_factor = 2.0  # ratio of the next force to `solved_force`
     iterations = failed.iterations
-    field = first_field
+    field = first_iterate(full_load)
     force = first_load_share * case.force
     for _ in range(max_load_steps):
         # An equilibrium with a smaller force is close to the solution, so full Newton steps are allowed at once.
         full_steps_below = np.inf if solved_force else UNSTABILISED_BELOW
-        elastic = _elastic_film(case, geometry, force)
-        result = solve_newton(elastic, solver, field, case.settings.tolerance, full_steps_below)
+        elastic = _elastic_film(case, full_load.mesh, force)
+        result = solve_newton(elastic, field, case.settings.tolerance, full_steps_below)
         iterations += result.iterations
-        if result.converged and force == case.force:
+        if result.status == "converged" and force == case.force:
             message = f"converged in {iterations} steps, the load in parts"
             return replace(result, iterations=iterations, message=message)
 
         # Choose the next force.
-        if result.converged:
+        if result.status == "converged":
             solved_force = force
             field = result.field
         elif solved_force == 0.0:
@@ -325,27 +311,28 @@ def _solve_by_load_steps(
     return replace(failed, iterations=iterations)
 
 
-def _first_field(start: Equilibrium | None, template: Template, default: Array) -> Array:
+def _first_field(start: Equilibrium | None, elastic: ElasticFilm) -> Array:
     """Return the first iterate of Newton's method, shape (n_node, 3).
 
     If the mesh of the starting equilibrium has the same elements, which may have another polynomial order, the first
-    iterate is interpolated from the field of the starting equilibrium.
+    iterate is interpolated from the field of the starting equilibrium. Otherwise it is an approximate deflection under
+    the probe and the static pressure.
 
     Args:
         start: Equilibrium of a similar press; None if there is no such equilibrium.
-        template: Template of the mesh.
-        default: First iterate in all other cases, shape (n_node, 3).
+        elastic: Discrete model of the film under the press.
     """
     if start is None:
-        return default
+        return first_iterate(elastic)
 
     # Compare the blocks, and the resolution except for the order.
+    template = elastic.mesh.template
     start_template = start.mesh.template
     has_same_blocks = start_template.topology == template.topology and start_template.half == template.half
     resolution_with_same_order = replace(start_template.resolution, order=template.resolution.order)
     has_same_resolution_except_order = resolution_with_same_order == template.resolution
     if not (has_same_blocks and has_same_resolution_except_order):
-        return default
+        return first_iterate(elastic)
     if start_template.resolution.order == template.resolution.order:
         return start.field
 

@@ -43,12 +43,11 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError
-from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mechanics.theory import elasticity, side_force_unit
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Surface, increased
-from isocharge.simulate.solver.assembly import SolveTangent, assembly, factor_tangent, single_threaded_blas
+from isocharge.simulate.solver.assembly import SolveTangent, factor_tangent, single_threaded_blas
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
 
 STEP = 1e-3
@@ -176,11 +175,8 @@ def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
     # Even and odd fields have different fixed displacements on the line of symmetry. Therefore the tangent is
     # factorised once for all even fields, and once for all odd fields.
     with single_threaded_blas():
-        elastic = ElasticFilm(solved.mesh.geometry, solved.groups)
-        solves = [
-            factor_tangent(elastic, assembly(solved.mesh.template, elastic.unknowns_per_node, odd), solved.field)
-            for odd in (False, True)
-        ]
+        elastic = solved.elastic
+        solves = [factor_tangent(elastic, solved.field, odd=odd) for odd in (False, True)]
         # An odd change does not displace any air on the whole film, so the pressure of trapped air remains constant.
         solved_for_odd = solved
         if elastic.back is not None:
@@ -213,8 +209,8 @@ def _change_by_imperfection(
 
     # Compute the change of the displacements that restores the equilibrium after one positive step. The change of the
     # residual by one step is half of the difference between both residuals.
-    positive_residual = ElasticFilm(positive_press.mesh.geometry, positive_press.groups).residual(positive_press.field)
-    negative_residual = ElasticFilm(negative_press.mesh.geometry, negative_press.groups).residual(negative_press.field)
+    positive_residual = positive_press.elastic.residual(positive_press.field)
+    negative_residual = negative_press.elastic.residual(negative_press.field)
     displacement_change = -0.5 * solve(positive_residual - negative_residual)
 
     # Compute the derivative of the stress by a central difference.
@@ -266,31 +262,28 @@ def holding_force(solved: Equilibrium) -> tuple[float, float]:
         Force (Fx, Fy) of the probe on the film, N. The force points inwards if the film would slip outwards.
     """
     mesh = solved.mesh
-    geometry = mesh.geometry
-    groups = solved.groups
     n_direction = 1 if mesh.template.half else 2  # a half template has no displacement across its line of symmetry
 
-    # Mean in-plane displacement of the footprint since the contact, shape (n_direction,). `geometry.load` contains the
+    # Mean in-plane displacement of the footprint since the contact, shape (n_direction,). `mesh.load` contains the
     # weights of the nodes in the mean over the footprint.
     field_before_contact = np.zeros_like(solved.field) if solved.rest is None else solved.rest.field
-    slip = geometry.load @ (solved.field - field_before_contact)[:, :n_direction]
+    slip = mesh.load @ (solved.field - field_before_contact)[:, :n_direction]
 
     # Mean displacement of the footprint under a unit side load in each direction, with one column for each load
     compliance = np.empty((n_direction, n_direction))
     with single_threaded_blas():
-        elastic = ElasticFilm(geometry, groups)
-        solve = factor_tangent(elastic, assembly(mesh.template, elastic.unknowns_per_node), solved.field)
+        solve = factor_tangent(solved.elastic, solved.field)
         for direction in range(n_direction):
             unit_load = np.zeros_like(solved.field)
-            unit_load[:, direction] = geometry.load
-            compliance[:, direction] = geometry.load @ solve(unit_load)[:, :n_direction]
+            unit_load[:, direction] = mesh.load
+            compliance[:, direction] = mesh.load @ solve(unit_load)[:, :n_direction]
 
     # Compute the scaled side load that cancels the slip.
     scaled_force = np.zeros(2)
     scaled_force[:n_direction] = -np.linalg.solve(compliance, slip)
 
     # Convert the side load to N, and rotate it from the frame of the press to the axes x and y.
-    force_unit = side_force_unit(solved.film, groups.squared_amplitude)
+    force_unit = side_force_unit(solved.film, solved.groups.squared_amplitude)
     force = complex(*scaled_force) * force_unit * cmath.rect(1.0, solved.direction)  # Fx + i Fy
     return force.real, force.imag
 
