@@ -24,18 +24,13 @@ def sensor(request):
     return replace(load_sensor("three-25um-biaxial"), electrodes=(triangle, square))
 
 
-@pytest.fixture
-def drawing(sensor):
-    return draw_layout(sensor)
-
-
 def box(points):
     return [*np.min(points, axis=0), *np.max(points, axis=0)]
 
 
-def test_dxf_has_the_positions_and_sizes_of_the_sensor(sensor, drawing, tmp_path):
+def test_dxf_has_the_positions_and_sizes_of_the_sensor(sensor, tmp_path):
     path = tmp_path / "layout.dxf"
-    path.write_text(to_dxf(drawing), "utf-8")
+    path.write_text(to_dxf(draw_layout(sensor)), "utf-8")
     document = ezdxf.readfile(path)
     assert not document.audit().errors
     assert document.units == ezdxf.units.MM
@@ -58,9 +53,9 @@ def test_rim_of_an_oval_film_is_not_a_circle():
     assert not space.query("CIRCLE")
 
 
-def test_svg_is_to_scale(sensor, drawing, tmp_path):
+def test_svg_is_to_scale(sensor, tmp_path):
     path = tmp_path / "layout.svg"
-    path.write_text(to_svg(drawing), "utf-8")
+    path.write_text(to_svg(draw_layout(sensor)), "utf-8")
     svg = SVG.parse(str(path), ppi=25.4)  # a pixel is a millimetre
     boxes = np.array([shape.bbox() for shape in svg.elements(lambda element: isinstance(element, Path))])
     film = boxes[np.argmax(boxes[:, 3] - boxes[:, 1])]

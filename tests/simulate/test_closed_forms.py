@@ -107,12 +107,10 @@ def michell_under_a_disk(z: np.ndarray, c: complex, radius: float) -> np.ndarray
 
 def read_outside(film: Film, probe: Probe, at: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     """Return points (x, y) on the film outside the probe, mm, and the same points as complex numbers in film radii."""
-    rng = np.random.default_rng(0)
-    near_probe = at + 3.0 * probe.reach * rng.uniform(-1.0, 1.0, (30, 2))
-    candidates = np.concatenate([ring(0.5 * film.radius), ring(0.95 * film.radius), near_probe])
-    is_outside_probe = np.hypot(*(candidates - at).T) > probe.reach
-    is_on_film = np.hypot(*candidates.T) < film.radius
-    points = candidates[is_outside_probe & is_on_film]
+    candidates = np.concatenate(
+        [ring(0.5 * film.radius), ring(0.95 * film.radius), at + ring(1.1 * probe.reach), at + ring(3.0 * probe.reach)]
+    )
+    points = candidates[np.hypot(*(candidates - at).T) > probe.reach]
     return points, points @ np.array([1.0, 1j]) / film.radius
 
 

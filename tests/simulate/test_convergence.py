@@ -1,6 +1,5 @@
 """Convergence of the deflection and of the charges with the order of the elements."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -48,28 +47,23 @@ def solves(film, request) -> list[Equilibrium]:
     return [solve(order) for order in (*ORDERS, 7)]
 
 
-def check(
-    solves: list[Equilibrium], output: Callable[[Equilibrium], np.ndarray], digits_per_order: float, final_error: float
-) -> None:
-    """Check the exponential convergence of an output.
+def charges(solved: Equilibrium, name: str, readout: str) -> np.ndarray:
+    """Return the touch charges of a built-in sensor with the film of an equilibrium and the given readout."""
+    return touch_charge(replace(load_sensor(name), film=solved.film, readout=readout), solved)
 
-    Args:
-        solves: Equilibria for increasing orders, the last one for the reference.
-        output: Function of an equilibrium.
-        digits_per_order: Smallest number of decimal digits that each order adds.
-        final_error: Largest relative error for the highest order of `ORDERS`.
-    """
+
+OUTPUTS = {
+    "deflection": (partial(deflection, points=PLACES), 0.5, 2e-5),
+    "edge": (partial(charges, name="three-25um-biaxial", readout="edge"), 0.3, 1e-4),
+    "area": (partial(charges, name="four-25um-uniaxial", readout="area"), 0.3, 1e-4),
+}
+"""Function of an equilibrium, smallest number of decimal digits that each order adds, and largest relative error for
+the highest order of `ORDERS`."""
+
+
+@pytest.mark.parametrize(("output", "digits_per_order", "final_error"), OUTPUTS.values(), ids=OUTPUTS)
+def test_deflection_and_charges_converge_exponentially_with_the_order(solves, output, digits_per_order, final_error):
     *values, reference = map(output, solves)
     errors = [relative_error(value, reference) for value in values]
     assert -np.polyfit(ORDERS, np.log10(errors), 1)[0] > digits_per_order
     assert errors[-1] < final_error
-
-
-def test_deflection_converges_exponentially_with_the_order(solves):
-    check(solves, partial(deflection, points=PLACES), 0.5, 2e-5)
-
-
-@pytest.mark.parametrize(("name", "readout"), [("three-25um-biaxial", "edge"), ("four-25um-uniaxial", "area")])
-def test_charge_converges_exponentially_with_the_order(solves, name, readout):
-    sensor = replace(load_sensor(name), film=solves[0].film, readout=readout)
-    check(solves, partial(touch_charge, sensor), 0.3, 1e-4)

@@ -14,16 +14,13 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import (
-    Circle,
-    Ellipse,
     Equilibrium,
     Film,
-    Finger,
-    Polygon,
     Probe,
     Sensor,
     deflection,
     load_sensor,
+    parse_probe,
     press,
     touch_charge,
 )
@@ -76,7 +73,7 @@ def read(name: str, source: str) -> list[ReferenceCase]:
         ReferenceCase(
             source,
             Film(radius, case["thickness_um"] * 1e-3, young * 1e3, poisson, case["pretension_MPa"]),
-            probe_of(case["probe"]),
+            probe_of(**case["probe"]),
             tuple(case["at_mm"]),
             case["force_N"],
             case["deflection_mm"],
@@ -86,18 +83,10 @@ def read(name: str, source: str) -> list[ReferenceCase]:
     ]
 
 
-def probe_of(about: dict) -> Probe:
+def probe_of(shape: str, turn_deg: float = 0.0, **sizes_mm: float) -> Probe:
     """Return the probe that an entry of a file describes."""
-    angle = np.deg2rad(about.get("turn_deg", 0.0))
-    if about["shape"] == "circle":
-        return Circle(about["radius_mm"])
-    if about["shape"] == "finger":
-        return Finger(about["radius_mm"])
-    if about["shape"] == "ellipse":
-        return Ellipse(about["width_mm"], about["height_mm"], angle)
-    if about["shape"] == "rectangle":
-        return Polygon.rectangle(about["width_mm"], about["height_mm"], angle)
-    return Polygon.triangle(about["side_mm"], angle)
+    sizes = "x".join(map(str, sizes_mm.values()))
+    return parse_probe(f"{shape}:{sizes}@{turn_deg}")
 
 
 CASES = [*read("film_cases.json", "collocation, dolfinx"), *read("film_cases_skfem.json", "scikit-fem")]

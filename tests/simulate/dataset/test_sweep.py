@@ -165,4 +165,3 @@ def test_shards_of_a_probe_with_many_corners_fit_into_a_file():
     rows = sweep_module._shard_size([PROBE, polygon], sweep_module.SHARD_SIZE)
     assert 1000 < rows < sweep_module.SHARD_SIZE
     assert np.full(rows, polygon.notation).nbytes < 2**26
-    assert sweep_module._shard_size([PROBE], sweep_module.SHARD_SIZE) == sweep_module.SHARD_SIZE

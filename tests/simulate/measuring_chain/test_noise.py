@@ -5,8 +5,7 @@ import pytest
 from scipy import stats
 
 from isocharge.common.errors import InputError
-from isocharge.simulate import NoiseModel, load_amplifier, noise_model
-from isocharge.simulate.measuring_chain import AMPLIFIER_LEVELS
+from isocharge.simulate import NoiseModel, noise_model
 
 
 @pytest.mark.parametrize(("charge", "sigma"), [(0.0, 1.0), (500.0, np.sqrt(2.0)), (3000.0, 6.0827625)])
@@ -24,12 +23,6 @@ def test_added_noise_is_gaussian_with_sigma(charge):
     rng = np.random.default_rng(0)
     drawn = (model.add(np.full(20_000, charge), rng) - charge) / model.sigma(np.array(charge))
     assert stats.kstest(drawn, "norm").pvalue > 0.01
-
-
-@pytest.mark.parametrize("level", AMPLIFIER_LEVELS)
-def test_noise_and_amplifier_levels_have_the_same_noise(level):
-    """Single readings for training and limits have the same noise as the time series of the virtual sensor."""
-    assert noise_model(level) == load_amplifier(level).noise
 
 
 @pytest.mark.parametrize(("white", "gain"), [(np.inf, 0.0), (np.nan, 0.0), (-1.0, 0.0), (0.0, -1.0)])

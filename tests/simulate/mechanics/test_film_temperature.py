@@ -7,15 +7,11 @@ import pytest
 
 from isocharge.simulate import load_sensor
 from isocharge.simulate.mechanics.warming import tension_change, warmed
+from solved_charges import with_film
 
 SENSOR = load_sensor("four-25um-biaxial")
 YOUNG = 3000.0
 POISSON = 0.34
-
-
-def film_with(**changes):
-    """Return the film of a built-in sensor with other attributes."""
-    return replace(SENSOR.film, pretension=0.8, **changes)
 
 
 def test_tension_turns_with_the_axis_of_an_orthotropic_film():
@@ -23,7 +19,7 @@ def test_tension_turns_with_the_axis_of_an_orthotropic_film():
 
     The strain is the expansion of the ring, which is of aluminium, minus that of the film.
     """
-    film = film_with(expansion=(-5e-6, 100e-6), young_ratio=2.0, axis=np.deg2rad(30.0))
+    film = replace(SENSOR.film, expansion=(-5e-6, 100e-6), young_ratio=2.0, axis=np.deg2rad(30.0))
     first = YOUNG * np.sqrt(2.0)
     second = YOUNG / np.sqrt(2.0)
     compliance = np.array([[1.0 / first, -POISSON / YOUNG], [-POISSON / YOUNG, 1.0 / second]])
@@ -35,7 +31,7 @@ def test_tension_turns_with_the_axis_of_an_orthotropic_film():
 
 
 def test_warmed_sensor_of_a_biaxial_film_stays_axisymmetric():
-    warm = warmed(replace(SENSOR, film=film_with(expansion=(1e-4, 1e-4))), 0.5)
+    warm = warmed(with_film(SENSOR, pretension=0.8, expansion=(1e-4, 1e-4)), 0.5)
     assert warm.film.is_axisymmetric
     assert warm.film.pretension == pytest.approx(0.8 - 0.5e-4 * YOUNG / (1.0 - POISSON))
     assert warmed(SENSOR, 5.0) == SENSOR

@@ -8,6 +8,7 @@ import pytest
 from isocharge.common.errors import SceneError
 from isocharge.simulate import (
     Circle,
+    Ellipse,
     GrowingFinger,
     Polygon,
     Resolution,
@@ -25,38 +26,57 @@ MEMBRANE = Theory(bending=False)
 
 
 @pytest.mark.parametrize(
-    ("probe", "at", "force", "message"),
+    ("changes", "probe", "at", "force", "message"),
     [
         (
+            {},
             PROBE,
             (44.5, 0.0),
             1.0,
             r"probe off the film: centre \(44\.5, 0\) mm, farthest .* circle:1\.0 45\.5 mm",
         ),
-        (Polygon.rectangle(10.0, 1.0), (39.9, 5.0), 1.0, r"off the film: centre \(39\.9, 5\) mm, .* rectangle"),
-        (PROBE, (np.nan, 0.0), 1.0, r"probe off the film: centre \(nan, 0\) mm"),
-        (GrowingFinger(1.0), (0.0, 0.0), 1e-6, r"growing-finger:1\.0 under 1e-06 N: expected a radius of at least"),
-        (GrowingFinger(1.0), (0.0, 0.0), -1.0, r"growing-finger:1\.0 under -1 N: expected a radius .* press with more"),
+        ({}, Polygon.rectangle(10.0, 1.0), (39.9, 5.0), 1.0, r"off the film: centre \(39\.9, 5\) mm, .* rectangle"),
+        ({}, PROBE, (np.nan, 0.0), 1.0, r"probe off the film: centre \(nan, 0\) mm"),
+        ({}, GrowingFinger(1.0), (0.0, 0.0), 1e-6, r"growing-finger:1\.0 under 1e-06 N: expected a radius of at least"),
         (
+            {},
+            GrowingFinger(1.0),
+            (0.0, 0.0),
+            -1.0,
+            r"growing-finger:1\.0 under -1 N: expected a radius .* press with more",
+        ),
+        (
+            {},
             PROBE,
             (0.0, 0.0),
             200.0,
             r"force 200 N stretches a film of 0\.025 mm beyond small strains: .* got 0\.152",
         ),
-        (Circle(0.9999), (44.0, 0.0), 1.0, r"press at \(44, 0\) mm comes within 0\.0001 mm of the rim, too near for a"),
-        (PROBE, (0.0, 0.0), 0.0, "force: expected at least 1e-12 N .* got 0 N"),
-        (PROBE, (0.0, 0.0), np.inf, "force: expected at least 1e-12 N .* got inf N"),
+        (
+            {},
+            Circle(0.9999),
+            (44.0, 0.0),
+            1.0,
+            r"press at \(44, 0\) mm comes within 0\.0001 mm of the rim, too near for a",
+        ),
+        ({}, PROBE, (0.0, 0.0), 0.0, "force: expected at least 1e-12 N .* got 0 N"),
+        ({}, PROBE, (0.0, 0.0), np.inf, "force: expected at least 1e-12 N .* got inf N"),
+        (
+            {"radius": 4500.0},
+            Circle(0.03),
+            (0.0, 0.0),
+            1.0,
+            r"expected a reach of at least 1e-05 of the film's radius \(4500 mm\), got 0\.03",
+        ),
+        ({}, Ellipse(16.0, 15.984), (36.85, 0.0), 1e-3, r"within 0\.1\d* mm of the rim: expected at least 1\.6 mm"),
+        ({"oval": 0.02}, PROBE, (0.0, 43.5), 0.1, r"off the film: .* 44\.5 mm from .*, the rim 44\.1 mm"),
+        ({"oval": 0.02}, PROBE, (45.2, 0.0), 0.1, r"off the film: .* 46\.2 mm from .*, the rim 45\.9 mm"),
+        ({"oval": 0.1}, Circle(42.0), (0.0, 0.0), 0.1, r"off the film: .* 42 mm from .*, the rim 40\.5 mm"),
     ],
 )
-def test_invalid_press_raises_scene_error(film, probe, at, force, message):
+def test_invalid_press_raises_scene_error(film, changes, probe, at, force, message):
     with pytest.raises(SceneError, match=message):
-        press(film, probe, at, force)
-
-
-def test_too_small_probe_raises_scene_error(film):
-    message = r"expected a reach of at least 1e-05 of the film's radius \(4500 mm\), got 0\.03"
-    with pytest.raises(SceneError, match=message):
-        press(replace(film, radius=4500.0), Circle(0.03), (0.0, 0.0), 1.0)
+        press(replace(film, **changes), probe, at, force)
 
 
 @pytest.mark.parametrize("read", [deflection, touch_stress])

@@ -92,8 +92,6 @@ def test_resolution_rejects_values_out_of_range(wrong):
 SCENES = {
     "inside, a taut film under a needle": (0.01606, 18.99, 0.271, Circle(0.1916), 23.39, 4.0),
     "inside, a plate under a needle": (0.4, 0.0, 0.11, Circle(0.157), 25.5, 1.2e-5),
-    "a taut film": (0.018, 16.0, 0.2, Circle(1.3), 37.5, 3e-5),
-    "a plate": (1.1, 0.66, 0.3, Polygon.rectangle(1.0, 0.6, 0.4), 40.1, 0.044),
     "a long rectangle lying along the rim": (0.348, 1.2, 0.2, Polygon.rectangle(13.4, 2.5, 1.6), 37.9, 8e-3),
     "a small circle half a millimetre from it": (0.104, 0.0, 0.12, Circle(0.2), 44.3, 2.8),
     "a thin film without bending": (0.005, 1.5, 0.49, Polygon.triangle(0.2, 1.0), 34.1, 5.1),

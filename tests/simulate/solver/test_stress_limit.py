@@ -47,19 +47,21 @@ def test_force_within_stress_reaches_the_stress_limit():
         force_within_stress(FILM, TIP, 5.0, (0.05, 2.0))
 
 
-def test_yield_force_of_a_taut_film_lies_in_the_range_of_forces():
+@pytest.mark.parametrize(
+    ("changes", "radius", "force_range"),
+    [({"pretension": 30.0}, 1.0, (1e-3, 20.0)), ({"radius": 1.0, "thickness": 5e-4}, 0.02, (1e-6, 1e-3))],
+    ids=["taut", "small"],
+)
+def test_yield_force_of_a_taut_film_lies_in_the_range_and_that_of_a_small_film_is_not_rounded_to_zero(
+    changes, radius, force_range
+):
     """With 30 MPa, the stress hardly grows at first, so a secant through the ends of the range leads far beyond it."""
-    taut = replace(FILM, pretension=30.0)
-    force = yield_force(taut, [TIP], (1e-3, 20.0))
-    assert largest_stress(taut, TIP, force) == pytest.approx(45.0, rel=2e-3)
+    film = replace(FILM, **changes)
+    probe = Circle(radius)
+    force = yield_force(film, [probe], force_range)
+    assert largest_stress(film, probe, force) == pytest.approx(45.0, rel=2e-3)
 
 
 def test_yield_force_of_a_single_force_that_stresses_the_film_too_much():
     assert yield_force(FILM, [TIP], (15.0, 15.0)) == 15.0
     assert yield_force(FILM, [TIP], (0.05, 0.05)) is None
-
-
-def test_yield_force_of_a_small_film_is_not_rounded_to_zero():
-    small = replace(FILM, radius=1.0, thickness=5e-4)
-    force = yield_force(small, [Circle(0.02)], (1e-6, 1e-3))
-    assert largest_stress(small, Circle(0.02), force) == pytest.approx(45.0, rel=2e-3)

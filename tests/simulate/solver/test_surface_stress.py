@@ -18,8 +18,6 @@ from isocharge.simulate import (
     touch_stress,
 )
 
-PLATE = Theory(bending=True)
-MEMBRANE = Theory(bending=False)
 FINE = Resolution(7, 8, 6, 2)
 FORCE = 1e-3
 
@@ -49,7 +47,7 @@ def outer(film, force: float, c: float, r: float) -> tuple[float, float]:
 
 def pressed_in_the_centre(film, radius):
     """Solve a plate under a small force on a disk, whose radius is given in mm."""
-    return press(film, Circle(radius), (0.0, 0.0), FORCE, SolveSettings(theory=PLATE, resolution=FINE))
+    return press(film, Circle(radius), (0.0, 0.0), FORCE, SolveSettings(resolution=FINE))
 
 
 def surface_stress(solved, surface: str, points: np.ndarray) -> np.ndarray:
@@ -97,7 +95,7 @@ def test_charge_of_a_surface_is_the_integral_of_its_stress(thick):
 
 def test_surface_readout_without_bending_raises_error(film):
     sensor = replace(load_sensor("three-25um-biaxial"), surface="bottom")
-    solved = press(film, Circle(1.0), (0.0, 0.0), 1.0, SolveSettings(theory=MEMBRANE))
+    solved = press(film, Circle(1.0), (0.0, 0.0), 1.0, SolveSettings(theory=Theory(bending=False)))
     with pytest.raises(SensorError, match=r"surface 'bottom' needs bending, .* solve it with SolveSettings\(theory="):
         touch_charge(sensor, solved)
     bent = press(film, Circle(1.0), (0.0, 0.0), 1.0)
