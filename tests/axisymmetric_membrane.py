@@ -1,9 +1,17 @@
-"""Axisymmetric membranes as boundary value problems of SciPy, with which the finite elements are compared."""
+"""Membranes with which the finite elements are compared: Green's function, and boundary value problems of SciPy."""
 
 import numpy as np
 from scipy.integrate import solve_bvp
 
 from isocharge.simulate import Film
+
+
+def harmonic(z: np.ndarray, c: complex) -> np.ndarray:
+    """Return Green's function of a clamped disk, in units of F / T with the tension T: the load and its image.
+
+    The positions z of the deflection and c of the point load are complex numbers x + i y in film radii.
+    """
+    return np.log(np.abs((1.0 - np.conj(c) * z) / (z - c))) / (2.0 * np.pi)
 
 
 def axisymmetric_membrane(film: Film, probe_radius: float, force: float, pressure: float = 0.0, tolerance=1e-9):

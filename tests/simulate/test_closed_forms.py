@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.special import iv, ivp, kv, kvp
 
-from axisymmetric_membrane import axisymmetric_membrane
+from axisymmetric_membrane import axisymmetric_membrane, harmonic
 from isocharge.simulate import (
     Circle,
     Film,
@@ -22,6 +22,7 @@ from isocharge.simulate import (
     press,
     touch_stress,
 )
+from isocharge.simulate.mechanics.theory import rotate_stress
 from solved_charges import relative_error
 
 REFINED = Resolution(order=7, around=8, rings=6)
@@ -40,13 +41,10 @@ def ring(radius: float, count: int = 7) -> np.ndarray:
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def radial_and_hoop(stress: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the stress in polar coordinates about the origin, (s_r, s_theta, s_r_theta), shapes (n,)."""
-    direction = points @ [1.0, 1j] / np.linalg.norm(points, axis=1)
-    s11, s22, s12 = stress.T
-    mean = 0.5 * (s11 + s22)
-    deviator = (0.5 * (s11 - s22) + 1j * s12) * np.conj(direction) ** 2
-    return mean + deviator.real, mean - deviator.real, deviator.imag
+def radial_and_hoop(stress: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the stress in polar coordinates about the origin, (s_r, s_theta, s_r_theta), shape (3, n)."""
+    x, y = points.T
+    return rotate_stress(stress, -np.arctan2(y, x)).T
 
 
 def plate_stiffness(film: Film) -> float:
@@ -80,11 +78,6 @@ def test_schwerin_point_load():
 
 # Green's functions of the disk. Positions are complex numbers x + i y in film radii: z is the position of the
 # deflection, and c is the position of the point load.
-
-
-def harmonic(z: np.ndarray, c: complex) -> np.ndarray:
-    """Return the deflection of a membrane with a large tension T, in units of F / T: the load and its image."""
-    return np.log(np.abs((1.0 - np.conj(c) * z) / (z - c))) / (2.0 * np.pi)
 
 
 def michell(z: np.ndarray, c: complex) -> np.ndarray:

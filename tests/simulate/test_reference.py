@@ -8,7 +8,7 @@ thick films.
 import json
 import re
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cached_property
 
 import numpy as np
 import pytest
@@ -53,6 +53,11 @@ class ReferenceCase:
     deflection: float
     charges: dict[str, np.ndarray]
 
+    @cached_property
+    def solved(self) -> Equilibrium:
+        """Equilibrium of the press, from which the charges of all sensors are computed."""
+        return press(self.film, self.probe, self.at, self.force)
+
     def sensor(self, key: str) -> Sensor:
         """Return the sensor of a key of `charges`."""
         layout, orientation, readout = key.split("-")
@@ -95,12 +100,6 @@ NEAR = 4.0
 """Electrodes closer to the edge of the footprint than this distance (mm) have a larger tolerance."""
 
 
-@cache
-def solve(film, probe, at, force) -> Equilibrium:
-    """Solve a press once. The charges of all sensors are computed from this solution."""
-    return press(film, probe, at, force)
-
-
 def allowed(case, sensor) -> np.ndarray:
     """Return the relative error that each electrode may have, shape (n_electrode,).
 
@@ -125,7 +124,7 @@ def test_charges_and_deflection(case):
     accuracy of scikit-fem is known in this form. The error that the simulator estimates, plus the error of the
     reference, is a bound for the largest error.
     """
-    solved = solve(case.film, case.probe, case.at, case.force)
+    solved = case.solved
     largest_error = 0.0
     for key, expected in case.charges.items():
         sensor = case.sensor(key)
@@ -145,7 +144,7 @@ def worst_errors(case) -> tuple[float, float]:
 
     The error of the charges is the largest one, relative to the largest charge. That of the deflection is relative.
     """
-    solved = solve(case.film, case.probe, case.at, case.force)
+    solved = case.solved
     charge_errors = [
         relative_error(touch_charge(case.sensor(key), solved), expected) for key, expected in case.charges.items()
     ]

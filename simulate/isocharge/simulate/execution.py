@@ -69,29 +69,19 @@ def in_order(
     task = partial(run_same_code, code_versions(), function)
     pending: deque[Future[Result]] = deque()
     try:
-        for job in jobs:
-            with _executor_errors():
+        with _executor_errors():
+            for job in jobs:
                 pending.append(executor.submit(task, job))
-            # Yield the oldest result if too many jobs are pending, or if all pending jobs are done. In the second case,
-            # the results are available without waiting.
-            while pending and (len(pending) >= max_pending or all(future.done() for future in pending)):
-                yield _result(pending.popleft())
-        while pending:
-            yield _result(pending.popleft())
+                # Yield the oldest result if too many jobs are pending, or if all pending jobs are done. In the second
+                # case, the results are available without waiting.
+                while pending and (len(pending) >= max_pending or all(future.done() for future in pending)):
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
     finally:
         # Cancel the remaining jobs after an error, or if the caller requests no further results.
         for future in pending:
             future.cancel()
-
-
-def _result(future: Future[Result]) -> Result:
-    """Wait until a future is finished, and return its result.
-
-    Raises:
-        WorkersLost: If the executor has lost the worker that computes the result.
-    """
-    with _executor_errors():
-        return future.result()
 
 
 @contextmanager

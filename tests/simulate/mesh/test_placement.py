@@ -13,6 +13,7 @@ from isocharge.simulate.mesh import template
 from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template, locate_points, template_for
+from isocharge.simulate.numerics.polygon import to_corners
 from isocharge.simulate.solver.load_case import LoadCase, choose_mesh
 
 RADIUS = 45.0
@@ -23,20 +24,19 @@ COMMON = settings(derandomize=True, deadline=None, max_examples=15)
 @st.composite
 def probes(draw) -> Probe:
     """Circles, ellipses, rectangles, triangles and other convex polygons, rotated by any angle."""
-    kind = draw(st.sampled_from(["circle", "ellipse", "rectangle", "triangle", "polygon"]))
     size = RADIUS * 10.0 ** draw(st.floats(-3.0, -0.7))
     angle = draw(st.floats(0.0, 2.0 * np.pi))
-    if kind == "circle":
-        return Circle(size)
-    if kind == "ellipse":
-        return Ellipse(2.0 * size, max(0.02, 2.0 * size * draw(st.floats(0.2, 1.0))), angle)
-    if kind == "rectangle":
-        return Polygon.rectangle(2.0 * size, max(0.02, 2.0 * size * draw(st.floats(0.1, 1.0))), angle)
-    if kind == "triangle":
-        return Polygon.triangle(1.7 * size, angle)
+    width = max(0.02, 2.0 * size * draw(st.floats(0.1, 1.0)))
     gaps = np.array(draw(st.lists(st.floats(0.4, 1.0), min_size=4, max_size=8)))
-    direction = 2.0 * np.pi * np.cumsum(gaps) / gaps.sum()
-    return Polygon.of(size * np.stack([np.cos(direction), np.sin(direction)], axis=1), angle)
+    corners = size * np.exp(2j * np.pi * np.cumsum(gaps) / gaps.sum())
+    shapes = [
+        Circle(size),
+        Ellipse(2.0 * size, max(width, 0.4 * size), angle),
+        Polygon.rectangle(2.0 * size, width, angle),
+        Polygon.triangle(1.7 * size, angle),
+        Polygon.of(to_corners(corners), angle),
+    ]
+    return draw(st.sampled_from(shapes))
 
 
 @st.composite

@@ -7,13 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from isocharge.simulate.numerics.polygon import area_in_disk, is_convex
+from isocharge.simulate.numerics.polygon import area_in_disk, is_convex, to_corners
 
 COMMON = settings(derandomize=True, deadline=None, max_examples=40)
-
-
-def corners_of(z: np.ndarray) -> np.ndarray:
-    return np.stack([z.real, z.imag], axis=1)
 
 
 @st.composite
@@ -27,17 +23,12 @@ def convex(draw) -> np.ndarray:
 @given(a=convex(), x=st.floats(-2, 2), y=st.floats(-2, 2), radius=st.floats(1e-3, 3.0))
 @COMMON
 def test_area_in_a_disk_is_the_limit_of_areas_in_polygons(a, x, y, radius):
-    centre = complex(x, y)
-    common = area_in_disk(a, centre, radius)
-    assert is_convex(corners_of(a))
-    assert not is_convex(corners_of(a)[::-1])
-    count = 2000
-    nearly = radius / np.sqrt(np.sin(2 * np.pi / count) * count / (2 * np.pi))
-    ring = centre + nearly * np.exp(2j * np.pi * np.arange(count) / count)
-    disk = shapely.Polygon(corners_of(ring))
-    assert shapely.intersection(shapely.Polygon(corners_of(a)), disk).area == pytest.approx(
-        common, abs=5e-6 * np.pi * radius**2
-    )
+    corners = to_corners(a)
+    assert is_convex(corners)
+    assert not is_convex(corners[::-1])
+    disk = shapely.Point(x, y).buffer(radius, quad_segs=1000)
+    common = shapely.intersection(shapely.Polygon(corners), disk).area
+    assert area_in_disk(a, complex(x, y), radius) == pytest.approx(common, abs=5e-6 * np.pi * radius**2)
 
 
 @pytest.mark.parametrize(
@@ -51,4 +42,4 @@ def test_area_in_a_disk_is_the_limit_of_areas_in_polygons(a, x, y, radius):
     ids=["straight corner", "reentrant corner", "repeated corner", "star"],
 )
 def test_polygon_is_not_convex(corners):
-    assert not is_convex(corners_of(np.array(corners)))
+    assert not is_convex(to_corners(np.array(corners)))

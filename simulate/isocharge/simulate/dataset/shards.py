@@ -367,28 +367,11 @@ def _read_shard(folder: Path, entry: _Shard, sensor: Sensor) -> Samples:
         raise DatasetError(
             f"{path} is damaged: expected sha256 {expected[:12]}..., got {checksum[:12]}...; make the dataset again"
         )
-    samples = _unpack(data, str(path))
-    _check_samples(samples, len(sensor.electrodes), str(path))
-    return samples
-
-
-def _unpack(data: bytes, where: str) -> Samples:
-    """Convert the content of the NPZ file of a shard into samples.
-
-    The file is not trusted. Code that the file may contain is not executed.
-
-    Args:
-        data: Content of the file.
-        where: First words of the error message, such as the path of the file.
-
-    Returns:
-        Samples of the shard. Their shapes, types and values are not checked.
-
-    Raises:
-        DatasetError: If the bytes are not an NPZ file with the columns of a shard.
-    """
+    # The file is not trusted. `npz_arrays` does not execute code that the file may contain.
     try:
         arrays = npz_arrays(data)
-        return Samples(**{column: arrays[column] for column in COLUMNS})
+        samples = Samples(**{column: arrays[column] for column in COLUMNS})
     except (ValueError, KeyError) as error:
-        raise DatasetError(f"{where}: not a shard with the columns {', '.join(COLUMNS)}: {cut(str(error))}") from error
+        raise DatasetError(f"{path}: not a shard with the columns {', '.join(COLUMNS)}: {cut(str(error))}") from error
+    _check_samples(samples, len(sensor.electrodes), str(path))
+    return samples

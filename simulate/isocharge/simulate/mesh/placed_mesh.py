@@ -64,7 +64,7 @@ class PlacedMesh:
 
         The shape is (n_element, n_point, 2, n_local).
         """
-        return _film_gradient(self._gauss_rule.derivatives, self.points)
+        return _film_gradient(self._element_rule.derivatives, self.points)
 
     @property
     def stacked_gradient(self) -> Array:
@@ -78,7 +78,7 @@ class PlacedMesh:
     @cached_property
     def weights(self) -> Array:
         """Integration weights of the quadrature points, shape (n_element, n_point). Their sum is the meshed area."""
-        return self._gauss_rule.film_weights(self.points)
+        return self._element_rule.film_weights(self.points)
 
     @cached_property
     def mass(self) -> Array:
@@ -94,7 +94,7 @@ class PlacedMesh:
         # Compute the pressure at the quadrature points of the elements of the footprint.
         template = self.template
         placement = self.placement
-        rule = self._gauss_rule
+        rule = self._element_rule
         if not placement.probe.has_uniform_pressure:
             rule = _gauss_rule(self.resolution.order, PRESSURE_POINTS)
         nodal_points = self.points[template.footprint]
@@ -124,7 +124,7 @@ class PlacedMesh:
         return np.bincount(template.nodes.ravel(), contributions.ravel(), template.n_node).astype(np.float64)
 
     @property
-    def _gauss_rule(self) -> "_ElementRule":
+    def _element_rule(self) -> "_ElementRule":
         """Integration rule on the reference element, whose points are the quadrature points."""
         order = self.resolution.order
         return _gauss_rule(order, order + 1)
