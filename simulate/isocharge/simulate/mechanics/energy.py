@@ -42,6 +42,7 @@ class ElasticFilm:
         membrane: Stretching energy.
         bending: Bending energy; None if the theory omits bending.
         back: Energy of the pressure on the whole film; None without static pressure and trapped air.
+        probe_force: Force of the probe along (U1, U2, W) at each node, shape (n_node, 3).
     """
 
     def __init__(self, mesh: PlacedMesh, groups: DimensionlessGroups) -> None:
@@ -51,6 +52,7 @@ class ElasticFilm:
         self.bending = Bending(mesh, groups.bending) if groups.bending > 0.0 else None
         has_back_pressure = groups.static_pressure != 0.0 or groups.compression != 0.0
         self.back = BackPressure(mesh, groups) if has_back_pressure else None
+        self.probe_force = np.outer(mesh.load, [*groups.side_load, groups.load])
 
     @property
     def unknowns_per_node(self) -> int:
@@ -63,16 +65,13 @@ class ElasticFilm:
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
         """
-        in_plane = field[:, :2]
         deflection = field[:, 2]
         stored_energy = self.membrane.energy(field)
         if self.bending is not None:
             stored_energy += self.bending.energy(deflection)
         if self.back is not None:
             stored_energy += self.back.energy(deflection)
-        work = self.groups.load * float(self.mesh.load @ deflection)
-        work += float(self.mesh.load @ in_plane @ np.array(self.groups.side_load))
-        return stored_energy - work
+        return stored_energy - float(np.sum(self.probe_force * field))
 
     def residual(self, field: Array) -> Array:
         """Compute the gradient of the potential energy: the internal force minus the external force at each node.
@@ -88,10 +87,7 @@ class ElasticFilm:
         if self.bending is not None:
             element_forces[..., 2] += self.bending.forces(deflection)
         residual = np.stack([self.mesh.gather(element_forces[..., i]) for i in range(3)], axis=1)
-
-        # Subtract the force of the probe perpendicular to the film, and its force in the plane of the film.
-        residual[:, 2] -= self.groups.load * self.mesh.load
-        residual[:, :2] -= np.outer(self.mesh.load, self.groups.side_load)
+        residual -= self.probe_force
 
         # `back.forces` is the derivative of the energy, which is the negative force of the pressure on the whole film.
         # Therefore the derivative is added.
@@ -106,7 +102,7 @@ class ElasticFilm:
         The load is the force of the probe, or the static pressure if there is no probe.
         """
         if self.back is None or self.groups.load != 0.0:
-            return self.groups.load * self.mesh.load
+            return self.probe_force[:, 2]
         return abs(self.groups.static_pressure) * self.back.weights
 
     def tangent(self, field: Array, added_tension: float = 0.0) -> Array:
