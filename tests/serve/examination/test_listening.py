@@ -1,7 +1,6 @@
 """Listening to a port at several baud rates, and with requests."""
 
 from contextlib import contextmanager
-from itertools import count
 from types import SimpleNamespace
 
 import pytest
@@ -30,16 +29,13 @@ def test_baud_rate_is_found(monkeypatch, silence_s, bauds, tried, good):
     def open_port(url, *, baud, request, wait):  # noqa: ARG001
         opened_bauds.append(baud)
         first_s = clock.now_s + silence_s
-        numbers = count()
 
         def read(timeout_s):
-            next_s = max(first_s, clock.now_s + 0.01)
-            clock.now_s = min(next_s, clock.now_s + timeout_s)
-            if clock.now_s < next_s:
-                return None
-            number = next(numbers)
-            line = b"A:%d.5,B:%d.25,C:7.5\n" % (number % 7, number % 5)
-            return Chunk(line if baud == 57600 else b"\xf8\x80\xfe\xff", 1e9 + clock.now_s, 0)
+            wait_s = max(first_s - clock.now_s, 0.01)
+            clock.now_s += min(wait_s, timeout_s)
+            line = b"A:%d.5,B:-2.25,C:7.5\n" % (round(100.0 * clock.now_s) % 7)
+            data = line if baud == 57600 else b"\xf8\x80\xfe\xff"
+            return Chunk(data, 1e9 + clock.now_s, 0) if wait_s <= timeout_s else None
 
         yield SimpleNamespace(read=read, start_up_s=10.0)
 

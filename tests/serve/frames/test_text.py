@@ -1,6 +1,8 @@
 """Parsing of lines of text: examples of each notation, recognition of the layout, and damaged lines."""
 
 import pickle
+from functools import reduce
+from operator import xor
 
 import numpy as np
 import pytest
@@ -231,15 +233,12 @@ def test_numbers_are_taken_out_of_any_text(notation, rows, line_end):
 
 
 @pytest.mark.parametrize("message", ["OK", "the tare is done", "ready ; go"])
-@pytest.mark.parametrize("names", [(), ("b", "a", "c", "d")])
-def test_message_does_not_replace_the_header(message, names):
-    frames = feed(",".join(names), message, "1,2,3,4", "2,3,4,5", "3,4,5,6", message, "4,5,6,7")
-    assert [frame.names for frame in frames] == [names] * 4
-
-
-def test_header_after_the_first_frames_names_the_next_frames():
-    frames = feed("1,2,3", "2,3,4", "3,4,5", "b,a,c", "4,5,6")
-    assert [frame.names for frame in frames] == [(), (), (), ("b", "a", "c")]
+@pytest.mark.parametrize("lines_before", [0, 3])
+def test_header_and_no_message_names_the_frames_after_it(message, lines_before):
+    lines = [f"{k},2,3,4" for k in range(5)]
+    lines.insert(lines_before, "b,a,c,d")
+    frames = feed(message, *lines[:4], message, *lines[4:])
+    assert [frame.names for frame in frames] == [()] * lines_before + [("b", "a", "c", "d")] * (5 - lines_before)
 
 
 MESSAGES = ["Sensor 1 ready", "Sensor 2 ready", "Sensor 3 ready", "load:0x3fff0018,len:4"] + ["rst:0x1,boot:0x13"] * 2
@@ -359,10 +358,7 @@ def test_first_line_of_a_pipe_or_file_is_malformed_only_without_a_header_comment
 
 def sentence(content):
     """Return a sentence as in NMEA 0183, with the exclusive or of the bytes between $ and * as its checksum."""
-    checksum = 0
-    for byte in content.encode():
-        checksum ^= byte
-    return f"${content}*{checksum:02X}"
+    return f"${content}*{reduce(xor, content.encode()):02X}"
 
 
 def test_sentences_with_their_checksum():
