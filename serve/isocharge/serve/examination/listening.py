@@ -62,10 +62,11 @@ class ReceivedData:
         chunks span n intervals. With fewer than two chunks, the result is the time of listening. The result is never
         0, so that a rate computed from it is finite.
         """
-        if len(self.chunks) < 2:
-            return max(self.seconds, np.finfo(float).eps)
-        first_to_last_s = self.chunks[-1].timestamp - self.chunks[0].timestamp
-        return max(first_to_last_s * len(self.chunks) / (len(self.chunks) - 1), np.finfo(float).eps)
+        span_s = self.seconds
+        if len(self.chunks) > 1:
+            first_to_last_s = self.chunks[-1].timestamp - self.chunks[0].timestamp
+            span_s = first_to_last_s * len(self.chunks) / (len(self.chunks) - 1)
+        return max(span_s, np.finfo(float).eps)
 
     @property
     def are_datagrams(self) -> bool:

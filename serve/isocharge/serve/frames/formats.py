@@ -6,7 +6,7 @@ Each format has a section class, which declares the keys of the format and creat
 from collections.abc import Mapping
 
 from isocharge.serve.frames.binary import BinaryParser
-from isocharge.serve.frames.frame import Frame, Parser
+from isocharge.serve.frames.frame import SEQ, TIMES_US, Frame, Parser
 from isocharge.serve.frames.frame_layout import FrameLayout, FrameSection
 from isocharge.serve.frames.text import TextParser
 
@@ -78,8 +78,7 @@ class TextFrames(FrameSection, tag="text", frozen=True):
     @property
     def meanings(self) -> Mapping[str, str]:
         """Meaning (`seq`, `t_us`, `t_ms` or `t_s`) of each name that the board uses for its counter or a clock."""
-        meanings = {self.seq: "seq", self.t_us: "t_us", self.t_ms: "t_ms", self.t_s: "t_s"}
-        return {name: meaning for name, meaning in meanings.items() if name}
+        return {name: meaning for meaning in (SEQ, *TIMES_US) if (name := getattr(self, meaning))}
 
     def parser(self) -> Parser:
         """Create a parser."""

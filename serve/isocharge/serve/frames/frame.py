@@ -225,12 +225,11 @@ class Columns:
         self.flags_column = flags_column
 
         # `TIMES_US` contains the unit of each clock, us, by the name of the clock, such as "t_ms".
-        clock_columns = [names.index(name) for name in TIMES_US if name in names]
-        self.clock_column = clock_columns[0] if clock_columns else None
+        clock_name = next((name for name in TIMES_US if name in names), None)
+        self.clock_column = None if clock_name is None else names.index(clock_name)
         self.clock_unit_us = 1.0
         if self.clock_column is not None:
-            clock_name = names[self.clock_column]
-            self.clock_unit_us = TIMES_US[clock_name] * scales[self.clock_column]
+            self.clock_unit_us = TIMES_US[names[self.clock_column]] * scales[self.clock_column]
 
         # All other columns are channels.
         self.channels = [

@@ -344,10 +344,12 @@ def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], 
         tokens: Parts of the line.
         counters: Names of counters and clocks.
     """
-    paths = [[token.name for token in path if token.kind != "quoted"] for path in _paths(tokens, _SEPARATORS)]
+    paths = [
+        ["", "", *(token.name for token in path if token.kind != "quoted")] for path in _paths(tokens, _SEPARATORS)
+    ]
     kinds = [token.kind for token in tokens if token.kind in _NUMBER_KINDS]
-    inner_names = [_NAMES_OF_TIMES.get(kind, ["", *path][-1]) for kind, path in zip(kinds, paths, strict=True)]
-    outer_names = [["", "", *path][-2] for path in paths]
+    inner_names = [_NAMES_OF_TIMES.get(kind, path[-1]) for kind, path in zip(kinds, paths, strict=True)]
+    outer_names = [path[-2] for path in paths]
     words = {token.name for token in tokens if token.kind == "word"}
     parts = [token for token in tokens if token.content not in ":="]
     following_units = [
@@ -373,9 +375,9 @@ def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], 
     is_single = len(channels) > 1 and len(named) == 1 and names[named[0]] not in counters
     if is_single and (named[0] == channels[0] or names[named[0]] in words):
         names[named[0]] = ""
-    alternating_names = (token.name for token in tokens if token.kind == "name")
-    if any(token.kind == "name" for token in tokens):
-        names = [_NAMES_OF_TIMES.get(kind) or next(alternating_names) for kind in kinds]
+    alternating_names = [token.name for token in tokens if token.kind == "name"]
+    if alternating_names:
+        names = [_NAMES_OF_TIMES.get(kind) or alternating_names.pop(0) for kind in kinds]
     full_units = ["coulomb" if unit == "C" else unit for unit in units]  # `A_C` would be an electrode with the name C
     names_with_units = [
         f"{name or f'ch{number}'}_{unit}" if unit and unit not in names else name

@@ -163,9 +163,7 @@ def _most_common_length(frames: Sequence[bytes]) -> tuple[int, int]:
 
     Both numbers are 0 if there are no frames.
     """
-    if not frames:
-        return 0, 0
-    return Counter(map(len, frames)).most_common(1)[0]
+    return max(Counter(map(len, frames)).most_common(1), default=(0, 0))
 
 
 def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDivision]:
@@ -214,6 +212,10 @@ ORDERS: tuple[ByteOrder, ...] = ("little", "big")
 """Byte orders that are tried."""
 
 
+MAX_CHECKED_FRAMES = 24
+"""Largest number of frames from which a checksum is recognised."""
+
+
 class Check(NamedTuple):
     """A checksum that fits the frames.
 
@@ -240,7 +242,10 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
     Args:
         rows: Bytes of the frames, shape (n, length).
     """
-    checked_rows = _drawn_rows(rows)
+    # Different frames are drawn at random. The first of the sorted frames differ in a few bits only, so that a wrong
+    # checksum could fit all of them by chance.
+    different_rows = np.random.default_rng(0).permutation(np.unique(rows, axis=0))
+    checked_rows = different_rows[:MAX_CHECKED_FRAMES]
     if len(checked_rows) < MIN_FRAMES:
         return
     frames = [row.tobytes() for row in checked_rows]
@@ -260,21 +265,6 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
                 if _fits(CHECKSUMS[name].compute, frames, start, size, order):
                     yield Check(size, order, name, start)
                     break
-
-
-def _drawn_rows(rows: Bytes, max_count: int = 24) -> Bytes:
-    """Draw different frames at random, from which a checksum is recognised.
-
-    The first frames of the sorted array would be unsuitable. They differ in a few bits only, so a wrong checksum could
-    fit all of them by chance. The result is always the same for the same frames.
-
-    Args:
-        rows: Bytes of the frames, shape (n, length).
-        max_count: Largest number of frames.
-    """
-    different_rows = np.unique(rows, axis=0)  # sorted
-    drawn_indices = np.random.default_rng(0).permutation(len(different_rows))[:max_count]
-    return np.asarray(different_rows[drawn_indices])
 
 
 def _fits(compute: Callable[[bytes], int], frames: list[bytes], start: int, size: int, order: ByteOrder) -> bool:

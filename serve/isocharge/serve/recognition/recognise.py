@@ -5,6 +5,7 @@ The format is the binary frames of isocharge, lines of text, or frames of fixed 
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
+from operator import itemgetter
 from string import printable
 from typing import Any
 
@@ -51,11 +52,13 @@ def described_frames_section(
     # Divisions with the same framing follow each other, so `groupby` collects all of them in one group.
     divisions = possible_divisions(chunks, are_datagrams=are_datagrams)
     for _framing, divisions_of_framing in groupby(divisions, key=lambda division: division.framing):
-        scored_sections: list[tuple[float, dict[str, Any]]] = []
-        for division in divisions_of_framing:
-            scored_sections += _scored_sections(division, examined_seconds)
+        scored_sections = [
+            scored_section
+            for division in divisions_of_framing
+            for scored_section in _scored_sections(division, examined_seconds)
+        ]
         if scored_sections:
-            _, best_section = min(scored_sections, key=lambda score_and_section: score_and_section[0])
+            _, best_section = min(scored_sections, key=itemgetter(0))
             return best_section
     return None
 
@@ -238,14 +241,14 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
         frames: Frames that the lines contain.
         frame_rate_Hz: Number of frames per second, Hz.
     """
-    meanings = _meanings(frames, frame_rate_Hz)  # "seq" or the name of a clock, by the position of the value in a frame
     names = list(layout.names)
     channels = [column for column, _ in layout.columns.channels]
     keys: dict[str, Any] = {}
-    for position, column in enumerate(channels):
-        if position in meanings and column not in layout.unnamed:
-            keys[meanings[position]] = names[column]
-        names[column] = meanings.get(position, names[column])
+    for position, meaning in _meanings(frames, frame_rate_Hz).items():
+        column = channels[position]
+        if column not in layout.unnamed:
+            keys[meaning] = names[column]
+        names[column] = meaning
 
     # Number the channels without names. Without names from a header, a counter or a clock, the columns need no names.
     if any(names[column] for column in layout.unnamed):
