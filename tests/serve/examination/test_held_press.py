@@ -8,7 +8,7 @@ import pytest
 from boards import encoded_frames, received
 from isocharge.serve import device_from_table
 from isocharge.serve.examination.port_check import examine_received
-from isocharge.serve.examination.press_detector import find_held_press
+from isocharge.serve.examination.press_detector import HeldPress, find_held_press
 from isocharge.serve.signal_chain.leak import LeakRule
 
 T_S = np.arange(0.0, 20.0, 0.005)
@@ -82,8 +82,8 @@ def test_leak_has_its_time_constant_although_frames_are_lost():
 
 @pytest.mark.parametrize("until_s", [0.0, 7.0])
 def test_no_press_or_a_short_press_has_no_result(until_s):
-    assert find_held_press(board(constant, until_s=until_s), T_S) is None
-    assert find_held_press(board(constant)[:300], T_S[:300]) is None
+    assert find_held_press(board(constant, until_s=until_s), T_S) == HeldPress()
+    assert find_held_press(board(constant)[:300], T_S[:300]) == HeldPress()
 
 
 def test_proposed_file_has_the_leak_and_the_offset_before_the_press():

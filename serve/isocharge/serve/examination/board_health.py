@@ -264,7 +264,7 @@ def channel_sentences(
                 yield f"{name} has a hum of {hum_pC:.2g} pC: set [hum] frequency_Hz = {frequency_Hz:g} in a device file"
 
 
-def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress | None) -> Iterator[str]:
+def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress) -> Iterator[str]:
     """Yield one sentence for each missing setting or property without which the force of a held press seems to change.
 
     The force seems to change because the amplifiers leak. Touches are computed in any case.
@@ -276,7 +276,7 @@ def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress
     Args:
         capture: The frames, at least one.
         device: Settings of the board.
-        held_press: Press that was held during the check; None if no press was held.
+        held_press: Press that was held during the check.
     """
     has_device_clock = capture.frames[0].t_us is not None
     if device.rule(LeakRule) is not None and not has_device_clock:
@@ -284,7 +284,7 @@ def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress
             "send the time of a device clock in each frame (t_us, t_ms or t_s): without it the leak is corrected with "
             "the arrival times, which jitter"
         )
-    if held_press is None and device.rule(LeakRule) is None and device.front_end != "current":
+    if not held_press.description and device.rule(LeakRule) is None and device.front_end != "current":
         yield (
             "state the time constants of the amplifiers in a device file ([leak] tau_s): without them the force of a "
             "held press seems to decrease. The time constants follow from the circuit. To measure them instead, listen "

@@ -4,7 +4,6 @@ The result contains the format and the rate of the frames, the health of the cha
 the settings that are still missing.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -175,8 +174,7 @@ def examine_received(
 
     values, times_s = capture.values()
     held_press = find_held_press(values, times_s)
-    rest_end_s = math.inf if held_press is None else held_press.rest_end_s
-    is_rest = times_s < rest_end_s
+    is_rest = times_s < held_press.rest_end_s
 
     # If no gain is stated, the values remain as the board sends them. With a gain, they are converted to pC.
     table = dict(device.table)
@@ -208,7 +206,7 @@ def examine_received(
             "again"
         )
         missing.insert(0, touch)
-    if held_press is not None and held_press.tau_s is not None:
+    if held_press.tau_s is not None:
         table = {"leak": {"tau_s": held_press.tau_s}} | table  # keeps a section that the device file already has
     missing += channel_count_sentences(capture, device, len(channels), electrodes)
     missing += unit_sentences(unit)
@@ -224,7 +222,7 @@ def examine_received(
         unit=unit,
         channels=channels,
         unused=tuple(name for position, name in enumerate(capture.names) if position not in electrode_at_position),
-        held="" if held_press is None else held_press.description,
+        held=held_press.description,
         touch=touch,
         missing=tuple(missing),
         missing_for_held_presses=tuple(held_press_sentences(capture, device, held_press)),

@@ -191,7 +191,7 @@ STEADY_SHARE = 0.02
 
 @dataclass(frozen=True)
 class HeldPress:
-    """A press that was held during the port check.
+    """A press that was held during the port check. The default values mean that no press was held.
 
     Attributes:
         rest_end_s: Time at which the rest before the press ends, s since the first frame.
@@ -199,12 +199,12 @@ class HeldPress:
         description: Sentence that describes whether and how the charge of the press changes.
     """
 
-    rest_end_s: float
-    tau_s: float | None
-    description: str
+    rest_end_s: float = math.inf
+    tau_s: float | None = None
+    description: str = ""
 
 
-def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
+def find_held_press(values: Array, times_s: Array) -> HeldPress:
     """Find a press that is held for at least `MIN_HELD_S`, and describe how its charge changes.
 
     Args:
@@ -212,11 +212,11 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
         times_s: Times since the first frame, shape (n,), s.
 
     Returns:
-        The press; None if no such press is found.
+        The press; the default values if no such press is found.
     """
     block_times_s, levels, is_touched = touched_blocks(values, times_s)
     if not is_touched.any():
-        return None
+        return HeldPress()
 
     begin_block = int(np.argmax(is_touched))
     held_blocks = int(np.argmin([*is_touched[begin_block:], False]))
@@ -226,7 +226,7 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress | None:
     has_rest = rest_blocks >= 2 * CHANGE_BLOCKS
     has_levels = end_block - settled_block >= CHANGE_BLOCKS
     if not (has_rest and has_levels and block_times_s[end_block] - block_times_s[settled_block] >= MIN_HELD_S):
-        return None
+        return HeldPress()
 
     # Project the levels onto the step. One unit is the charge at the beginning of the press.
     step = levels[settled_block] - levels[rest_blocks - 1]

@@ -130,6 +130,10 @@ class _Token(NamedTuple):
         return self.content.strip("\"'")
 
 
+_EDGE = _Token("", "", 0, False)
+"""Token that stands for the beginning and the end of a line."""
+
+
 class Line(NamedTuple):
     """Places and names of the numbers in a line of text, and the skeleton of the line.
 
@@ -241,10 +245,10 @@ def parse_line(text: str, *, has_header: bool = False, counters: Collection[str]
     units = {"pC", *_CHARGE_UNITS}
     skeleton = ""
     word_count = 0
-    for previous, token in zip([None, *tokens], tokens, strict=False):
-        is_beside_mark = previous is None or "mark" in (previous.kind, token.kind)
+    for previous, token in pairwise([_EDGE, *tokens]):
+        is_beside_mark = "mark" in (previous.kind, token.kind)
         is_unit = token.content in units
-        if token.kind in ("word", "name") and not is_unit and (previous is None or not is_beside_mark):
+        if token.kind in ("word", "name") and not is_unit and not is_beside_mark:
             word_count += 1
         if is_beside_mark:
             skeleton += _CODES["optional blanks"]
@@ -353,9 +357,7 @@ def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], 
     words = {token.name for token in tokens if token.kind == "word"}
     parts = [token for token in tokens if token.content not in ":="]
     following_units = [
-        following.content
-        for token, following in pairwise([*parts, _Token("mark", "", 0, False)])
-        if token.kind in _NUMBER_KINDS
+        following.content for token, following in pairwise([*parts, _EDGE]) if token.kind in _NUMBER_KINDS
     ]
     # The word `C` may be the name of an electrode, but a word behind several numbers is no name.
     known_units = OTHER_CHARGE_UNITS if following_units.count("C") > 1 else _CHARGE_UNITS
