@@ -106,8 +106,7 @@ def possible_divisions(chunks: Sequence[bytes], *, are_datagrams: bool) -> Itera
         # The length of a frame divides the length of every datagram. It therefore also divides the greatest common
         # divisor of these lengths.
         divisible_length = gcd(*map(len, chunks))
-        max_length = min(divisible_length, MAX_FRAME_BYTES)
-        for length in range(MIN_FRAME_BYTES, max_length + 1):
+        for length in range(MIN_FRAME_BYTES, MAX_FRAME_BYTES + 1):
             if divisible_length % length == 0:
                 yield _adjacent_frames(DATAGRAM, data, length)
     for name, stuffing in STUFFINGS.items():
@@ -184,8 +183,9 @@ def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDiv
         latest_position: dict[bytes, int] = {}
         for position in range(len(data) - size + 1):
             code = data[position : position + size]
-            start = latest_position.get(code, position)
-            starts_by_distance[-size, code, position - start].append(start)
+            distance = position - latest_position.get(code, position)
+            if MIN_FRAME_BYTES <= distance <= MAX_FRAME_BYTES:
+                starts_by_distance[-size, code, distance].append(position - distance)
             latest_position[code] = position
 
     # For each length of a frame, the largest number of positions at which frames of this length begin
@@ -193,7 +193,7 @@ def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDiv
     for (*_code, length), starts in sorted(starts_by_distance.items()):  # the first of equal counts: a pair of bytes
         is_frequent = len(starts) * length > COVERED_SHARE * len(data)
         is_best = len(starts) > len(best_starts.get(length, ()))
-        if is_frequent and is_best and MIN_FRAME_BYTES <= length <= MAX_FRAME_BYTES:
+        if is_frequent and is_best:
             best_starts[length] = starts
 
     def best_first(length: int) -> tuple[float, int]:
@@ -210,10 +210,6 @@ def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDiv
 
 ORDERS: tuple[ByteOrder, ...] = ("little", "big")
 """Byte orders that are tried."""
-
-
-MAX_CHECKED_FRAMES = 24
-"""Largest number of frames from which a checksum is recognised."""
 
 
 class Check(NamedTuple):
@@ -242,10 +238,9 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
     Args:
         rows: Bytes of the frames, shape (n, length).
     """
-    # Different frames are drawn at random. The first of the sorted frames differ in a few bits only, so that a wrong
-    # checksum could fit all of them by chance.
-    different_rows = np.random.default_rng(0).permutation(np.unique(rows, axis=0))
-    checked_rows = different_rows[:MAX_CHECKED_FRAMES]
+    # At most 24 different frames are drawn at random. The first of the sorted frames differ in a few bits only, so that
+    # a wrong checksum could fit all of them by chance.
+    checked_rows = np.random.default_rng(0).permutation(np.unique(rows, axis=0))[:24]
     if len(checked_rows) < MIN_FRAMES:
         return
     frames = [row.tobytes() for row in checked_rows]
