@@ -79,17 +79,20 @@ def track(tracker, contact, t_s, flags=(), charge_pC=None):
     return frame.tracking.tracked, frame.tracking.event
 
 
-def recorded_lines(predictor, rows, table):
-    """Return the records of a stream of charges as lines of JSON.
+def recorded_lines(predictor, rows, table, requests=None):
+    """Return the records of a stream of charges at 1 kHz as lines of JSON.
 
     Args:
         predictor: The model.
         rows: Charges of the frames, shape (n, n_electrode), pC.
         table: Sections of the device file, in addition to `[tare]`.
+        requests: Functions that are called with the stream before the frames with some numbers.
     """
     touch = TouchStream(predictor, device_from_table({"tare": {"frames": 10}} | table, "b"))
     lines = []
     for number, row in enumerate(rows.tolist()):
+        if number in (requests or {}):
+            requests[number](touch)
         chunk = Chunk(encode_frame(Frame(number, 1000 * number, tuple(row))), 5.0 + 1e-3 * number, 0)
         lines += [structs.replace(record, latency_us=0.0).to_json() for record in touch.feed(chunk)]
     return lines

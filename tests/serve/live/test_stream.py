@@ -93,11 +93,6 @@ def test_file_without_a_frame_raises_an_error(predictor, data):
         list(stream([Chunk(data, 1e9, 0)] if data else [], predictor))
 
 
-def test_wrong_number_of_charges_raises_an_error(record_after_rest):
-    with pytest.raises(ChargeError, match=r"model linear/1 expects 3 charges \('A', 'B', 'C'\), frame 10 has 4"):
-        record_after_rest(Frame(10, 0, (1.0, 2.0, 3.0, 4.0)))
-
-
 SENSORS_OF_ANY_SIGN = [
     {"name": "presses-alone"},
     {"name": "opposite-poling", "film": {"radius_mm": 45.0}, "piezo": {"d31": -8.0, "d32": -8.0}},

@@ -145,11 +145,3 @@ def test_error_of_tau_has_the_theoretical_effect(error):
     charge_pC, _ = correct_leak(amplifier_output(touch_charge()), tau_s=TAU_S * (1 + error))
     lost_share = error / (1 + error) * (1 - math.exp(-7.0 / TAU_S))
     assert charge_pC[2000, 0] == pytest.approx(400.0 * (1 - lost_share), abs=1.0)
-
-
-def test_slow_common_warming_is_no_touch():
-    warming_pC_per_s = 3.0
-    output_pC = amplifier_output(warming_pC_per_s * np.arange(4000) / RATE_HZ)
-    charge_pC, contact = correct_leak(output_pC)
-    assert not contact.any()
-    assert np.abs(charge_pC[1000:]).max() < 4.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from isocharge.serve import Chunk, Contact, Frame, Predictor, TouchStream, device_from_table, encode_frame
+from isocharge.serve import Contact, Predictor
 from isocharge.serve.flags import INVALID
 from isocharge.serve.model.model_folder import find_model, load_model
 from isocharge.serve.record.record import TrackedContact
@@ -218,22 +218,14 @@ def test_touch_continues_if_the_clock_is_set_back():
     assert track(tracker, None, 50.2) == (None, "release")
 
 
-@pytest.mark.parametrize("change", ["a tare", "another model"])
-def test_touch_during_a_tare_or_a_change_of_the_model_has_one_press_and_one_end(change, film, predictor):
-    touch = TouchStream(predictor, device_from_table({"track": {}}, "b"))
-    rest = np.zeros((150, 3))
-    charge = np.concatenate([rest, np.tile(film.charges(np.array([[2.0, -3.0, 0.5]])), (200, 1)), rest])
+@pytest.mark.parametrize("request_change", [lambda touch: touch.tare(), lambda touch: touch.use(touch.predictor)])
+def test_touch_during_a_tare_or_a_change_of_the_model_has_one_press_and_one_end(request_change, film, predictor):
+    force_N = np.repeat([0.0, 0.5, 0.0], [50, 500, 50])
+    charge = film.charge_pC(np.full(600, 2.0), np.full(600, -3.0), force_N)
     noisy_charge = charge + np.random.default_rng(0).standard_normal(charge.shape)
-    records = []
-    for number, row in enumerate(noisy_charge.tolist()):
-        if number == 300 and change == "a tare":
-            touch.tare()
-        elif number == 300:
-            touch.use(predictor)
-        frame = encode_frame(Frame(number, 5000 * number, tuple(row)))
-        records += touch.feed(Chunk(frame, 5.0 + 5e-3 * number, 0))
-    events = [record.event for record in records if record.event in ("press", "tap", "release")]
-    assert events == ["press", "release"]
+    lines = recorded_lines(predictor, noisy_charge, {"track": {}}, {300: request_change})
+    events = [json.loads(line)["event"] for line in lines]
+    assert [event for event in events if event in ("press", "tap", "release")] == ["press", "release"]
 
 
 @pytest.mark.parametrize("frames_per_time", [2, 10])
@@ -282,13 +274,8 @@ def test_records_with_track_only_add_fields(film, predictor):
     noise = np.random.default_rng(0).standard_normal((30, 3))
     rows = np.concatenate([rest, film.charges(np.array([[2.0, -3.0, 0.5]])) + noise, rest])
 
-    plain_lines = recorded_lines(predictor, rows, {})
-    records = [json.loads(line) for line in recorded_lines(predictor, rows, {"track": {}})]
-    assert [record["event"] for record in records].count("press") == 1
-    assert records[40]["event"] == "tap"
-    assert abs(records[39]["tracked"]["x_mm"] - 2.0) < 0.05
-    for record, plain_line in zip(records, plain_lines, strict=True):
+    plain, tracked = ([*map(json.loads, recorded_lines(predictor, rows, table))] for table in ({}, {"track": {}}))
+    assert (abs(tracked[39]["tracked"]["x_mm"] - 2.0) < 0.05, tracked[40]["event"]) == (True, "tap")
+    for record, plain_record in zip(tracked, plain, strict=True):
         assert (record["tracked"] is None) == (not record["contact"])
-        assert record["other"] is None
-        added = {name: record[name] for name in ("tracked", "event", "other")}
-        assert record == json.loads(plain_line) | added
+        assert record == plain_record | {name: record[name] for name in ("tracked", "event", "other")}
