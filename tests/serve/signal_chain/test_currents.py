@@ -47,27 +47,31 @@ def test_integral_of_currents_is_the_charge_and_detects_touches(tau_s, force):
     np.testing.assert_allclose(integral_pC[is_held], charge_pC[is_held], atol=60.0)
 
 
-@pytest.mark.parametrize("damage", ["lost", "repeated", "late", "counter stands still", "invalid"])
+ORDERS = {
+    "lost": [*range(52), *range(54, 85)],
+    "repeated": [*range(54), *range(53, 85)],
+    "late": [*range(53), 54, 53, *range(55, 85)],
+    "counter stands still": range(85),
+    "invalid": range(85),
+}
+"""Numbers of the frames in the order in which they arrive, by the damage of the transmission."""
+
+
+@pytest.mark.parametrize("damage", ORDERS)
 def test_charge_survives_a_damaged_frame_in_a_rise(damage, predictor):
     # 45 frames at rest, a rise of 20 frames with a current that grows and decreases, and a hold
     share = np.arange(20) / 19
     rise = 5.0 * share * (1.0 - share) ** 2
     current_pC = np.concatenate([np.zeros(45), rise, np.zeros(20)])[:, None] * [40.0, 30.0, 20.0]
     frames = [Frame(number, 1000 * number, tuple(row)) for number, row in enumerate(current_pC.tolist())]
-    if damage == "lost":
-        del frames[52:54]
-    elif damage == "repeated":
-        frames.insert(54, frames[53])
-    elif damage == "late":
-        frames[53], frames[54] = frames[54], frames[53]
-    elif damage == "counter stands still":
+    if damage == "counter stands still":
         for frame in frames:
             frame.seq = 7
-    else:
+    if damage == "invalid":
         frames[53].values = (math.nan,) * 3
     device = device_from_table({"front_end": "current", "tare": {"frames": 40}}, "b")
     stream = TouchStream(predictor, device)
-    data = b"".join(map(encode_frame, frames))
+    data = b"".join(encode_frame(frames[number]) for number in ORDERS[damage])
     *_, last = stream.frames(Chunk(data, 5.0, 0))
     # A lost current is assumed to be the mean of its neighbours, and each current is at most 1/9 of the charge.
     np.testing.assert_allclose(last.charge_pC, current_pC.sum(axis=0), rtol=0.01)

@@ -8,7 +8,7 @@ warming cannot be distinguished from force. On the uniaxial film, whose electrod
 import numpy as np
 import pytest
 
-from isocharge.serve.signal_chain.thermal import ThermalRule, Warming
+from isocharge.serve.signal_chain.thermal import Warming
 from stage_runner import StageRunner
 
 ANGLE = 2 * np.pi * np.arange(4) / 4
@@ -32,11 +32,6 @@ def misfit_of(film):
     return lambda charge_pC: np.abs(charge_pC @ direction) / NOISE_pC
 
 
-def warming_stage(misfit):
-    """Return a stage that estimates the warming with a misfit function."""
-    return StageRunner(4, misfit, common_mode={}).stage(Warming)
-
-
 def follow_warming(film, common_charges_pC):
     """Estimate a common charge that changes in steps of 50 ms during a press.
 
@@ -45,41 +40,36 @@ def follow_warming(film, common_charges_pC):
         common_charges_pC: Common charge in each step, shape (n,), pC.
 
     Returns:
-        The estimates, shape (n,), pC, and the last state.
+        The estimates, which are added to the tare, shape (n,), pC, and the flags of the last frame.
     """
     charges_pC = np.random.default_rng(0).normal(np.add.outer(common_charges_pC, film @ CONTACT), 0.5)
-    warming = warming_stage(misfit_of(film))
-    estimates = []
-    for charge_pC in charges_pC:
-        warming._estimate(charge_pC - warming._charge_pC, 0.05)
-        estimates.append(warming._charge_pC)
-    return np.array(estimates), warming
+    chain = chain_in_contact(misfit_of(film))
+    readings = [chain.advance(TARE_PC + charge_pC, 0.0, 0.05) for charge_pC in charges_pC]
+    return np.array([reading.tare_pC[0] for reading in readings]) - TARE_PC[0], readings[-1].flags
 
 
 def test_warming_of_half_a_kelvin_is_followed_unless_it_is_inseparable_from_force():
     """The film warms by 0.5 K, which is 135 pC on 9 mm^2, with the time constant of 25 um of PVDF in air, 2.7 s."""
     ramp = 135.0 * (1.0 - np.exp(-0.05 * np.arange(400) / 2.7))
-    estimates, warming = follow_warming(UNIAXIAL, ramp)
+    estimates, flags = follow_warming(UNIAXIAL, ramp)
     assert np.abs(estimates - ramp).max() < 15.0
     assert estimates[-50:] == pytest.approx(135.0, abs=5.0)
-    assert not warming._is_blind
+    assert flags == ("thermal",)
 
-    estimates, warming = follow_warming(BIAXIAL, ramp)
+    estimates, flags = follow_warming(BIAXIAL, ramp)
     assert not estimates.any()
-    assert warming._is_blind
+    assert flags == ("blind",)
 
 
 def test_uncertainty_of_the_warming_grows_while_it_is_inseparable_from_force():
     """A blind time of 10 s. The first estimate after it removes nearly the whole warming of 18 pC."""
-    warming = warming_stage(lambda charge_pC: film_misfit(charge_pC))
     film_misfit = misfit_of(BIAXIAL)
+    chain = chain_in_contact(lambda charge_pC: film_misfit(charge_pC))
     for _ in range(200):
-        warming._estimate(np.ones(4), 0.05)
-    assert warming._is_blind
-    assert warming._variance_pC2 == pytest.approx(10.0 * ThermalRule().wander_pC ** 2)
+        assert advance(chain, 0.0).flags == ("blind",)
     film_misfit = misfit_of(UNIAXIAL)
-    warming._estimate(PRESS + 18.0, 0.05)
-    assert warming._charge_pC == pytest.approx(18.0, rel=0.05)
+    advance(chain, 18.0)
+    assert warming_of(chain) == pytest.approx(18.0, rel=0.05)
 
 
 PRESS = UNIAXIAL @ CONTACT
@@ -89,9 +79,9 @@ TARE_PC = np.full(4, 7.0)
 """Charges at rest, shape (4,), pC."""
 
 
-def chain_in_contact(**sections):
-    """Return a signal chain in the middle of a press. Its next frame of 40 ms contains an estimate of the warming."""
-    chain = StageRunner(4, misfit_of(UNIAXIAL), tare={"frames": 2}, common_mode={"every_s": 0.05}, **sections)
+def chain_in_contact(misfit=None, **sections):
+    """Return a signal chain in the middle of a press, whose next frame of 50 ms contains an estimate of the warming."""
+    chain = StageRunner(4, misfit or misfit_of(UNIAXIAL), tare={"frames": 2}, common_mode={"every_s": 0.05}, **sections)
     for _ in range(3):
         chain.advance(TARE_PC, 0.0, 1e-6)
     for dt_s in (1e-6, 0.01, 0.01):
@@ -101,7 +91,7 @@ def chain_in_contact(**sections):
 
 def advance(chain, common_pC, *, limited=False):
     """Process a frame of the press with a common charge on each electrode. The frame contains an estimate."""
-    return chain.advance(PRESS + common_pC + TARE_PC, 0.0, 0.04, limited=limited)
+    return chain.advance(PRESS + common_pC + TARE_PC, 0.0, 0.05, limited=limited)
 
 
 def warming_of(chain):
