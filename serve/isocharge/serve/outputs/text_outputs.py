@@ -44,26 +44,30 @@ def csv_lines(context: OutputContext) -> LineFormat:
     return LineFormat(f"{header}\n", lambda record: csv_row(record, context.electrodes))
 
 
-class StandardOutput:
-    """Output that writes one line to standard output for each record."""
+class TextOutput:
+    """Output that writes one line for each record, such as to standard output."""
 
-    def __init__(self, write: Callable[[str], object], lines: LineFormat) -> None:
-        """Store the function that writes a text to standard output, and write the header if there is a header."""
-        self._write = write
+    def __init__(self, write_text: Callable[[str], object], lines: LineFormat) -> None:
+        """Store the function that writes a text, and write the header if there is a header."""
+        self._write_text = write_text
         self._to_line = lines.to_line
         if lines.header:
-            write(lines.header)
+            write_text(lines.header)
 
     def write(self, record: PredictionRecord) -> None:
         """Write the line of a record."""
-        self._write(self._to_line(record) + "\n")
+        self._write_text(self._to_line(record) + "\n")
 
     def close(self) -> None:
         """Leave standard output open."""
 
 
 class TextFile(FileOutput):
-    """Output that writes one line to a new file for each record."""
+    """Output that writes one line to a new file for each record.
+
+    Attributes:
+        write: Function that writes the line of a record. It raises an `OutputError` if the disk is full.
+    """
 
     def __init__(self, path: Path, lines: LineFormat, *, is_live: bool) -> None:
         """Create the file, and write the header if there is a header.
@@ -78,16 +82,7 @@ class TextFile(FileOutput):
             OutputError: If the file cannot be created.
         """
         super().__init__(path, is_live=is_live)
-        self._to_line = lines.to_line
-        self._write_text(lines.header)
-
-    def write(self, record: PredictionRecord) -> None:
-        """Write one line for a record.
-
-        Raises:
-            OutputError: If the disk is full.
-        """
-        self._write_text(self._to_line(record) + "\n")
+        self.write = TextOutput(self._write_text, lines).write
 
     def _write_text(self, text: str) -> None:
         with as_output_errors(self._path):
@@ -105,7 +100,7 @@ def _text_kinds(name: str, suffix: str, lines: Callable[[OutputContext], LineFor
     standard_output = OutputKind(
         form=name,
         accepts=name.__eq__,
-        open=lambda _, context: StandardOutput(context.write_stdout, lines(context)),
+        open=lambda _, context: TextOutput(context.write_stdout, lines(context)),
         is_standard_output=True,
     )
     file = OutputKind(

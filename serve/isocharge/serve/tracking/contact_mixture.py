@@ -338,7 +338,7 @@ class ContactMixture:
         domain = self.charges.domain
         coordinates = np.linspace(-domain.radius, domain.radius, grid_points)
         grid = np.stack(np.meshgrid(coordinates, coordinates), axis=-1).reshape(-1, 2)
-        grid = grid[np.hypot(grid[:, 0], grid[:, 1]) <= domain.radius]
+        grid = grid[np.hypot(*grid.T) <= domain.radius]
         mean = np.zeros((len(grid), MOTION.stop + len(self.charges.electrodes)))
         mean[:, POSITION] = grid
         mean[:, 2] = domain.centre[2]
@@ -360,7 +360,7 @@ class ContactMixture:
         """
         updated = update_components(self.charges, prior, charge_pC, variance_pC2, iterations)
         components = updated.components
-        distance_mm = np.hypot(components.mean[:, 0], components.mean[:, 1])
+        distance_mm = np.hypot(*components.mean[:, POSITION].T)
         is_outside = distance_mm > MAX_RELATIVE_RADIUS * self.charges.domain.radius
         log_weight = np.where(is_outside, -np.inf, components.log_weight)
         best = int(log_weight.argmax())
