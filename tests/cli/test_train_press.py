@@ -77,7 +77,7 @@ class Script:
         return event
 
 
-STEADY = WatchResult(Phase.taken, press=SteadyPress(np.full(4, 500.0), np.ones(4), 0.7, 100, ()))
+STEADY = WatchResult(Phase.taken, press=SteadyPress(np.full(4, 500.0), 0.7, ()))
 TARED = WatchResult(Phase.waiting)
 HELD = WatchResult(Phase.settling)
 

@@ -172,12 +172,9 @@ def model(models, tmp_path):
     return folder
 
 
-def test_records_with_track_have_the_field_other_and_are_repeated_bit_for_bit(model):
+def test_records_with_track_have_the_field_other(model):
     rows = np.concatenate([np.zeros((10, 3)), noisy_charges(np.zeros(40)), np.zeros((5, 3))])
-    predictor = Predictor(model)
-    lines = recorded_lines(predictor, rows, {"track": {}})
-    assert lines == recorded_lines(predictor, rows, {"track": {}})
-
+    lines = recorded_lines(Predictor(model), rows, {"track": {}})
     last = json.loads(lines[45])
     released = json.loads(lines[-1])
     tracked = last["tracked"]

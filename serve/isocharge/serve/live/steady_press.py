@@ -53,17 +53,12 @@ class SteadyPress(NamedTuple):
 
     Attributes:
         charge_pC: Mean touch charges over the window, shape (n_electrode,), pC.
-        scatter_pC: Standard deviation of each charge about a straight line that is fitted to it, shape (n_electrode,),
-            pC.
         held_s: Time from the touch to the end of the window, s.
-        frames: Number of frames in the window.
         flags: Flags of `isocharge.serve.flags` that at least one frame in the window has.
     """
 
     charge_pC: Array
-    scatter_pC: Array
     held_s: float
-    frames: int
     flags: tuple[str, ...]
 
 
@@ -136,7 +131,7 @@ class PressWatch:
         """
         self._electrodes = electrodes
         self._phase = Phase.taring
-        self._rest_frames: deque[tuple[float, Array]] = deque()  # times and charges of the latest frames without touch
+        self._frames: deque[Frame] = deque()  # the latest frames without touch, or the window of the present press
         self._begin(-math.inf)
 
     def _begin(self, t_s: float) -> None:
@@ -147,12 +142,11 @@ class PressWatch:
         """
         self._begin_s = t_s
         self._end_s = t_s  # time of the latest frame of the press
-        rest_charges_pC = [charge_pC for rest_s, charge_pC in self._rest_frames if rest_s <= t_s - self.EDGE_S]
-        self._rest_frames.clear()
+        rest_charges_pC = [frame.charge_pC for frame in self._frames if frame.clock_s <= t_s - self.EDGE_S]
+        self._frames.clear()
         self._rest_pC: Array | None = None  # mean charges just before the touch; None without enough frames
         if len(rest_charges_pC) >= self.MIN_REST_FRAMES:
-            self._rest_pC = np.mean(rest_charges_pC, axis=0)
-        self._window: deque[Frame] = deque()  # the latest frames
+            self._rest_pC = np.array(rest_charges_pC).mean(axis=0)
         self._last_check_s = t_s  # time at which the window was last examined
         self._reason = ""  # why the press is not steady yet; empty before the first examined window
         self._min_scatter_pC = math.inf  # smallest scatter of all windows
@@ -181,7 +175,7 @@ class PressWatch:
         """
         if RECONNECTED in frame.flags or RESTART in frame.flags:
             # The charges and times before the interruption cannot be compared with later ones.
-            self._rest_frames.clear()
+            self._frames.clear()
             self._end_s = -math.inf
             self._phase = Phase.taring
             return WatchResult(Phase.refused, PORT_LOST)
@@ -190,7 +184,7 @@ class PressWatch:
                 self._phase = Phase.taring
             return WatchResult(self._phase)
         if not frame.is_contact:
-            return self._process_rest(frame.charge_pC, frame.clock_s)
+            return self._process_rest(frame)
 
         # Something touches the film.
         if self._phase in (Phase.waiting, Phase.taring):
@@ -216,12 +210,10 @@ class PressWatch:
         if self._rest_pC is None:
             is_short = held_s < self.MIN_HELD_S
             return WatchResult(Phase.settling) if is_short else WatchResult(Phase.refused, NO_REST_BEFORE_PRESS)
-        self._window.append(frame)
-        while self._window[0].clock_s < self._end_s - self.WINDOW_S:
-            self._window.popleft()
+        self._store(frame, self.WINDOW_S)
 
         # The window is examined several times within its length, but not in each frame, which would take too long.
-        is_window_full = held_s >= self.WINDOW_S and len(self._window) >= self.MIN_FRAMES
+        is_window_full = held_s >= self.WINDOW_S and len(self._frames) >= self.MIN_FRAMES
         if is_window_full and self._end_s - self._last_check_s >= self.WINDOW_S / self.CHECKS_PER_WINDOW:
             self._last_check_s = self._end_s
             press = self._examine_window(self._rest_pC, frame.noise_pC)
@@ -244,8 +236,8 @@ class PressWatch:
             rest_pC: Mean charges just before the touch, shape (n_electrode,), pC.
             noise_pC: Standard deviation of each charge at rest, shape (n_electrode,), pC.
         """
-        times_s = np.array([frame.clock_s for frame in self._window])
-        charge_pC = np.array([frame.charge_pC for frame in self._window]) - rest_pC  # shape (frames, n_electrode)
+        times_s = np.array([frame.clock_s for frame in self._frames])
+        charge_pC = np.array([frame.charge_pC for frame in self._frames]) - rest_pC  # shape (frames, n_electrode)
 
         # The line is fitted by least squares. Its value at the mean time of the frames is the mean charge.
         centred_s = times_s - times_s.mean()
@@ -256,8 +248,8 @@ class PressWatch:
 
         reason = self._unsteady(mean_pC, scatter_pC, slope_pC_per_s, float(times_s[-1] - times_s[0]), noise_pC)
         if not reason:
-            flags = dict.fromkeys(flag for frame in self._window for flag in frame.flags)  # each flag once
-            return SteadyPress(mean_pC, scatter_pC, self._end_s - self._begin_s, len(self._window), tuple(flags))
+            flags = dict.fromkeys(flag for frame in self._frames for flag in frame.flags)  # each flag once
+            return SteadyPress(mean_pC, self._end_s - self._begin_s, tuple(flags))
         if scatter_pC.max() <= self._min_scatter_pC:
             self._min_scatter_pC = float(scatter_pC.max())
             self._reason = reason
@@ -284,7 +276,7 @@ class PressWatch:
             return f"the charge of {self._electrodes[worst]} shakes by {scatter_pC[worst]:.2g} pC"
 
         # The change of a line through n values has the standard deviation sqrt(12 / n) times that of one value.
-        drift_std_pC = scatter_pC * math.sqrt(12.0 / len(self._window))
+        drift_std_pC = scatter_pC * math.sqrt(12.0 / len(self._frames))
         # A charge that is smaller than the mean magnitude may change as much as a charge of the mean magnitude.
         reference_pC = np.maximum(np.abs(charge_pC), mean_magnitude_pC)
         max_drift_pC = self.MAX_RELATIVE_DRIFT * reference_pC + self.DRIFT_SIGMAS * drift_std_pC
@@ -298,22 +290,26 @@ class PressWatch:
             "leak of the amplifiers with isocharge serve doctor"
         )
 
-    def _process_rest(self, charge_pC: Array, t_s: float) -> WatchResult:
+    def _store(self, frame: Frame, duration_s: float) -> None:
+        """Store a frame, and discard the frames that are older than `duration_s`."""
+        self._frames.append(frame)
+        while self._frames[0].clock_s < frame.clock_s - duration_s:
+            self._frames.popleft()
+
+    def _process_rest(self, frame: Frame) -> WatchResult:
         """Store a frame in which nothing touches the film, and refuse a press that has ended without becoming steady.
 
         Frames within `EDGE_S` after a press are not stored. A touch shorter than `MIN_HELD_S` is ignored.
 
         Args:
-            charge_pC: Touch charges of the frame, shape (n_electrode,), pC.
-            t_s: Time of the frame, s.
+            frame: The frame.
         """
         is_press_unfinished = self._phase is Phase.settling
+        if self._phase is not Phase.waiting:
+            self._frames.clear()  # frames of a press
         self._phase = Phase.waiting
-        if t_s > self._end_s + self.EDGE_S:
-            self._rest_frames.append((t_s, charge_pC))
-        oldest_rest_s = t_s - self.EDGE_S - self.REST_S
-        while self._rest_frames and self._rest_frames[0][0] < oldest_rest_s:
-            self._rest_frames.popleft()
+        if frame.clock_s > self._end_s + self.EDGE_S:
+            self._store(frame, self.EDGE_S + self.REST_S)
 
         held_s = self._end_s - self._begin_s
         if is_press_unfinished and held_s >= self.MIN_HELD_S:
