@@ -73,6 +73,11 @@ def errors(answers: list[Contact], truth: np.ndarray) -> dict[str, float]:
     }
 
 
+def model_errors(predictor: Predictor, truth: np.ndarray, charge: np.ndarray) -> dict[str, float]:
+    """Return the errors of the contacts that a model computes from charges, shape (n, n_electrode), pC."""
+    return errors([predictor.predict(row) for row in charge], truth)
+
+
 class Bench:
     """One film, from its presses to the errors of its models.
 
@@ -170,7 +175,7 @@ def followed_errors(
         return errors([follower.follow_contact(predictor.predict(row), row) for row in charge], truth)
 
     ways = {
-        "not followed": errors([predictor.predict(row) for row in charge], truth),
+        "not followed": model_errors(predictor, truth, charge),
         "followed": errors_after(touches),
     }
     if change != 0.0:
@@ -190,17 +195,16 @@ def film_results(bench: Bench, counts: list[int], *, has_all_cases: bool) -> dic
     truth, charge = bench.later(0.0)
     for count in counts:
         result, predictor = bench.calibrated(bench.contact[:count], bench.charge[:count])
-        answers = [predictor.predict(row) for row in charge]
-        results[f"{count} presses"] = errors(answers, truth)
+        results[f"{count} presses"] = model_errors(predictor, truth, charge)
     if not has_all_cases:
         return results
 
     _, offset_predictor = bench.calibrated(bench.contact, bench.charge + OFFSET_pC)
-    results["offset"] = errors([offset_predictor.predict(row) for row in charge + OFFSET_pC], truth)
+    results["offset"] = model_errors(offset_predictor, truth, charge + OFFSET_pC)
     contact = bench.contact.copy()
     contact[:, 2] *= 1.0 + HYSTERESIS * np.sign(bench.rng.standard_normal(len(contact)))
     _, hysteresis_predictor = bench.calibrated(contact, bench.charge)
-    results["hysteresis"] = errors([hysteresis_predictor.predict(row) for row in charge], truth)
+    results["hysteresis"] = model_errors(hysteresis_predictor, truth, charge)
 
     cases = [(f"{change:+g} MPa", change, np.ones(len(GAINS))) for change in bench.later_charge]
     for name, change, gains in (*cases, ("gain", 0.0, GAINS)):
@@ -211,8 +215,7 @@ def film_results(bench: Bench, counts: list[int], *, has_all_cases: bool) -> dic
             problem = replace(bench.problem, earlier=result.film.drifted())
             mean_charge = bench.touches(change).mean(axis=1)
             _, again = bench.calibrated(np.full((TOUCHES, 3), np.nan), mean_charge, problem)
-            truth, charge = bench.later(change)
-            results[f"again, {name}"] = errors([again.predict(row) for row in charge], truth)
+            results[f"again, {name}"] = model_errors(again, *bench.later(change))
     for name, values in results.items():
         report_progress(name, values)
     return results

@@ -72,15 +72,6 @@ class Case:
         seconds = time.process_time() - started
         return {"cpu_s": round(seconds, 2), **self.test.errors(predict(self.test.charge))}
 
-    def network(self) -> InverseNetwork:
-        """Return an untrained network of the default size."""
-        return InverseNetwork(
-            self.domain,
-            logarithmic_features(self.train.charge),
-            self.train.charge,
-            NetworkConfig(),
-        )
-
 
 class Adam:
     """The optimiser Adam of PyTorch with the interface of `Soap`."""
@@ -104,14 +95,10 @@ WITHOUT = {
 
 def train(case: Case, steps: int | None, change: AbstractContextManager[object] | None = None) -> Predict:
     """Train as `isocharge train fit` does, or with a change."""
+    charge = case.train.charge
     with threads_and_seed(1, 0), change or nullcontext():
-        network = case.network()
+        network = InverseNetwork(case.domain, logarithmic_features(charge), charge, NetworkConfig())
         contact_stage(network, case.train, case.noise, TrainingConfig(steps=steps)).run()
-    return predictor(network)
-
-
-def predictor(network: InverseNetwork) -> Predict:
-    """Return the contacts of a network as a function of charges."""
     folded = fold_network(network)
     return lambda charge: folded.outputs(charge)[0]
 

@@ -58,16 +58,6 @@ def random_sensor(number: int) -> tuple[Sensor, Circle]:
     return Sensor(f"random-{number}", film, piezo, electrodes), Circle(round(float(probe_radius), 2))
 
 
-def describe(sensor: Sensor, probe: Circle) -> dict[str, Any]:
-    """Return the drawn quantities of a sensor for the table."""
-    return {
-        "electrodes": len(sensor.electrodes),
-        "thickness_um": round(1e3 * sensor.film.thickness, 1),
-        "pretension_MPa": round(sensor.film.pretension, 2),
-        "probe": probe.notation,
-    }
-
-
 def measure(sensor: Sensor, probe: Circle) -> dict[str, Any]:
     """Train a network for a sensor, and return its errors over the limit.
 
@@ -95,7 +85,12 @@ def main() -> None:
     rows: dict[str, dict[str, Any]] = {}
     for number in range(options.sensors):
         sensor, probe = random_sensor(number)
-        row = describe(sensor, probe)
+        row = {
+            "electrodes": len(sensor.electrodes),
+            "thickness_mm": sensor.film.thickness,
+            "pretension_MPa": sensor.film.pretension,
+            "probe": probe.notation,
+        }
         try:
             row |= measure(sensor, probe)
         except IsochargeError as error:

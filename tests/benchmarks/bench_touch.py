@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from shared import inner_radius_mm, model_film, options, percentiles, print_results
@@ -42,23 +42,8 @@ WINDOW = 20
 """Number of frames over which errors are averaged."""
 
 
-class Press(NamedTuple):
-    """A press of 1 N.
-
-    Attributes:
-        position: Position x + iy, mm.
-        begin_s: Time at which the force begins to rise, s.
-        end_s: Time at which the force is zero again, s.
-    """
-
-    position: complex
-    begin_s: float
-    end_s: float
-
-    def rows(self) -> list[tuple[float, float, float, float]]:
-        """Return the rows (time, x, y, force) of a script, between which the force is linear."""
-        corners = ((self.begin_s, 0.0), (self.begin_s + RAMP_s, 1.0), (self.end_s - RAMP_s, 1.0), (self.end_s, 0.0))
-        return [(time_s, self.position.real, self.position.imag, force_N) for time_s, force_N in corners]
+Press = tuple[complex, float, float]
+"""Position x + iy of a press of 1 N, mm; the time at which its force begins to rise, and that at which it ends, s."""
 
 
 def press_film(film: ForwardMap, presses: Sequence[Press], end_s: float) -> tuple[Script, Array]:
@@ -66,8 +51,11 @@ def press_film(film: ForwardMap, presses: Sequence[Press], end_s: float) -> tupl
 
     The charges have the shape (n_frame, n_electrode), pC.
     """
-    nothing = (0.0, 0.0, 0.0)
-    rows = [(0.0, *nothing), *(row for press in presses for row in press.rows()), (end_s, *nothing)]
+    rows = [(0.0, 0.0, 0.0, 0.0)]
+    for position, press_begin_s, press_end_s in presses:
+        corners = (press_begin_s, 0.0), (press_begin_s + RAMP_s, 1.0), (press_end_s - RAMP_s, 1.0), (press_end_s, 0.0)
+        rows += [(time_s, position.real, position.imag, force_N) for time_s, force_N in corners]
+    rows.append((end_s, 0.0, 0.0, 0.0))
     script = VirtualScript(presses=tuple(rows)).script(RATE_Hz)
     charge = np.zeros((len(script), len(film.electrodes)))
     contact = np.column_stack([script.x_mm, script.y_mm, script.force_N])
@@ -148,7 +136,7 @@ def accuracy(
     phase = 2j * np.pi * rng.uniform(size=count)
     position = film.domain.radius * np.sqrt(rng.uniform(size=count)) * np.exp(phase)
     *begins_s, end_s = REST_s + (PRESS_s + PAUSE_s) * np.arange(count + 1)
-    presses = [Press(place, begin_s, begin_s + PRESS_s) for place, begin_s in zip(position, begins_s, strict=True)]
+    presses = [(place, begin_s, begin_s + PRESS_s) for place, begin_s in zip(position, begins_s, strict=True)]
     script, charge = press_film(film, presses, end_s)
     records = stream_records(predictor, charge, amplifier, gain_error, seed)
 
@@ -186,7 +174,7 @@ def warm_hand(predictor: Predictor, film: ForwardMap, seed: int) -> dict[str, An
     hand = {"step": 2.0, "step_at": 10.0, "step_for": 10.0, "pyro_mismatch": 0.2, "limit": 3000.0}
     for level, position, has_common_mode in product(("reference", "bench"), (0.5 + 0.3j, 4.0 - 2.0j), (False, True)):
         amplifier = replace(load_amplifier(level), **hand)
-        script, charge = press_film(film, [Press(position, 7.0, 17.0)], 20.0)
+        script, charge = press_film(film, [(position, 7.0, 17.0)], 20.0)
         records = stream_records(predictor, charge, amplifier, GAIN_ERROR, seed, has_common_mode=has_common_mode)
         errors = contact_errors(script, records)
         windows = np.array([part.mean(axis=0) for part in np.array_split(errors, len(errors) // WINDOW)])

@@ -137,28 +137,18 @@ def analyze(*words):
     return done.returncode, done.stdout + done.stderr
 
 
-needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze")
-
-
-@needs_systemd
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze")
 @pytest.mark.parametrize("names", UNITS)
-def test_systemd_analyze_accepts_the_units(tmp_path, names):
+def test_systemd_analyze_accepts_the_units_and_the_page_states_their_exposure(tmp_path, names):
     unit = installed_unit(tmp_path, names)
     assert analyze("verify", unit) == (0, "")
+    _, report = analyze("security", "--offline=true", unit)
+    exposure, word = re.findall(r"exposure level for .*: ([\d.]+) (\w+)", report)[0]
+    page = (ROOT / "serve/docs/systemd.md").read_text("utf-8")
+    assert re.search(rf"as {re.escape(exposure)}( of 10)? \({word}\)", page)
     last = tmp_path / names[-1]
     last.write_text(last.read_text().replace(PROGRAM, "/nowhere/isocharge"))
     assert "/nowhere/isocharge" in analyze("verify", unit)[1]  # so verify has read this file
-
-
-@needs_systemd
-def test_the_page_states_the_exposure_of_the_units(tmp_path):
-    page = (ROOT / "serve/docs/systemd.md").read_text("utf-8")
-    for number, names in enumerate(UNITS):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        _, report = analyze("security", "--offline=true", installed_unit(folder, names))
-        exposure, word = re.findall(r"exposure level for .*: ([\d.]+) (\w+)", report)[0]
-        assert re.search(rf"as {re.escape(exposure)}( of 10)? \({word}\)", page)
 
 
 def unit_command(name):
