@@ -1,4 +1,4 @@
-"""The site: lists of attributes, the page of the commands, the workflow that publishes it, and the issue forms."""
+"""The site: lists of attributes, the page of the commands, and the issue forms."""
 
 import sys
 
@@ -52,15 +52,6 @@ def test_the_page_of_the_commands_contains_every_command_with_its_options(site, 
         section = text.partition(f"\n## isocharge {name}\n")[2].partition("\n## ")[0]
         assert f"Usage: isocharge {name} " in section
         assert all(option in section for parameter in command.params for option in parameter.opts if "--" in option)
-
-
-def test_the_workflow_builds_the_site_as_make_docs_does():
-    workflow = yaml.safe_load((ROOT / ".github/workflows/site.yml").read_text("utf-8"))
-    steps = workflow["jobs"]["build"]["steps"]
-    assert {"run": "make docs"} in steps
-    (upload,) = (step for step in steps if "upload-pages-artifact" in step.get("uses", ""))
-    assert f" {upload['with']['path']}\n" in (ROOT / "Makefile").read_text("utf-8")
-    assert workflow["jobs"]["publish"]["needs"] == "build"
 
 
 @pytest.mark.parametrize("path", FORMS, ids=lambda path: path.stem)

@@ -3,9 +3,8 @@
     python tests/benchmarks/bench_http.py [--model NAME|PATH] [--seconds 10]
 
 The ten lines (`bare_app.py`) give the same answer with a `Predictor`. The client and the servers share the cores. The
-client of single presses is a plain socket, the same for both servers. Latency: one request at a time over one open
-connection, in turns. Throughput: 32 connections, each with one request under way, in ten turns. Requests with 1024
-presses are sent by Triton's stock client, which codes and decodes the arrays.
+client is a plain socket, the same for both servers. Latency: one request at a time over one open
+connection, in turns. Throughput: 32 connections, each with one request under way, in ten turns.
 """
 
 import argparse
@@ -18,17 +17,14 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tritonclient.http
 from shared import in_turns, options, print_results
 
 from isocharge.serve import find_model, load_model
 from isocharge.serve.benchmark import Contender
-from isocharge.serve.model.session import OUTPUTS
 
 CONNECTIONS = 32
 
@@ -118,23 +114,12 @@ def throughput(address: Address, request: bytes, seconds: float) -> float:
     return answers / (now_s - begin_s)
 
 
-def stock_infer(client: Any, name: str, charges: np.ndarray, *, binary: bool) -> None:
-    """Send arrays to a model and receive its arrays by Triton's stock client, in JSON or as binary data."""
-    tensor = tritonclient.http.InferInput("charge_pC", list(charges.shape), "FP32")
-    tensor.set_data_from_numpy(charges, binary_data=binary)
-    outputs = [tritonclient.http.InferRequestedOutput(output, binary_data=binary) for output in OUTPUTS]
-    answer = client.infer(name, [tensor], outputs=outputs)
-    for output in OUTPUTS:
-        answer.as_numpy(output)
-
-
-def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
-    """Return the rows of each table by its title."""
+def measure(asked: argparse.Namespace) -> dict[str, Any]:
+    """Return the results by title."""
     folder = find_model(asked.model).resolve()
     model = load_model(folder).metadata
-    charges = np.random.default_rng(asked.seed).uniform(300.0, 1500.0, (1024, len(model.electrodes))).astype(np.float32)
-    first_charges = charges[0].tolist()
-    tensor = {"name": "charge_pC", "datatype": "FP32", "shape": [1, len(first_charges)], "data": first_charges}
+    charge_pC = np.random.default_rng(asked.seed).uniform(300.0, 1500.0, len(model.electrodes)).tolist()
+    tensor = {"name": "charge_pC", "datatype": "FP32", "shape": [1, len(charge_pC)], "data": charge_pC}
     body = json.dumps({"inputs": [tensor]})
     head = f"POST /v2/models/{model.name}/infer HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
     request = f"{head}Content-Length: {len(body)}\r\n\r\n{body}".encode()
@@ -151,21 +136,15 @@ def measure(asked: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
             name: stack.enter_context(closing(Connection(address, request))) for name, address in addresses.items()
         }
         one_press = [Contender(name, 1, connection.ask) for name, connection in connections.items()]
-        client = stack.enter_context(tritonclient.http.InferenceServerClient("{}:{}".format(*addresses["isocharge"])))
-        codings = [
-            Contender(name, 1, partial(stock_infer, client, model.name, charges, binary=name == "binary"))
-            for name in ("JSON", "binary")
-        ]
-        results = {
-            "one press, one request at a time": in_turns(one_press, asked.seconds),
-            "1024 presses, stock client": in_turns(codings, asked.seconds),
-        }
+        latencies = in_turns(one_press, asked.seconds)
         rounds = [
             [throughput(address, request, asked.seconds / 10) for address in addresses.values()] for _ in range(10)
         ]
-    medians = np.median(rounds, axis=0)
-    results["32 connections, answers per second"] = dict(zip(addresses, medians.round().tolist(), strict=True))
-    return results
+    medians = np.median(rounds, axis=0).round().tolist()
+    return {
+        "one press, one request at a time": latencies,
+        "32 connections, answers per second": dict(zip(addresses, medians, strict=True)),
+    }
 
 
 def main() -> None:
