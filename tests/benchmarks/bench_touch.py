@@ -153,13 +153,6 @@ def accuracy(
     }
 
 
-def false_contacts_at_rest(predictor: Predictor, film: ForwardMap, amplifier: Amplifier, seed: int) -> dict[str, int]:
-    """Count the contacts in ten minutes without a touch."""
-    charge = np.zeros((round(600 * RATE_Hz), len(film.electrodes)))
-    records = stream_records(predictor, charge, amplifier, GAIN_ERROR, seed)
-    return {"false_contacts": sum(record.contact for record in records)}
-
-
 def warm_hand(predictor: Predictor, film: ForwardMap, seed: int) -> dict[str, Any]:
     """Measure the largest errors of presses during which a hand comes over the film, with and without the estimate.
 
@@ -194,10 +187,12 @@ def main() -> None:
     if asked.hand:
         print_results("hand", asked, warm_hand(predictor, film, asked.seed))
         return
+    rest_charge = np.zeros((round(600 * RATE_Hz), len(film.electrodes)))
+    records_at_rest = stream_records(predictor, rest_charge, amplifier, GAIN_ERROR, asked.seed)
     results = {
         "gains to 0.2 %": accuracy(predictor, film, amplifier, asked.presses, GAIN_ERROR, asked.seed),
         "gains off by 1 % rms": accuracy(predictor, film, amplifier, asked.presses, 0.0, asked.seed),
-        "nothing for 600 s": false_contacts_at_rest(predictor, film, amplifier, asked.seed),
+        "false contacts in 600 s": sum(record.contact for record in records_at_rest),
     }
     print_results("touch", asked, results)
 
