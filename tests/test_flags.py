@@ -63,7 +63,7 @@ def test_a_trained_model_with_an_electrode_in_the_centre_notices_presses_anywher
     table = sensor_to_dict(load_sensor("four-25um-biaxial"))
     table["electrodes"]["E"] = [0.0, 0.0]
     sensor = sensor_from_dict(table | {"name": "five"})
-    dataset = simulated_presses(sensor, [Circle(1.0)], 8.0, (0.05, 2.0))
+    dataset = simulated_presses(sensor, [Circle(1.0)], 8.0)
     model = release(fit(dataset), tmp_path / "five")
     rings = whole_film_shares(str(model.folder), 500, SEED, (8.0, 15.0, 20.0, 30.0, 43.0))
     assert rings["inside the working area"].flagged < 1.0

@@ -280,7 +280,6 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
         monkeypatch.setattr(f"isocharge.cli.demo.full_demo.{name}", stub)
     run_demo(out, 2.0, SENSOR)
     table, err = capsys.readouterr()
-    assert 400 <= int(re.search(r"(\d+) frames, 0 lost, 0 repeated", err)[1]) < 500  # more came than were followed
     assert re.findall(r"^(\d)\. (\w+): ", err, re.M) == [
         *zip("1234", ("simulate", "train", "serve", "show"), strict=True)
     ]
@@ -291,7 +290,7 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
         if tolerance is not None:  # live, there is one press only
             assert abs(np.log(live_error[0] / error)) < tolerance
     pressed, felt = figures[0].axes[2].lines[:2]
-    assert (pressed.get_label(), felt.get_label(), (out / "presses").is_dir()) == ("pressed", "estimated", True)
+    assert (out / "presses").is_dir()
     np.testing.assert_allclose(felt.get_xydata(), pressed.get_xydata(), atol=0.5)
 
 

@@ -48,9 +48,8 @@ def test_addresses_in_use_or_impossible_are_refused(handler, start_http, tmp_pat
     for address, message in [
         (Address(host, int(port)), f"cannot listen on 127.0.0.1:{port}: .*in use"),
         (Address(uds=tmp_path / "touch.sock"), "touch.sock: .*in use; choose another address"),
-        (Address(uds=tmp_path / "file"), "file: .*in use; choose another address"),
+        (Address(uds=tmp_path / "file"), "file: .*in use"),
         (Address(uds=tmp_path / "no/such.sock"), "cannot listen on"),
-        (Address(uds=tmp_path / ("a" * 200)), "cannot listen on"),
         (Address(uds=tmp_path / ("a" * 300)), "File name too long"),
         (Address("192.0.2.1"), "cannot listen on 192.0.2.1:0: "),
         (Address("no.such.host.invalid"), "cannot listen on no.such.host.invalid:0: "),

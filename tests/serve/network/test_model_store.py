@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 
 import grpc
@@ -251,13 +252,11 @@ def test_no_inference_is_lost_while_folders_are_moved_and_loaded(film, store, fo
         while not has_ended.is_set():
             handler.answer("POST", "/v2/repository/models/linear/load", [], b"")
 
-    threads = [threading.Thread(target=target) for target in (move_folders, load)]
-    for thread in threads:
-        thread.start()
-    try:
-        statuses = {handler.answer("POST", INFER, [], BODY).status for _ in range(1_000)}
-    finally:
-        has_ended.set()
-        for thread in threads:
-            thread.join()
+    with ThreadPoolExecutor(2) as threads:
+        changes = [threads.submit(move_folders), threads.submit(load)]
+        try:
+            statuses = {handler.answer("POST", INFER, [], BODY).status for _ in range(1_000)}
+        finally:
+            has_ended.set()
+    assert [change.exception() for change in changes] == [None, None]
     assert statuses == {200}

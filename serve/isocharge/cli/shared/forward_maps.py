@@ -126,19 +126,21 @@ MANY_SIMULATED_PRESSES = 96_000
 trained on fewer presses have larger errors near the rim of this area."""
 
 
-def simulated_presses(sensor: Sensor, probes: Sequence[Probe], radius: float, force: tuple[float, float]) -> Dataset:
-    """Simulate presses with the default settings of a sweep.
+def simulated_presses(
+    sensor: Sensor, probes: Sequence[Probe], radius: float, executor: Executor | None = None
+) -> Dataset:
+    """Simulate presses with the default settings of a sweep, and with its default range of forces.
 
     Args:
         sensor: The sensor.
         probes: The probes.
         radius: Largest distance of a press from the centre, mm.
-        force: Smallest and largest force, N.
+        executor: Executor that runs the solves; None for this process.
     """
     from isocharge.simulate import Sweep, run_sweep  # imports the solver
 
     has_few_electrodes = len(sensor.electrodes) <= FEW_ELECTRODES
     n_press = N_SIMULATED_PRESSES if has_few_electrodes else MANY_SIMULATED_PRESSES
-    sweep = Sweep(radius, force, samples=n_press)
-    with TemporaryDirectory() as folder, solving_executor(sensor.film) as executor:
+    sweep = Sweep(radius, samples=n_press)
+    with TemporaryDirectory() as folder:
         return read_dataset(run_sweep(Path(folder) / "presses", sensor, probes, sweep, executor=executor))

@@ -26,6 +26,7 @@ from isocharge.serve.network.grpc import server
 from isocharge.serve.network.grpc.service import METHODS, SERVICE, Service
 from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.protocol.handler import Handler
+from serve.network.http.test_server import wait_until
 
 PROTO = Path(__file__).parents[4] / "serve/isocharge/serve/network/grpc/inference.proto"
 
@@ -243,11 +244,8 @@ def test_new_call_replaces_the_call_that_waits_longest(serve, silent_call):
     silent_calls = [silent_call(silent_channel, "ModelStreamInfer") for _ in range(5)]
     time.sleep(0.3)
     assert all(is_served(busy_channel) for _ in range(3))
-    deadline_s = time.monotonic() + 60.0
-    while not any(call.done() for call in silent_calls) and time.monotonic() < deadline_s:
-        time.sleep(0.01)  # the end of a call reaches the client a moment later
-    ended_call = next(call for call in silent_calls if call.done())
-    assert refusal(ended_call) == "DEADLINE_EXCEEDED"
+    wait_until(lambda: any(call.done() for call in silent_calls))  # the end reaches the client a moment later
+    assert {refusal(call) for call in silent_calls if call.done()} == {"DEADLINE_EXCEEDED"}
     assert not all(call.done() for call in silent_calls)
 
 

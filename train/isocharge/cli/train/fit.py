@@ -131,10 +131,10 @@ def fit_command(
         sensor_name = output.resolve().name  # this sensor has no other name than that of the model
         train = partial(fit_presses, presses, sensor_name, probes=tuple(sorted(set(probe or ["unknown"]))))
 
-    version_folder = check_target(output, version, electrodes)
+    check_target(output, version, electrodes)
     with shown_progress():
         fitted = train(fit_config)
-        released = _release(fitted, version_folder)
+        released = _release(fitted, output, version)
     show_result({"folder": str(released.folder), "errors": dict(released.metadata.errors)}, json=json)
 
 
@@ -174,7 +174,7 @@ def _refuse_settings(path: Path | None, config: FitConfig) -> None:
             )
 
 
-def _release(fitted: Fitted, version_folder: Path) -> Release:
+def _release(fitted: Fitted, model_folder: Path, version: int) -> Release:
     """Write a trained network as a version of a model.
 
     If the folder of the model refuses the version, for example because another process has written this version during
@@ -182,13 +182,13 @@ def _release(fitted: Fitted, version_folder: Path) -> Release:
 
     Args:
         fitted: The network.
-        version_folder: Folder of the version.
+        model_folder: Folder of the model.
+        version: Number of the version.
 
     Raises:
         IsochargeError: If the folder refuses the version. The message names the temporary folder.
     """
-    model_folder = version_folder.parent
-    write = partial(release, fitted, version=int(version_folder.name), command=this_command())
+    write = partial(release, fitted, version=version, command=this_command())
     try:
         return write(model_folder)
     except (OutputExists, OutputError, ModelError) as error:
@@ -210,4 +210,5 @@ def _fit_simulated_presses(sensor: Sensor, notations: Sequence[str], radius: str
     noise = misfit_noise(config.training.noise_model)
     with solving_executor(sensor.film) as executor:
         radius_mm = sweep_radius(radius, sensor, probes, DEFAULT_FORCE_RANGE, executor, noise)
-    return fit(simulated_presses(sensor, probes, radius_mm, DEFAULT_FORCE_RANGE), config)
+        dataset = simulated_presses(sensor, probes, radius_mm, executor)
+    return fit(dataset, config)

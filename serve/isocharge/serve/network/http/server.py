@@ -123,7 +123,7 @@ class Connection(HttpToolsProtocol):
         self._is_reading = False
         self._pending_bytes = 0
         self.deadline = math.inf
-        if self.cycle is not None and self.cycle.response_complete:  # the application has not read the whole body
+        if self.cycle.response_complete:  # the application has not read the whole body
             self.deadline = self.loop.time() + self._limits.idle_seconds
         super().on_message_complete()
 
