@@ -4,6 +4,7 @@ import json
 import os
 import re
 import threading
+from contextlib import closing
 from functools import partial
 from types import SimpleNamespace
 
@@ -215,7 +216,7 @@ def test_a_press_that_had_begun_is_left_out_and_a_line_is_not(charges):
                 armed.wait(60)
             yield Chunk(data, number / RATE_HZ, 0)
 
-    with PressEvents(chunks(), ReadingStream(NAMES), PressWatch(NAMES), reader) as events:
+    with closing(PressEvents(chunks(), ReadingStream(NAMES), PressWatch(NAMES), reader)) as events:
         coming = iter(events.next, None)
         assert any(event.phase is Phase.settling for event in coming)
         os.write(keyboard, b"u\n")

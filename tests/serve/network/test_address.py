@@ -79,11 +79,8 @@ def test_address_of_other_machines_needs_a_token(host):
     with pytest.raises(InputError, match=f"{host} lets other machines in: give --token TOKEN"):
         check_exposure(Address(host), None)
     check_exposure(Address(host), "sesame")
-
-
-@pytest.mark.parametrize("address", [Address(), Address("127.0.0.2"), Address("::1"), Address("localhost")])
-def test_loopback_address_needs_no_token(address):
-    check_exposure(address, None)
+    for loopback in ("127.0.0.1", "127.0.0.2", "::1", "localhost"):
+        check_exposure(Address(loopback), None)
 
 
 def test_unix_socket_of_another_server_is_not_replaced(handler, tmp_path):

@@ -199,11 +199,11 @@ def test_bad_bodies_are_refused_with_the_reason(ask, case):
 
 
 @pytest.mark.parametrize("length", ["", "-1", "+5", "1_0", "1e3", "9999", "9" * 5000, "0x10", " 5", "٣"])
-def test_wrong_inference_header_content_length_is_refused(handler, length):
+def test_wrong_inference_header_content_length_is_refused(ask, length):
     body, _ = binary_request(np.float32(PRESS))
-    response = handler.answer("POST", INFER, [(b"inference-header-content-length", length.encode())], body)
-    assert response.status == 400
-    assert b"Inference-Header-Content-Length: expected a whole number up to" in response.body
+    status, error = refusal(ask("POST", INFER, body, inference_header_content_length=length))
+    assert status == 400
+    assert "Inference-Header-Content-Length: expected a whole number up to" in error
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """`isocharge train press`: record presses at a port, and write the file of measured presses."""
 
 import shlex
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -129,7 +130,7 @@ def press_command(
                 no_frames_advice_added(port, device),  # first, because it changes the errors of the next two
                 # A machine goes on while the port is lost, so its session must end.
                 open_source(port, baud=baud, reconnect=contacts is None, request=board.request) as source,
-                PressEvents(source, stream, PressWatch(problem.electrodes), keyboard) as events,
+                closing(PressEvents(source, stream, PressWatch(problem.electrodes), keyboard)) as events,
             ):
                 dialogue = Dialogue(session, events)
                 if contacts is None:

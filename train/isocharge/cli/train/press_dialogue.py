@@ -8,10 +8,9 @@ sequence.
 """
 
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from io import FileIO
 from queue import Queue
-from typing import Self
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from isocharge.cli.shared.terminal import say
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, PortLost, PressError
 from isocharge.serve import Chunk, ReadingStream
+from isocharge.serve.frames.frame import Frame
 from isocharge.serve.live.steady_press import PORT_LOST, Phase, PressWatch, SteadyPress, WatchResult
 from isocharge.train.calibration.session import PressSession, describe_press, read_answer
 
@@ -30,16 +30,14 @@ class SessionEnd(Exception):
 class PressEvents:
     """Events of a port and a keyboard, in the order in which they happen.
 
-    The object is a context manager that starts and stops the reading threads.
-
     No reading is lost, because the port is also read while a person answers a question and while a fit runs. Therefore,
-    the watch also detects that a probe is lifted while a question is open.
+    the watch also detects that a probe was lifted while a question was open.
     """
 
     def __init__(
         self, chunks: Iterable[Chunk], stream: ReadingStream, watch: PressWatch, keyboard: int | None = None
     ) -> None:
-        """Initialise the events. Reading starts when the context is entered.
+        """Start the threads that read the port and the keyboard.
 
         Args:
             chunks: Iterable over the bytes of an open port.
@@ -47,35 +45,30 @@ class PressEvents:
             watch: Detector of steady presses.
             keyboard: File descriptor of the keyboard; None for no keyboard.
         """
-        self._chunks = chunks
-        self._stream = stream
         self._watch = watch
-        self._keyboard = keyboard
-        self._queue: Queue[tuple[int, WatchResult | str | Exception]] = Queue()
+        self._queue: Queue[Frame | str | Exception | None] = Queue()  # None is a call of `arm`
+        self._waiting_arms = 0  # number of calls of `arm` that are still in the queue
         self._stop = threading.Event()
-        self._arm_count = 0  # number of calls of `arm`
-        self._port_thread = threading.Thread(target=self._read_port, name="press port", daemon=True)
+        self._port_thread = self._start_reading(_frames(chunks, stream))
+        if keyboard is not None:
+            # The file is not buffered, because a buffer would hold a lock when the program ends.
+            lines = FileIO(keyboard, closefd=False)
+            self._start_reading(line.decode(errors="replace") for line in lines)
 
-    def __enter__(self) -> Self:
-        """Start the threads that read the port and the keyboard."""
-        self._port_thread.start()
-        if self._keyboard is not None:
-            threading.Thread(target=self._read_keyboard, args=[self._keyboard], daemon=True).start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
+    def close(self) -> None:
         """Stop the threads. A thread that waits for a silent port or for the keyboard ends only with the process."""
         self._stop.set()
         self._port_thread.join(timeout=1.0)
 
     def arm(self) -> None:
         """Discard all earlier readings, and detect only presses that begin after this call."""
-        self._arm_count += 1
+        self._waiting_arms += 1
+        self._queue.put(None)
 
     def next(self) -> WatchResult | str:
         """Wait for the next reading or typed line.
 
-        Readings that were made before the last call of `arm` are discarded.
+        Readings that were made before the last call of `arm` are passed to the watch, but are not returned.
 
         Returns:
             Result of the watch for a reading, or the typed line.
@@ -85,49 +78,46 @@ class PressEvents:
             IsochargeError: If the port fails.
         """
         while True:
-            arm_count, event = self._queue.get()
+            event = self._queue.get()
             if isinstance(event, Exception):
                 raise event
-            is_typed_line = isinstance(event, str)
-            is_recent = arm_count == self._arm_count
-            if is_typed_line or is_recent:
+            if isinstance(event, str):
                 return event
+            if event is None:
+                self._watch.arm()
+                self._waiting_arms -= 1
+                continue
+            watched = self._watch.feed(event)
+            if not self._waiting_arms:
+                return watched
 
-    def _read_port(self) -> None:
-        """Read the port until its end, and put the events of the readings into the queue.
+    def _start_reading(self, items: Iterable[Frame | str]) -> threading.Thread:
+        """Start a thread that puts readings or typed lines into the queue, and return the thread."""
+        thread = threading.Thread(target=self._read, args=[items], daemon=True)
+        thread.start()
+        return thread
 
-        The press watch finds steady presses in the readings. If another thread calls `arm`, the press watch begins
-        again. Each event is stored with the number of earlier calls of `arm`. The method `next` can therefore discard
-        the events before the last call of `arm`. The method runs in its own thread.
+    def _read(self, items: Iterable[Frame | str]) -> None:
+        """Put readings or typed lines into the queue until they end.
+
+        The method runs in its own thread. An error is put into the queue, too. It is raised again by `next`, in the
+        thread that waits for events.
         """
-        arm_count = self._arm_count  # number of calls for which the watch is armed
         try:
-            for chunk in self._chunks:
+            for item in items:
                 if self._stop.is_set():
                     return
-                must_be_armed = arm_count != self._arm_count
-                if must_be_armed:
-                    arm_count = self._arm_count
-                    self._watch.arm()
-                for frame in self._stream.frames(chunk):
-                    self._queue.put((arm_count, self._watch.feed(frame)))
-            self._stream.finish()
-            self._queue.put((arm_count, SessionEnd()))
-        except Exception as error:  # raised again by `next`, in the thread that waits for events
-            self._queue.put((arm_count, error))
+                self._queue.put(item)
+            self._queue.put(SessionEnd())
+        except Exception as error:
+            self._queue.put(error)
 
-    def _read_keyboard(self, keyboard: int) -> None:
-        """Read lines from the keyboard until its end, and put them into the queue.
 
-        The method runs in its own thread.
-
-        Args:
-            keyboard: File descriptor of the keyboard.
-        """
-        # The file is not buffered, because a buffer would hold a lock when the program ends.
-        for line in FileIO(keyboard, closefd=False):
-            self._queue.put((self._arm_count, line.decode(errors="replace")))
-        self._queue.put((self._arm_count, SessionEnd()))
+def _frames(chunks: Iterable[Chunk], stream: ReadingStream) -> Iterator[Frame]:
+    """Decode the bytes of a port, and yield its readings until the port ends."""
+    for chunk in chunks:
+        yield from stream.frames(chunk)
+    stream.finish()
 
 
 PHASE_TEXTS = {
