@@ -12,7 +12,7 @@ def test_a_map_that_folds_is_reported_drawn_and_written(command, refused, tmp_pa
     noise = tmp_path / "quiet.toml"
     noise.write_text("white_pC = 0.5\n")
     code, out, err = command(*UNIAXIAL, "--noise", noise, "--json", "-o", tmp_path / "out")
-    numbers, picture = json.loads(out), imread(tmp_path / "out" / "identify.png")
+    numbers = json.loads(out)
     assert (code, numbers) == (0, json.loads((tmp_path / "out" / "identify.json").read_text()))
     area = numbers["working_area"]
     assert max(1.5, area["radius_mm"]) < area["fold_radius_mm"] < 5.0
@@ -24,9 +24,8 @@ def test_a_map_that_folds_is_reported_drawn_and_written(command, refused, tmp_pa
     mirror = numbers["mirror_region"]
     assert (mirror["from_mm"], mirror["to_mm"]) == (area["radius_mm"], pytest.approx(42.8))
     assert mirror["words"] in err
-    assert imread(tmp_path / "out" / "mirror.png").std() > 0.1
-    assert picture.shape[0] > 400
-    assert picture.std() > 0.1
+    for name in ("identify.png", "mirror.png"):
+        assert imread(tmp_path / "out" / name).std() > 0.1
     refused(*UNIAXIAL, "-o", tmp_path / "out", message="already there", code=1)  # before anything is solved
 
 

@@ -10,22 +10,21 @@ from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 
 import grpc
-import numpy as np
-import onnx
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from onnx import helper, numpy_helper
 from prometheus_client import generate_latest
 
 from infer_requests import BODY, INFER
 from isocharge.common.errors import ModelError, ModelNotFound
+from isocharge.serve import load_model
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.metrics import RequestLog, Traffic
 from isocharge.serve.network.model_store import open_model_store
 from isocharge.serve.network.protocol.handler import Handler
 from isocharge.serve.network.protocol.routes import ROUTES
 from model_files import put_graph
+from serve.conftest import LinearFilm
 from serve.network.grpc.test_service import call
 from serve.network.http.test_server import exchange
 
@@ -46,13 +45,10 @@ def labels(store):
 
 def a_failing_graph(version):
     """Replace the graph by one that declares the right shapes, but fails with the golden charges."""
-    model = onnx.load_from_string((version / "model.onnx").read_bytes())
-    model.graph.initializer.append(numpy_helper.from_array(np.array([99], dtype=np.int64), "row 99"))
-    node = next(node for node in model.graph.node if "contact" in node.output)
-    node.output[0] = "inner"
-    model.graph.node.append(helper.make_node("Gather", ["inner", "row 99"], ["one row"], axis=0))
-    model.graph.node.append(helper.make_node("Mul", ["inner", "one row"], ["contact"]))
-    put_graph(version, model.SerializeToString())
+    row_99 = "row = Constant <value_ints = [99]> ()\n    sum_99 = Gather <axis = 0> (sum, row)\n    "
+    changed = {"force = Div .sum, pC_per_N": f"{row_99}force = Div (sum, sum_99"}
+    film = LinearFilm.with_electrodes(3)
+    put_graph(version, film.onnx(load_model(version).metadata.to_props(), renamed=changed))
 
 
 FAULTS = {
