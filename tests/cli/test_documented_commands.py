@@ -8,11 +8,7 @@ import typer
 
 from cli.test_help import COMMANDS
 from isocharge.cli.main import app
-from kept import ROOT
-
-PAGES = [*ROOT.glob("*.md"), *(ROOT / "models").glob("*.md")]
-for stage in ("simulate", "train", "serve"):
-    PAGES += [ROOT / stage / "README.md", *(ROOT / stage / "docs").glob("*.md")]
+from test_pages import PAGES
 
 GROUPS = ("simulate", "train", "serve")
 SHELL_BLOCK = re.compile(r"^```(?:sh|text|console)\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -38,9 +34,7 @@ def shell_commands(text):
 
 
 def documented_commands():
-    for page in sorted(PAGES):
-        text = page.read_text("utf-8")
-        name = page.relative_to(ROOT).as_posix()
+    for name, text in PAGES.items():
         for block in SHELL_BLOCK.finditer(text):
             for words in shell_commands(block[1]):
                 yield pytest.param(words, True, id=f"{name}: {' '.join(words)}")
@@ -79,7 +73,7 @@ def test_a_documented_command_line_parses(words, is_complete):
 
 
 def test_the_reference_lists_every_command():
-    reference = (ROOT / "REFERENCE.md").read_text("utf-8").partition("## Commands")[2]
+    reference = PAGES["REFERENCE.md"].partition("## Commands")[2]
     assert sorted(re.findall(r"^\| `isocharge (.+?)` \|", reference, re.MULTILINE)) == sorted(COMMANDS)
 
 
