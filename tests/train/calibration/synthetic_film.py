@@ -9,9 +9,11 @@ with the position p, the direction d_e of the electrode, and the deviation v_k o
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from isocharge.common.contact_domain import with_log_force
 from isocharge.simulate import Domain
 
 LENGTH_MM = 7.0
@@ -37,35 +39,29 @@ class SyntheticFilm:
     def values(self):
         return self.prior.mean
 
-    @property
+    @cached_property
     def effects(self):
-        """Derivatives of ln Q: constants, slopes in x, y and ln F, each of shape (n_property, n_electrode)."""
-        rng = np.random.default_rng(0)
-        shape = (len(self.prior.names), len(self.prior.sensor.electrode_names))
-        constant, by_x, by_y, by_force = EFFECT * rng.standard_normal((4, *shape)) / self.prior.std[:, None]
-        constant[self.prior.index("pretension")] = -0.2  # a taut film gives smaller charges
-        return constant, 0.5 * by_x / LENGTH_MM, 0.5 * by_y / LENGTH_MM, 0.15 * by_force
+        """Derivatives of the coefficients with respect to the properties, shape (4, n_property, n_electrode)."""
+        shape = (4, len(self.prior.names), len(self.prior.sensor.electrode_names))
+        effects = EFFECT * np.random.default_rng(0).standard_normal(shape) / self.prior.std[:, None]
+        effects *= np.reshape([1.0, 0.5 / LENGTH_MM, 0.5 / LENGTH_MM, 0.15], (4, 1, 1))
+        effects[0, self.prior.index("pretension")] = -0.2  # a taut film gives smaller charges
+        return effects
+
+    def coefficients(self, values):
+        """Coefficients of ln Q of a film in 1, x, y and ln F, shape (4, n_electrode)."""
+        centres = np.array([electrode.centre for electrode in self.prior.sensor.electrodes])
+        x, y = centres.T / np.hypot(*centres.T) / LENGTH_MM
+        mean_film = np.array([np.full(len(x), np.log(600.0)), x, y, np.full(len(x), 0.7)])
+        return mean_film + np.einsum("k,fke->fe", values - self.prior.mean, self.effects)
 
     def linearised(self, values, contact):
-        x, y, force = contact.T
-        log_force = np.log(force)
-        constant, by_x, by_y, by_force = self.effects
-        outer = np.multiply.outer
-        effect = constant + outer(x, by_x) + outer(y, by_y) + outer(log_force, by_force)
-        log_charge = np.log(600.0) + 0.7 * log_force[:, None] + contact[:, :2] @ self._directions.T
-        charge = np.exp(log_charge + np.einsum("k,nke->ne", values - self.prior.mean, effect))
-        return charge, charge[:, :, None] * effect.swapaxes(1, 2)
+        terms = np.column_stack([np.ones(len(contact)), with_log_force(contact)])
+        charge = np.exp(terms @ self.coefficients(values))
+        return charge, charge[:, :, None] * np.einsum("nf,fke->nek", terms, self.effects)
 
     def charges(self, values, contact):
         return self.linearised(values, contact)[0]
 
     def contact_slopes(self, values, contact):
-        charge, _ = self.linearised(values, contact)
-        _, by_x, by_y, by_force = (np.tensordot(values - self.prior.mean, effect, 1) for effect in self.effects)
-        slopes = np.column_stack([self._directions + np.column_stack([by_x, by_y]), 0.7 + by_force])
-        return charge[:, :, None] * slopes
-
-    @property
-    def _directions(self):
-        centres = np.array([electrode.centre for electrode in self.prior.sensor.electrodes])
-        return centres / np.linalg.norm(centres, axis=1, keepdims=True) / LENGTH_MM
+        return self.charges(values, contact)[:, :, None] * self.coefficients(values)[1:].T

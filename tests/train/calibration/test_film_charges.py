@@ -178,22 +178,24 @@ FILMS = {
         lambda: CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0)),
         {"pretension": 1.0, "tension_difference": 0.25, "stiffness_xy": 0.26, "d31": 0.2},
         ("pretension", "tension_difference", "d31"),
+        0.3,
     ),
-    "five electrodes": (five_electrodes, {"pretension": 1.2, "shift_x": 0.3}, ("shift_x",)),
-    "charges of both signs": (opposite_coefficients, {"pretension": 1.2}, ("pretension",)),
+    "five electrodes": (five_electrodes, {"pretension": 1.2, "shift_x": 0.3}, ("shift_x",), 0.3),
+    "charges of both signs": (opposite_coefficients, {"pretension": 1.2}, ("pretension",), 0.5),  # they nearly fold
 }
-"""Problems, properties that differ from the described film, and the properties of them that the presses determine."""
+"""Problems, properties that differ from the described film, the properties of them that the presses determine, and the
+largest rms error of later positions, mm."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("film", FILMS)
 def test_film_is_calibrated_and_its_model_finds_contacts(film, tmp_path):
-    make_problem, changes, determined = FILMS[film]
+    make_problem, changes, determined, largest_error_mm = FILMS[film]
     problem = make_problem()
     prior = problem.prior.layout.prior
     sensor_and_probe = prior.film(film_values(prior, **changes))
     result, distance, force_error = calibrated(problem, *sensor_and_probe, tmp_path / "film")
     for name in determined:
         assert abs(result.film.value(name) - changes[name]) < 4.0 * result.film.std(name)
-    assert np.sqrt(np.mean(distance**2)) < 0.3
+    assert np.sqrt(np.mean(distance**2)) < largest_error_mm
     assert np.sqrt(np.mean(force_error**2)) < 0.03

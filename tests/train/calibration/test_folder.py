@@ -115,7 +115,6 @@ def test_next_version_has_wider_regions_that_hold_for_held_out_presses(written, 
     np.testing.assert_allclose(answers[3:6], factor * plain_answers[3:6], rtol=1e-4)
     error = ((answers[:3] - others.contact.T) / answers[3:6]) ** 2
     assert np.mean(error.sum(axis=0) < 7.815) >= 0.85
-    assert (path / "card.md").read_bytes() == (path / "2" / "card.md").read_bytes()
     assert f"{factor:.3g} times as large" in (path / "card.md").read_text()
     moved_presses = replace(held_out, contact=np.where(np.arange(30)[:, None] < 2, 9.0, held_out.contact))
     with pytest.raises(PressError, match=r"at least 22 held-out presses within 8 mm.*got 21 of 23"):

@@ -9,6 +9,7 @@ from tests.train.measured import measured_presses
 from tests.train.short_training import short_training
 
 from isocharge.cli.train import fit as fit_command
+from isocharge.common.contact_domain import with_log_force
 from isocharge.common.errors import PressError
 from isocharge.serve import Contact, Predictor, read_presses
 from isocharge.serve.prediction.press_check import check_presses
@@ -48,16 +49,6 @@ def draw_forces(rng, count):
     return np.exp(rng.uniform(*np.log(FORCES_N), count))
 
 
-def linear_charges(contact, centre_mm):
-    """Return charges without noise, shape (n, 4), pC, that are linear in x, y and ln F.
-
-    Args:
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        centre_mm: Position at which a force of 1 N gives no charge.
-    """
-    return np.column_stack([contact[:, :2] - centre_mm, np.log(contact[:, 2])]) @ SLOPES.T
-
-
 def contacts_on_l(count, seed):
     """Draw contacts on an area with the shape of an L, of 1,200 mm^2, whose middle is not the origin."""
     rng = np.random.default_rng(seed)
@@ -67,9 +58,12 @@ def contacts_on_l(count, seed):
 
 
 def charges_on_l(contact, seed):
-    """Return the charges of contacts on the L with white noise, shape (n, 4), pC."""
+    """Return charges with white noise, shape (n, 4), pC, that are linear in x, y and ln F.
+
+    The contacts (x, y, F) have the shape (n, 3), mm and N. A force of 1 N on the middle of the L gives no charge.
+    """
     noise = NOISE_pC * np.random.default_rng(seed).standard_normal((len(contact), 4))
-    return linear_charges(contact, [20.0, -5.0]) + noise
+    return (with_log_force(contact) - [20.0, -5.0, 0.0]) @ SLOPES.T + noise
 
 
 def presses_on_l():
