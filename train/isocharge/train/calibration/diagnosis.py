@@ -33,14 +33,23 @@ MIN_LARGEST_DISTANCE_MM = 0.05
 """Smallest credible distance of the outermost press, mm. If it is smaller, the positions were probably in metres."""
 
 
-FORCE_UNITS_N = {"g": 9.80665e-3, "mN": 1e-3, "kg": 9.80665, "lbf": 4.4482216}
-"""Units in which forces may have been written by mistake."""
+UNITS = {
+    "the forces are in g, not N": (1.0, 9.80665e-3, 1.0),
+    "the forces are in mN, not N": (1.0, 1e-3, 1.0),
+    "the forces are in kg, not N": (1.0, 9.80665, 1.0),
+    "the forces are in lbf, not N": (1.0, 4.4482216, 1.0),
+    "the positions are in m, not mm": (1e3, 1.0, 1.0),
+    "the positions are in cm, not mm": (10.0, 1.0, 1.0),
+    "the positions are in inch, not mm": (25.4, 1.0, 1.0),
+    "the positions are in um, not mm": (1e-3, 1.0, 1.0),
+    "the charges are in nC, not pC": (1.0, 1.0, 1e3),
+    "the charges are in C, not pC": (1.0, 1.0, 1e12),
+    "the charges are in fC, not pC": (1.0, 1.0, 1e-3),
+}
+"""Wrong units that the search for mistakes considers.
 
-POSITION_UNITS_mm = {"m": 1e3, "cm": 10.0, "inch": 25.4, "um": 1e-3}
-"""Units in which positions may have been written by mistake."""
-
-CHARGE_UNITS_pC = {"nC": 1e3, "C": 1e12, "fC": 1e-3}
-"""Units in which charges may have been written by mistake."""
+Each entry is a sentence, and the factors that correct the positions, the forces and the charges.
+"""
 
 PRETENSIONS_MPa = (0.3, 1.5, 3.0)
 """Pretensions of the films with which presses are compared, MPa."""
@@ -279,12 +288,8 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
     """
     contact = presses.contact
     charge = presses.charge_pC
-    for unit, factor in FORCE_UNITS_N.items():
-        yield f"the forces are in {unit}, not N", contact * [1.0, 1.0, factor], charge
-    for unit, factor in POSITION_UNITS_mm.items():
-        yield f"the positions are in {unit}, not mm", contact * [factor, factor, 1.0], charge
-    for unit, factor in CHARGE_UNITS_pC.items():
-        yield f"the charges are in {unit}, not pC", contact, charge * factor
+    for sentence, (position_factor, force_factor, charge_factor) in UNITS.items():
+        yield sentence, contact * [position_factor, position_factor, force_factor], charge * charge_factor
     if is_one_place(presses):
         return
 

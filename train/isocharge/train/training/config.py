@@ -6,12 +6,12 @@ A TOML file with the tables `network` and `training` can replace the default val
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from msgspec import Meta, json
+from msgspec import Meta
 from msgspec.structs import replace
 
 from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.common.errors import ConfigError
-from isocharge.common.structs import Settings, WrongKey, convert, read_toml
+from isocharge.common.structs import Settings, WrongKey, convert, plain_values, read_toml
 from isocharge.simulate import NoiseModel, noise_model
 
 Width = Annotated[int, Meta(ge=1, le=4096)]
@@ -165,7 +165,7 @@ class FitConfig(Settings, frozen=True):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as nested dictionaries that can be written to JSON."""
-        return json.decode(json.encode(self), type=dict[str, Any])
+        return dict(plain_values(self))
 
     def checked(self) -> "FitConfig":
         """Check the ranges of all settings, and return a copy of the settings.
