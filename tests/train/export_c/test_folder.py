@@ -51,10 +51,9 @@ def test_command_writes_the_folder_once(command, refused, tmp_path):
     header = (tmp_path / "c" / "isocharge_device.h").read_text()
     assert "#define ISOCHARGE_LEAK_TAU_S {10.0, 10.0, 10.0}" in header
     assert header.startswith('/* The numbers of the signal chain, from the device file "bench board". Written by')
-    assert 'the numbers of the signal chain, from the device file "bench board" |' in (
-        (tmp_path / "c" / "README.md").read_text()
-    )
-    assert "Written by `isocharge train export-c three-25um-biaxial --" in (tmp_path / "c" / "README.md").read_text()
+    readme = (tmp_path / "c" / "README.md").read_text()
+    assert 'the numbers of the signal chain, from the device file "bench board" |' in readme
+    assert "Written by `isocharge train export-c three-25um-biaxial --" in readme
     refused(*words, message="is already there and is not overwritten", code=1)
 
 
