@@ -13,6 +13,7 @@ from isocharge.simulate import (
     Circle,
     FilmPrior,
     Finger,
+    ForwardMap,
     GrowingFinger,
     load_sensor,
     local_workers,
@@ -167,35 +168,44 @@ def five_electrodes():
     return CalibrationProblem(sensor, parse_probe("rectangle:4.0x2.0"), radius=5.0, force_range=(0.2, 1.5))
 
 
-def opposite_coefficients():
-    """Return the problem of a film on which the electrodes on the y axis have negative charges."""
-    sensor = with_piezo(load_sensor("four-25um-biaxial"), d31=12.0, d32=-8.0)
-    return CalibrationProblem(sensor, Circle(1.0), radius=5.0, force_range=(0.1, 1.0))
-
-
 FILMS = {
     "T1 / T2 = 1.7 and E1 / E2 = 1.3": (
         lambda: CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0)),
         {"pretension": 1.0, "tension_difference": 0.25, "stiffness_xy": 0.26, "d31": 0.2},
         ("pretension", "tension_difference", "d31"),
-        0.3,
     ),
-    "five electrodes": (five_electrodes, {"pretension": 1.2, "shift_x": 0.3}, ("shift_x",), 0.3),
-    "charges of both signs": (opposite_coefficients, {"pretension": 1.2}, ("pretension",), 0.5),  # they nearly fold
+    "five electrodes": (five_electrodes, {"pretension": 1.2, "shift_x": 0.3}, ("shift_x",)),
 }
-"""Problems, properties that differ from the described film, the properties of them that the presses determine, and the
-largest rms error of later positions, mm."""
+"""Problems, properties that differ from the described film, and the properties of them that the presses determine."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("film", FILMS)
 def test_film_is_calibrated_and_its_model_finds_contacts(film, tmp_path):
-    make_problem, changes, determined, largest_error_mm = FILMS[film]
+    make_problem, changes, determined = FILMS[film]
     problem = make_problem()
     prior = problem.prior.layout.prior
     sensor_and_probe = prior.film(film_values(prior, **changes))
     result, distance, force_error = calibrated(problem, *sensor_and_probe, tmp_path / "film")
     for name in determined:
         assert abs(result.film.value(name) - changes[name]) < 4.0 * result.film.std(name)
-    assert np.sqrt(np.mean(distance**2)) < largest_error_mm
+    assert np.sqrt(np.mean(distance**2)) < 0.3
     assert np.sqrt(np.mean(force_error**2)) < 0.03
+
+
+@pytest.mark.slow
+def test_film_with_charges_of_both_signs_is_calibrated():
+    """The electrodes on the x axis have positive charges, and those on the y axis negative charges."""
+    sensor = with_piezo(load_sensor("four-25um-biaxial"), d31=12.0, d32=-8.0)
+    problem = CalibrationProblem(sensor, Circle(1.0), radius=5.0, force_range=(0.1, 1.0))
+    prior = problem.prior.layout.prior
+    film = ForwardMap.build(*prior.film(film_values(prior, pretension=1.2)), 5.2, (0.08, 1.2))
+    rng = np.random.default_rng(2)
+    contact = draw_contacts(rng, problem.domain, 15)
+    charge = film.charges(contact)
+    assert 0.3 < (charge < 0.0).mean() < 0.7
+    presses = measured_presses(problem, with_rig_errors(contact, rng), problem.noise.add(charge, rng))
+    result = calibrate(presses, problem)
+    assert abs(result.film.value("pretension") - 1.2) < 4.0 * result.film.std("pretension") < 1.2
+    residual = result.charges.charges(result.film.film_values, contact) - charge
+    assert np.sqrt(np.mean((residual / problem.noise.sigma(charge)) ** 2)) < 3.0
