@@ -135,16 +135,10 @@ class Contacts(NamedTuple):
         total_std = np.sqrt(std**2 + np.diagonal(covariance, axis1=1, axis2=2))
         i, j = [0, 0, 1], [1, 2, 2]  # the pairs (x, y), (x, F) and (y, F)
         total = correlation * std[:, i] * std[:, j] + covariance[:, i, j]
-        x_std_mm, y_std_mm, force_std_N = total_std.T.astype(np.float32)
-        xy, xF, yF = (total / (total_std[:, i] * total_std[:, j])).T.astype(np.float32)
-        return self._replace(
-            x_std_mm=x_std_mm,
-            y_std_mm=y_std_mm,
-            force_std_N=force_std_N,
-            xy_correlation=xy,
-            xF_correlation=xF,
-            yF_correlation=yF,
-        )
+        total_correlation = total / (total_std[:, i] * total_std[:, j])
+        stds = total_std.T.astype(np.float32)
+        correlations = total_correlation.T.astype(np.float32)
+        return Contacts(self.x_mm, self.y_mm, self.force_N, *stds, self.misfit, *correlations)
 
 
 def write_finite(write: Callable[..., object], values: Iterable[float]) -> bool:
@@ -167,47 +161,23 @@ def write_finite(write: Callable[..., object], values: Iterable[float]) -> bool:
         return False
 
 
-def as_press(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
-    """Convert the charges of one press to an array of shape (electrodes,), float32, pC.
+def as_charges(charge_pC: ArrayLike, electrodes: tuple[str, ...], *, is_batch: bool) -> Singles:
+    """Convert the charges of one press or of n presses to a contiguous array of shape (n, electrodes), float32, pC.
 
     Args:
-        charge_pC: Charges, pC, in the order of the electrodes.
+        charge_pC: Charges, pC, in the order of the electrodes: shape (electrodes,) for one press, or shape
+            (n, electrodes) for a batch.
         electrodes: Names of the electrodes.
+        is_batch: Whether the charges are those of a batch.
 
     Raises:
-        ChargeError: If the number of charges is wrong, or a charge is not finite. The message names the electrode.
-    """
-    expected = f"{len(electrodes)} charges {electrodes}"
-    charges = _as_numbers(charge_pC, expected, (len(electrodes),))
-    return np.asarray(as_float32(charges[np.newaxis], electrodes)[0])
-
-
-def as_batch(charge_pC: ArrayLike, electrodes: tuple[str, ...]) -> Singles:
-    """Convert the charges of n presses to a contiguous array of shape (n, electrodes), float32, pC.
-
-    Args:
-        charge_pC: Charges, shape (n, electrodes), pC, with the columns in the order of the electrodes.
-        electrodes: Names of the electrodes.
-
-    Raises:
-        ChargeError: If the shape is wrong, or a charge is not finite. The message names the electrode and the row.
+        ChargeError: If the charges are not numbers, their array has another shape, or a charge is not finite. The
+            message names the electrode and, for a batch, the row.
     """
     n_electrode = len(electrodes)
-    expected = f"rows of {n_electrode} charges {electrodes}, shape (n, {n_electrode})"
-    return as_float32(_as_numbers(charge_pC, expected, ("n", n_electrode)), electrodes)
-
-
-def _as_numbers(charge_pC: ArrayLike, expected: str, shape: tuple[str | int, ...]) -> NDArray[np.number]:
-    """Convert charges to an array of numbers.
-
-    Args:
-        charge_pC: Charges of one press or of several presses, pC.
-        expected: Description of the required charges, for error messages.
-        shape: Required shape, in which a name stands for any length.
-
-    Raises:
-        ChargeError: If the charges are not numbers, or their array has another shape.
-    """
+    expected = f"{n_electrode} charges {electrodes}"
+    if is_batch:
+        expected = f"rows of {expected}, shape (n, {n_electrode})"
     try:
         charges = np.asarray(charge_pC)
     except ValueError as error:  # rows of different lengths
@@ -215,9 +185,9 @@ def _as_numbers(charge_pC: ArrayLike, expected: str, shape: tuple[str | int, ...
     # Numbers are floats, signed or unsigned integers. The array has lost the mask of a masked array.
     if charges.dtype.kind not in "fiu" or np.ma.is_masked(charge_pC):
         raise ChargeError(f"expected {expected} as numbers (pC), got {charge_pC!r:.200}")
-    if charges.ndim != len(shape) or charges.shape[-1] != shape[-1]:
+    if charges.ndim != 1 + is_batch or charges.shape[-1] != n_electrode:
         raise ChargeError(f"expected {expected}, got an array of shape {charges.shape}")
-    return charges
+    return as_float32(charges.reshape(-1, n_electrode), electrodes)
 
 
 def as_float32(charges: NDArray[Any], electrodes: tuple[str, ...]) -> Singles:

@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import ModelError, OutputExists, error_prefix, shown
 from isocharge.common.files import new_folder, read_needed, refuse_existing, sha256_of, write_whole
-from isocharge.serve.model.contact import as_batch
+from isocharge.serve.model.contact import as_charges
 from isocharge.serve.model.metadata import NAME, VERSION, ModelMetadata
 from isocharge.serve.model.session import (
     INPUT,
@@ -324,7 +324,7 @@ def write_model(
     where = f"the new model {metadata.label}"
     session = open_session(onnx_model, where)
     check_interface(session, len(metadata.electrodes), where)
-    charges = as_batch(golden_charge_pC, metadata.electrodes)
+    charges = as_charges(golden_charge_pC, metadata.electrodes, is_batch=True)
     golden = make_golden(session, onnx_model, charges, contact_floors(metadata), companion_files)
 
     # Write the version under a temporary name. `new_folder` renames it to `target` after the check has succeeded.

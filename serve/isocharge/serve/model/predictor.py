@@ -23,7 +23,7 @@ from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ChargeError
 from isocharge.common.structs import WrongKey, convert
 from isocharge.serve.flags import BEYOND
-from isocharge.serve.model.contact import Contact, Contacts, Validity, as_batch, as_press, write_finite
+from isocharge.serve.model.contact import Contact, Contacts, Validity, as_charges, write_finite
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.model.model_folder import find_model, load_checked_model
 from isocharge.serve.model.session import COLUMNS, BoundPress, run
@@ -129,7 +129,7 @@ class Predictor:
         if self.noise is self.metadata.noise:
             contact = self._predict_one(charge_pC)
         else:
-            contacts = self._predict_with_noise(as_press(charge_pC, self.metadata.electrodes)[np.newaxis])
+            contacts = self._predict_with_noise(as_charges(charge_pC, self.metadata.electrodes, is_batch=False))
             contact = Contact(*np.asarray(contacts, float)[0].tolist())
 
         if not self._has_warned and BEYOND in self.flags(contact):
@@ -151,8 +151,8 @@ class Predictor:
         with self._press_lock:
             # `write_finite` writes the charges, and returns False if it cannot convert them or a charge is not finite.
             if not write_finite(press.write, values):
-                # The slow conversion `as_press` accepts more number types. Its errors name the electrode.
-                press.write(*as_press(charge_pC, self.metadata.electrodes))
+                # The slow conversion `as_charges` accepts more number types. Its errors name the electrode.
+                press.write(*as_charges(charge_pC, self.metadata.electrodes, is_batch=False)[0])
             press.run()
             return Contact(*press.read())
 
@@ -207,7 +207,7 @@ class Predictor:
         Raises:
             ChargeError: If the shape is wrong, or a charge is not finite. The message names the electrode and the row.
         """
-        charges = as_batch(charge_pC, self.metadata.electrodes)
+        charges = as_charges(charge_pC, self.metadata.electrodes, is_batch=True)
         if self.noise is not self.metadata.noise:
             return self._predict_with_noise(charges)
         return self._predict(charges)
