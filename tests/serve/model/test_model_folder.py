@@ -192,18 +192,14 @@ def test_find_model_searches_the_repositories_in_the_documented_order(roots):
         assert find_model("m", roots["given"]).resolve().parents[1] == roots[name].resolve(), name
 
 
-def test_find_model_returns_the_numerically_highest_version(roots):
+def test_find_model_takes_a_name_a_version_or_a_path_and_returns_the_numerically_highest_version(roots):
     for version in ("1", "10", "9", "011", "draft", ".11.abcd"):
         put(roots["given"], version=version)
-    assert find_model("m", roots["given"]).name == "10"
-    assert find_model("m/1", str(roots["given"])).name == "1"
-
-
-def test_find_model_takes_the_path_of_a_model_a_version_or_an_onnx_file(roots):
-    folder = put(roots["given"])
-    for path in (folder.parent, folder, folder / "model.onnx"):
-        assert find_model(path) == folder, path
-        assert find_model(str(path)) == folder, path
+    folder = roots["given"] / "m"
+    for path in (folder, folder / "10", folder / "10/model.onnx"):
+        assert find_model(path) == find_model(str(path)) == folder / "10", path
+    assert find_model("m", roots["given"]) == folder / "10"
+    assert find_model("m/1", str(roots["given"])) == folder / "1"
 
 
 def test_text_is_taken_as_a_path_if_no_model_has_the_name(roots):
