@@ -30,8 +30,7 @@ def signed_charges(contact):
     return contact[:, 2:] * (contact[:, :2] @ [[10.0, 0.0, 4.0], [0.0, 10.0, -4.0]] + [0.0, 0.0, 50.0])
 
 
-@pytest.mark.parametrize("forces", [(0.5,), (0.2, 1.0), (0.2, 0.5, 1.0, 1.8)])
-@pytest.mark.parametrize("scatter", [0.0, 0.01])
+@pytest.mark.parametrize(("forces", "scatter"), [((0.5,), 0.0), ((0.2, 1.0), 0.0), ((0.2, 0.5, 1.0, 1.8), 0.01)])
 @pytest.mark.parametrize("is_signed", [False, True])
 def test_presses_with_few_forces_determine_no_higher_powers_of_the_force(film, forces, scatter, is_signed):
     """A series of a higher degree would agree at these forces, but be wrong by the size of the charge between them."""
