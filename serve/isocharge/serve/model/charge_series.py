@@ -53,18 +53,19 @@ class Series:
 
     coefficients: Array
 
-    def values_and_derivatives(self, coordinates: Array) -> Array:
-        """Evaluate the series and its derivatives with respect to the three coordinates.
+    def values_and_derivatives(self, coordinates: Array, excess: Array) -> Array:
+        """Evaluate the series and its derivatives with respect to the three coordinates, and continue it linearly.
 
         The points are processed in chunks of at most `CHUNK_SIZE` points. In each chunk, the method first sums over the
         polynomials in x and y, and then over the polynomials in the logarithm of the force.
 
         Args:
             coordinates: Scaled coordinates of n points, shape (n, 3). Coordinates outside [-1, 1] are clipped.
+            excess: Differences between the points to which the series is continued and these points, shape (n, 3).
 
         Returns:
-            Values and derivatives, shape (n, 4, n_electrode). The second axis contains the value and the derivatives
-            with respect to x, y and the logarithm of the force.
+            Values at the continued points, and derivatives, shape (n, 4, n_electrode). The second axis contains the
+            value and the derivatives with respect to x, y and the logarithm of the force.
         """
         n_x, _n_y, n_force, n_electrode = self.coefficients.shape  # numbers of polynomials, and of electrodes
         degree = n_x - 1  # the same in x and in y
@@ -83,7 +84,10 @@ class Series:
             # (points, 1, n_force) @ (points, n_force, 4 * n_electrode).
             chunk_values = force_terms[:, None, :] @ force_coefficients
             evaluated_chunks.append(chunk_values[:, 0, :])
-        return np.concatenate(evaluated_chunks).reshape(len(coordinates), 4, n_electrode)
+        values = np.concatenate(evaluated_chunks).reshape(len(coordinates), 4, n_electrode)
+        if excess.any():
+            values[:, 0] += np.einsum("ns,nsk->nk", excess, values[:, 1:])
+        return values
 
     @cached_property
     def _term_coefficients(self) -> Array:
@@ -228,7 +232,7 @@ class ChargeSeries:
             pC/mm, pC/mm and pC.
         """
         nearest, excess = self._nearest_in_domain(contact)
-        values = _continued(self._calibrated.values_and_derivatives(nearest), excess)
+        values = self._calibrated.values_and_derivatives(nearest, excess)
         charge_pC, _, by_contact = self._charges(values, nearest, excess)
         return charge_pC + self.offset_pC, by_contact
 
@@ -246,7 +250,7 @@ class ChargeSeries:
         n_contact = len(contact)
         n_electrode = len(self.electrodes)
         nearest, excess = self._nearest_in_domain(contact)
-        node_values = _continued(self._node_series.values_and_derivatives(nearest), excess)
+        node_values = self._node_series.values_and_derivatives(nearest, excess)
         node_values = node_values.reshape(n_contact, 4, -1, n_electrode)
         states = np.broadcast_to(state, (n_contact, 1 + self.direction_count))
         weights, weight_slopes = interpolation_weights(self.node_MPa, states[:, 0])  # shape (n, n_node)
@@ -255,7 +259,7 @@ class ChargeSeries:
         value = np.einsum("nk,nske->nse", weights, node_values)  # shape (n, 4, n_electrode)
         value_by_state = np.einsum("nk,nke->ne", weight_slopes, node_values[:, 0])[:, :, None]
         if self._direction_series is not None:
-            direction_values = _continued(self._direction_series.values_and_derivatives(nearest), excess)
+            direction_values = self._direction_series.values_and_derivatives(nearest, excess)
             direction_values = direction_values.reshape(n_contact, 4, -1, n_electrode)
             value = value + np.einsum("nk,nske->nse", states[:, 1:], direction_values)
             value_by_state = np.concatenate([value_by_state, direction_values[:, 0].swapaxes(1, 2)], axis=2)
@@ -365,16 +369,3 @@ def interpolation_weights(nodes: Array, points: Array) -> tuple[Array, Array]:
     weights = polynomial.polyval(points / scale, node_polynomials)
     slopes = polynomial.polyval(points / scale, polynomial.polyder(node_polynomials)) / scale
     return np.asarray(weights.T, dtype=float), np.asarray(slopes.T, dtype=float)
-
-
-def _continued(values: Array, excess: Array) -> Array:
-    """Continue a series linearly beyond the contacts at which it was evaluated.
-
-    Args:
-        values: Values and derivatives, shape (n, 4, k), as `Series.values_and_derivatives` returns them. The values are
-            changed in place.
-        excess: Differences between the contacts and these evaluated contacts, in unit coordinates, shape (n, 3).
-    """
-    if excess.any():
-        values[:, 0] += np.einsum("ns,nsk->nk", excess, values[:, 1:])
-    return values
