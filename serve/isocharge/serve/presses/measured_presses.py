@@ -175,10 +175,10 @@ class MeasuredPresses:
         rules = PRESS_RULES | dict.fromkeys(self.electrodes, CHARGE_RULE)
         for name in UNCERTAINTY:
             rules[name] = replace(rules[name], may_be_empty=False)
-        columns = NumberColumns(self.columns, np.array(self.lines, dtype=np.intp), self.row_noun)
+        columns = NumberColumns(self.columns, self.lines, self.row_noun)
         columns.check(rules, where="", error_class=PressError)  # the caller knows the file, if there is one
 
-        _refuse_half_positions(self.contact, self.lines, self.row_noun)
+        _refuse_half_positions(columns)
         has_no_charge = np.isnan(self.charge_pC).all(axis=1)
         if has_no_charge.any():
             raise PressError(
@@ -187,22 +187,20 @@ class MeasuredPresses:
             )
 
 
-def _refuse_half_positions(contact: Array, lines: Sequence[int], row_noun: str) -> None:
+def _refuse_half_positions(columns: NumberColumns) -> None:
     """Raise an error for the first press of which only one of x and y is known.
 
     Args:
-        contact: Position and force of each press, shape (n, 3); NaN if unknown.
-        lines: Number of the line of each press, for the error message.
-        row_noun: What `lines` counts.
+        columns: Columns of the presses, with `x_mm` and `y_mm`.
 
     Raises:
         PressError: If there is such a press.
     """
-    is_half = np.isnan(contact[:, 0]) != np.isnan(contact[:, 1])
+    is_half = np.isnan(columns.values["x_mm"]) != np.isnan(columns.values["y_mm"])
     if is_half.any():
         raise PressError(
-            f"{row_noun} {lines[is_half.argmax()]}: expected both x_mm and y_mm, or two empty cells, got one of them; "
-            "give the other"
+            f"{columns.row_noun} {columns.row_numbers[is_half.argmax()]}: expected both x_mm and y_mm, or two empty "
+            "cells, got one of them; give the other"
         )
 
 
@@ -256,7 +254,7 @@ def read_presses(
             position_std_mm=values["position_std_mm"],
             force_std=values["force_std"],
             electrodes=electrode_names,
-            lines=tuple(columns.row_numbers.tolist()),
+            lines=tuple(columns.row_numbers),
             ignored=tuple(name for name in table.header if name not in columns.values),
             row_noun=columns.row_noun,
         )
@@ -307,10 +305,9 @@ def read_press_list(path: Path) -> Array:
     path = Path(path)
     with open_table(path, CONTACT, PressError, f"a header with {', '.join(CONTACT)}") as table:
         columns = _read_rows(table, {name: PRESS_RULES[name] for name in CONTACT}, {})
-    contact = np.column_stack([columns.values[name] for name in CONTACT])
     with error_prefix(f"{path}, ", PressError):
-        _refuse_half_positions(contact, columns.row_numbers.tolist(), columns.row_noun)
-    return contact
+        _refuse_half_positions(columns)
+    return np.column_stack([columns.values[name] for name in CONTACT])
 
 
 def write_presses(path: Path, presses: MeasuredPresses) -> None:

@@ -14,7 +14,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from isocharge.common.arrays import LARGEST, Array, Booleans, Integers
+from isocharge.common.arrays import LARGEST, Array, Booleans
 from isocharge.common.errors import InputError, shown
 
 log = logging.getLogger(__name__)
@@ -67,12 +67,12 @@ class NumberColumns:
 
     Attributes:
         values: The columns by their names, each of shape (n,); NaN for an empty cell.
-        row_numbers: Number of the line or row in the file from which each row was read, shape (n,).
+        row_numbers: Number of the line or row in the file from which each row was read.
         row_noun: What the row numbers count: "line" for the lines of a text, or "row" for the rows of a table.
     """
 
     values: Mapping[str, Array]
-    row_numbers: Integers
+    row_numbers: Sequence[int]
     row_noun: str
 
     def check(self, rules: Mapping[str, ColumnRule], where: str, error_class: type[InputError]) -> None:

@@ -127,7 +127,7 @@ class CsvTable(NumberTable):
             )
         rows = np.asarray(numbers, dtype=np.float64).reshape(len(line_numbers), len(column_indices))
         values = dict(zip(column_indices, rows.T, strict=True))
-        return NumberColumns(values, np.array(line_numbers, dtype=np.intp), "line")
+        return NumberColumns(values, line_numbers, "line")
 
     def _number(self, text: str) -> float | None:
         """Return the number in a cell: NaN for an empty cell, and None for a cell without a finite number.
@@ -328,7 +328,7 @@ class ParquetTable(NumberTable):
             }
             if any(len(column) != row_count for column in values.values()):
                 raise ValueError(f"the columns do not have {row_count:,} rows as stated in the metadata")
-        return NumberColumns(values, np.arange(1, row_count + 1, dtype=np.intp), "row")
+        return NumberColumns(values, range(1, row_count + 1), "row")
 
 
 def parquet_bytes(columns: Mapping[str, Array]) -> bytes:

@@ -295,8 +295,8 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
     probe_column = np.full(count, probe.notation)
     orientation_deg = np.full(count, np.rad2deg(probe.angle) % 360.0)  # its notation does not contain its rotation
     samples = Samples(x_mm, y_mm, force_N, probe_column, orientation_deg, complete_presses.charge_pC)
-    manifest: dict[str, object] = {}  # measured presses have no settings of a simulator
-    return Dataset(sensor, samples, manifest, presses_sha256(complete_presses))
+    sha256 = presses_sha256(complete_presses)
+    return Dataset(sensor, samples, manifest={}, sha256=sha256)  # measured presses have no settings of a simulator
 
 
 def measured_presses_of(dataset: Dataset) -> MeasuredPresses:
