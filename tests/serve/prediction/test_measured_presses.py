@@ -1,6 +1,7 @@
 """Measured presses: any spreadsheet's file is read, what is wrong is named, and writing loses nothing."""
 
 import csv
+import re
 
 import numpy as np
 import pytest
@@ -8,8 +9,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from isocharge.common.arrays import LARGEST
-from isocharge.common.errors import OutputError, PressError
-from isocharge.serve import MeasuredPresses, read_presses, write_presses
+from isocharge.common.errors import ChargeError, OutputError, PressError
+from isocharge.serve import MeasuredPresses, read_charges, read_presses, write_presses
+from isocharge.serve.prediction.table import read_charge_file
 from isocharge.serve.presses import measured_presses
 from isocharge.serve.presses.measured_presses import PRESS_RULES, read_press_list
 from isocharge.serve.presses.table_file import csv_text
@@ -19,15 +21,21 @@ HEADER = "x_mm,y_mm,force_N,A,B,C"
 
 
 @pytest.fixture
-def read(tmp_path):
-    """Read a text, or bytes, as a file `presses.csv`."""
+def write(tmp_path):
+    """Write a text, or bytes, as `presses.csv`, and return the path."""
 
-    def read(text, **options):
+    def write(text):
         path = tmp_path / "presses.csv"
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        return read_presses(path, NAMES, **options)
+        return path
 
-    return read
+    return write
+
+
+@pytest.fixture
+def read(write):
+    """Read a text, or bytes, as a file `presses.csv`."""
+    return lambda text, **options: read_presses(write(text), NAMES, **options)
 
 
 @pytest.mark.parametrize(
@@ -51,9 +59,8 @@ def test_a_quoted_cell_may_hold_a_line_that_begins_with_a_hash(read):
     assert presses.charge_pC[:, 2].tolist() == [6.0, 7.0]
 
 
-def test_without_names_all_other_columns_are_electrodes(read, tmp_path):
-    (tmp_path / "all.csv").write_text("force_N,A,y_mm,x_mm,C\n0.5,10,2,1,30\n")
-    presses = read_presses(tmp_path / "all.csv")
+def test_without_names_all_other_columns_are_electrodes(read, write):
+    presses = read_presses(write("force_N,A,y_mm,x_mm,C\n0.5,10,2,1,30\n"))
     assert (presses.electrodes, presses.charge_pC.tolist(), presses.ignored) == (("A", "C"), [[10.0, 30.0]], ())
     assert presses.of_electrodes(("C", "A"), "mine").charge_pC.tolist() == [[30.0, 10.0]]
     with pytest.raises(PressError, match=r"electrodes \('A', 'B'\) of mine, got \('A', 'C'\); missing: 'B'"):
@@ -61,13 +68,11 @@ def test_without_names_all_other_columns_are_electrodes(read, tmp_path):
     assert read("day,x_mm,y_mm,note,A,B,C\n1,2,3,a,4,5,6\n").ignored == ("day", "note")
 
 
-def test_a_list_of_presses_for_a_machine(tmp_path):
-    (tmp_path / "list.csv").write_text("n,x_mm,y_mm,force_N\n1,2,-3,0.5\n2,,,1\n")
-    nan = np.nan
-    np.testing.assert_array_equal(read_press_list(tmp_path / "list.csv"), [[2.0, -3.0, 0.5], [nan, nan, 1.0]])
-    (tmp_path / "list.csv").write_text("x_mm,y_mm,force_N\n1,1,1\n1,1,-1\n")
-    with pytest.raises(PressError, match=r"list\.csv, line 3, column 'force_N': expected a positive force"):
-        read_press_list(tmp_path / "list.csv")
+def test_a_list_of_presses_for_a_machine(write):
+    path = write("n,x_mm,y_mm,force_N\n1,2,-3,0.5\n2,,,1\n")
+    np.testing.assert_array_equal(read_press_list(path), [[2.0, -3.0, 0.5], [np.nan, np.nan, 1.0]])
+    with pytest.raises(PressError, match=r"presses\.csv, line 3, column 'force_N': expected a positive force"):
+        read_press_list(write("x_mm,y_mm,force_N\n1,1,1\n1,1,-1\n"))
 
 
 def test_row_of_units_below_the_header_is_ignored(read):
@@ -157,6 +162,69 @@ def test_arrays_of_different_lengths_are_refused():
     ones = np.ones(2)
     with pytest.raises(PressError, match=r"shapes \(\(2, 3\), \(2, 3\), .*, got \(\(2, 3\), \(2, 2\),"):
         MeasuredPresses(np.ones((2, 3)), np.ones((2, 2)), ones, 0.1 * ones, NAMES, (1, 2))
+
+
+# Headers and encodings of other programs
+
+ROW = "1,2,3,4,5,6\n"
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("x_mm,y_mm,force_N,Ladung A [pC],B,C", r"got the header \[.*'Ladung A \[pC\]'.*; missing: \['A'\]"),
+        ("x_mm,y_mm,force_N,a,B,C", "rename 'a' to 'A' and check its unit, or remove the column; missing"),
+        ("x_mm,y_mm,force_N,A [pC],B [pC],C [pC]", r"rename 'A \[pC\]' to 'A'"),
+        ("x_mm,y_mm,force_N,A_pC,B_pC,C_pC", "rename 'A_pC' to 'A'"),
+        ("x [mm],y_mm,force_N,A,B,C", r"rename 'x \[mm\]' to 'x_mm'"),
+        ("x_mm,y_mm,Force (N),A,B,C", r"rename 'Force \(N\)' to 'force_N'"),
+        ("x_mm,y_mm,Force_STD,A,B,C", "rename 'Force_STD' to 'force_std'"),
+        ("x_m,y_m,force_N,A,B,C", "rename 'x_m' to 'x_mm' and check its unit"),
+        ("x_mm,y_mm,force (mN),A,B,C", r"rename 'force \(mN\)' to 'force_N' and check"),
+        ("x_mm,y_mm,force_N,A [nC],B,C", r"rename 'A \[nC\]' to 'A' and check"),
+    ],
+)
+def test_similar_header_names_the_column_to_rename(write, header, message):
+    with pytest.raises(PressError, match=message) as caught:
+        read_presses(write(f"{header}\n{ROW}"), NAMES)
+    assert "expected a header with x_mm, y_mm, force_N and the electrodes" in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+def test_headers_where_every_other_column_is_an_electrode(write):
+    """A channel may have any name, but not one that stands for position or force."""
+    assert read_presses(write("X_N,X_P,Y\n1,2,3")).electrodes == ("X_N", "X_P", "Y")
+    assert read_presses(write(f"x_mm,y_mm,force_N,a,f,Ladung [pC]\n{ROW}")).electrodes == ("a", "f", "Ladung [pC]")
+    for misspelt, name in (("force [N]", "force_N"), ("Temperature_C", "temperature_C")):
+        with pytest.raises(PressError, match=f"rename '{re.escape(misspelt)}' to '{name}' and check"):
+            read_presses(write(f"x_mm,y_mm,{misspelt},a,b,c\n{ROW}"))
+
+
+TEXT = f"# Größe\nx_mm,y_mm,force_N,A,B,C\n{ROW}"
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (TEXT.encode("utf-16"), r"presses\.csv, line 1: the byte 0xff is not text in UTF-8: .* iconv -f UTF-16"),
+        (TEXT[8:].encode("utf-16-le"), r"line 1: the byte 0x00 is not text in UTF-8: .* iconv -f UTF-16"),
+        (TEXT.encode("latin-1"), r"line 1: the byte 0xf6 is not text in UTF-8: .*WINDOWS-1252"),
+        (f"{TEXT[8:]}{ROW * 5000}1,2,3,4,5,ü".encode("cp1252"), "line 5003: the byte 0xfc"),
+        (b"PK\x03\x04\xff\xff", "the byte 0xff is not text in UTF-8: export the file as CSV in UTF-8"),
+    ],
+)
+@pytest.mark.parametrize("read", [read_presses, read_charge_file])
+def test_headers_in_other_encodings_are_refused(write, read, data, message):
+    with pytest.raises((PressError, ChargeError), match=message) as caught:
+        read(write(data), NAMES)
+    assert str(caught.value).count("presses.csv") == 1
+
+
+def test_two_byte_order_marks_of_utf_8_are_accepted(write):
+    path = write(b"\xef\xbb\xbf" * 2 + TEXT.encode())
+    assert len(read_presses(path, NAMES)) == 1
+    np.testing.assert_array_equal(read_charge_file(path, NAMES), [[4, 5, 6]])
+    assert read_charges(["\ufeffA,B,C\n", "1,2,3\n"], NAMES, "text").tolist() == [[1, 2, 3]]
 
 
 # Round trips
