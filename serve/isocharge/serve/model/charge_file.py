@@ -46,14 +46,14 @@ NUMBERS = ("charge_std", "offset_pC", "pretension_MPa", "tension_std_MPa")
 def charge_map_bytes(series: ChargeSeries) -> bytes:
     """Return the content of the file `charges.npz` for a charge map."""
     arrays: dict[str, Any] = {
-        "format": np.array(FORMAT),
+        "format": FORMAT,
         "series": series.coefficients.astype(np.float32),
         "node_MPa": series.node_MPa,
-        "radius_mm": np.array(series.domain.radius),
-        "force_N": np.array(series.domain.force_range),
-        "is_folded": np.array(int(series.is_folded)),
+        "radius_mm": series.domain.radius,
+        "force_N": series.domain.force_range,
+        "is_folded": int(series.is_folded),
     }
-    arrays |= {name: np.array(getattr(series, name)) for name in NUMBERS}
+    arrays |= {name: getattr(series, name) for name in NUMBERS}
     if series.directions is not None:
         arrays["directions"] = series.directions.astype(np.float32)
     if series.log_size is not None:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
-from msgspec import Meta, Struct, to_builtins
+from msgspec import Meta, Struct, structs, to_builtins
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, is_printable, shown
@@ -227,9 +227,8 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         Raises:
             ModelError: If a value, such as NaN, cannot be expressed in JSON.
         """
-        values = {name: getattr(self, name) for name in self.__struct_fields__}
         props = {}
-        for name, value in values.items():
+        for name, value in structs.asdict(self).items():
             if value is None:
                 continue
             try:
