@@ -68,7 +68,7 @@ class Domain:
         Returns:
             Scaled coordinates, shape (n, 3), dimensionless.
         """
-        return np.asarray((with_log_force(contact) - self.centre) / self.scale)
+        return (with_log_force(contact) - self.centre) / self.scale
 
     def to_contact(self, unit: Array) -> Array:
         """Convert the scaled coordinates that `to_unit` returns back into contacts (x, y, F).
@@ -98,7 +98,7 @@ class Domain:
         Returns:
             Whether each contact lies in the domain, shape (n,).
         """
-        return np.asarray(~self.is_outside(contact) & ~np.isnan(contact).any(axis=1))
+        return ~self.is_outside(contact) & ~np.isnan(contact).any(axis=1)
 
     def check(self, contact: Array, source: str) -> Array:
         """Convert contacts into an array of floats, and raise an error if a contact lies outside the domain.

@@ -103,7 +103,7 @@ class Series:
 
         coefficients = series_and_derivatives[:, x_degree, y_degree]  # (4, n_term, force_degree + 1, n_electrode)
         coefficients_by_term = coefficients.transpose(1, 2, 0, 3)  # shape (n_term, force_degree + 1, 4, n_electrode)
-        return np.asarray(coefficients_by_term.reshape(len(x_degree), -1))
+        return coefficients_by_term.reshape(len(x_degree), -1)
 
 
 def position_degrees(degree: int) -> tuple[Integers, Integers]:
@@ -134,9 +134,9 @@ def chebyshev_terms(coordinates: Array, degree: int, force_degree: int) -> tuple
         the logarithm of the force, shape (n, force_degree + 1).
     """
     x, y, log_force = np.clip(coordinates, -1.0, 1.0).T
-    x_polynomials = chebyshev.chebvander(x, degree).astype(float)  # shape (n, degree + 1)
-    y_polynomials = chebyshev.chebvander(y, degree).astype(float)
-    force_polynomials = chebyshev.chebvander(log_force, force_degree).astype(float)
+    x_polynomials = chebyshev.chebvander(x, degree)  # shape (n, degree + 1)
+    y_polynomials = chebyshev.chebvander(y, degree)
+    force_polynomials = chebyshev.chebvander(log_force, force_degree)
 
     x_degree, y_degree = position_degrees(degree)
     position_terms = x_polynomials[:, x_degree] * y_polynomials[:, y_degree]
@@ -349,7 +349,7 @@ def series_size(log_size: Array, unit_log_force: Array, excess: Array | float = 
 
 def _limited_exp(logarithm: Array) -> Array:
     """Compute exponential functions. The magnitudes of the arguments are limited to `MAX_VALUE`."""
-    return np.asarray(np.exp(np.clip(logarithm, -MAX_VALUE, MAX_VALUE)))
+    return np.exp(np.clip(logarithm, -MAX_VALUE, MAX_VALUE))
 
 
 def interpolation_weights(nodes: Array, points: Array) -> tuple[Array, Array]:
@@ -368,4 +368,4 @@ def interpolation_weights(nodes: Array, points: Array) -> tuple[Array, Array]:
     node_polynomials = np.linalg.inv(polynomial.polyvander(nodes / scale, nodes.size - 1))
     weights = polynomial.polyval(points / scale, node_polynomials)
     slopes = polynomial.polyval(points / scale, polynomial.polyder(node_polynomials)) / scale
-    return np.asarray(weights.T, dtype=float), np.asarray(slopes.T, dtype=float)
+    return weights.T, np.asarray(slopes.T, dtype=float)

@@ -138,7 +138,7 @@ class Contacts(NamedTuple):
         total_correlation = total / (total_std[:, i] * total_std[:, j])
         stds = total_std.T.astype(np.float32)
         correlations = total_correlation.T.astype(np.float32)
-        return Contacts(self.x_mm, self.y_mm, self.force_N, *stds, self.misfit, *correlations)
+        return Contacts(*[self.x_mm, self.y_mm, self.force_N, *stds, self.misfit, *correlations])
 
 
 def write_finite(write: Callable[..., object], values: Iterable[float]) -> bool:

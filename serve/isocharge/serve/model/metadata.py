@@ -75,7 +75,7 @@ class ModelNoise(Struct, frozen=True, kw_only=True):
         """
         white_pC = np.asarray(self.white_pC)
         gain = np.asarray(self.gain)
-        return np.asarray(white_pC**2 + (gain * charge_pC) ** 2)
+        return white_pC**2 + (gain * charge_pC) ** 2
 
 
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]

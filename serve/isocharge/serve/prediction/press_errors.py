@@ -305,7 +305,7 @@ def chi_squared_deviate(statistic: ArrayLike, degrees: ArrayLike) -> Array:
     """
     variance = 2.0 / (9.0 * np.asarray(degrees, dtype=float))
     cube_root = np.cbrt(np.asarray(statistic, dtype=float) / degrees)
-    return np.asarray((cube_root - (1.0 - variance)) / np.sqrt(variance))
+    return (cube_root - (1.0 - variance)) / np.sqrt(variance)
 
 
 def chi_squared_survival(statistic: float, degrees: int) -> float:

@@ -54,7 +54,7 @@ class ColumnRule:
             is_violation |= values <= 0.0
         if not self.may_be_empty:
             is_violation |= np.isnan(values)
-        return np.asarray(is_violation)
+        return is_violation
 
 
 CHARGE_RULE = ColumnRule("a charge in pC")
