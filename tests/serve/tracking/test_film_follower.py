@@ -61,13 +61,12 @@ def model_in(folder, series, noise=NOISE):
     """
     shutil.copy(GOLDEN, folder)
     put_charge_map(folder, charge_map_bytes(series))
-    calibrated = series.calibrated_series
 
     def predict(charge_pC):
         contact = np.array([0.0, 0.0, np.log(0.5)])
         for _ in range(6):
             place = np.array([[contact[0], contact[1], np.exp(contact[2])]])
-            charge, slopes = calibrated.linearised(place)
+            charge, slopes = series.linearised(place)
             weight = 1.0 / NOISE.sigma(charge[0])
             step, *_ = np.linalg.lstsq(weight[:, None] * slopes[0], weight * (charge_pC - charge[0]), rcond=None)
             contact = np.clip(contact + step, [-9.0, -9.0, -4.0], [9.0, 9.0, 2.0])
@@ -239,7 +238,7 @@ def test_film_that_is_lost_again_keeps_the_state_of_the_latest_touches(series, m
 
 
 def test_models_that_cannot_be_followed_are_refused(series, tmp_path):
-    single = series.calibrated_series
+    single = replace(series, coefficients=series.coefficients[:1], node_MPa=np.zeros(1), directions=None)
     with pytest.raises(ModelError, match="calibrate"):
         new_follower(model_in(tmp_path, single))
     three = replace(

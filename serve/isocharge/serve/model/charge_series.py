@@ -24,7 +24,7 @@ A calibrated film may change. The map then also depends on the state of the film
   d_ke is another Chebyshev series.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -266,12 +266,6 @@ class ChargeSeries:
 
         charge_pC, charge_per_value, by_contact = self._charges(value, nearest, excess)
         return ModelValues(charge_pC + self.offset_pC, by_contact, charge_per_value[:, :, None] * value_by_state)
-
-    @property
-    def calibrated_series(self) -> "ChargeSeries":
-        """Charge map of the film as it was calibrated, with a single node and without directions."""
-        coefficients = self._calibrated.coefficients[np.newaxis]
-        return replace(self, coefficients=coefficients, node_MPa=np.zeros(1), directions=None)
 
     @cached_property
     def _calibrated(self) -> Series:

@@ -223,7 +223,7 @@ def training_data(
         sha256=sha256_of(charge.tobytes()),
         outside=_outside_presses(charges, domain, executor),
         yield_force_N=yield_force(sensor.film, [probe], domain.force_range),
-        field=series.calibrated_series,
+        field=series,  # the training uses the charges of the calibrated film
     )
 
 
