@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.optimize import least_squares
 
-from isocharge.serve.model.robust_estimate import ModelValues, Prior, RobustProblem
+from isocharge.serve.model.robust_estimate import ModelValues, RobustProblem
 
 DIRECTION = 0.2 * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 STATE_EFFECT = np.array([[0.3, 0.1, 0.2, 0.15], [0.02, -0.05, 0.04, 0.01]])
@@ -32,8 +32,7 @@ def presses(rng, count, state):
 
 def estimate(charge, start, **options):
     covariance = np.tile(NOISE**2 * np.eye(4), (len(charge), 1, 1))
-    prior = Prior(np.zeros(2), np.diag([0.5, 2.0]) ** 2)
-    problem = RobustProblem(model, charge, covariance, prior, **options)
+    problem = RobustProblem(model, charge, covariance, np.zeros(2), np.diag([0.5, 2.0]) ** 2, **options)
     point = problem.estimate(np.zeros(2), start, tolerance=1e-9)
     return point, problem.state_covariance(point)
 

@@ -55,18 +55,6 @@ class ModelValues(NamedTuple):
     by_state: Array
 
 
-class Prior(NamedTuple):
-    """Gaussian prior of the state.
-
-    Attributes:
-        mean: Mean of the state, shape (p,).
-        covariance: Covariance of the state, shape (p, p).
-    """
-
-    mean: Array
-    covariance: Array
-
-
 class RobustPoint(NamedTuple):
     """State and contacts of a `RobustProblem`, with the whitened residuals and derivatives at this point.
 
@@ -101,7 +89,8 @@ class RobustProblem:
         model: Callable[[Array, Array], ModelValues],
         charge_pC: Array,
         covariance_pC2: Array,
-        prior: Prior,
+        prior_mean: Array,
+        prior_covariance: Array,
         *,
         measured_contacts: Array | float = 0.0,
         contact_std: Array | float = np.inf,
@@ -117,7 +106,8 @@ class RobustProblem:
                 coordinates of a contact may have any meaning, for example x, y and the logarithm of the force.
             charge_pC: Measured charges of the presses, shape (n, e), pC.
             covariance_pC2: Covariances of the charges of each press, shape (n, e, e), pC^2.
-            prior: Prior of the state.
+            prior_mean: Mean of the Gaussian prior of the state, shape (p,).
+            prior_covariance: Covariance of the Gaussian prior of the state, shape (p, p).
             measured_contacts: Measured coordinates of the contacts, shape (n, 3). Those without a finite standard
                 deviation are ignored.
             contact_std: Standard deviations of the measured coordinates, shape (n, 3); NaN or infinity for a coordinate
@@ -128,8 +118,8 @@ class RobustProblem:
         self._model = model
         self._charge_pC = charge_pC
         self._whitening = np.linalg.inv(np.linalg.cholesky(covariance_pC2))  # one matrix per press, shape (n, e, e)
-        self._prior = prior
-        self._precision = np.linalg.inv(prior.covariance)
+        self._prior_mean = prior_mean
+        self._precision = np.linalg.inv(prior_covariance)
         self._freedom = freedom
         n_press, n_electrode = charge_pC.shape
         self._measured = np.nan_to_num(measured_contacts)
@@ -194,7 +184,7 @@ class RobustProblem:
         chi2 = (residual**2).sum(axis=1) + (contact_residual**2).sum(axis=1)
         weights = (self._freedom + self._degrees) / (self._freedom + chi2)
         press_cost = 0.5 * (self._freedom + self._degrees) * np.log1p(chi2 / self._freedom)
-        deviation = state - self._prior.mean
+        deviation = state - self._prior_mean
         return RobustPoint(
             state=state,
             contacts=contacts,
@@ -242,7 +232,7 @@ class RobustProblem:
         remaining_residual = point.residual - (point.by_contact @ contact_shift[:, :, None])[:, :, 0]
         weighted = (point.weights[:, None, None] * point.by_state).reshape(-1, n_state)
         normal_matrix = self._precision + weighted.T @ remaining_slopes
-        gradient = self._precision @ (self._prior.mean - point.state) + weighted.T @ remaining_residual.ravel()
+        gradient = self._precision @ (self._prior_mean - point.state) + weighted.T @ remaining_residual.ravel()
         symmetric = 0.5 * (normal_matrix + normal_matrix.T)
         return symmetric, gradient, contact_shift, contact_by_state
 

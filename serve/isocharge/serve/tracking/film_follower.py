@@ -39,7 +39,7 @@ from isocharge.serve.flags import BEYOND, FILM, GAP, MISFIT, OUTSIDE, REPEAT, ST
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.charge_file import FILE, read_charge_map
 from isocharge.serve.model.contact import Contact, is_close
-from isocharge.serve.model.robust_estimate import ModelValues, Prior, RobustProblem
+from isocharge.serve.model.robust_estimate import ModelValues, RobustProblem
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.stage import Rule, Setting, Setup, Stage
 from isocharge.serve.signal_chain.thermal import warming_ratios
@@ -299,8 +299,9 @@ class FilmFollower(Stage):
         scale = self._error_scale
         covariance_pC2 = scale * (np.diag(variance_pC2) + np.outer(touch_offset_pC, touch_offset_pC))
         start = self._log_contact(self.follow_contact(self.predictor.predict(charge_pC), charge_pC))
-        prior = Prior(self._state, self._covariance)
-        problem = RobustProblem(self._values, charge_pC[np.newaxis], covariance_pC2[np.newaxis], prior)
+        problem = RobustProblem(
+            self._values, charge_pC[np.newaxis], covariance_pC2[np.newaxis], self._state, self._covariance
+        )
         state_bounds = (self._lowest, self._highest)
         estimate = problem.estimate(self._state, start, contact_bounds=self._contact_bounds, state_bounds=state_bounds)
         self._state = estimate.state

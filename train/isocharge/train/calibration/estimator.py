@@ -23,7 +23,6 @@ from scipy.special import chdtrc, chdtri, softmax
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.contact_domain import with_log_force
 from isocharge.serve.model.robust_estimate import ModelValues, RobustPoint, RobustProblem
-from isocharge.serve.model.robust_estimate import Prior as StatePrior
 from isocharge.simulate import NoiseModel, noise_model
 from isocharge.simulate.sensor.film_properties import UNEVEN_TENSIONS
 from isocharge.train.calibration.film_charges import FilmCharges
@@ -340,7 +339,8 @@ def _most_probable_point(
         lambda contacts, state: model_values(charges, prior.layout, data, state, contacts),
         data.charge,
         charge_variance[:, :, None] * np.eye(charge_variance.shape[1]),
-        StatePrior(prior.mean, prior.covariance(TYPICAL)),
+        prior.mean,
+        prior.covariance(TYPICAL),
         measured_contacts=data.contact,
         contact_std=data.contact_std,
     )
