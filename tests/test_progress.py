@@ -1,4 +1,4 @@
-"""Work in a second thread: its progress, its errors, and its end when the first thread fails."""
+"""Work in a second thread: its progress, and its end when the first thread fails."""
 
 import threading
 import time
@@ -17,13 +17,6 @@ def test_the_progress_of_a_second_thread_reaches_the_listener(shown_title, title
         assert future.result() is None
         report("sums", 2, 2)
     assert calls == [(title, 1, 2, "half"), ("sums", 2, 2, "")]
-
-
-def test_an_error_of_the_second_thread_is_raised_by_its_result():
-    with second_thread() as executor:
-        future = executor.submit(int, "no number")
-        with pytest.raises(ValueError, match="no number"):
-            future.result()
 
 
 def test_a_second_thread_stops_at_its_next_report_if_the_first_thread_is_interrupted():

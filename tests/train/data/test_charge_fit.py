@@ -17,14 +17,6 @@ from isocharge.train.training.training_data import TrainingData, invertible_doma
 DOMAIN = Domain(8.0, (0.05, 2.0))
 
 
-def test_charges_agree_with_the_simulator(split, film):
-    field = split.field
-    contact = draw_contacts(np.random.default_rng(8), DOMAIN, 500)
-    relative_error = np.abs(field.charges(contact) / film.charges(contact) - 1.0)
-    assert np.median(relative_error) < 2e-4
-    assert np.sqrt(np.mean(relative_error**2)) < 2.0 * field.charge_std
-
-
 def signed_charges(contact):
     """Return charges of both signs that are proportional to the force."""
     return contact[:, 2:] * (contact[:, :2] @ [[10.0, 0.0, 4.0], [0.0, 10.0, -4.0]] + [0.0, 0.0, 50.0])
