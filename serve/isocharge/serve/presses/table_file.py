@@ -206,7 +206,8 @@ def _checked_lines(lines: Iterable[str], source: TableSource) -> Iterator[str]:
     line_number = 0
     try:
         for line_number, line in enumerate(lines, start=1):
-            wrong_byte = _WRONG_BYTE.search(line)
+            is_plain = line.isascii() and "\0" not in line  # is fast to check, and true for most lines
+            wrong_byte = None if is_plain else _WRONG_BYTE.search(line)
             if wrong_byte:  # the file is binary, or text in another encoding
                 raise source.error(
                     f", line {line_number}: the byte 0x{ord(wrong_byte[0]) & 0xFF:02x} is not text in UTF-8: export "
