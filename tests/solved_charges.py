@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from isocharge.simulate import SolveSettings, press, touch_charge
+from isocharge.simulate import Electrode, SolveSettings, press, touch_charge
 
 
 def with_film(sensor, **changes):
@@ -15,6 +15,12 @@ def with_film(sensor, **changes):
 def with_piezo(sensor, **changes):
     """Return a sensor with other values of some piezoelectric coefficients, pC/N."""
     return replace(sensor, piezo=replace(sensor.piezo, **changes))
+
+
+def with_squares(sensor, *places):
+    """Return a sensor with square electrodes of 3 mm at positions (x, y), mm."""
+    squares = (Electrode.of_square(name, place, 3.0) for name, place in zip("ABCDEFGH", places, strict=False))
+    return replace(sensor, electrodes=tuple(squares))
 
 
 def solved_charge(sensor, probe, at, force, *settings, **options):

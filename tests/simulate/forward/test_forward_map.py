@@ -116,14 +116,12 @@ def test_one_family_of_solves_serves_every_readout(near_map, changes):
     assert errors(other, draw(near_map, 8, seed=4)[0]).max() < 1e-3
 
 
-def test_contact_pressure(near_map, oriented_map):
+def test_contact_pressure(oriented_map):
     """d33 counts on the electrode under the probe, however the probe is rotated."""
-    for plain in (near_map, oriented_map):
-        sensor = with_piezo(plain.sensor, d33=-30.0)
-        contact, rotation = draw(plain, 40, seed=6)
-        centres = np.array([electrode.centre for electrode in sensor.electrodes])
-        nearest = np.argsort(np.linalg.norm(contact[:, None, :2] - centres, axis=2).min(axis=1))[:4]
-        assert errors(replace(plain, sensor=sensor), contact[nearest], rotation[nearest]).max() < 1e-3
+    sensor = with_piezo(oriented_map.sensor, d33=-30.0)
+    contact, rotation = draw(oriented_map, 4, seed=6)
+    contact[:, :2] = 0.75 * np.array([electrode.centre for electrode in sensor.electrodes])
+    assert errors(replace(oriented_map, sensor=sensor), contact, rotation).max() < 1e-3
 
 
 FILMS = {
@@ -264,13 +262,9 @@ def test_a_probe_that_keeps_its_orientation_needs_few_turns(near_electrodes, pro
 def test_rotation_of_a_probe_whose_map_has_its_own_orientation_is_refused(near_electrodes):
     sensor = with_film(near_electrodes, **UNEVEN_FILMS["tension"])
     domain = Domain(1.0, (1.0, 1.0))
-    contact = np.array([(0.5, 0.0, 1.0)])
-    counts = NodeCount(1, 1, (1,))
-    oriented = ForwardMap.build_unchecked(sensor, Ellipse(2.0, 1.4), domain, counts, COARSE)
+    oriented = ForwardMap.build_unchecked(sensor, Ellipse(2.0, 1.4), domain, NodeCount(1, 1, (1,)), COARSE)
     with pytest.raises(SceneError, match=r"ellipse:2.0x1.4 in its own orientation, got a rotation by 0.1 rad"):
-        oriented.charges(contact, 0.1)
-    free = ForwardMap.build_unchecked(sensor, Ellipse(2.0, 1.4), domain, counts, COARSE, orientation="random")
-    assert np.isfinite(free.charges(contact, 0.1)).all()
+        oriented.charges(np.array([(0.5, 0.0, 1.0)]), 0.1)
 
 
 @pytest.mark.slow

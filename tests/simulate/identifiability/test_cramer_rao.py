@@ -8,8 +8,9 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from function_map import round_map
-from isocharge.simulate import ChargeSpline, Domain, Electrode, NoiseModel, limits_at, noise_model
+from isocharge.simulate import ChargeSpline, Domain, NoiseModel, limits_at, noise_model
 from isocharge.simulate.identifiability.cramer_rao import cramer_rao
+from solved_charges import with_squares
 
 REFERENCE = noise_model("reference")
 AT = np.array([[8.0, 0.0], [0.0, 8.0], [-8.0, 0.0], [0.0, -8.0]])
@@ -70,9 +71,8 @@ def test_limits_of_a_layout_agree_with_an_independent_search(three_map):
 
     The largest error differs by up to 4 % between grids.
     """
-    places = {"A": (0.5, -14.1), "B": (-5.1, 6.3), "C": (-0.2, -0.3), "D": (8.6, 1.1)}
-    electrodes = tuple(Electrode.of_square(*place, 3.0) for place in places.items())
-    charges = ChargeSpline.of(replace(three_map, sensor=replace(three_map.sensor, electrodes=electrodes)), spacing=0.3)
+    sensor = with_squares(three_map.sensor, (0.5, -14.1), (-5.1, 6.3), (-0.2, -0.3), (8.6, 1.1))
+    charges = ChargeSpline.of(replace(three_map, sensor=sensor), spacing=0.3)
     steps = 0.3 * np.arange(-26, 27)
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     at = grid[np.hypot(*grid.T) <= 8.0]

@@ -11,7 +11,6 @@ from isocharge.simulate import (
     ChargeSpline,
     Circle,
     Domain,
-    Electrode,
     ForwardMap,
     load_sensor,
     noise_model,
@@ -26,6 +25,7 @@ from isocharge.simulate.identifiability.working_area import (
 )
 from isocharge.simulate.numerics.disk import Rings
 from kept import kept
+from solved_charges import with_squares
 
 REFERENCE = noise_model("reference")
 FORCES = (0.05, 2.0)
@@ -44,15 +44,14 @@ def folds_of(charge_map, rings: Rings | None = None) -> np.ndarray:
     return find_folds(charge_map, rings or Rings.spread(charge_map.domain.radius), 1.0, REFERENCE)
 
 
-def squares(film, *places):
-    """Forward map of the same film with square electrodes of 3 mm at given positions."""
-    electrodes = [Electrode.of_square(name, place, 3.0) for name, place in zip("ABCDEFGH", places, strict=False)]
-    return replace(film, sensor=replace(film.sensor, electrodes=tuple(electrodes)))
-
-
 INNER = ((-0.9, 1.4), (8.7, 11.4), (15.2, -18.1), (-14.7, -5.3))
 """Positions of four electrodes that do not lie on a circle, one of them within the area, mm. There is no fold up to
 15 mm."""
+
+
+def squares(film):
+    """Return the forward map of the same film with square electrodes at the positions `INNER`."""
+    return replace(film, sensor=with_squares(film.sensor, *INNER))
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +92,7 @@ def test_find_folds_finds_a_fold_smaller_than_the_rings():
 
 def test_error_does_not_exceed_its_limit_on_finer_rings_within_the_working_area(film):
     """Beside an electrode within the area, the error may be larger between two rings than on both rings."""
-    charges = ChargeSpline.of(squares(film, *INNER), 9.0, 0.3)
+    charges = ChargeSpline.of(squares(film), 9.0, 0.3)
     working = working_area(charges, REFERENCE, search_pairs=False, error=0.3)
     assert limits_at(charges, Rings.spread(working.radius).contacts(0.05), REFERENCE).position.max() <= 0.3
     assert working.radius == pytest.approx(working.error_radius, abs=0.101)
@@ -120,7 +119,7 @@ def test_find_folds_finds_nothing_in_a_sharply_bent_map():
 
 def test_find_folds_finds_nothing_beside_an_electrode(film):
     """The orientation seems reversed between rings with a spacing of 0.3 mm, but not between ten times as many."""
-    charges = ChargeSpline.of(squares(film, *INNER), 4.0)
+    charges = ChargeSpline.of(squares(film), 4.0)
     assert len(find_folds(charges, Rings.spread(4.0, 13, 60), 0.05, REFERENCE)) == 0
 
 

@@ -10,7 +10,6 @@ from tests.simulate.conftest import COARSE
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate import (
     Circle,
-    Electrode,
     ForwardMap,
     identify,
     limits_at,
@@ -19,6 +18,7 @@ from isocharge.simulate import (
 )
 from isocharge.simulate.identifiability.identification import Identification, map_to_search
 from kept import kept
+from solved_charges import with_squares
 
 REFERENCE = noise_model("reference")
 SENSOR = load_sensor("three-25um-biaxial")
@@ -56,9 +56,8 @@ def test_statistics_agree_with_random_positions(film, identification):
 
 def test_working_area_with_an_electrode_at_the_centre_is_small(film):
     """The area is smaller than the spacing of the rings on the whole film."""
-    places = ((0.0, 0.0), (8.66, 5.0), (-8.66, 5.0))
-    electrodes = tuple(Electrode.of_square(name, at, 3.0) for name, at in zip("ABC", places, strict=True))
-    numbers = Identification.of(replace(film, sensor=replace(SENSOR, electrodes=electrodes)), REFERENCE).to_dict()
+    sensor = with_squares(SENSOR, (0.0, 0.0), (8.66, 5.0), (-8.66, 5.0))
+    numbers = Identification.of(replace(film, sensor=sensor), REFERENCE).to_dict()
     assert 0.0 < numbers["working_area"]["radius_mm"] < 0.5
     assert all(0.0 < row["position_median_mm"] <= 1.0 for row in numbers["limits_in_working_area"])
 

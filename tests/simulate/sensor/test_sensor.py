@@ -140,15 +140,11 @@ def test_electrodes_that_touch_except_for_rounding_do_not_overlap(three, x):
         replace(three, electrodes=(left, overlapping))
 
 
-def test_area_of_a_union_counts_overlaps_once():
+def test_area_of_a_union_counts_overlaps_once_and_only_metal_with_a_back():
     """The area of a trace is its width times the length of its middle line. Overlapping metal counts once."""
     assert TRACED.area == pytest.approx(9.0 + 0.5 * (14.0 - 1.5), rel=1e-12)
     twice = TRACED.with_trace(((9.0, 0.0), (4.0, 0.0)), 0.5)
     assert twice.area == pytest.approx(TRACED.area, rel=1e-12)
     assert twice.centre == (0.0, 0.0)
-
-
-def test_electrode_collects_where_front_and_back_overlap():
-    """The metal on the back covers a quarter of the plane, and therefore parts of the pad and of the trace."""
-    quarter = ((0.0, 0.0), (20.0, 0.0), (20.0, 20.0), (0.0, 20.0))
+    quarter = ((0.0, 0.0), (20.0, 0.0), (20.0, 20.0), (0.0, 20.0))  # metal on the back of a quarter of the plane
     assert replace(TRACED, back=(quarter,)).area == pytest.approx(2.25 + 0.25 * 7.75 + 0.5 * 4.75, rel=1e-12)
