@@ -1,7 +1,5 @@
 """Fixtures for the tests of forward maps."""
 
-from dataclasses import replace
-
 import pytest
 from tests.simulate.conftest import COARSE
 
@@ -13,17 +11,13 @@ from isocharge.simulate import (
     load_sensor,
 )
 from kept import kept
+from solved_charges import with_squares
 
 
 @pytest.fixture(scope="session")
 def near_electrodes() -> Sensor:
     """A uniaxial sensor with electrodes 5 mm from the centre, so that the probe can lie on them."""
-    sensor = load_sensor("four-25um-uniaxial")
-    inward = tuple(
-        replace(e, corners=tuple((x - 0.5 * e.centre[0], y - 0.5 * e.centre[1]) for x, y in e.corners))
-        for e in sensor.electrodes
-    )
-    return replace(sensor, electrodes=inward)
+    return with_squares(load_sensor("four-25um-uniaxial"), (5.0, 0.0), (0.0, 5.0), (-5.0, 0.0), (0.0, -5.0))
 
 
 @pytest.fixture(scope="session")

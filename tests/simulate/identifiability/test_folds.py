@@ -176,8 +176,7 @@ def test_allowed_error_bounds_the_working_area():
     assert float(unique_radius) == pytest.approx(FOLD_X, abs=0.11)
     assert working.radius < float(unique_radius)
     for radius, exceeds in ((working.error_radius, False), (working.error_radius + 0.1, True)):
-        ring = radius * np.exp(2j * np.pi * np.arange(360) / 360)
-        contact = np.stack([ring.real, ring.imag, np.full(360, 0.05)], axis=1)
+        contact = Rings.spread(radius, 1, 360).contacts(0.05)
         assert (limits_at(folded_map(), contact, REFERENCE).position.max() > 0.2) == exceeds
 
 

@@ -79,12 +79,6 @@ def test_area_reach_and_period_are_the_closed_forms(shape):
     assert shape.probe.reach == pytest.approx(shape.reach, rel=1e-12)
 
 
-def test_boundary_goes_round_the_area_anticlockwise(shape):
-    points = boundary_points(shape.probe, 4000)
-    assert area_of(to_corners(points)) == pytest.approx(shape.area, rel=1e-3)
-    assert np.abs(points).max() == pytest.approx(shape.reach, rel=1e-3)
-
-
 def test_farthest_distance_is_that_of_the_farthest_boundary_point(shape):
     at = (5.0, -3.0)
     expected = np.abs(complex(*at) + boundary_points(shape.probe, 20000)).max()
