@@ -285,5 +285,5 @@ def _point_derivatives(derivatives: Array, points: Complexes) -> Complexes:
         derivatives: Derivatives of the basis functions; see `_film_gradient`.
         points: Film points x + iy of the nodes of every element, shape (n_element, n_local), in film radii.
     """
-    # Sum over the nodes n, for each local coordinate k (xi or eta), element e and point p.
-    return np.asarray(np.einsum("kepn,en->kep", derivatives, points))
+    # Sum over the nodes, which are the last axis of `derivatives` and the column of points of each element.
+    return np.asarray((derivatives @ points[..., None])[..., 0])
