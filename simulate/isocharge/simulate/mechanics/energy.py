@@ -397,10 +397,8 @@ class Bending:
         Returns:
             Forces, shape (n_element, n_local).
         """
-        laplacian_column = self.laplacian(deflection)[self.mesh.template.nodes][
-            ..., None
-        ]  # shape (n_element, n_local, 1)
-        return -self.stiffness * (self._laplace @ laplacian_column)[..., 0]
+        element_laplacian = self.laplacian(deflection)[self.mesh.template.nodes]  # shape (n_element, n_local)
+        return -self.stiffness * (self._laplace @ element_laplacian[..., None])[..., 0]
 
     def extend(self, tangent: Array) -> Array:
         """Add bending to the element matrices K of the membrane.
