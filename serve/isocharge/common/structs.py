@@ -25,7 +25,6 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -213,18 +212,20 @@ def _describe_mistake(value: Any, expected_type: Any, error: msgspec.ValidationE
     Args:
         value: Value from TOML or JSON.
         expected_type: Type to which the value cannot be converted.
-        error: Exception of msgspec. If `__post_init__` of a struct has raised an exception, it is the cause of `error`.
+        error: Exception of msgspec. If `__post_init__` of a struct has raised an exception, that exception is the
+            cause of `error`.
         path: Names of the keys that lead to the value; empty for the whole content.
     """
     item_types = _item_types(value, expected_type)
     for key, item_type in item_types.items():
-        with suppress(LookupError):  # the table need not have this key
+        try:
             item = value[key]
-            try:
-                msgspec.convert(item, item_type)
-            except msgspec.ValidationError as item_error:
-                item_path = f"{path}[{key}]" if isinstance(key, int) else _join(path, key)
-                return _describe_mistake(item, item_type, item_error, item_path)
+            msgspec.convert(item, item_type)
+        except LookupError:  # the table need not have this key
+            continue
+        except msgspec.ValidationError as item_error:
+            item_path = f"{path}[{key}]" if isinstance(key, int) else _join(path, key)
+            return _describe_mistake(item, item_type, item_error, item_path)
 
     wrong_key = _WRONG_KEY.match(str(error))
     cause = error.__cause__

@@ -225,8 +225,8 @@ def parse_line(text: str, *, has_header: bool = False, counters: Collection[str]
 
     Args:
         text: The line, as `clean_text` returns it.
-        has_header: Whether a header names the numbers. Words that alternate with the numbers are not names then.
-        counters: Names of counters and clocks, which are names also if the other numbers of the line have none.
+        has_header: Whether a header names the numbers, so that words between the numbers are not names.
+        counters: Names of counters and clocks. They are names even if no other number of the line has one.
 
     Raises:
         ValueError: If the line contains characters that are not printable.
@@ -330,7 +330,7 @@ def _index_positions(tokens: list[_Token]) -> list[int]:
 
 
 def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], list[str]]:
-    """Return the name of each number without and with its unit; empty without a name.
+    """Return the names of the numbers, and the names with their units. A number without a name has an empty text.
 
     The name of a number is the last word or key between this number and the previous number or separator, as in
     `A: 3.5`, `A -> 3.5` and `<A>3.5</A>`. These rules apply in this order:

@@ -255,7 +255,8 @@ class ChargeSeries:
         states = np.broadcast_to(state, (n_contact, 1 + self.direction_count))
         weights, weight_slopes = interpolation_weights(self.node_MPa, states[:, 0])  # shape (n, n_node)
 
-        # v with its derivatives with respect to the contact, and the derivatives of v with respect to the state
+        # The value v that the series represent, with its derivatives with respect to the contact; then the derivatives
+        # of v with respect to the state
         value = np.einsum("nk,nske->nse", weights, node_values)  # shape (n, 4, n_electrode)
         value_by_state = np.einsum("nk,nke->ne", weight_slopes, node_values[:, 0])[:, :, None]
         if self._direction_series is not None:

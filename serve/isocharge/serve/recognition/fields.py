@@ -186,7 +186,8 @@ def _number_parts(number_bytes: Bytes, type_name: FieldType, frame_rate_Hz: floa
         min_magnitude, max_magnitude = PLAUSIBLE_MAGNITUDES
         if not min_magnitude < magnitude < max_magnitude:
             return
-        # The share `Weights.fraction` of the bytes contains digits. Low bytes that are always 0 contain no digits.
+        # Only the share `Weights.fraction` of the bytes contains the digits of the number. Low bytes that are always 0
+        # contain no digits.
         low_zero_byte_count = np.argmin(is_zero)  # index of the lowest byte that is not always 0
         digit_byte_count = Weights.fraction * size - low_zero_byte_count
         unit = magnitude * 256.0**-digit_byte_count
@@ -205,8 +206,8 @@ def _number_parts(number_bytes: Bytes, type_name: FieldType, frame_rate_Hz: floa
         clock_score = high_score + _bits(counter_steps - np.median(counter_steps), unit, size)
         yield Part("clock", type_name, size, clock_score, name=name, scale=tick_duration)
 
-    # The magnitude is counted as one more step. The score of a type is therefore lower if the values in this type are
-    # close to 0 or, for an unsigned type, close to the middle of its range.
+    # The magnitude is added to the steps, so that a type has a lower score if its values are close to 0 or, for an
+    # unsigned type, close to the middle of its range.
     channel_score = Weights.channel + _bits(np.append(steps, magnitude), unit, size)
     yield Part("channel", type_name, size, channel_score)
 

@@ -162,7 +162,9 @@ def _most_common_length(frames: Sequence[bytes]) -> tuple[int, int]:
 
     Both numbers are 0 if there are no frames.
     """
-    return max(Counter(map(len, frames)).most_common(1), default=(0, 0))
+    if not frames:
+        return 0, 0
+    return Counter(map(len, frames)).most_common(1)[0]
 
 
 def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDivision]:

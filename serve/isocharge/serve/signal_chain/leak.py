@@ -177,8 +177,10 @@ class Leak(Stage):
     def _advance(self, frame: Frame, previous: Frame, output_pC: Array) -> None:
         """Add the charge that is new since the previous frame to the touch charge.
 
-        Out of contact, the touch charge should be zero. It therefore decays to zero, and the inflow is learned from the
-        new charge. If frames are missing, the touch may have ended meanwhile, or its charge may have become wrong.
+        The new charge is the part of the output that does not follow from the previous output by the leak, without the
+        inflow, which is the constant current at the inputs of the amplifiers. Out of contact, the touch charge should
+        be zero. Therefore, it is made to decay to zero, and the inflow is learned from the new charge. If frames are
+        missing, the touch may have ended meanwhile, or its charge may have become wrong.
 
         Args:
             frame: The frame.

@@ -104,7 +104,9 @@ class Tare(Stage):
         self._is_search_limited = True  # whether the search ends with an error after too many frames
 
     def step(self, frame: Frame) -> None:
-        """Subtract the tare from a frame. While there is no tare, search for a tare, and remove the charges.
+        """Subtract the tare from a frame. While there is no tare, search for it, and remove the charges from the frame.
+
+        If the tare follows, it changes with each frame by the drift that the previous frame shows.
 
         Raises:
             TareError: If the film is touched during the whole search for a tare.
@@ -119,7 +121,7 @@ class Tare(Stage):
         if self._follows:
             if self._previous is not None:
                 self._tare_pC = self._tare_pC + self._change_pC(self._previous)
-            # The charge out of contact decays, but the charge of a finger that is leaving the film does not.
+            # The stage of the touches lets the charge out of contact decay, but not that of a finger that is leaving.
             frame.is_base_held = True
             if self._rule is not None:
                 frame.base_relax_s = self._rule.relax_s

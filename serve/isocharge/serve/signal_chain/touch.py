@@ -182,8 +182,9 @@ class Touch(Stage):
         Args:
             frame: The frame.
             charge: Charges relative to the touch thresholds, shape (n_electrode,), dimensionless.
-            direction: Direction of the latest touch, or of any touch if the latest touch no longer matters, shape
-                (n_electrode,), dimensionless. It is zero if a touch may have any direction.
+            direction: Expected direction of a touch, shape (n_electrode,), dimensionless. It is the direction of the
+                latest touch while the charges of that touch may remain, and later the direction that all touches share.
+                It is zero if a touch may have any direction.
         """
         # While a finger leaves the film, a remaining base must not decay, because this charge still belongs to the
         # finger.
@@ -194,15 +195,15 @@ class Touch(Stage):
         change = charge - self._base
         change_size = _norm(change)
         if float(change @ direction) < OPPOSING_COSINE * change_size * _norm(direction):
-            self._base = charge
-        elif change_size > 1.0:
+            self._base = charge  # a release or a drift, which changes the charges against the direction of a touch
+        elif change_size > 1.0:  # a touch begins
             self._is_contact = True
             self._peak = min(size, _norm(self._previous))
             self._touch_direction = charge / max(size, 1.0)
             self._has_drifted = _norm(self._mean - self._base) > 0.5
             return
         elif is_remainder and size < _norm(self._base):
-            self._base = charge
+            self._base = charge  # the remaining charge of the latest touch becomes smaller
 
         self._mean = charge + math.exp(-frame.dt_s / RISE_S) * (self._mean - charge)
         if size > 1.0 and float(charge @ direction) < 0.0:

@@ -308,7 +308,8 @@ class FilmFollower(Stage):
         self._covariance = problem.state_covariance(estimate)
         self._touch_count += 1
 
-        # Twice the cost is the squared distance, in which large residuals have little weight.
+        # Twice the cost is the sum of the squared residuals, in which large residuals have little weight. The scale
+        # makes it relative to the unscaled errors.
         self._mean_square += (2.0 * scale * estimate.cost - self._mean_square) / MEMORY_TOUCHES
         is_changed = np.abs(estimate.state) > CLEAR_CHANGE * np.sqrt(self._covariance.diagonal())
         at_end = is_changed & ((estimate.state <= self._lowest) | (estimate.state >= self._highest))

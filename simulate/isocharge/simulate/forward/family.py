@@ -141,7 +141,7 @@ class Family:
             domain: Presses for which the stress will be interpolated.
             film: Film on which the probe presses.
             probe: Probe that presses the film.
-            count: Numbers of distances and forces, and harmonics of the angles.
+            count: Numbers of distances and of forces, and the largest harmonics of the angles.
             orientation: Whether the probe keeps its own orientation ("fixed") or may be rotated ("random"). On an
                 axisymmetric film, and under an axisymmetric probe, a rotation needs no further solves.
 
@@ -159,7 +159,7 @@ class Family:
 
         period = probe.period
         is_oriented = orientation == "fixed" and not film.is_axisymmetric and not probe.is_axisymmetric
-        if is_oriented:  # the film itself only has the symmetry of half a turn
+        if is_oriented:  # film and probe together repeat after the period of both; the film repeats after half a turn
             symmetry_order = round(2.0 * np.pi / period)
             period = 2.0 * np.pi / math.gcd(symmetry_order, 2)
         has_directions = not film.is_axisymmetric and not is_oriented

@@ -95,8 +95,8 @@ class ElectrodePieces:
     ) -> "ElectrodePieces":
         """Return the pieces of electrodes at their nominal positions.
 
-        The attribute `charge_per_stress` contains the weights of s11, s22 and s12 in the mean stress, because the
-        electrodes of a layout have no piezoelectric coefficients.
+        The electrodes of a layout have no piezoelectric coefficients. The attribute `charge_per_stress` therefore
+        contains the weights of s11, s22 and s12 in the mean stress.
 
         Args:
             electrodes: Electrodes of a layout, at least one.

@@ -64,8 +64,8 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
         """Return the inverse of the position error, which is zero at a fold, shape of the positions without (2,)."""
         return np.asarray(1.0 / limits_at(charge_map, contacts(position), noise).position).reshape(position.shape[:-1])
 
-    # Refine the minima of the precision. In each round, the step is halved, and each position moves to the best of the
-    # 25 neighbours that are up to two steps away along x and y.
+    # Refine the minima of the precision. In each round, the step is halved, and each position moves to the best of 25
+    # points: itself and the 24 points that are up to two steps away along x and y.
     position, step = _starting_points(rings, precision(rings.position))
     neighbours = np.stack(np.meshgrid(range(-2, 3), range(-2, 3)), axis=-1).reshape(-1, 2)
     while len(position) and step.max() > 0.05 * FOLD_WIDTH:
@@ -74,8 +74,8 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
         trial = onto_disk(trial.reshape(-1, 2), radius).reshape(trial.shape)
         position = trial[np.arange(len(trial)), precision(trial).argmin(axis=1)]
 
-    # Compare the orientations at opposite points a and b of a circle around each position. The orientation is reversed
-    # if the determinant of the products is negative, which are sums over the electrodes (e).
+    # A position is on a fold if the charge map reverses its orientation between two opposite points of a circle around
+    # it. With the derivatives J1 and J2 at these points, the orientation is reversed if det(J1' J2) is negative.
     angle = np.pi * np.arange(4) / 4.0
     half_width = 0.5 * FOLD_WIDTH * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     sides = np.stack([position[:, None] + half_width, position[:, None] - half_width])

@@ -112,7 +112,10 @@ class PressedFilm:
 
     @classmethod
     def interpolate(cls, fields: ForwardMap, presses: Array) -> "PressedFilm":
-        """Compute the charges per area that several presses cause.
+        """Interpolate the stress fields at the positions of presses, and convert the stress to charge per area.
+
+        The meshes cover half of the film. The charge per area is therefore computed twice: for points of the meshed
+        half, and for points that are reflected into it.
 
         Args:
             fields: Stress fields that `solve_fields` returns, in a domain that contains the presses.
@@ -128,13 +131,13 @@ class PressedFilm:
         coefficients = rotate_stress(np.eye(3), direction[:, None]) @ charge_per_stress  # shape (n, 3)
         n_solved = len(fields.table)
         table = np.moveaxis(fields.table.reshape(n_solved, -1, 3), 2, 1).reshape(3 * n_solved, -1)
-        # In the mirror image, the shear stress has the opposite sign.
+        # At reflected points, the shear stress has the opposite sign.
         both_coefficients = np.stack([coefficients, coefficients * [1.0, 1.0, -1.0]])
         weights = press_weights[:, :, None] * both_coefficients[:, :, None]  # shape (2, n, n_solved, 3)
         flat_weights = weights.reshape(2 * len(presses), -1).astype(np.float32)
         density = flat_weights @ table
         density = density.reshape(2, len(presses), meshes.template.n_element, -1, len(COLUMNS))
-        # The derivative with respect to the movement across the direction of the press is odd.
+        # At reflected points, the derivative for a movement across the direction of the press has the opposite sign.
         density[1, ..., COLUMNS.index("y")] *= -1.0
         return cls(position, fields.probe, meshes, density)
 

@@ -263,6 +263,9 @@ def _estimate_with_errors(
 ) -> Estimation:
     """Search for the film and for bad presses with assumed errors, and estimate the film under all hypotheses.
 
+    The result is the average over the hypotheses, whose weights are proportional to their evidence. Hypotheses with a
+    weight below `MIN_WEIGHT` are left out.
+
     Args:
         charges: Charges of a solved film and of similar films.
         stated: The presses with their stated errors.
@@ -275,7 +278,8 @@ def _estimate_with_errors(
     point = _most_probable_point(charges, data, prior, previous)
     redundancy = np.maximum(np.isfinite(data.measured_std).sum(axis=1) - 3, 0)  # a contact has three unknowns
     is_bad = (redundancy > 0) & (chdtrc(np.maximum(redundancy, 1), point.chi2) < BAD_PROBABILITY)
-    # Presses are bad only if most presses agree with each other. Otherwise, no film explains the presses.
+    # If most presses seem to be bad, the assumed film is wrong, and not the presses. Among a few presses, a bad press
+    # cannot be recognised. In both cases, all presses are used.
     if is_bad.mean() > 0.5 or len(data) <= FEW_PRESSES:
         is_bad[:] = False
     is_used = ~is_bad
@@ -299,6 +303,7 @@ def _estimate_with_errors(
         means, covariances = zip(*(fit.posterior() for fit in fits), strict=True)
         mean = np.average(means, axis=0, weights=weight)
         covariance = np.average(covariances, axis=0, weights=weight)
+        # The means of the hypotheses differ, which adds to the covariance of the average.
         covariance += np.cov(means, rowvar=False, ddof=0, aweights=weight)
         used_contact = used_contact + Linearised.of(model, used_data, used_contact).contact_change(mean - unknowns)
         unknowns = np.clip(mean, *prior.bounds)

@@ -146,7 +146,7 @@ def _measure_detection(
     noisy_charge = presses.noisy(noise, seed)
 
     def detected_fraction(*wrong_gains: float) -> float:
-        """Return the mean share of presses that cause an alarm if one electrode in turn has one of some wrong gains."""
+        """Return the share of alarms over all presses, electrodes and gains, with one wrong electrode at a time."""
         is_faulty = np.eye(noisy_charge.shape[1], dtype=bool)  # one electrode in each row
         faulty_charges = [noisy_charge * gains for gain in wrong_gains for gains in np.where(is_faulty, gain, 1.0)]
         _, _, misfit = predict(np.concatenate(faulty_charges))

@@ -102,13 +102,14 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     skip = next(constants)
     bias = next(constants)
     last = Layer(weight=next(constants), bias=bias)
-    # ONNX would also repeat a single number for all columns, C does not.
+    # ONNX repeats a single number for all columns, but the C code does not, so such a bias is refused.
     has_biases = all(layer.bias.shape == layer.weight.shape[1:] for layer in (*hidden, last, Layer(skip, bias)))
     if not (hidden and has_biases):
         raise ValueError("expected hidden layers, and a bias for each column of the weights")
 
-    # In the outputs of each layer, find where those of the misfit perceptron begin, from the last layer to the first.
-    # The inputs of the misfit perceptron begin at the first input with a weight for one of its outputs.
+    # Each matrix contains the weights of the contact perceptron in its first rows and columns, and those of the misfit
+    # perceptron in the others. Find the first column of the misfit perceptron in each layer, from the last layer to the
+    # first. In a hidden layer, it is the first row of the next layer with a weight for the misfit perceptron.
     starts = [ANGLES.stop]
     for weight, _ in (last, *hidden[:0:-1]):
         starts.append(int(weight[:, starts[-1] :].any(axis=1).argmax()))

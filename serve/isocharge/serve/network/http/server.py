@@ -81,12 +81,12 @@ class Connection(HttpToolsProtocol):
     def data_received(self, data: bytes) -> None:
         """Parse data of the client in pieces. Refuse a request whose head, trailers or chunk extensions are too long.
 
-        The beginning of a head is not counted if its piece also contains the end of another request. Such a head may be
-        twice as long.
+        The bytes are counted from the end of the previous request. If a piece of the data contains this end, the
+        beginning of the next head in the same piece is not counted, so that such a head may be twice as long.
         """
         limit = self._limits.header_bytes
         while data and not self.transport.is_closing():
-            size = limit + 1 - self._pending_bytes  # so many bytes of a head show that it is too long
+            size = limit + 1 - self._pending_bytes  # a byte more than permitted
             self._pending_bytes += len(data[:size])
             super().data_received(data[:size])
             data = data[size:]
@@ -95,9 +95,13 @@ class Connection(HttpToolsProtocol):
                 return
 
     def eof_received(self) -> bool:  # type: ignore[override]
-        """Keep the connection open until all complete requests are answered, although the client sends no more data."""
-        # With TLS, both directions can only be closed together.
-        return self._close_after_responses() and self.scheme == "http"
+        """Return whether to keep the connection open after the client has stopped sending.
+
+        It is kept open over HTTP until all complete requests are answered. With TLS, both directions can only be closed
+        together.
+        """
+        has_open_requests = self._close_after_responses()
+        return has_open_requests and self.scheme == "http"
 
     def on_message_begin(self) -> None:
         """Begin a request, and refuse it if too many requests wait for the response to an earlier request."""
@@ -169,8 +173,8 @@ class Connection(HttpToolsProtocol):
     def refuse(self, status: int, message: str) -> None:
         """Send a refusal as the last response of the connection, and count it.
 
-        If earlier, complete requests are not answered yet, their responses are the last ones, and the refusal is not
-        sent. If the body of the refused request has begun, or the server has stopped, the refusal is sent at once.
+        If earlier, complete requests are not answered yet, the connection is closed after their responses, and the
+        refusal is neither sent nor counted.
 
         Args:
             status: HTTP status.
