@@ -29,7 +29,7 @@ from isocharge.serve import find_model, load_model
 from isocharge.simulate import load_sensor
 from isocharge.simulate.dataset.sweep import solve_maps
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
-from kept import kept
+from kept import ROOT, kept
 
 SENSOR = "three-25um-biaxial"
 
@@ -219,6 +219,7 @@ BAD = [
     ("simulate design SENSOR --electrodes 3 --probe triangle:3 --radius 8 -o OUT", "expected circle:RADIUS"),
     ("train fit -o OUT", "InputError: expected either a DATASET folder or --sensor SENSOR"),
     ("train fit SENSOR -o OUT", f"{SENSOR}: expected a dataset folder or a file of measured presses"),
+    (f"train fit {ROOT}/pyproject.toml -o OUT", "pyproject.toml: expected a dataset folder or a file of measured"),
     ("train fit FILE --radius 5 -o OUT", "--radius: has no effect on measured presses; leave the option out"),
     ("train fit --sensor SENSOR --force-std 0.1 -o OUT", "--force-std: has no effect on simulated presses"),
     (

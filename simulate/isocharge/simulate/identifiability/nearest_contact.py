@@ -262,7 +262,7 @@ def local_minima(
         start.reshape(-1, 3),
         min_change=min_change,
     )
-    return contact.reshape(start.shape), residual.reshape(*start.shape[:2], -1)
+    return contact.reshape(start.shape), residual.reshape(*start.shape[:2], charge.shape[1])
 
 
 def starting_contacts(

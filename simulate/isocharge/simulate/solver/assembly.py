@@ -54,7 +54,7 @@ class Assembly:
         skeleton: Indices of the free unknowns on sides, in the order of elimination, shape (n_skeleton,).
     """
 
-    def __init__(self, mesh: Template, unknowns_per_node: int, odd: bool = False) -> None:
+    def __init__(self, mesh: Template, unknowns_per_node: int, odd: bool) -> None:
         """Number the unknowns, and compute the sparsity pattern of the skeleton matrix.
 
         The skeleton consists of the unknowns on the sides of the elements. The unknowns in the interior of an element

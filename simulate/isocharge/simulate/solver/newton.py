@@ -115,7 +115,7 @@ def solve_newton(
     Returns:
         The result, which may not have converged.
     """
-    free = assembly(elastic.mesh.template, elastic.unknowns_per_node).free[:, :3]
+    free = assembly(elastic.mesh.template, elastic.unknowns_per_node, False).free[:, :3]
     iterate = _Iterate(elastic, free, first_field)
     step_sizes: list[float] = []
     for iteration in range(MAX_ITERATIONS + 1):

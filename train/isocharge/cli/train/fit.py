@@ -85,7 +85,7 @@ def fit_command(
 
     Example: isocharge train fit presses.csv -o models/pad
     """
-    if dataset is not None and not dataset.exists():
+    if dataset is not None and (dataset.suffix == ".toml" or not dataset.exists()):
         raise InputError(
             f"{dataset}: expected a dataset folder or a file of measured presses; there is neither. The option "
             "--sensor names a sensor"

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITIO
 from isocharge.train.calibration.calibrate import calibrate, solve_even
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
 from isocharge.train.calibration.estimator import FEW_PRESSES
+from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.calibration.result import CalibrationResult
 
@@ -120,7 +122,6 @@ class PressSession:
         """
         self.problem = problem
         self._executor = executor
-        self._charges = solve_even(problem, executor)  # of the film that was solved last; the next fit begins with it
         self._save = save
         self._until = until
         self._stds = {"position_std_mm": position_std_mm, "force_std": force_std}
@@ -136,6 +137,11 @@ class PressSession:
 
     def __len__(self) -> int:
         return len(self.presses)
+
+    @cached_property
+    def _charges(self) -> FilmCharges:
+        """Charges of the film that was solved last, with which the next fit begins; at first of an even film."""
+        return solve_even(self.problem, self._executor)
 
     @property
     def proposed(self) -> ProposedPress:
