@@ -124,6 +124,18 @@ def test_press_has_its_charge_at_any_rate(rate_Hz, tau_s):
     assert np.mean(charges) == pytest.approx(400.0, rel=3e-3 if rate_Hz * tau_s < 50.0 else 5e-4)
 
 
+def test_charge_that_was_subtracted_as_warming_does_not_leak_from_the_integral_of_currents():
+    """Without a current, the charge that remains decays with the time constant of the integral."""
+    chain = StageRunner(front_end="current", tare={"frames": 10}, leak={"tau_s": 1.0})
+    currents_pC = np.zeros((30, 3))
+    currents_pC[20:23] = 100.0
+    *_, frame = chain.run(currents_pC, 100.0)
+    assert frame.is_contact
+    frame.warming_pC = 20.0
+    next_frame = chain.advance(np.zeros(3), 0.4, 0.1)
+    np.testing.assert_allclose(next_frame.charge_pC, (frame.charge_pC - 20.0) * math.exp(-0.1), rtol=1e-3)
+
+
 def test_inflow_is_learned_out_of_contact():
     """The inflow is 5 pC/s after the tare. Without its estimate, it adds 50 pC to each electrode in a press of 10 s."""
     press_pC = touch_charge(8.0, 10.0, 300.0, seconds=22.0)

@@ -218,7 +218,7 @@ def _checked_lines(lines: Iterable[str], source: TableSource) -> Iterator[str]:
     except InputError:  # is a ValueError, too
         raise
     except ValueError as cause:  # the next line is too long
-        raise source.error(f", line {line_number + 1}: not CSV text ({cause})") from cause
+        raise source.error(f", line {line_number + 1}: not CSV text in UTF-8 ({cause})") from cause
 
 
 def _numbered_rows(

@@ -106,7 +106,7 @@ def possible_divisions(chunks: Sequence[bytes], *, are_datagrams: bool) -> Itera
         # The length of a frame divides the length of every datagram. It therefore also divides the greatest common
         # divisor of these lengths.
         divisible_length = gcd(*map(len, chunks))
-        for length in range(MIN_FRAME_BYTES, MAX_FRAME_BYTES + 1):
+        for length in range(MIN_FRAME_BYTES, min(divisible_length, MAX_FRAME_BYTES) + 1):
             if divisible_length % length == 0:
                 yield _adjacent_frames(DATAGRAM, data, length)
     for name, stuffing in STUFFINGS.items():

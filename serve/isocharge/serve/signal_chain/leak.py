@@ -188,9 +188,9 @@ class Leak(Stage):
             output_pC: Output of the amplifiers above the tare, shape (n_electrode,), pC.
         """
         dt_s = frame.dt_s
+        self._charge_pC = self._charge_pC - previous.warming_pC
         innovation_pC = self._innovation_pC(output_pC, np.exp(-dt_s / self._tau_s))
         surplus_pC = innovation_pC - self._inflow.pC_per_s * dt_s  # new touch charge and noise
-        self._charge_pC = self._charge_pC - previous.warming_pC
         if previous.is_contact:
             self._inflow.pause()
         else:
