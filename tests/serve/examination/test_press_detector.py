@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from isocharge.serve.examination.press_detector import find_touch
+from isocharge.serve.examination.press_detector import block_medians, find_touch
 from isocharge.simulate import load_amplifier
 
 RATE_HZ = 200.0
@@ -75,3 +75,9 @@ def test_damaged_value_is_not_taken_for_a_touch():
     charges[300] = 1e6
     charges[500, 1] = np.nan
     assert find_touch(charges, times_s, unit_is_pC=True) is None
+
+
+def test_hum_averages_out_of_block_medians():
+    times_s = np.arange(0.0, 2.0, 0.001)
+    hum = 100.0 * np.sin(2.0 * np.pi * 50.0 * times_s)
+    assert np.abs(block_medians(hum[:, None], times_s)).max() < 1.0

@@ -166,6 +166,12 @@ def test_added_output_cannot_change_the_records_of_other_outputs(record, tmp_pat
     assert json.loads(path.read_text("utf-8"))["charge_pC"] == {"A": 1.0}
 
 
+def test_added_kind_that_cannot_tell_what_it_accepts_is_named(add_kind):
+    add_kind(raise_error, None)
+    with pytest.raises(InputError, match=r"output mine \(mine:KIND\): .* 'touch.txt' \(RuntimeError: not open\)"):
+        output_kind("touch.txt")
+
+
 @pytest.mark.usefixtures("failing")
 def test_output_that_fails_ends_a_replay_with_its_name(record):
     outputs = Outputs(["broken"], context()).__enter__()

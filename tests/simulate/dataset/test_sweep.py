@@ -88,6 +88,7 @@ def test_presses_outside_the_radius_reach_up_to_the_clamp(small_dataset):
     assert distance.min() >= 8.0
     assert distance.max() == pytest.approx(42.8, abs=0.01)
     assert np.mean(distance < 25.0) == pytest.approx((25.0**2 - 8.0**2) / (42.8**2 - 8.0**2), abs=1e-3)
+    assert np.mean(outside.force_N < np.sqrt(0.05 * 2.0)) == pytest.approx(0.5, abs=1e-3)
     for i in np.flatnonzero(distance < 30.0)[:3]:
         expected = solved_charge(read.sensor, PROBE, (outside.x_mm[i], outside.y_mm[i]), outside.force_N[i])
         np.testing.assert_allclose(outside.charge_pC[i], expected, rtol=5e-3)
@@ -164,3 +165,4 @@ def test_shards_of_a_probe_with_many_corners_fit_into_a_file():
     rows = sweep_module._shard_size([PROBE, polygon], sweep_module.SHARD_SIZE)
     assert 1000 < rows < sweep_module.SHARD_SIZE
     assert np.full(rows, polygon.notation).nbytes < 2**26
+    assert sweep_module._shard_size([PROBE], sweep_module.SHARD_SIZE) == sweep_module.SHARD_SIZE

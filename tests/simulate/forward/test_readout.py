@@ -194,6 +194,20 @@ def test_contact_charge_follows_gain_and_place_of_the_electrodes():
 # Charges without a touch
 
 
+def test_contact_charges_of_many_presses_are_those_of_each_press():
+    """The presses lie at the edges of two electrodes, of which one has a positive y, and on the film alone."""
+    sensor = replace(PRESSED, electrodes=PRESSED.electrodes[:2])
+    places = [(8.5, 1.5), (8.5, -1.7), (1.0, 8.0), (-1.3, -8.0), (4.0, 3.0)]
+    contact = np.column_stack([places, [0.3, 0.5, 0.7, 0.9, 1.1]])
+    orientation = np.linspace(0.0, 1.0, len(contact))
+    probe = Polygon.triangle(1.0)
+    expected = [
+        contact_charge(sensor, probe.rotated(angle), (x, y), force)
+        for (x, y, force), angle in zip(contact.tolist(), orientation.tolist(), strict=True)
+    ]
+    np.testing.assert_allclose(contact_charges(sensor, probe, contact, orientation), expected)
+
+
 def test_thermal_charge():
     """A coefficient of -30 uC/(m^2 K) gives -27 pC on 9 mm^2 for a temperature step of 0.1 K.
 

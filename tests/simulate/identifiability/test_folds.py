@@ -60,13 +60,21 @@ def film():
     return kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0), 11.5, FORCES)
 
 
-@pytest.mark.parametrize("shapes", [(), (constant,)], ids=["three charges", "constant fourth charge"])
-def test_find_folds_finds_a_known_fold_line(shapes):
+@pytest.mark.parametrize(
+    ("charge_map", "axis"),
+    [
+        (folded_map(), 0),
+        (folded_map(constant), 0),
+        (shaped_charges(lambda x, _: x, lambda _, y: y - y**2 / (2.0 * FOLD_X)), 1),
+    ],
+    ids=["three charges", "constant fourth charge", "fold line along x"],
+)
+def test_find_folds_finds_a_known_fold_line(charge_map, axis):
     """Both sides of a line are compared across the line."""
-    points = folds_of(folded_map(*shapes))
+    points = folds_of(charge_map)
     assert len(points) > 50
-    assert points[:, 0] == pytest.approx(FOLD_X, abs=0.1)
-    assert np.ptp(points[:, 1]) > 7.0
+    assert points[:, axis] == pytest.approx(FOLD_X, abs=0.1)
+    assert np.ptp(points[:, 1 - axis]) > 7.0
     assert (np.diff(np.hypot(*points.T)) >= 0.0).all()
 
 

@@ -66,6 +66,9 @@ def test_pictures_of_an_oval_film_end_at_its_rim(axes):
         np.concatenate([path.vertices for path in axes.collections[0].get_paths()]),
     ):
         np.testing.assert_allclose(np.abs(drawn).max(axis=0), [41.4, 48.6], rtol=1e-3)
+    axes.clear()
+    draw_section(axes, solved)
+    np.testing.assert_allclose(axes.lines[0].get_xdata()[[0, -1]], [-48.6, 48.6])
 
 
 def test_draw_section_goes_through_the_probe(axes):

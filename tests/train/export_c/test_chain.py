@@ -57,9 +57,6 @@ SINGLE_PRECISION = ("-DISOCHARGE_CHAIN_FLOAT", "-Wdouble-promotion")
 ELECTRODES = ("A", "B", "C", "D")
 RATE_Hz = 200.0
 HUM_Hz = 60.0
-SINGLE_PRECISION = ("-DISOCHARGE_CHAIN_FLOAT", "-Wdouble-promotion")
-"""Options of the compiler. The second refuses double precision, which small processors would emulate."""
-
 T_OF_HOLD_s = np.arange(0.0, 30.0, 1.0 / RATE_Hz)
 
 
