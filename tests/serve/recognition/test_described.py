@@ -89,13 +89,22 @@ class RandomBoard:
         self.data = stream[lost_bytes:]
 
     def is_read_by(self, table):
-        """Return whether a description gives the counter, the clock and a channel with the values of each electrode."""
+        """Return whether a description gives the counter, the clock and the values of the latest frames.
+
+        The values must be in adjacent channels.
+        """
         names = {entry.get("name", "")[:2] for entry in table["fields"]}
         if not {field["name"][:2] for field in self.head if "name" in field} <= names:
             return False
         parsed = parsed_values(table, self.data)
-        is_found = [np.isin(parsed, sent).all(axis=0).any() for sent in self.values.T]
-        return len(parsed) >= FRAMES - 3 and all(is_found)
+        electrodes = self.values.shape[1]
+        for n_missing in (0, 1):  # at the end
+            sent = self.values[FRAMES - len(parsed) - n_missing : FRAMES - n_missing]
+            for first in range(parsed.shape[1] - electrodes + 1):
+                channels = parsed[:, first : first + electrodes]
+                if len(sent) == len(parsed) >= FRAMES - 3 and np.allclose(channels, sent, rtol=1e-6):
+                    return True
+        return False
 
 
 def parsed_values(table, data):

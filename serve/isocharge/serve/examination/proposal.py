@@ -70,10 +70,10 @@ def unit_of(capture: Capture, max_noise_V: float = 0.02) -> str:
 
     The unit is guessed from the names and the values of the channels. The first rule that applies determines the unit.
 
-    - The unit is the unit that all names of channels state, such as nC for `A_nC`.
+    - If all names of channels state the same unit, this is the unit, such as nC for `A_nC`.
     - The unit is pC for binary frames of isocharge.
     - The unit is counts if all values are whole numbers.
-    - The unit is volts if all names end in `V`, or if all values have little noise.
+    - The unit is volts if all names end in `V`, or if there is noise, but at most `max_noise_V` on each channel.
     - The unit of all other values is assumed to be pC.
 
     Args:

@@ -56,7 +56,7 @@ Raw = TypeVar("Raw")
 class Frame:
     """One reading of a sensor, on its way from the bytes to its record.
 
-    A parser creates the frame. The clock and then the stages of the stream fill in the further attributes.
+    A parser creates the frame. The clock of the stream, and after it each stage, sets some of the other attributes.
 
     Attributes:
         seq: Frame counter, modulo the `seq_modulus` of the parser; None if the format has no counter.

@@ -163,8 +163,8 @@ class PressWatch:
         `waiting` follows until a touch begins. The phase `settling` follows until the press is accepted or refused. The
         phase `lift` follows until the finger leaves the film. The phase `waiting` then begins again.
 
-        The charges at rest before a press are measured from frames of the time `REST_S`, which ends `EDGE_S` before the
-        touch is detected.
+        The charges at rest before a press are measured in a period of the length `REST_S`, which ends `EDGE_S` before
+        the touch is detected.
 
         Args:
             frame: The frame, after the stages of a `ReadingStream`.

@@ -77,11 +77,11 @@ class Predictor:
         self.noise = loaded.metadata.noise
 
     def with_noise(self, white_pC: float | Sequence[float], gain: float | Sequence[float]) -> "Predictor":
-        """Return a predictor of the same model whose standard deviations are those for another noise of the charges.
+        """Return a predictor of the same model for charges with another noise.
 
-        The contacts are the same. The covariance of a contact is increased by the covariance that the additional noise
-        of the charges causes, which is computed from predictions with changed charges. If the noise is smaller than the
-        noise of the training, the standard deviations do not change. The misfit is in units of the larger noise.
+        The predicted contacts are the same. Noise beyond that of the training increases the covariance of a contact.
+        The increase is computed from predictions with changed charges. With less noise than in the training, the
+        standard deviations do not change. The misfit is in units of the larger noise.
         `predict_into` ignores the noise.
 
         Args:
@@ -91,12 +91,12 @@ class Predictor:
                 number or as a list.
 
         Raises:
-            ChargeError: If a standard deviation is not a finite number from 0, or if a list has another length.
+            ChargeError: If a standard deviation is not a finite number of at least 0, or if a list has another length.
         """
         stated = {"name": "stated", "white_pC": white_pC, "gain": gain}
         noise = convert(stated, ModelNoise, "noise", ChargeError)
         try:
-            structs.replace(self.metadata, noise=noise)  # makes the checks of the metadata
+            structs.replace(self.metadata, noise=noise)  # runs the checks of the metadata
         except WrongKey as error:
             raise ChargeError(f"{error.key}: {error}") from error
         # The new predictor uses the same session. A touch must also exceed the stated noise.

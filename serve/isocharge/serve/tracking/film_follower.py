@@ -330,9 +330,10 @@ class FilmFollower(Stage):
         return min(max(self._mean_square, SMALLEST_ERROR_SCALE), 1.0)
 
     def _apply_estimate(self) -> None:
-        """Compute the state for which contacts are corrected, if the pretension may also be unchanged.
+        """Compute the state of the film for which contacts are corrected.
 
-        The state is the mean over two cases: the pretension has changed, or it has not. Before the touches, both cases
+        The pretension may have changed, or it may not have changed. The state is the mean over both cases, weighted by
+        their probabilities. Before the touches, both cases
         have the probability 1/2. The touches multiply the odds of the second case by the ratio of the probability
         densities of no change (t = 0) after and before the touches (Savage-Dickey ratio, Dickey 1971).
 

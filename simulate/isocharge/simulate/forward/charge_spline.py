@@ -306,10 +306,10 @@ def _fit_disk(forward_map: ForwardMap, force: Array, radius: float, spacing: flo
 
 
 def _fit_positions(cells: int) -> Array:
-    """Return the positions in the unit disk and on its edge to which a spline is fitted.
+    """Return the positions at which a spline is fitted, in the unit disk and on its edge.
 
-    There are 1.6 positions per cell of the spline, and two additional positions on the edge of the disk per cell along
-    the edge.
+    There are 1.6 positions for each cell of the spline. On the edge of the disk, there are two further positions for
+    each length of one cell.
 
     Args:
         cells: Number of cells of the spline along the diameter of the disk.

@@ -12,11 +12,11 @@ which the sum of the three terms equals F / (E h a). Between the three limiting 
 approximation. The in-plane displacement is proportional to A^2. If the deflection is divided by a A, the scaled
 deflection is of order one. Only the ratios of the three terms then remain as parameters of the press.
 
-Stretching is always geometrically nonlinear and includes the pretension. *Bending*, the resistance of the film to
-bending, can be omitted. Bending is important near the rim and near the probe, and for the stress at the surfaces of the
-film. The effect of bending reaches as far as the bending length sqrt(D / N), where D is the bending stiffness and N is
-the tension force per length. If the pretension and the induced tension are small, the bending stiffness carries the
-load.
+Stretching is always geometrically nonlinear and includes the pretension. *Bending* is the resistance of the film to a
+change of its curvature, and a theory may omit it. Bending is important near the rim and near the probe, and for the
+stress at the surfaces of the film. The effect of bending reaches as far as the bending length sqrt(D / N), where D is
+the bending stiffness and N is the tension force per length. If the pretension and the induced tension are small, the
+bending stiffness carries the load.
 
 The scales of a press also show where a theory is valid. The bending length determines the error of a theory without
 bending (`error_estimate.modelling_error`), and the amplitude determines whether the strains are small enough for

@@ -270,14 +270,15 @@ def _solve_by_load_steps(
     """Solve a press for increasing forces, because the solve with the full force has failed.
 
     Each solve starts from the field under the largest force for which an equilibrium was found. After each successful
-    solve, the force is multiplied by a factor. The factor is two at the beginning. If a solve fails, the square root of
-    the factor is used instead. If the solve with the first force fails, no further force is tried.
+    solve, the force is multiplied by a factor, which is two at the beginning. After each failed solve, the factor is
+    replaced by its square root, and the smaller force is tried. If the solve with the first force fails, no further
+    force is tried.
 
     Args:
         case: The press.
         failed: Result of the failed solve with the full force.
         full_load: Discrete model of the film under the full force.
-        first_load_share: Share of the full load in the first load step, if the solve with the full load fails.
+        first_load_share: Share of the full load in the first load step.
         max_load_steps: Largest number of load steps.
 
     Returns:

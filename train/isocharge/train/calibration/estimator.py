@@ -263,8 +263,8 @@ def _estimate_with_errors(
 ) -> Estimation:
     """Search for the film and for bad presses with assumed errors, and estimate the film under all hypotheses.
 
-    The result is the average over the hypotheses, whose weights are proportional to their evidence. Hypotheses with a
-    weight below `MIN_WEIGHT` are left out.
+    The result is a weighted average over the hypotheses. The weight of a hypothesis is proportional to its evidence.
+    Hypotheses with a weight below `MIN_WEIGHT` are left out.
 
     Args:
         charges: Charges of a solved film and of similar films.

@@ -156,7 +156,7 @@ class FilmCharges:
         return sensor
 
     def _mechanics(self, values: Array) -> dict[str, float]:
-        """Return values by the names of their properties. The uneven parts of the pretension are converted into MPa.
+        """Return properties by their names, with the uneven parts of the pretension in MPa instead of relative to it.
 
         Args:
             values: Properties of a film, shape (n_property,).

@@ -116,8 +116,8 @@ class PressSession:
             presses: Presses of an earlier session that is continued; None to begin without presses.
             position_std_mm: Standard deviation of the positions of further presses, mm.
             force_std: Standard deviation of the forces of further presses, relative to the force.
-            until: Ratio of position errors up to which the session is complete, as `ENOUGH`. With 0, the session is
-                never complete.
+            until: The session is complete when the position error due to the film, divided by that due to the noise,
+                is at most this number, as `ENOUGH`. With 0, the session is never complete.
             executor: Executor that runs the solves; None for this process.
         """
         self.problem = problem
@@ -140,7 +140,7 @@ class PressSession:
 
     @cached_property
     def _charges(self) -> FilmCharges:
-        """Charges of the film that was solved last, with which the next fit begins; at first of an even film."""
+        """Charges of the film that was solved last. The next fit begins with them; the first one with an even film."""
         return solve_even(self.problem, self._executor)
 
     @property

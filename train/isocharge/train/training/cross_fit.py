@@ -379,9 +379,9 @@ def _distillation_stage(
     targets = Posterior(*(torch.stack(values).mean(dim=0) for values in zip(*outputs, strict=True)))
 
     def loss(random: torch.Generator) -> Tensor:
-        """Return the mean squared differences from the targets for a random batch.
+        """Return the squared differences from the targets, summed over the outputs and averaged over a random batch.
 
-        The differences of the means are divided by the standard deviations.
+        The differences of the means are divided by the standard deviations, and their squares are halved.
         """
         rows = torch.randint(len(charge), (config.batch,), generator=random)
         target = Posterior(*(values[rows] for values in targets))
