@@ -359,7 +359,7 @@ def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], 
     following_units = [
         following.content for token, following in pairwise([*parts, _EDGE]) if token.kind in _NUMBER_KINDS
     ]
-    # The word `C` may be the name of an electrode, but a word behind several numbers is no name.
+    # The word `C` may be the name of an electrode, but a word behind several numbers is not a name.
     known_units = OTHER_CHARGE_UNITS if following_units.count("C") > 1 else _CHARGE_UNITS
     # The first word after the previous number is a name, or the unit of the previous number.
     preceding_units = [[token.name.strip("[]") for token in path[1:]] for path in _paths(tokens)]

@@ -58,7 +58,7 @@ def _columns(electrodes: Sequence[str], fields: Sequence[Field]) -> Iterator[tup
 
 
 def _part_names(field: Field, electrodes: Sequence[str]) -> Sequence[str]:
-    """Return the names of the numbers in an object: the fields of a struct, or the electrodes; empty without object."""
+    """Return the names of the numbers in an object, the fields of a struct or the electrodes; empty for other types."""
     if field.json_type != "object":
         return ()
     return [part.name for part in field.parts] or electrodes

@@ -333,9 +333,9 @@ class FilmFollower(Stage):
         """Compute the state of the film for which contacts are corrected.
 
         The pretension may have changed, or it may not have changed. The state is the mean over both cases, weighted by
-        their probabilities. Before the touches, both cases
-        have the probability 1/2. The touches multiply the odds of the second case by the ratio of the probability
-        densities of no change (t = 0) after and before the touches (Savage-Dickey ratio, Dickey 1971).
+        their probabilities. Before the touches, both cases have the probability 1/2. The touches multiply the odds of
+        the second case by the ratio of the probability densities of no change (t = 0) after and before the touches
+        (Savage-Dickey ratio, Dickey 1971).
 
         The covariance remains that of a film which has changed, because hardly any film keeps its pretension exactly.
         The square of the shift to the estimate without a change is added to it, times the probability of this estimate.
