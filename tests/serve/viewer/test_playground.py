@@ -210,5 +210,5 @@ def test_every_model_of_the_page_is_a_biaxial_film_whose_stress_the_series_descr
     sensor = model.metadata.sensor
     assert sensor["film"] == pytest.approx(json.loads(SERIES.read_bytes())["film"])
     assert sensor["piezo"]["d31"] == sensor["piezo"]["d32"]
-    outlines = describe_film(name, model.metadata)["outlines_mm"]
-    assert [len(outlines[electrode]) for electrode in model.metadata.electrodes] == [4] * len(outlines)
+    polygons = describe_film(name, model.metadata)["polygons_mm"]
+    assert [len(polygons[electrode][0]) for electrode in model.metadata.electrodes] == [4] * len(polygons)

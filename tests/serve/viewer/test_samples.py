@@ -1,7 +1,5 @@
 """Samples of the live page: their numbers, their storage in a tape, and coalescing."""
 
-from contextlib import closing
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -103,8 +101,7 @@ def test_live_tape_stores_the_latest_samples():
 @pytest.fixture
 def recorded():
     """Return an empty tape of a recording."""
-    with closing(RecordedTape(TYPE)) as tape:
-        yield tape
+    return RecordedTape(TYPE)
 
 
 def test_recorded_tape_replaces_times_that_go_back_or_are_missing(recorded):

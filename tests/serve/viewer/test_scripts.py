@@ -23,17 +23,16 @@ FILM = Film(radius=45.0, thickness=0.025, young=3000.0, poisson=0.34)
 def test_electrode_polygons_include_the_calibration(film):
     """A released model has squares. The other film has polygons with traces, turned by a right angle and shifted."""
     described = describe_film("left", load_model(find_model("three-25um-biaxial")).metadata)
-    squares = np.array([described["outlines_mm"][name] for name in "ABC"])
+    squares = np.squeeze([described["polygons_mm"][name] for name in "ABC"], axis=1)  # without traces
     angle = np.radians([-90.0, 30.0, 150.0])
     np.testing.assert_allclose(squares.mean(axis=1), 10.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1), atol=1e-6)
     np.testing.assert_allclose(np.ptp(squares, axis=1), 3.0)
-    assert described["more_mm"] == {}
     trace = {"more_mm": [[[2, 0], [2, -9], [3, -9]]], "back_mm": [[[2, 0], [3, 0], [2, 1]]]}
     electrodes = {name: {"polygon_mm": [[2, 0], [3, 0], [2, 1]]} | trace for name in "ABC"}
     turned = {"name": "mine", "electrodes": electrodes, "calibration": {"rotation_deg": 90.0, "shift_mm": [0.5, 0.25]}}
     described = describe_film("left", film.metadata(sensor=turned))
-    np.testing.assert_allclose(described["outlines_mm"]["C"], [[0.5, 2.25], [0.5, 3.25], [-0.5, 2.25]], atol=1e-12)
-    np.testing.assert_allclose(described["more_mm"]["C"], [[[0.5, 2.25], [9.5, 2.25], [9.5, 3.25]]], atol=1e-12)
+    polygons = [[[0.5, 2.25], [0.5, 3.25], [-0.5, 2.25]], [[0.5, 2.25], [9.5, 2.25], [9.5, 3.25]]]
+    np.testing.assert_allclose(described["polygons_mm"]["C"], polygons, atol=1e-12)
 
 
 def node(script):
@@ -50,9 +49,9 @@ def test_page_shows_the_whole_area_of_a_film_whose_corner_is_the_origin(radius_m
     """The area has x from 0 to 60 mm. It is in the middle of the view unless the film has a radius."""
     film = {
         "working_area_mm": [[0, -15], [60, -15], [60, 15], [0, 15]],
-        "outlines_mm": {},
+        "polygons_mm": {},
         "force_range_N": [0.2, 5.0],
-        "radius_mm": radius_mm,
+        "film": {"radius_mm": radius_mm},
         "electrodes": [],
     }
     at, reach, on_pad, beyond = node(

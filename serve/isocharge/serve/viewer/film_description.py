@@ -19,17 +19,12 @@ def describe_film(name: str, metadata: ModelMetadata) -> dict[str, Any]:
         name: Name of the stream, which the page shows.
         metadata: Metadata of the model.
     """
-    film = metadata.sensor.get("film")
-    polygons_mm = _electrode_polygons(metadata.sensor, metadata.electrodes)  # for each electrode, the pad is the first
     description = {
         "name": name,
         "model": metadata.label,
-        "sensor": metadata.frame_id,
         "electrodes": metadata.electrodes,
-        "outlines_mm": {electrode: pad for electrode, (pad, *_) in polygons_mm.items()},
-        "more_mm": {electrode: leads for electrode, (_, *leads) in polygons_mm.items() if leads},
-        "film": film,
-        "radius_mm": film.get("radius_mm") if isinstance(film, dict) else None,
+        "polygons_mm": _electrode_polygons(metadata.sensor, metadata.electrodes),
+        "film": metadata.sensor.get("film"),
         "working_area_mm": metadata.working_area_mm,
         "force_range_N": metadata.force_range_N,
         "probes": metadata.probes,
@@ -83,6 +78,5 @@ def _designed_polygons(parts: dict[str, Any], name: str) -> list[Any]:
     part = parts[name]
     if isinstance(part, dict):
         return [part["polygon_mm"], *part.get("more_mm", [])]
-    half_side_mm = 0.5 * parts["side_mm"]
-    corners_mm = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * half_side_mm + part
-    return [corners_mm]
+    unit_square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    return [(unit_square - 0.5) * parts["side_mm"] + part]

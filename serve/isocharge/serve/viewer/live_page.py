@@ -233,7 +233,7 @@ def serve_page(page: LivePage, address: Address, tls: Tls | None = None) -> Iter
         InputError: If the TLS files cannot be used.
         ListenError: If the address is in use or cannot be used.
     """
-    with closing(page.tape), closing(HttpServer(page, address, tls)) as server:
+    with closing(HttpServer(page, address, tls)) as server:
         thread = Thread(target=server.run, name="live page", daemon=True)
         thread.start()
         try:

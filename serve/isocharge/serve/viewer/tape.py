@@ -58,10 +58,9 @@ def sample_values(record: PredictionRecord, electrodes: tuple[str, ...]) -> tupl
         record: The record.
         electrodes: Names of the electrodes, in the order of the charges.
     """
-    values = [getattr(record, name) for name in RECORD_NUMBERS]
-    if record.tracked is not None:  # the tracked contact has only some of the numbers
-        values = [getattr(record.tracked, name, value) for name, value in zip(RECORD_NUMBERS, values, strict=True)]
-    others = [None if record.other is None else getattr(record.other, name) for name in OTHER_NUMBERS]
+    # The tracked contact, if there is one, has only some of the numbers.
+    values = [getattr(record.tracked, name, getattr(record, name)) for name in RECORD_NUMBERS]
+    others = [getattr(record.other, name, None) for name in OTHER_NUMBERS]
     flags = sum(FLAG_BITS.get(flag, 0) for flag in record.flags)
     record_count = 1  # `coalesce` adds the counts of the samples that it replaces by a single sample
     charge_pC = record.charge_pC or {}
@@ -182,42 +181,31 @@ class Tape:
         duration_s = end_s - self.timestamp(first)
         return (self.total - 1 - first) / duration_s if duration_s > 0.0 else None  # None also if a time is NaN
 
-    def close(self) -> None:
-        """Close the file of the samples if the tape has a file."""
-
 
 class RecordedTape(Tape):
-    """Tape that stores all samples of a recording in a temporary file.
+    """Tape that stores the samples of a recording in a temporary file.
 
     If the time of a sample is missing or is earlier than the time of the previous sample, the previous time is stored
     instead. The stored times therefore never decrease.
     """
 
     def __init__(self, dtype: "np.dtype[Any]") -> None:
-        """Create the temporary file.
+        """Create the temporary file, which is removed when the tape is no longer used.
+
+        The file has room for the samples of 18 hours at 1 kHz. It occupies the disk only as far as samples are stored.
 
         Args:
             dtype: NumPy type of a sample.
         """
         super().__init__(dtype)
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115
-        self._map_file(LIVE_SAMPLES)
+        with tempfile.TemporaryFile() as file:  # the mapping keeps the closed file
+            self._ring = np.memmap(file, dtype, "r+", shape=(1 << 26,))
 
     def append(self, values: tuple[float | None, ...]) -> None:
-        """Append a sample. If the mapped file is full, its capacity is doubled."""
-        if self.total == len(self._ring):
-            self._map_file(2 * len(self._ring))
+        """Append a sample."""
         time_s, *others = values
         _, latest_time_s = self.span()
         super().append((max(latest_time_s, time_s or 0.0), *others))
-
-    def close(self) -> None:
-        """Close the temporary file, so that the operating system removes it."""
-        self._file.close()
-
-    def _map_file(self, capacity: int) -> None:
-        """Map the file to memory, with a size of `capacity` samples. The stored samples are unchanged."""
-        self._ring = np.memmap(self._file, self._ring.dtype, "r+", shape=(capacity,))
 
     def overview(self) -> list[float]:
         """Return the largest force in each of `MAX_DRAWN_SAMPLES` pieces of the recording, N."""

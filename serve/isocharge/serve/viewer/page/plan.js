@@ -10,9 +10,12 @@ const HATCH_MM = 1.5, TRAIL_S = 1.6, LENS_MM = 1.0, SIGMAS_95 = 2.448, LENS_PX =
 export class Plan {
   constructor(canvas, film) {
     [this.canvas, this.film] = [canvas, film];
-    const corners = [...film.working_area_mm, ...Object.values(film.outlines_mm).flat()];
+    this.filmRadius = film.film?.radius_mm;
+    /** Pads of the electrodes. */
+    this.pads = Object.values(film.polygons_mm).map(([pad]) => pad);
+    const corners = [...film.working_area_mm, ...this.pads.flat()];
     // The view is centred on the film; without a film, as for a pad known by presses alone, on the working area.
-    this.middle = film.radius_mm ? { x: 0, y: 0 } : middleOf(corners);
+    this.middle = this.filmRadius ? { x: 0, y: 0 } : middleOf(corners);
     this.reach = 1.16 * Math.max(...corners.map(([x, y]) => Math.hypot(x - this.middle.x, y - this.middle.y)));
     this.largest = film.force_range_N[1];
     this.region = film.unnoticed ? unnoticedRegion(film.unnoticed) : [];
@@ -57,7 +60,7 @@ export class Plan {
     const g = this.base.getContext("2d"), px = this.css, { film } = this;
     this.toMillimetres(g);
     g.lineJoin = "round";
-    if (film.radius_mm) { g.fillStyle = theme.film; circle(g, 0, 0, film.radius_mm); g.fill(); }
+    if (this.filmRadius) { g.fillStyle = theme.film; circle(g, 0, 0, this.filmRadius); g.fill(); }
     if (this.region.length) this.drawRegion(g);
     g.lineWidth = px; g.strokeStyle = theme.line;
     this.drawGrid(g);
@@ -65,13 +68,13 @@ export class Plan {
     g.setLineDash([4 * px, 4 * px]); g.lineWidth = 1.5 * px; g.strokeStyle = theme.accent; g.stroke(); g.setLineDash([]);
     film.electrodes.forEach((name, k) => this.drawElectrode(g, name, k, px));
     this.drawScale(g, px);
-    if (film.radius_mm) this.drawWhole(g, px);
+    if (this.filmRadius) this.drawWhole(g, px);
   }
 
   /** Lines every 5 mm: 50 mm from the middle of a film to each side, or over the whole view of a pad. */
   drawGrid(g) {
-    const { middle, film } = this;
-    const half = film.radius_mm ? 50 : 5 * Math.ceil(this.reach / 5);
+    const { middle } = this;
+    const half = this.filmRadius ? 50 : 5 * Math.ceil(this.reach / 5);
     const x0 = 5 * Math.round(middle.x / 5), y0 = 5 * Math.round(middle.y / 5);
     for (let at = -half; at <= half; at += 5) {
       segment(g, x0 + at, y0 - half, x0 + at, y0 + half);
@@ -99,11 +102,11 @@ export class Plan {
   }
 
   drawElectrode(g, name, k, px) {
-    const outline = this.film.outlines_mm[name];
+    const [outline, ...leads] = this.film.polygons_mm[name] ?? [];
     if (!outline) return;
     const { colour, dash } = lineStyle(k);
     g.fillStyle = colour + "30"; g.strokeStyle = colour; g.lineWidth = 2 * px;
-    for (const polygon of this.film.more_mm?.[name] ?? []) { path(g, polygon); g.fill(); }
+    for (const polygon of leads) { path(g, polygon); g.fill(); }
     path(g, outline); g.fill(); g.setLineDash(dash.map((d) => d * px)); g.stroke(); g.setLineDash([]);
     const x = mean(outline, 0), y = mean(outline, 1);
     this.text(g, name, x, y, 15 * px, theme.ink, "center", "600");
@@ -118,19 +121,19 @@ export class Plan {
 
   /** The whole film, small, in the corner: where this view is on it. */
   drawWhole(g, px) {
-    const size = 34 * px, scale = size / this.film.radius_mm, x = -this.reach + size + 10 * px, y = -this.reach + size + 10 * px;
+    const size = 34 * px, scale = size / this.filmRadius, x = -this.reach + size + 10 * px, y = -this.reach + size + 10 * px;
     g.save(); g.translate(x, y); g.scale(scale, scale);
     const thin = px / scale;
     g.fillStyle = theme.card; g.strokeStyle = theme.quiet; g.lineWidth = 1.2 * thin;
-    circle(g, 0, 0, this.film.radius_mm); g.fill(); g.stroke();
+    circle(g, 0, 0, this.filmRadius); g.fill(); g.stroke();
     this.drawUnnoticed(g, "40");
     g.fillStyle = theme.quiet;
-    for (const outline of Object.values(this.film.outlines_mm)) { path(g, outline); g.fill(); }
+    for (const outline of this.pads) { path(g, outline); g.fill(); }
     g.strokeStyle = theme.accent; g.strokeRect(-this.reach, -this.reach, 2 * this.reach, 2 * this.reach);
     g.restore();
     const isShaded = this.region.length > 0;
     // Two lines beside the overview. The longer line is below the electrodes of the built-in sensors.
-    const diameter = `Ø ${2 * this.film.radius_mm} mm`;
+    const diameter = `Ø ${2 * this.filmRadius} mm`;
     const left = x + size + 6 * px;
     const lowerLine = y - size + 6 * px;
     const upperLine = y - size + 20 * px;
@@ -214,7 +217,7 @@ export class Plan {
   lensPlace(size, px, touch) {
     const far = this.reach - size - 10 * px;
     const corners = [[far, -far], [far, far], [-far, far]].map(([x, y]) => [this.middle.x + x, this.middle.y + y]);
-    const edges = Object.values(this.film.outlines_mm).flat();
+    const edges = this.pads.flat();
     const hides = ([x, y]) => Math.hypot(touch.x - x, touch.y - y) < size + 24 * px || edges.some(([u, v]) => Math.hypot(u - x, v - y) < size + 4 * px);
     return corners.find((corner) => !hides(corner)) ?? corners[0];
   }

@@ -21,7 +21,7 @@ const STRETCH = 4, AROUND = 72, FLAT_AROUND = 32, FLAT_RINGS = [0, 0.25, 0.5, 0.
 export class Relief {
   constructor(canvas, caption, film) {
     Object.assign(this, { canvas, caption, film, yaw: -0.55, pitch: 0.62, isStale: true });
-    this.radius = film.radius_mm ?? 45;
+    this.radius = film.film?.radius_mm ?? 45;
     const probe = /^circle:([\d.]+)/.exec(film.probes[0] ?? ""), isDescribed = film.film?.radius_mm && film.film.thickness_um && film.film.young_GPa;
     this.deflection = isDescribed ? new Deflection(film.film, Number(probe?.[1] ?? 1), film.force_range_N[1]) : null;
     [this.gl, this.finest] = isDrawnByProcessor() ? [canvas.getContext("webgl", { antialias: false }), 1] : [canvas.getContext("webgl", { antialias: true }), 1.5];
@@ -143,8 +143,7 @@ export class Relief {
     this.line(rim, theme.quiet);
     this.line(closed(this.film.working_area_mm), theme.accent);
     this.film.electrodes.forEach((name, k) => {
-      const outline = this.film.outlines_mm[name];
-      for (const polygon of outline ? [outline, ...this.film.more_mm?.[name] ?? []] : []) this.line(closed(polygon), lineStyle(k).colour);
+      for (const polygon of this.film.polygons_mm[name] ?? []) this.line(closed(polygon), lineStyle(k).colour);
     });
   }
 

@@ -6,7 +6,7 @@ class PlaygroundSensor {
   constructor(description, series, networkBytes) {
     this.description = description;
     this.series = series;
-    const outlines = description.electrodes.map((name) => description.outlines_mm[name]);
+    const outlines = description.electrodes.map((name) => description.polygons_mm[name][0]);
     this.electrodes = new Electrodes(outlines, description.piezo_pC_per_N);
     this.network = new Network(networkBytes);
     this.largestDistance = Math.max(...description.working_area_mm.map(([x, y]) => Math.hypot(x, y)));
