@@ -7,7 +7,6 @@ loopback address, to which only programs on the same machine can connect.
 import contextlib
 import errno
 import ipaddress
-import os
 import resource
 import socket
 import ssl
@@ -203,16 +202,14 @@ def _listen_unix(path: Path, backlog: int) -> socket.socket:
     Raises:
         OSError: If the socket cannot be created.
     """
-    previous_mask = os.umask(0o177)  # only the owner may read and write the file that `bind` creates
     listening = socket.socket(socket.AF_UNIX)
     try:
         listening.bind(str(path))
+        path.chmod(0o600)  # before `listen`, the system refuses all connections
         listening.listen(backlog)
     except OSError:
         listening.close()
         raise
-    finally:
-        os.umask(previous_mask)
     return listening
 
 

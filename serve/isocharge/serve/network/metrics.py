@@ -19,7 +19,6 @@ from typing import Any
 
 import onnxruntime as ort
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info, ProcessCollector
-from prometheus_client.metrics import MetricWrapperBase
 
 from isocharge.common.errors import package_version
 
@@ -123,24 +122,20 @@ class Statistics:
 
     def to_json(self) -> dict[str, Any]:
         """Return the counters as a JSON object with the names that Triton uses in its statistics."""
-        answered = int(_value(self.latency, "_count"))
-        refused = int(_value(self.refused, "_total"))
+        families = [family for metric in vars(self).values() for family in metric.collect()]
+        values = {sample.name: sample.value for family in families for sample in family.samples}
+        answered = int(values["isocharge_inference_seconds_count"])
+        refused = int(values["isocharge_inferences_refused_total"])
         return {
-            "last_inference": round(1e3 * _value(self.latest, "")),
-            "inference_count": int(_value(self.presses, "_total")),
+            "last_inference": round(1e3 * values["isocharge_inference_latest_seconds"]),
+            "inference_count": int(values["isocharge_presses_total"]),
             "execution_count": answered,
             "inference_stats": {
-                "success": {"count": answered, "ns": round(1e9 * _value(self.latency, "_sum"))},
-                "fail": {"count": refused, "ns": round(1e9 * _value(self.refused_time, "_total"))},
+                "success": {"count": answered, "ns": round(1e9 * values["isocharge_inference_seconds_sum"])},
+                "fail": {"count": refused, "ns": round(1e9 * values["isocharge_refused_seconds_total"])},
             },
             "batch_stats": [],
         }
-
-
-def _value(metric: MetricWrapperBase, ending: str) -> float:
-    """Return the value of a metric with labels whose name has the given ending."""
-    (family,) = metric.collect()
-    return next(sample.value for sample in family.samples if sample.name == f"{family.name}{ending}")
 
 
 Client = tuple[str, int] | None

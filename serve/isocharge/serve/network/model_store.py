@@ -14,7 +14,6 @@ import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -68,8 +67,8 @@ class Version(NamedTuple):
 
     name: str
     number: int
-    loaded: LoadedVersion | None
-    reason: str
+    loaded: LoadedVersion | None = None
+    reason: str = ""
 
 
 class ModelStore:
@@ -94,9 +93,8 @@ class ModelStore:
         self._roots = roots
         self._change_lock = threading.Lock()
         self.metrics = ModelMetrics()
-        # Versions by the name of the model. The dictionary is replaced as a whole, so that no thread reads half of a
-        # change. It is sorted, and so are the versions of each model.
-        self._versions: dict[str, list[Version]] = {}
+        # The list is sorted. It is replaced as a whole, so that no thread reads half of a change.
+        self._versions: list[Version] = []
         for name, folder in self._folders().items():
             self._load_versions(name, folder)
         if not self.versions_of():
@@ -120,7 +118,7 @@ class ModelStore:
             return versions[-1]
         label = f"{name}/{version}" if version else name
         available = ", ".join(loaded.metadata.label for loaded in self.versions_of()) or "no model"
-        reasons = dict.fromkeys(row.reason for row in self._find(name, version) if row.reason)  # without repetitions
+        reasons = dict.fromkeys(self.refusals(name, version))  # without repetitions
         raise ModelNotFound("; ".join([f"model {label!r:.200} is not found", f"serving: {available}", *reasons]))
 
     def label(self, name: str, version: str = "") -> str | None:
@@ -137,14 +135,13 @@ class ModelStore:
         """
         return [row.loaded for row in self._find(name, version) if row.loaded]
 
-    def refusals(self) -> list[str]:
-        """Return the reasons why versions were refused or unloaded, sorted by name and version."""
-        return [row.reason for row in self._find() if row.reason]
+    def refusals(self, name: str | None = None, version: str = "") -> list[str]:
+        """Return the reasons why versions were refused or unloaded. `versions_of` describes the arguments."""
+        return [row.reason for row in self._find(name, version) if row.reason]
 
     def _find(self, name: str | None = None, version: str = "") -> list[Version]:
         """Return versions as `versions_of`, but also the versions that are not loaded."""
-        rows = chain(*self._versions.values()) if name is None else self._versions.get(name, [])
-        return [row for row in rows if version in ("", str(row.number))]
+        return [row for row in self._versions if name in (None, row.name) and version in ("", str(row.number))]
 
     def index(self) -> list[dict[str, str]]:
         """Return one row for every version that is loaded, was refused or was unloaded, and for every other model.
@@ -152,7 +149,7 @@ class ModelStore:
         A row contains the name of the model, and the number and the state of the version. If the version was refused or
         unloaded, the row also contains the reason. The number is empty if no version of a model was found.
         """
-        new_names = self._folders().keys() - self._versions.keys()
+        new_names = self._folders().keys() - {row.name for row in self._versions}
         return [
             {
                 "name": row.name,
@@ -160,7 +157,7 @@ class ModelStore:
                 "state": "READY" if row.loaded else "UNAVAILABLE",
                 "reason": row.reason,
             }
-            for row in sorted([*self._find(), *(Version(name, 0, None, "") for name in new_names)])
+            for row in sorted([*self._versions, *(Version(name, 0) for name in new_names)])
         ]
 
     def load(self, name: str) -> None:
@@ -178,13 +175,12 @@ class ModelStore:
                 loaded before remain loaded.
         """
         with self._change_lock:
-            folder = self._folders().get(name)
-            if folder is None:
-                self._replace(name, [row for row in self._find(name) if row.loaded])
-                raise ModelNotFound(f"model {name!r:.200} is not found in the repository")
-            self._load_versions(name, folder)
+            folders = self._folders()
+            self._load_versions(name, folders.get(name))
+        if name not in folders:
+            raise ModelNotFound(f"model {name!r:.200} is not found in the repository")
         # All valid versions are loaded now. The error only reports which versions are refused.
-        reasons = [row.reason for row in self._find(name) if row.reason]
+        reasons = self.refusals(name)
         if reasons:
             raise ModelError("; ".join(reasons))
 
@@ -202,7 +198,7 @@ class ModelStore:
         """Search the repositories for models, and return the folder of each model by the name of the model."""
         return {name: root / name for root in reversed(self._roots) for name in model_names(root)}
 
-    def _load_versions(self, name: str, folder: Path) -> None:
+    def _load_versions(self, name: str, folder: Path | None) -> None:
         """Load every version in the folder of a model, and replace the versions that were loaded before.
 
         Earlier versions that are no longer in the folder are removed, unless a version is refused or the folder
@@ -210,17 +206,17 @@ class ModelStore:
 
         Args:
             name: Name of the model.
-            folder: Folder of the model.
+            folder: Folder of the model, or None if there is no such folder.
         """
         earlier = {row.number: row._replace(reason="") for row in self._find(name) if row.loaded}
         rows: dict[int, Version] = {}
-        for number, version_folder in version_folders(folder).items():
-            row = earlier.get(number, Version(name, number, None, ""))
+        folders = version_folders(folder) if folder else {}
+        for number, version_folder in folders.items():
             try:
-                row = row._replace(loaded=self._load_version(name, number, version_folder))
+                rows[number] = Version(name, number, self._load_version(name, number, version_folder))
             except Exception as error:  # any error in one folder must not affect the other models
-                row = row._replace(reason=_refusal_reason(version_folder, error))
-            rows[number] = row
+                row = earlier.get(number, Version(name, number))
+                rows[number] = row._replace(reason=_refusal_reason(version_folder, error))
         if not rows or any(row.reason for row in rows.values()):
             rows = earlier | rows
         self._replace(name, list(rows.values()))
@@ -245,8 +241,8 @@ class ModelStore:
     def _replace(self, name: str, rows: list[Version]) -> None:
         """Replace all versions of a model, and remove the metrics of the versions that are no longer listed."""
         removed_numbers = {row.number for row in self._find(name)} - {row.number for row in rows}
-        versions = self._versions | {name: sorted(rows)}
-        self._versions = {model: versions[model] for model in sorted(versions) if versions[model]}
+        others = [row for row in self._versions if row.name != name]
+        self._versions = sorted([*others, *rows])
         for number in removed_numbers:
             self.metrics.remove(name, number)
 

@@ -31,7 +31,7 @@ from isocharge.common.structs import convert
 from isocharge.serve.network.metrics import Exchange
 from isocharge.serve.network.protocol.handler import Handler
 from isocharge.serve.network.protocol.inference import DATATYPES, InferBody, infer
-from isocharge.serve.network.protocol.response import client_message, statuses
+from isocharge.serve.network.protocol.response import refusal
 from isocharge.serve.network.protocol.routes import ROUTES, Request
 
 SERVICE = "inference.GRPCInferenceService"
@@ -67,9 +67,7 @@ def read_request(message: Any) -> tuple[InferBody, bytes]:
     Raises:
         RequestError: If the message is not a request for an inference.
     """
-    raw_contents = message.raw_input_contents
-    if len(raw_contents) > 1:
-        raise RequestError(f"expected one input tensor, got {len(raw_contents)} raw contents")
+    raw_contents = b"".join(message.raw_input_contents)
     content = {
         "id": message.id,
         "inputs": [
@@ -83,9 +81,9 @@ def read_request(message: Any) -> tuple[InferBody, bytes]:
             for tensor in message.inputs
         ],
         "outputs": [{"name": output.name, "parameters": _unsupported_parameters(output)} for output in message.outputs],
-        "parameters": {"binary_data_output": len(raw_contents) > 0},
+        "parameters": {"binary_data_output": raw_contents != b""},
     }
-    return convert(content, InferBody, "", RequestError), b"".join(raw_contents)
+    return convert(content, InferBody, "", RequestError), raw_contents
 
 
 def _numbers(tensor: Any) -> list[Any] | None:
@@ -96,10 +94,10 @@ def _numbers(tensor: Any) -> list[Any] | None:
     """
     contents = {field.name: list(values) for field, values in tensor.contents.ListFields()}
     expected = f"{tensor.datatype.lower()}_contents"
-    numbers = contents.pop(expected, None)
-    if contents and tensor.datatype in DATATYPES:
-        raise RequestError(f"input {tensor.name!r:.50}: expected only {expected}, got {', '.join(contents)}")
-    return numbers
+    others = contents.keys() - {expected}
+    if others and tensor.datatype in DATATYPES:
+        raise RequestError(f"input {tensor.name!r:.50}: expected only {expected}, got {', '.join(sorted(others))}")
+    return contents.get(expected)
 
 
 def _unsupported_parameters(tensor: Any) -> dict[str, bool]:
@@ -184,8 +182,12 @@ class Service:
             call.status = "OK"
         except grpc.aio.InternalError as error:  # no message can be sent or read, as the client has ended the call
             raise asyncio.CancelledError from error
+        except TimeoutError:
+            call.status = "DEADLINE_EXCEEDED"
+            call.error = "TimeoutError"
+            message = "the call waited too long for its client, others needed its place, or the server stops"
         except Exception as error:  # every error is sent to the client
-            call.status, message = _status_and_message(error)
+            _, call.status, message = refusal(error)
             call.error = type(error).__name__
         finally:
             self._open_count -= 1
@@ -258,31 +260,19 @@ class Service:
         else:
             # The body of the equivalent HTTP request has the same fields as the message.
             body = MessageToJson(request, preserving_proto_field_name=True).encode()
-            answer = self._answer_route(
-                name, Request(self._store, self._limits, self._traffic, {}, body, model_name, model_version)
-            )
+            equivalent = Request(self._store, self._limits, self._traffic, {}, body, model_name, model_version)
+            try:
+                answer = ROUTE_OF_METHOD[name].respond(equivalent)
+            except ModelError:
+                if name not in ("ServerReady", "ModelReady"):
+                    raise
+                answer = {"ready": False}  # gRPC has no status for this answer
+            if name in ANSWER_FIELDS:
+                answer = {ANSWER_FIELDS[name]: answer}
             response = ParseDict(answer, response_type())
         response_data: bytes = response.SerializeToString()
         call.bytes_out += len(response_data)
         return response_data
-
-    def _answer_route(self, name: str, request: Request) -> dict[str, Any]:
-        """Return the content of the response to a request that is answered like a request to the HTTP server.
-
-        Args:
-            name: Name of the gRPC method.
-            request: The equivalent HTTP request.
-
-        Raises:
-            IsochargeError: If the request is refused.
-        """
-        try:
-            answer = ROUTE_OF_METHOD[name].respond(request)
-        except ModelError:
-            if name not in ("ServerReady", "ModelReady"):
-                raise
-            return {"ready": False}  # gRPC has no status for this answer
-        return {ANSWER_FIELDS[name]: answer} if name in ANSWER_FIELDS else answer
 
     def _infer(self, request: Any) -> Any:
         """Run a model on the charges of a ModelInferRequest, and return the ModelInferResponse."""
@@ -300,7 +290,7 @@ class Service:
         try:
             response = response_type(infer_response=self._infer(request))
         except Exception as error:  # every error is sent to the client
-            status, message = _status_and_message(error)
+            _, status, message = refusal(error)
             response = response_type(error_message=message)
         self._traffic.count("grpc", f"{STREAM_METHOD} message", status)  # `_handle` counts the whole stream as one call
         return response
@@ -349,14 +339,3 @@ class Service:
                 return await context.read()
             finally:
                 self._waiting.pop(timeout, None)
-
-
-def _status_and_message(error: Exception) -> tuple[str, str]:
-    """Return the gRPC status and the error message with which a failed call is ended."""
-    if isinstance(error, TimeoutError):
-        return (
-            "DEADLINE_EXCEEDED",
-            "the call waited too long for its client, others needed its place, or the server stops",
-        )
-    _, grpc_status = statuses(error)
-    return grpc_status, client_message(error)

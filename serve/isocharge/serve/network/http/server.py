@@ -45,12 +45,17 @@ class Connection(HttpToolsProtocol):
             uvicorn_arguments: Arguments that uvicorn passes to its protocols.
         """
         super().__init__(**uvicorn_arguments)
-        self.deadline = math.inf
-        self._write_deadline = math.inf  # time by which the client must have read its responses, s
+        self._allow(limits.header_seconds)
+        # Time by which the client must have read its responses, s
+        self._write_deadline = self.loop.time() + limits.body_seconds
         self._limits = limits
         self._traffic = traffic
         self._is_reading = False  # whether a request has begun and is not complete
         self._pending_bytes = 0  # bytes since the latest complete head, part of a body, or complete request
+
+    def _allow(self, seconds: float) -> None:
+        """Set the time that the client has from now on to send further data, s."""
+        self.deadline = self.loop.time() + seconds
 
     def connection_made(self, transport: Any) -> None:
         """Begin the connection. If there are too many connections, end one that waits for a request.
@@ -60,9 +65,6 @@ class Connection(HttpToolsProtocol):
         is refused.
         """
         super().connection_made(transport)
-        now = self.loop.time()
-        self.deadline = now + self._limits.header_seconds
-        self._write_deadline = now + self._limits.body_seconds
         if len(self.connections) <= self._limits.connections:
             return
         others: Any = self.connections - {self}  # all connections are of this class
@@ -108,13 +110,13 @@ class Connection(HttpToolsProtocol):
         if len(self.pipeline) >= self._limits.queued_requests:
             raise httptools.HttpParserError  # uvicorn calls `send_400_response`; the parser ignores all later data
         self._is_reading = True
-        self.deadline = self.loop.time() + self._limits.header_seconds
+        self._allow(self._limits.header_seconds)
         super().on_message_begin()
 
     def on_headers_complete(self) -> None:
         """Set the deadline of the body."""
         self._pending_bytes = 0
-        self.deadline = self.loop.time() + self._limits.body_seconds
+        self._allow(self._limits.body_seconds)
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
@@ -128,7 +130,7 @@ class Connection(HttpToolsProtocol):
         self._pending_bytes = 0
         self.deadline = math.inf
         if self.cycle.response_complete:  # the application has not read the whole body
-            self.deadline = self.loop.time() + self._limits.idle_seconds
+            self._allow(self._limits.idle_seconds)
         super().on_message_complete()
 
     def close_if_overdue(self, now: float) -> None:
@@ -188,7 +190,7 @@ class Connection(HttpToolsProtocol):
         headers = b"".join(b"%s: %s\r\n" % header for header in response.headers)
         self.transport.write(STATUS_LINE[status] + headers + b"connection: close\r\n\r\n" + response.body)
         self.transport.close()
-        self.deadline = self.loop.time() + self._limits.header_seconds
+        self._allow(self._limits.header_seconds)
 
 
 class HttpServer:
@@ -252,8 +254,8 @@ class HttpServer:
         """
 
         async def serve() -> None:
-            async with self._server.beside as contexts:
-                await contexts.enter_async_context(beside or nullcontext())
+            async with AsyncExitStack() as self._server.beside:
+                await self._server.beside.enter_async_context(beside or nullcontext())
                 await self._server.serve([self._socket])
 
         uvloop.run(serve())
@@ -279,10 +281,7 @@ class _Server(uvicorn.Server):
         beside: Contexts that are closed as soon as the server is to stop.
     """
 
-    def __init__(self, config: uvicorn.Config) -> None:
-        """Create a server that does not listen yet."""
-        super().__init__(config)
-        self.beside = AsyncExitStack()
+    beside: AsyncExitStack
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:

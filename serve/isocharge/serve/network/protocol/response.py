@@ -31,25 +31,21 @@ INTERNAL_MESSAGE = "internal error; the server's log says more"
 """Message to the client for an error that is not an IsochargeError."""
 
 
-def statuses(error: Exception) -> tuple[int, str]:
-    """Return the HTTP status and the name of the gRPC status that report an error to the client."""
-    return next(
-        (http_status, grpc_status)
-        for error_class, http_status, grpc_status in _STATUSES
-        if isinstance(error, error_class)
-    )
-
-
-def client_message(error: Exception) -> str:
-    """Return the message about an error that is sent to the client.
+def refusal(error: Exception) -> tuple[int, str, str]:
+    """Return the HTTP status, the name of the gRPC status and the message that report an error to the client.
 
     Every error other than an IsochargeError is unexpected, and its message may contain secrets. An unexpected error is
     therefore written to the log, and the client receives a general message.
     """
-    if isinstance(error, errors.IsochargeError):
-        return str(error)
-    log.exception("a request failed", exc_info=error)
-    return INTERNAL_MESSAGE
+    message = str(error)
+    if not isinstance(error, errors.IsochargeError):
+        log.exception("a request failed", exc_info=error)
+        message = INTERNAL_MESSAGE
+    return next(
+        (http_status, grpc_status, message)
+        for error_class, http_status, grpc_status in _STATUSES
+        if isinstance(error, error_class)
+    )
 
 
 class Response(NamedTuple):
@@ -92,8 +88,8 @@ def error_response(error: Exception) -> Response:
     the allowed method. If the token is missing or wrong, the header `WWW-Authenticate` contains the required kind of
     authentication.
     """
-    http_status, _ = statuses(error)  # the status of gRPC is not needed
-    response = json_response({"error": client_message(error)}, http_status)
+    http_status, _, message = refusal(error)  # the status of gRPC is not needed
+    response = json_response({"error": message}, http_status)
     if isinstance(error, errors.WrongMethod):
         response.headers.append((b"allow", error.allowed.encode()))
     if isinstance(error, errors.TokenError):
