@@ -75,19 +75,3 @@ def test_a_documented_command_line_parses(words, is_complete):
 def test_the_reference_lists_every_command():
     reference = PAGES["REFERENCE.md"].partition("## Commands")[2]
     assert sorted(re.findall(r"^\| `isocharge (.+?)` \|", reference, re.MULTILINE)) == sorted(COMMANDS)
-
-
-@pytest.mark.parametrize(
-    ("option", "address"),
-    [
-        ([], None),
-        (["--live"], "127.0.0.1:8001"),
-        (["--live", "8080"], "8080"),
-        (["--live", "[::1]:0"], "[::1]:0"),
-        (["--live=localhost:8080"], "localhost:8080"),
-    ],
-)
-def test_live_takes_an_address_or_none(option, address):
-    assert parse(["serve", "stream", "three-25um-biaxial", "--port", "film", *option])["live"] == address
-    assert parse(["serve", "replay", *option, "touch.rec"])["live"] == address
-    assert parse(["demo", *option, "--seconds", "5"])["live"] == address

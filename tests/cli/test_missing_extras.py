@@ -26,7 +26,7 @@ EXTRAS = {"serve http": "http", "serve plot": "simulate", "serve virtual": "simu
 """The extra of each command that is not that of its group."""
 
 OPTIONS = {
-    "demo --live": "simulate,http",
+    "demo --live 0": "simulate,http",
     "serve stream three-25um-biaxial --port - --live 0": "http",
     "serve stream three-25um-biaxial --port - --output touch.mcap": "record",
     "serve check three-25um-biaxial presses.parquet": "parquet",

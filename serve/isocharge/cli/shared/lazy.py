@@ -1,45 +1,15 @@
 """Groups of commands that import the module of a command only when the command is called.
 
 The help of a group is therefore printed without importing the commands of the group.
-
-The value of the option `--live` may be omitted, as in `--live` or `--live 8080`. Typer requires a value for every
-option that is not a flag. A group therefore inserts the default value into the command line before Typer parses the
-command line.
 """
 
-from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Mapping
 from typing import Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from isocharge.common.errors import require
-
-DEFAULT_LIVE_ADDRESS = "127.0.0.1:8001"
-"""Address of the live page if `--live` has no value."""
-
-
-def insert_live_address(words: Sequence[str]) -> list[str]:
-    """Insert the default address after each option `--live` whose value is omitted.
-
-    The next word of the command line is the value if it looks like PORT or HOST:PORT.
-
-    Args:
-        words: The command line. Words after `--` are arguments and remain as they are.
-
-    Example:
-        >>> insert_live_address(["--live", "--seconds", "5"])
-        ['--live', '127.0.0.1:8001', '--seconds', '5']
-    """
-    completed_words: list[str] = []
-    for word, next_word in pairwise([*words, ""]):
-        completed_words.append(word)
-        is_option = word == "--live" and "--" not in completed_words
-        is_address = next_word.isdecimal() or (":" in next_word and not next_word.startswith("-"))
-        if is_option and not is_address:
-            completed_words.append(DEFAULT_LIVE_ADDRESS)
-    return completed_words
 
 
 def lazy_group(summary: str, summaries: Mapping[str, str]) -> typer.Typer:
@@ -72,7 +42,6 @@ def lazy_group(summary: str, summaries: Mapping[str, str]) -> typer.Typer:
             name, command, remaining_args = super().resolve_command(ctx, args)
             if name in functions:
                 command = load_command(functions[name])
-                remaining_args = insert_live_address(remaining_args)
             return name, command, remaining_args
 
     return typer.Typer(

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from msgspec import structs
 
-from isocharge.cli.shared.lazy import DEFAULT_LIVE_ADDRESS
 from isocharge.cli.shared.terminal import say, warnings_passed_to
 from isocharge.common.errors import InputError, require, shown
 from isocharge.serve import PredictionRecord, Recorder, TouchStream
@@ -35,10 +34,9 @@ STATE_INTERVAL_S = 0.25
 LiveOption = Annotated[
     str | None,
     typer.Option(
-        metavar="[HOST:PORT]",
-        help=f"Show the film on a page for browsers, at {DEFAULT_LIVE_ADDRESS} or at the given address. A port alone "
-        "is a port of this machine, and port 0 chooses a free port. An address that other machines can reach needs "
-        "--token. (default: no page)",
+        metavar="[HOST:]PORT",
+        help="Show the film on a page for browsers at this address. A port alone is a port of this machine, and port 0 "
+        "chooses a free port. An address that other machines can reach needs --token. (default: no page)",
     ),
 ]
 
@@ -102,7 +100,7 @@ def page_address(live: str) -> Address:
     """
     host, _, port = live.rpartition(":")
     if port not in map(str, range(1 << 16)):
-        raise InputError(f"--live: expected PORT or HOST:PORT, as 8001 or {DEFAULT_LIVE_ADDRESS}, got {shown(live)}")
+        raise InputError(f"--live: expected PORT or HOST:PORT, as 8001 or 127.0.0.1:8001, got {shown(live)}")
     return Address(host.strip("[]") or "127.0.0.1", int(port))
 
 
