@@ -87,12 +87,12 @@ def refused(reason):
     return WatchResult(Phase.refused, reason=reason)
 
 
-def dialogue(*events, asks=True, contacts=None):
+def dialogue(*events, contacts=None):
     """The session after a dialogue with a person, or with a machine that makes the presses of a list."""
     session, script = FakeSession(), Script(*events)
     talk = Dialogue(session, script)
     if contacts is None:
-        talk.guide_person(asks=asks)
+        talk.guide_person()
     else:
         talk.follow_machine(contacts)
     assert not script.events
@@ -111,7 +111,7 @@ def test_enter_takes_a_press_as_proposed(capsys):
     assert message.endswith("With --until 0 the same command takes more presses.\n")
 
 
-FIRST, SECOND, THIRD = ((float(x), 0.0, 1.0) for x in range(3))
+FIRST = (0.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -135,10 +135,6 @@ def test_a_press_that_is_refused_is_asked_for_again(capsys):
     session, script = dialogue(refused("it moves"), refused(PORT_LOST), STEADY, "", "q")
     assert (session.taken, script.armed) == ([FIRST], 4)
     assert "not taken: it moves; press again" in capsys.readouterr().err
-
-
-def test_nothing_is_asked_with_yes():
-    assert dialogue(STEADY, STEADY, STEADY, asks=False)[0].taken == [FIRST, SECOND, THIRD]
 
 
 LIST = np.array([[1.0, 1.0, 0.5], [2.0, 2.0, 0.5], [3.0, 3.0, np.nan]])
@@ -270,7 +266,7 @@ def test_a_calibration_without_an_output_only_states_the_film(command, desk, mon
 def test_a_file_with_further_columns_is_not_overwritten(refused, desk):
     text = "x_mm,y_mm,force_N,A,B,C,D,comment\n1,1,1,500,500,500,500,mine\n"
     (desk / "presses.csv").write_text(text)
-    refused(*PRESS, "--port", "some.bin", "--yes", message="got further columns: comment")
+    refused(*PRESS, "--port", "some.bin", "--press-list", "list.csv", message="got further columns: comment")
     assert (desk / "presses.csv").read_text() == text
 
 
@@ -280,8 +276,8 @@ def test_a_file_with_further_columns_is_not_overwritten(refused, desk):
         ("--port some.bin --press-list far.csv", "far.csv, press 2: expected a press within 8.5 mm", 2),
         ("--port some.bin --press-list half.csv", "half.csv, line 2: expected both x_mm and y_mm", 2),
         ("--port some.bin --press-list nothing.csv", "cannot be read", 2),
-        ("--port some.bin --yes -o .", "expected a file in an existing folder", 1),
-        ("--port some.bin --yes -o nowhere/presses.csv", "nowhere", 1),
+        ("--port some.bin --press-list list.csv -o .", "expected a file in an existing folder", 1),
+        ("--port some.bin --press-list list.csv -o nowhere/presses.csv", "nowhere", 1),
         ("--port noise.bin --press-list list.csv", "no intact frame", 1),
     ],
 )

@@ -55,10 +55,6 @@ def press_command(
     force_std: ForceStdOption = 0.01,
     device: DeviceOption = None,
     baud: BaudOption = 115200,
-    yes: Annotated[
-        bool,
-        typer.Option("--yes", help="Take each press as made where it was proposed, without asking. (default: ask)"),
-    ] = False,
     press_list: Annotated[
         Path | None,
         typer.Option(
@@ -96,11 +92,9 @@ def press_command(
     if earlier is not None:
         problem = replace(problem, earlier=read_earlier(earlier, problem))
 
-    # A machine makes the presses of a list. Without a list, a person makes the presses, and is asked about each press
-    # unless --yes is given.
+    # A machine makes the presses of a list. Without a list, a person makes the presses, and is asked about each press.
     contacts = None if press_list is None else read_press_list(press_list)
-    asks_person = contacts is None and not yes
-    keyboard = STDIN_FILENO if asks_person else None
+    keyboard = STDIN_FILENO if contacts is None else None
     board = load_device(device)
     if board.rule(ThermalRule) is not None:
         say(f"{device}: [common_mode] is not used for these presses, because it needs a model of the film")
@@ -134,7 +128,7 @@ def press_command(
             ):
                 dialogue = Dialogue(session, events)
                 if contacts is None:
-                    dialogue.guide_person(asks=asks_person)
+                    dialogue.guide_person()
                 else:
                     dialogue.follow_machine(contacts)
         finally:

@@ -162,18 +162,12 @@ class Dialogue:
         flags = f" [{', '.join(press.flags)}]" if press.flags else ""
         say(f"   steady after {press.held_s:.1f} s: {charges} pC{flags}")
 
-    def guide_person(self, *, asks: bool = True) -> None:
-        """Propose and record presses until the film is known accurately enough, or the person quits.
-
-        Args:
-            asks: Whether to ask after each press where it was made. If not, each press counts as made at the proposed
-                place with the proposed force.
-        """
-        if asks:
-            say("   (press elsewhere if you cannot reach a place; type u to undo the last press, q to quit)")
+    def guide_person(self) -> None:
+        """Propose and record presses until the film is known accurately enough, or the person quits."""
+        say("   (press elsewhere if you cannot reach a place; type u to undo the last press, q to quit)")
         try:
             while not self._session.enough:
-                self._guide_press(asks=asks)
+                self._guide_press()
         except SessionEnd:
             return
         say("The film is known well enough. With --until 0 the same command takes more presses.")
@@ -221,7 +215,7 @@ class Dialogue:
     def _wait_for(self, *phases: Phase) -> WatchResult:
         """Wait for the next reading in one of the given phases.
 
-        Readings in other phases are only displayed, and typed lines are ignored.
+        Readings in other phases are only displayed. A machine types nothing.
 
         Raises:
             SessionEnd: If the port or the input has ended.
@@ -229,21 +223,16 @@ class Dialogue:
         """
         while True:
             event = self._events.next()
-            if isinstance(event, str):  # a typed line
-                continue
-            if event.phase in phases:
-                return event
-            self._say_phase(event)
+            if isinstance(event, WatchResult):
+                if event.phase in phases:
+                    return event
+                self._say_phase(event)
 
-    def _guide_press(self, *, asks: bool) -> None:
+    def _guide_press(self) -> None:
         """Propose a press, and wait until it has been recorded or until another press must be proposed.
 
         When the charges of a press are steady, the person is asked where the press was made. The answer records or
         discards the press. The person can also type a command at any time.
-
-        Args:
-            asks: Whether to ask where a steady press was made. If not, the press counts as made at the proposed place
-                with the proposed force.
         """
         proposed = self._session.proposed
         steady_press: SteadyPress | None = None  # the press about which a question is open; None without a question
@@ -263,9 +252,6 @@ class Dialogue:
                 continue  # readings do not matter while the question is open
             elif event.press is not None:
                 self._say_steady(event.press)
-                if not asks:
-                    self._take(event.press, proposed.contact)
-                    return
                 steady_press = event.press
                 say('   Was it there, and as hard? Enter: yes; or type "x y force" (? is unknown), u: undo, q: quit')
             elif event.phase == Phase.refused:
