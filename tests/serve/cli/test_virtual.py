@@ -35,7 +35,7 @@ def solved(monkeypatch):
         return small_map(*(FILM_9 if (sensor, probe) == FILM_9 else DESCRIBED))
 
     monkeypatch.setattr(ForwardMap, "build", build)
-    monkeypatch.setattr("isocharge.cli.shared.virtual_sensor.SCRIPT_S", 3.0)
+    monkeypatch.setattr("isocharge.cli.shared.virtual_sensor.PRESSES_S", 2.0)
     return solved
 
 

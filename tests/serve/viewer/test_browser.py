@@ -2,6 +2,7 @@
 
 import re
 import signal
+import threading
 import time
 
 import numpy as np
@@ -25,19 +26,19 @@ LATENCY = """() => {
 
 
 @pytest.fixture
-def sensor(film):
-    """A sensor that nothing touches, so that the first tare is right however late the stream starts."""
-    nowhere = np.full(round(RATE_HZ), np.nan)
-    with VirtualSensor(film.charges, Script(nowhere, nowhere, np.zeros_like(nowhere), RATE_HZ)) as sensor:
-        yield sensor
+def touch():
+    """Event before which nothing touches the film, so that the first tare is right however late the stream starts."""
+    return threading.Event()
 
 
 @pytest.fixture
-def presses():
-    """Presses that stand still, with pauses that are long enough for a tare, played again and again."""
+def sensor(film, touch):
+    """A sensor of presses that stand still, with pauses that are long enough for a tare, played again and again."""
     rows = [row for press in PRESSES for row in ((np.nan, np.nan, 0.0), press)]
     counts = [round(PAUSE_S * RATE_HZ), round(PRESS_S * RATE_HZ)] * len(PRESSES)
-    return Script(*np.repeat(rows, counts, axis=0).T, RATE_HZ)
+    presses = Script(*np.repeat(rows, counts, axis=0).T, RATE_HZ)
+    with VirtualSensor(film.charges, presses, noise=lambda charge_pC, _: charge_pC * touch.is_set()) as sensor:
+        yield sensor
 
 
 @pytest.fixture
@@ -69,9 +70,9 @@ def wait_for(page, expression, timeout_s=40.0):
     return value
 
 
-def test_live_page_shows_numbers_and_sends_tare_pause_record_and_marker(page, sensor, film, presses, tmp_path):
+def test_live_page_shows_numbers_and_sends_tare_pause_record_and_marker(page, touch, tmp_path):
     wait_for(page, "isocharge.page.film.drawnKind === 'none'")
-    sensor.use(film.charges, presses)
+    touch.set()
     # The kind and the numbers are read at once: a press that ends in between takes its numbers away.
     x, y, force = wait_for(page, f"isocharge.page.film.drawnKind === 'contact' && {SHOWN}")
     assert min(np.hypot(px - x, py - y) + abs(pressed - force) for px, py, pressed in PRESSES) < 0.3
@@ -108,11 +109,10 @@ def test_live_page_shows_numbers_and_sends_tare_pause_record_and_marker(page, se
         assert plan["y"] + plan["height"] <= height  # the film is seen without scrolling
 
 
-def test_live_page_takes_the_numbers_away_when_the_frames_stop(stream, page, sensor, film):
+def test_live_page_takes_the_numbers_away_when_the_frames_stop(stream, page, touch):
     process, _ = stream
     wait_for(page, "isocharge.page.film.drawnKind === 'none'")
-    one = np.ones(round(RATE_HZ))
-    sensor.use(film.charges, Script(2.0 * one, one, one, RATE_HZ))
+    touch.set()
     wait_for(page, "isocharge.page.film.drawnKind === 'contact'")
     process.send_signal(signal.SIGSTOP)
     shown = wait_for(page, f"isocharge.page.film.drawnKind === 'silent' && {{shown: {SHOWN}}}")["shown"]

@@ -1,7 +1,6 @@
 """`isocharge serve virtual`: a virtual sensor, which uses the forward map and the amplifier of the simulation."""
 
 import threading
-import time
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,7 +15,7 @@ from isocharge.cli.shared.virtual_sensor import film_charges, measure_function, 
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
-from isocharge.serve import Script, VirtualSensor, encode_frame, encode_text
+from isocharge.serve import VirtualSensor, encode_frame, encode_text
 from isocharge.serve.virtual_sensor.script import VirtualScript, load_script
 from isocharge.simulate import (
     Circle,
@@ -41,10 +40,10 @@ def virtual_command(
         float,
         typer.Option(
             min=0.0,
-            max=1e6,
-            help="Time after the start in which nothing touches the film, at least, s. The film is solved meanwhile.",
+            max=3600.0,
+            help="Time before the first random press, s. A script states its own.",
         ),
-    ] = 0.0,
+    ] = 1.0,
     noise: Annotated[
         str, typer.Option(help="Amplifier: clean, reference, measured, bench, surgery, or a TOML file.")
     ] = "reference",
@@ -74,8 +73,8 @@ def virtual_command(
 ) -> None:
     """Play a sensor: simulate presses that wander over the film, and send their charges as frames on a pseudo-terminal.
 
-    Prints the path of the port, solves the film, then plays until Ctrl-C. Nothing touches the film while the film is
-    solved, during --rest, and in the first second of the random presses.
+    Solves the film, prints the path of the port, then plays until Ctrl-C. After the time --rest and a minute of random
+    presses, the same begins again.
 
     Example: isocharge serve virtual three-25um-biaxial --link /tmp/film
     """
@@ -93,34 +92,25 @@ def virtual_command(
         distance_mm = np.hypot(scripted_presses.x_mm, scripted_presses.y_mm)
         radius = max(DEFAULT_RADIUS, ROUNDING_MARGIN * float(np.nanmax(distance_mm)))
         force_max = max(force_max, ROUNDING_MARGIN * float(scripted_presses.force_N.max()))
-    electrode_count = len(played_sensor.electrodes)
-    # Until the film is solved, the player sends frames without a touch. It then only computes the charges of an empty
-    # list of contacts, for which the first function returns an empty array.
-    no_position = np.full(1, np.nan)
+    with shown_progress(), solving_executor(played_sensor.film) as executor:
+        forward_map = ForwardMap.build(
+            played_sensor,
+            footprint,
+            radius=radius,
+            force_range=(DEFAULT_PLAYED_FORCE_RANGE[0], force_max),
+            executor=executor,
+        )
     player = VirtualSensor(
-        lambda _: np.zeros((0, electrode_count)),
-        Script(no_position, no_position, np.zeros(1), rate),
-        noise=measure_function(load_amplifier(noise), electrode_count, rate, seed),
+        film_charges(forward_map),
+        scripted_presses or random_script(forward_map, seed, rate, force_max, rest),
+        noise=measure_function(load_amplifier(noise), len(forward_map.electrodes), rate, seed),
         seed=seed,
         encode=encode_frame if frames == "binary" else partial(encode_text, notation=frames),
         faults=settings.faults,
         link=link,
     )
     with until_stopped(), player:
-        start_s = time.monotonic()
         announce(player.port_path)
-        say("solving the film, which is not touched until then")
-        with shown_progress(), solving_executor(played_sensor.film) as executor:
-            forward_map = ForwardMap.build(
-                played_sensor,
-                footprint,
-                radius=radius,
-                force_range=(DEFAULT_PLAYED_FORCE_RANGE[0], force_max),
-                executor=executor,
-            )
-        threading.Event().wait(start_s + rest - time.monotonic())  # sleeps, unless the time is negative
-        presses = scripted_presses or random_script(forward_map, seed, rate, force_max)
-        player.use(film_charges(forward_map), presses)
         played_name = sensor if film is None else f"film {film} of {sensor}"
         say(f"playing {played_name} at {rate:g} Hz; Ctrl-C stops")
         threading.Event().wait(seconds)  # sleeps until Ctrl-C if `seconds` is None

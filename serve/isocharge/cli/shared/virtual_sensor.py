@@ -8,8 +8,8 @@ from isocharge.serve import Script, VirtualSensor, wander
 from isocharge.serve.virtual_sensor.sensor import Charges, Noise
 from isocharge.simulate import Amplifier, ForwardMap, load_amplifier
 
-SCRIPT_S = 60.0
-"""Length of the random script that a virtual sensor repeats, s."""
+PRESSES_S = 60.0
+"""Duration of the random presses that a virtual sensor repeats, s."""
 
 
 def virtual_sensor(forward_map: ForwardMap) -> VirtualSensor:
@@ -22,7 +22,9 @@ def virtual_sensor(forward_map: ForwardMap) -> VirtualSensor:
     return VirtualSensor(film_charges(forward_map), script, noise=measure, seed=seed)
 
 
-def random_script(forward_map: ForwardMap, seed: int, rate_Hz: float, max_force_N: float) -> Script:
+def random_script(
+    forward_map: ForwardMap, seed: int, rate_Hz: float, max_force_N: float, rest_s: float = 1.0
+) -> Script:
     """Return a script of presses that wander over the whole area of a forward map.
 
     Args:
@@ -30,11 +32,13 @@ def random_script(forward_map: ForwardMap, seed: int, rate_Hz: float, max_force_
         seed: Seed of the presses.
         rate_Hz: Frames per second, Hz.
         max_force_N: Largest force, N. It is reduced to the largest force of the forward map if necessary.
+        rest_s: Time before the first press, s.
     """
     min_force_N, max_map_force_N = forward_map.domain.force_range
     return wander(
         seed=seed,
-        seconds=SCRIPT_S,
+        seconds=rest_s + PRESSES_S,
+        rest_s=rest_s,
         rate_Hz=rate_Hz,
         radius_mm=forward_map.domain.radius,
         force_range_N=(min_force_N, min(max_map_force_N, max_force_N)),

@@ -17,9 +17,6 @@ from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SceneError
 from isocharge.common.structs import Finite, NotNegative, Settings, WrongKey, read_toml
 
-INITIAL_REST_S = 1.0
-"""Time without a press at the start of a random script, s. A reader measures its tare in this time."""
-
 PRESS_DURATION_S = (1.0, 3.0)
 """Shortest and longest duration of a random press, s."""
 
@@ -155,6 +152,7 @@ def wander(
     *,
     seed: int,
     seconds: float = 60.0,
+    rest_s: float = 1.0,
     rate_Hz: float = 200.0,
     radius_mm: float = DEFAULT_RADIUS,
     force_range_N: tuple[float, float] = DEFAULT_PLAYED_FORCE_RANGE,
@@ -163,11 +161,12 @@ def wander(
 
     Each press moves from one random point to another, while its force changes from one random force to another. The
     forces stay within the given range, because a forward map is only valid in a range of forces. The script begins with
-    `INITIAL_REST_S` without a press.
+    `rest_s` without a press.
 
     Args:
         seed: Seed of all random choices.
         seconds: Length of the script, s.
+        rest_s: Time without a press at the start of the script, s. A reader measures its tare in this time.
         rate_Hz: Number of frames per second, Hz.
         radius_mm: Radius of the disk that contains all presses, mm.
         force_range_N: Smallest and largest force, N.
@@ -185,7 +184,7 @@ def wander(
         )
     rng = np.random.default_rng(seed)
     rows = [(0.0, 0.0, 0.0, 0.0)]
-    start_s = INITIAL_REST_S
+    start_s = rest_s
     while start_s < seconds:
         end_s = start_s + rng.uniform(*PRESS_DURATION_S)
         distance_mm = radius_mm * np.sqrt(rng.uniform(size=2))  # distributes the points evenly over the disk

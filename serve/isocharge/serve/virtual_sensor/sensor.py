@@ -166,20 +166,23 @@ class VirtualSensor:
         self._faults = faults or Faults()
         self._link = link
         self._clean_pC = _clean_charges(charges, script)  # touch charges of the script, shape (n, electrodes)
-        self._next_script: tuple[Script, Array] | None = None  # script that follows the present one, with its charges
         n_electrode = self._clean_pC.shape[1]
         random_pC = self._rng.uniform(-MAX_RANDOM_OFFSET_pC, MAX_RANDOM_OFFSET_pC, n_electrode)
         self._offset_pC = random_pC if offset_pC is None else np.asarray(offset_pC)
 
+        self._reset_counters()
+        self._stop = threading.Event()
+        self._writer: threading.Thread | None = None
+        self._port_stack = contextlib.ExitStack()  # closes the port and removes the link
+        self.port_path = ""
+
+    def _reset_counters(self) -> None:
+        """Set all counters to zero."""
         self.withheld = 0
         self.lost = 0
         self.corrupted = 0
         self.paused_s = 0.0
         self._frame_count = 0
-        self._stop = threading.Event()
-        self._writer: threading.Thread | None = None
-        self._port_stack = contextlib.ExitStack()  # closes the port and removes the link
-        self.port_path = ""
 
     @property
     def url(self) -> str:
@@ -197,40 +200,19 @@ class VirtualSensor:
         """Number of frames that were written."""
         return self._frame_count - self.withheld - self.lost
 
-    def use(self, charges: Charges, script: Script) -> None:
-        """Replace the script by another script with the same frame rate, and play the new script from its beginning.
-
-        The change takes effect within `BLOCK_S`. The amplifier keeps its state.
-
-        Args:
-            charges: Forward map.
-            script: The presses.
-
-        Raises:
-            SceneError: If the forward map returns charges of another shape, or charges that are not finite.
-        """
-        self._next_script = (script, _clean_charges(charges, script))
-
     def frames(self) -> Iterator[bytes]:
         """Compute the frames of the script, and yield the bytes of each frame without waiting until the frame is due.
 
         The bytes are empty if the frame is lost because of a fault.
 
-        The charges are computed in blocks of frames. A new script takes effect at the beginning of a block. The script
-        is repeated without end until another script is given.
+        The charges are computed in blocks of frames. The script is repeated without end.
         """
-        first_frame_of_script = 0
         block_size = max(1, round(BLOCK_S * self.script.rate_Hz))
-        for first_frame_of_block in itertools.count(step=block_size):
-            if self._next_script is not None:
-                self.script, self._clean_pC = self._next_script
-                self._next_script = None
-                first_frame_of_script = first_frame_of_block
-            first_row = first_frame_of_block - first_frame_of_script
-            rows = range(first_row, first_row + block_size)
+        for first_frame in itertools.count(step=block_size):
+            rows = range(first_frame, first_frame + block_size)
             clean_pC = self._clean_pC.take(rows, axis=0, mode="wrap")  # after its last row, the script begins again
             block_pC = self._noise(clean_pC, self._rng) + self._offset_pC  # shape (block_size, electrodes)
-            for frame_number, charge_pC in enumerate(block_pC.tolist(), start=first_frame_of_block):
+            for frame_number, charge_pC in enumerate(block_pC.tolist(), start=first_frame):
                 yield self._frame_bytes(frame_number, tuple(charge_pC))
 
     def _frame_bytes(self, frame_number: int, charge_pC: tuple[float, ...]) -> bytes:
@@ -263,11 +245,7 @@ class VirtualSensor:
         Raises:
             InputError: If the link cannot be created.
         """
-        self.lost = 0
-        self.corrupted = 0
-        self.withheld = 0
-        self.paused_s = 0.0
-        self._frame_count = 0
+        self._reset_counters()
         self._stop.clear()
         port = PseudoPort()
         self._port_stack.callback(port.close)
