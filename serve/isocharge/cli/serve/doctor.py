@@ -1,5 +1,6 @@
 """`isocharge serve doctor`: examine what a port sends, and write the device file of the board."""
 
+import tomllib
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -17,7 +18,6 @@ from isocharge.common.toml_text import to_toml
 from isocharge.serve import Examination, Port, Predictor, device_from_table, examine, load_device
 from isocharge.serve.examination.electrode_check import ElectrodeCheck, check_electrodes, corrected_table
 from isocharge.serve.examination.listening import BAUDS
-from isocharge.serve.port.serial_line import Request
 
 HEAD = "Written by `isocharge serve doctor` from what came through a port; the keys are in serve/docs/device_file.md."
 """First line of a device file."""
@@ -65,8 +65,8 @@ def doctor_command(
     request: Annotated[
         str | None,
         typer.Option(
-            metavar="TEXT",
-            help=r"What the board has to be asked, as in '?\n' or '\x01\x04'. (default: nothing)",
+            metavar="BYTES",
+            help="Request that the board answers with a frame, in hexadecimal, as in '3F 0A'. (default: none)",
         ),
     ] = None,
     check_wiring: Annotated[
@@ -93,13 +93,14 @@ def doctor_command(
     if write is not None:
         refuse_existing(write)
     electrodes = Predictor(model, models=models).metadata.electrodes if model else ()  # empty for any model
-    gain = None if pC_per_unit is None else {"pC_per_unit": _parse_gain(pC_per_unit)}
+    gain = None if pC_per_unit is None else _parse_gain(pC_per_unit)
     for option, value, section in (("--pc-per-unit", gain, "gain"), ("--request", request, "frames")):
         if value is not None and device is not None:
             raise InputError(
                 f"{option}: expected none beside --device, because the device file states it; leave the option out, "
                 f"or write it into the section [{section}] of {device}"
             )
+    request_table = device_from_table({"frames": {"request": request}}, "--request")
     say(f"listening for {seconds:g} s; leave the film alone")
     examination = examine(
         port,
@@ -108,7 +109,7 @@ def doctor_command(
         device=load_device(device),
         electrodes=electrodes,
         gain=gain,
-        request=None if request is None else _parse_request(request),
+        request=request_table.request,
         wait=wait,
     )
     if not json:
@@ -177,44 +178,23 @@ def port_lines() -> Iterator[str]:
         yield f"{port.device} ({port.description}): {received}"
 
 
-def _parse_gain(text: str) -> Any:
-    """Parse `--pc-per-unit`, and return one number or a number for each electrode.
+def _parse_gain(text: str) -> dict[str, Any]:
+    """Return the value of `--pc-per-unit` as the content of the section `[gain]`.
+
+    The value has the notation of TOML, except that a table such as `A=0.1,B=-0.1` has no braces.
 
     Args:
-        text: Value of the option, such as `0.1` or `A=0.1,B=-0.1`.
+        text: Value of the option.
 
     Raises:
         InputError: If the text has neither of these forms.
     """
     try:
-        if "=" not in text:
-            return float(text)
-        pairs = (part.partition("=") for part in text.split(","))
-        return {electrode.strip(): float(number) for electrode, _equals_sign, number in pairs}
+        return tomllib.loads(f"pC_per_unit = {{{text}}}" if "=" in text else f"pC_per_unit = {text}")
     except ValueError as error:
         raise InputError(
             f"--pc-per-unit: expected a number like 0.0457, or A=0.0457,B=-0.0457, got {text!r}"
         ) from error
-
-
-def _parse_request(text: str) -> Request:
-    r"""Convert the text of `--request` to the bytes that are sent to the board as a request for each frame.
-
-    Args:
-        text: Value of the option. Each escape sequence, such as `\n` or `\x01`, stands for one byte.
-
-    Raises:
-        InputError: If the text is empty, an escape sequence is wrong, or a character does not fit into one byte.
-    """
-    try:
-        # The codec `unicode_escape` decodes escape sequences in bytes of Latin-1. Other characters first become escape
-        # sequences themselves. The last step refuses them, because they do not fit into one byte.
-        data = text.encode("latin-1", "backslashreplace").decode("unicode_escape").encode("latin-1")
-    except UnicodeError:
-        data = b""
-    if not data:
-        raise InputError(rf"--request: expected a text like '?\n' or '\x01\x04', got {text!r}")
-    return Request(data)
 
 
 def _write_device_file(path: Path, examination: Examination, model: str) -> None:

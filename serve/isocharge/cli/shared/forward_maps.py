@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.terminal import say
-from isocharge.common.defaults import DEFAULT_STRESS_LIMIT, FEW_ELECTRODES
+from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.common.errors import InputError, IsochargeError
 from isocharge.simulate import Dataset, Film, NoiseModel, Probe, Sensor, read_dataset
 from isocharge.simulate.execution import cores, dask_workers, local_workers
@@ -100,20 +100,19 @@ def sweep_radius(
     return smallest_radius
 
 
-def warn_of_stress(film: Film, probes: Iterable[Probe], max_force: float, limit: float = DEFAULT_STRESS_LIMIT) -> None:
-    """Print a warning for each probe that can stress the film beyond a limit.
+def warn_of_stress(film: Film, probes: Iterable[Probe], max_force: float) -> None:
+    """Print a warning for each probe that can stress the film beyond `DEFAULT_STRESS_LIMIT`.
 
     Args:
         film: The film.
         probes: The probes.
         max_force: Largest force, N.
-        limit: Limit of the stress, MPa.
     """
     from isocharge.simulate.solver.stress_limit import stress_caution
 
     for probe in probes:
         with suppress(IsochargeError):  # the caller computes the same press later, and then reports the error
-            caution = stress_caution(film, probe, max_force, limit)
+            caution = stress_caution(film, probe, max_force)
             if caution:
                 say(f"caution: {caution}")
 

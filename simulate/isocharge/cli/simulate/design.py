@@ -12,11 +12,9 @@ from isocharge.cli.shared.options import (
     NoiseOption,
     SeedOption,
     SensorArgument,
-    StressLimitOption,
     WorkersOption,
 )
 from isocharge.cli.shared.terminal import say, show_result, shown_progress
-from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
 from isocharge.simulate import Circle, load_sensor, noise_model, parse_probe
@@ -56,7 +54,6 @@ def design_command(
     force: ForceOption = 1.0,
     noise: NoiseOption = "reference",
     seed: SeedOption = 0,
-    stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
     workers: WorkersOption = None,
 ) -> None:
     """Search for the electrode positions with the smallest position errors.
@@ -86,7 +83,7 @@ def design_command(
         side=side,
         seed=seed,
     )
-    warn_of_stress(case.sensor.film, [footprint], force, stress_limit)
+    warn_of_stress(case.sensor.film, [footprint], force)
 
     # Search for the positions, and write the files.
     with shown_progress(), executor_for(workers) as executor:

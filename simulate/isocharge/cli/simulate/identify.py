@@ -13,7 +13,7 @@ from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.files import new_folder, refuse_existing
 from isocharge.simulate import identify, load_sensor, noise_model, parse_probe
 from isocharge.simulate.plots.error_maps import identification_picture, mirror_picture
-from isocharge.simulate.plots.figure import picture_bytes
+from isocharge.simulate.plots.figure import save_picture
 
 
 def identify_command(
@@ -62,11 +62,10 @@ def identify_command(
     # Write the pictures and the results.
     if output is not None:
         with new_folder(output) as folder:
-            (folder / "identify.png").write_bytes(picture_bytes(identification_picture(identification)))
+            save_picture(identification_picture(identification), folder / "identify.png")
             if identification.mirror is not None:
-                picture = mirror_picture(described_sensor, identification.mirror)
-                (folder / "mirror.png").write_bytes(picture_bytes(picture))
-            (folder / "identify.json").write_bytes(json_module.dumps(results, indent=1).encode())
+                save_picture(mirror_picture(described_sensor, identification.mirror), folder / "mirror.png")
+            (folder / "identify.json").write_text(json_module.dumps(results, indent=1))
 
     # Print the results and a summary in sentences, which state the working area.
     limits = "limits_in_working_area"

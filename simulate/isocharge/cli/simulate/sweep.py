@@ -11,11 +11,10 @@ from isocharge.cli.shared.options import (
     RadiusOption,
     SeedOption,
     SensorArgument,
-    StressLimitOption,
     WorkersOption,
 )
 from isocharge.cli.shared.terminal import say, shown_progress
-from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.files import refuse_existing
 from isocharge.simulate import Sweep, load_sensor, parse_probe, run_sweep
 
@@ -32,7 +31,6 @@ def sweep_command(
         typer.Option(help="Angle of the probe: as given, or random for each press."),
     ] = "fixed",
     seed: SeedOption = 0,
-    stress_limit: StressLimitOption = DEFAULT_STRESS_LIMIT,
     workers: WorkersOption = None,
     cluster: Annotated[
         str | None,
@@ -51,7 +49,7 @@ def sweep_command(
 
     refuse_existing(output)
     _, max_force = force
-    warn_of_stress(film_sensor.film, probes, max_force, stress_limit)
+    warn_of_stress(film_sensor.film, probes, max_force)
     with shown_progress(), executor_for(workers, cluster) as executor:
         largest_distance = sweep_radius(radius, film_sensor, probes, force, executor)
         sweep = Sweep(largest_distance, force, samples, seed, orientation)
