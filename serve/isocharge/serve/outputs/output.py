@@ -2,7 +2,7 @@
 
 Every output implements the interface `Output`. An `OutputKind` declares which targets belong to a kind of output. The
 class `WriterQueue` keeps a slow output from delaying a live stream. `FileOutput` is the base class of outputs that
-write files, and `AddedOutput` wraps an output of another package.
+write files.
 
 Other packages can add kinds of outputs. Such a package must declare an entry point in the group "isocharge.outputs".
 The entry point must refer to an `OutputKind`.
@@ -17,7 +17,6 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, Queue
@@ -37,7 +36,7 @@ class Output(Protocol):
     """
 
     def write(self, record: PredictionRecord, /) -> None:
-        """Write a record.
+        """Write a record, which must not be changed, because the other outputs receive the same record.
 
         If this method raises an exception in a live stream, the output receives no more records, and the stream
         continues without this output.
@@ -99,7 +98,7 @@ MAX_WAITING_ITEMS = 10_000
 """Largest number of items that wait in a `WriterQueue`. Records of ten seconds at 1 kHz occupy about 10 MB."""
 
 CLOSE_TIMEOUT_s = 1.0
-"""Default of the argument `close_timeout_s` of a `WriterQueue`, s."""
+"""Longest time that `WriterQueue.close` waits for the consumer to take the next item, s."""
 
 
 class WriterQueue(Generic[T]):
@@ -113,24 +112,15 @@ class WriterQueue(Generic[T]):
         lost: Number of items that were dropped without being written.
     """
 
-    def __init__(
-        self,
-        write: Callable[[T], object],
-        is_ready: Callable[[], bool] = lambda: True,
-        *,
-        close_timeout_s: float = CLOSE_TIMEOUT_s,
-    ) -> None:
+    def __init__(self, write: Callable[[T], object], is_ready: Callable[[], bool] = lambda: True) -> None:
         """Start the thread.
 
         Args:
             write: Function that the thread calls with each item.
             is_ready: Function that the thread calls before it writes an item. The function waits for a short time, and
                 returns whether the consumer accepts an item.
-            close_timeout_s: Longest time that `close` waits for the consumer to take the next item, s. After this time,
-                the waiting items count as lost.
         """
         self.lost = 0
-        self._close_timeout_s = close_timeout_s
         self._write = write
         self._is_ready = is_ready
         self._items: Queue[T | None] = Queue()  # None ends the thread
@@ -164,7 +154,7 @@ class WriterQueue(Generic[T]):
     def close(self) -> None:
         """Write the waiting items as long as the consumer accepts items, and close the queue.
 
-        If the consumer accepts no item within the timeout, the waiting items are dropped and counted as lost.
+        If the consumer accepts no item within `CLOSE_TIMEOUT_s`, the waiting items are dropped and counted as lost.
 
         Raises:
             Exception: The exception that `write` has raised in the thread, unless `put` has raised it already.
@@ -173,9 +163,9 @@ class WriterQueue(Generic[T]):
         earlier_count = 0
         while self._thread.is_alive() and self._items.unfinished_tasks != earlier_count:
             earlier_count = self._items.unfinished_tasks
-            self._thread.join(self._close_timeout_s)
+            self._thread.join(CLOSE_TIMEOUT_s)
         self._is_abandoned.set()
-        self._thread.join(self._close_timeout_s)
+        self._thread.join(CLOSE_TIMEOUT_s)
         if self._items.unfinished_tasks > 0:
             self.lost += self._items.unfinished_tasks - 1  # the last task is the None
         self._raise_error()
@@ -200,45 +190,6 @@ class WriterQueue(Generic[T]):
             self._items.task_done()
         except Exception as error:  # `put` or `close` raises it again in the thread of the caller
             self._error = error
-
-
-END_TIMEOUT_s = 15.0
-"""Half of the longest time for which a command waits until an output of another package is closed, s."""
-
-
-class AddedOutput:
-    """Wrapper that prevents an output of another package from changing records and from keeping the command running."""
-
-    def __init__(self, output: Output) -> None:
-        """Store the output of the other package."""
-        self._output = output
-
-    def write(self, record: PredictionRecord) -> None:
-        """Write a copy of the record, so that the other outputs do not receive the changes of this output."""
-        self._output.write(deepcopy(record))
-
-    def close(self) -> None:
-        """Close the output."""
-        self._end(self._output.close)
-
-    def discard(self) -> None:
-        """Discard the output, because the records are incomplete."""
-        self._end(lambda: discard(self._output))
-
-    def _end(self, end: Callable[[], None]) -> None:
-        """Call a function that ends the output in another thread, because the function may never return.
-
-        Raises:
-            Exception: The error of the function.
-            RuntimeError: If the function does not return in time.
-        """
-        ending: WriterQueue[Callable[[], None]] = WriterQueue(
-            lambda end_output: end_output(), close_timeout_s=END_TIMEOUT_s
-        )
-        ending.put(end)
-        ending.close()
-        if ending.is_stuck:
-            raise RuntimeError(f"it is still not closed after {2.0 * END_TIMEOUT_s:g} s")
 
 
 class FileOutput:

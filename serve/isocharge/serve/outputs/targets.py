@@ -9,7 +9,6 @@ from typing import Any, Self
 
 from isocharge.common.errors import InputError, shown
 from isocharge.serve.outputs.output import (
-    AddedOutput,
     Output,
     OutputContext,
     OutputKind,
@@ -138,11 +137,9 @@ class Outputs:
         for target, kind in self._kinds.items():
             try:
                 output = kind.open(target, self._context)
-                if kind not in OUTPUT_KINDS:
-                    output = AddedOutput(output)
             except BaseException as error:
                 self._is_discarded = True
-                self.close()
+                self._stack.close()
                 if isinstance(error, Exception):
                     raise output_error(error, target)  # noqa: B904  # the cause is set
                 raise
