@@ -15,7 +15,7 @@ import pytest
 from attacks.faults import mutated, with_junk
 from infer_requests import infer_request
 from isocharge.serve.network.grpc.service import METHODS, SERVICE
-from isocharge.serve.network.model_store import open_model_store
+from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol.handler import Handler
 
 NAME = "three-25um-biaxial"
@@ -110,7 +110,7 @@ def test_requests_with_faults(server, attack):
 
 def test_headers_of_other_sites(attack):
     """Whatever follows it, the name of another site in `Host` or `Origin` changes nothing and is refused."""
-    store = open_model_store(MODELS)
+    store = ModelStore(MODELS)
     handler = Handler(store)
     path = f"/v2/repository/models/{NAME}/unload"
     hosts = (b"evil.example:8000", b"127.0.0.1.evil.example", b"localhost.evil.example")
@@ -130,7 +130,7 @@ def test_headers_of_other_sites(attack):
 
 def test_bodies_with_faults(attack):
     """Past the transport: what the handler makes of any body, with any header that says how to read it."""
-    handler = Handler(open_model_store(MODELS))
+    handler = Handler(ModelStore(MODELS))
     good = json.loads(BODY)
     headers = ([], [(b"content-encoding", b"gzip")], [(b"content-encoding", b"deflate")])
 

@@ -24,7 +24,7 @@ from isocharge.serve import ModelMetadata, PredictionRecord, Predictor, write_mo
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.network.address import Address
 from isocharge.serve.network.http.server import HttpServer
-from isocharge.serve.network.model_store import open_model_store
+from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol.handler import Handler
 from isocharge.serve.record.record import selected_fields
 
@@ -193,7 +193,7 @@ def store(film, tmp_path):
     """A store with two versions of the linear model, in a folder that only this test uses."""
     film.write(tmp_path / "models")
     film.write(tmp_path / "models", version=2)
-    return open_model_store(tmp_path / "models")
+    return ModelStore(tmp_path / "models")
 
 
 @pytest.fixture

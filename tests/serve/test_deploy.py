@@ -22,7 +22,7 @@ import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from isocharge.serve import find_model
-from isocharge.serve.network.model_store import open_model_store
+from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol.handler import Handler
 from processes import finished
 
@@ -52,7 +52,7 @@ def assert_golden(host):
 
 
 def test_stock_client_receives_the_golden_outputs(start_http):
-    assert_golden(start_http(Handler(open_model_store(MODELS))).url.removeprefix("http://"))
+    assert_golden(start_http(Handler(ModelStore(MODELS))).url.removeprefix("http://"))
 
 
 @pytest.mark.slow
@@ -254,7 +254,7 @@ def test_dashboard_and_alerts_ask_for_metrics_that_there_are(start_http):
     rules = [rule["expr"] for rule in yaml.safe_load((files / "alerts.yml").read_text())["groups"][0]["rules"]]
     panels = json.loads((files / "grafana/isocharge.json").read_text())["panels"]
     queries = " ".join(rules + [target["expr"] for panel in panels for target in panel["targets"]])
-    url = start_http(Handler(open_model_store(MODELS))).url
+    url = start_http(Handler(ModelStore(MODELS))).url
     urllib.request.urlopen(f"{url}/v2/health/ready", timeout=20).close()
     with urllib.request.urlopen(f"{url}/metrics", timeout=20) as answer:
         families = text_string_to_metric_families(answer.read().decode())

@@ -17,7 +17,7 @@ from isocharge.common.errors import DeviceError
 from isocharge.serve import Frame, device_from_table, encode_frame, flags
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.live.device import STAGES
-from isocharge.serve.network.model_store import open_model_store
+from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol.handler import Handler
 from isocharge.serve.signal_chain.touch import TouchRule
 from layout_encoder import encode_layout
@@ -82,7 +82,7 @@ def test_examples_of_the_pages_run(page_example, desks, installed, start_http, r
     )
     if page_example.language == "python":
         if "127.0.0.1:8000" in text:
-            text = text.replace("127.0.0.1:8000", start_http(Handler(open_model_store())).url.removeprefix("http://"))
+            text = text.replace("127.0.0.1:8000", start_http(Handler(ModelStore())).url.removeprefix("http://"))
         run_example(text, folder, environment)
         return
     if "curl" in text and shutil.which("curl") is None:

@@ -20,10 +20,10 @@ def test_invalid_tokens_are_refused(token):
 
 
 @pytest.mark.parametrize(
-    ("certificate", "key"), [("none.pem", None), ("cert.pem", None), ("key.pem", "cert.pem"), (".", None)]
+    ("certificate", "key"), [("none.pem", "none.pem"), ("cert.pem", "cert.pem"), ("key.pem", "cert.pem"), (".", ".")]
 )
 def test_tls_files_that_cannot_be_used(handler, tls_files, certificate, key):
-    tls = Tls(tls_files / certificate, key and tls_files / key)
+    tls = Tls(tls_files / certificate, tls_files / key)
     with pytest.raises(InputError, match=r"pem.*|tls.*: not a certificate and its unencrypted private key"):
         HttpServer(handler, Address(), tls)
 
@@ -98,7 +98,7 @@ def test_unix_socket_of_another_server_is_not_replaced(handler, tmp_path):
 def test_certificate_that_is_a_pipe_is_refused(tmp_path):
     os.mkfifo(tmp_path / "cert.pem")
     with pytest.raises(InputError, match="not a regular file"):
-        Tls(tmp_path / "cert.pem").context()
+        Tls(tmp_path / "cert.pem", tmp_path / "cert.pem").context()
 
 
 def test_token_needs_the_bearer_scheme_in_any_case():

@@ -6,7 +6,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from infer_requests import BODY, INFER, infer_request
 from isocharge.serve.flags import MISFIT
-from isocharge.serve.network.model_store import open_model_store
+from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol.handler import Handler
 
 
@@ -65,7 +65,7 @@ def test_metrics_list_loaded_and_refused_versions(film, tmp_path):
     film.write(tmp_path)
     film.write(tmp_path, version=2)
     (film.write(tmp_path, version=3) / "golden.json").unlink()
-    store = open_model_store(tmp_path)
+    store = ModelStore(tmp_path)
     samples = scrape(Handler(store))
     ready = [value(samples, "model_ready", model="linear", version=v) for v in ("1", "2", "3")]
     assert ready == [1, 1, 0]

@@ -20,7 +20,7 @@ from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.serve import load_model
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.metrics import RequestLog, Traffic
-from isocharge.serve.network.model_store import open_model_store
+from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol.handler import Handler
 from isocharge.serve.network.protocol.routes import ROUTES
 from model_files import put_graph
@@ -74,7 +74,7 @@ def test_broken_version_leaves_other_versions_available(film, store, folder, how
         ("READY", True),
     ]
 
-    store = open_model_store(folder.parent)
+    store = ModelStore(folder.parent)
     assert states(store) == [("linear", "1", "READY"), ("linear", "2", "UNAVAILABLE"), ("other", "1", "READY")]
     assert store.get("linear").version == "1"
     for name, reason in (("linear", f"; .*{message}"), ("other", "$")):
@@ -86,7 +86,7 @@ def test_a_model_in_another_ones_folder_is_refused(film, tmp_path):
     film.write(tmp_path)
     shutil.copytree(tmp_path / "linear", tmp_path / "other")
     shutil.copytree(tmp_path / "linear/1", tmp_path / "linear/2")
-    store = open_model_store(tmp_path)
+    store = ModelStore(tmp_path)
     assert labels(store) == ["linear/1"]
     copied_version, copied_model = store.refusals()
     assert "expected linear/2, as the folders are called, got linear/1" in copied_version

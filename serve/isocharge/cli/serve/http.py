@@ -24,7 +24,7 @@ from isocharge.serve.network.address import Address, Tls, check_exposure
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.http.server import HttpServer
 from isocharge.serve.network.metrics import RequestLog, Traffic
-from isocharge.serve.network.model_store import ModelStore, open_model_store
+from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol.handler import Handler
 from isocharge.serve.outputs.output import WriterQueue
 
@@ -78,7 +78,7 @@ def http_command(
 
     # Load the models, and serve them until Ctrl-C.
     with suppress(KeyboardInterrupt), _traffic(log_format) as traffic:
-        store = open_model_store(models)
+        store = ModelStore(models)
         for reason in store.refusals():
             log.warning("refused: %s", reason)
         handler = Handler(store, traffic=traffic, access=access)

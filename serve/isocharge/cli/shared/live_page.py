@@ -83,7 +83,7 @@ def given_tls(certificate: Path | None, key: Path | None) -> Tls | None:
         InputError: If the key is given without a certificate.
     """
     if certificate is not None:
-        return Tls(certificate, key)
+        return Tls(certificate, key or certificate)
     if key is not None:
         raise InputError("--tls-key: expected --tls-cert too, got the key alone")
     return None

@@ -51,8 +51,7 @@ class Address:
                 _remove_stale_socket(self.uds)
                 return _listen_unix(self.uds, backlog)
             # create_server sets SO_REUSEADDR. The port of an earlier server can therefore be used again at once.
-            is_ipv6 = ":" in self.host
-            family = socket.AF_INET6 if is_ipv6 else socket.AF_INET
+            family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
             accepts_ipv4_too = self.host == "::" and socket.has_dualstack_ipv6()
             return socket.create_server(
                 (self.host, self.port), family=family, backlog=backlog, dualstack_ipv6=accepts_ipv4_too
@@ -89,11 +88,11 @@ class Tls:
 
     Attributes:
         certificate: File with the certificate chain.
-        key: File with the private key, or None if the file of the certificate also contains the key.
+        key: File with the private key, which may be the file of the certificate.
     """
 
     certificate: Path
-    key: Path | None = None
+    key: Path
 
     def context(self) -> ssl.SSLContext:
         """Create the TLS context of a server from its certificate and its private key.
@@ -101,9 +100,7 @@ class Tls:
         Raises:
             InputError: If a file cannot be read, or if the certificate and the key do not belong together.
         """
-        paths = [self.certificate]
-        if self.key is not None:
-            paths.append(self.key)
+        paths = dict.fromkeys([self.certificate, self.key])  # a single path if both are in one file
         context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         try:
             for path in paths:
@@ -126,7 +123,7 @@ class Tls:
             InputError: If a file cannot be read, or if the certificate and the key do not belong together.
         """
         self.context()  # checks the files
-        return read_whole(self.key or self.certificate), read_whole(self.certificate)
+        return read_whole(self.key), read_whole(self.certificate)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ are refused, the old version remains available.
 
 import logging
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -80,17 +80,20 @@ class ModelStore:
         metrics: Metrics of the requests to each version. They also contain versions that were refused or unloaded.
     """
 
-    def __init__(self, roots: Sequence[Path]) -> None:
-        """Load all versions of all models in the repositories.
+    def __init__(self, models: str | Path | None = None) -> None:
+        """Load all versions of all models in one repository, or in all repositories that `find_model` searches.
+
+        If several repositories contain a model, the model in the first of them is used. The methods `load` and `index`
+        search the repositories again, so that new models are found.
 
         Args:
-            roots: Folders of the repositories. If several repositories contain a model, the model in the first of them
-                is used. The methods `load` and `index` search the repositories again, so that new models are found.
+            models: Folder of the only repository. By default, all repositories are searched.
 
         Raises:
-            ModelError: If there is no model, or no version passes its checks.
+            ModelError: If `models` is not a folder or contains no model, or if no version passes its checks.
         """
-        self._roots = roots
+        roots = repositories(models)
+        self._roots = roots if models is None else roots[:1]
         self._change_lock = threading.Lock()
         self.metrics = ModelMetrics()
         # The list is sorted. It is replaced as a whole, so that no thread reads half of a change.
@@ -98,7 +101,7 @@ class ModelStore:
         for name, folder in self._folders().items():
             self._load_versions(name, folder)
         if not self.versions_of():
-            searched = ", ".join(map(str, roots))
+            searched = ", ".join(map(str, self._roots))
             missing = f"expected models, <name>/<version>/model.onnx, found none in {searched}; correct --models"
             raise ModelError(f"no model can be served: {'; '.join(self.refusals()) or missing}")
 
@@ -121,7 +124,7 @@ class ModelStore:
         reasons = dict.fromkeys(self.refusals(name, version))  # without repetitions
         raise ModelNotFound("; ".join([f"model {label!r:.200} is not found", f"serving: {available}", *reasons]))
 
-    def label(self, name: str, version: str = "") -> str | None:
+    def label(self, name: str = "", version: str = "") -> str | None:
         """Return the label `name/version` of the version that `get` returns, or None if the version is not loaded."""
         versions = self.versions_of(name, version)
         return versions[-1].metadata.label if versions else None
@@ -245,20 +248,6 @@ class ModelStore:
         self._versions = sorted([*others, *rows])
         for number in removed_numbers:
             self.metrics.remove(name, number)
-
-
-def open_model_store(models: str | Path | None = None) -> ModelStore:
-    """Load all models in one repository, or in all repositories that `find_model` searches.
-
-    Args:
-        models: Folder of the only repository. By default, all repositories are searched. If several repositories
-            contain a model, the model in the first of them is used.
-
-    Raises:
-        ModelError: If `models` is not a folder or contains no model, or if no version passes its checks.
-    """
-    roots = repositories(models)
-    return ModelStore(roots if models is None else roots[:1])
 
 
 def _refusal_reason(folder: Path, error: Exception) -> str:

@@ -10,7 +10,7 @@ import base64
 import gzip
 import json
 import re
-from importlib.resources import as_file, files
+from pathlib import Path
 from typing import Any
 
 from isocharge.serve.flags import BEYOND, MEANINGS, MISFIT, OUTSIDE, STRESS
@@ -49,14 +49,13 @@ def playground_html() -> str:
     Raises:
         ModelError: If a released model is missing.
     """
-    with as_file(files("isocharge.serve.viewer")) as folder:
-        stress = json.loads((folder / SERIES_FILE).read_bytes())
-        icon = (folder / "page/icon.svg").read_bytes()
-        styles = [(folder / name).read_text("utf-8") for name in STYLES]
-        scripts = [(folder / name).read_text("utf-8") for name in SCRIPTS]
-        html = (folder / "playground/index.html").read_text("utf-8")
+    folder = Path(__file__).parent
+    icon = (folder / "page/icon.svg").read_bytes()
+    styles = [(folder / name).read_text("utf-8") for name in STYLES]
+    scripts = [(folder / name).read_text("utf-8") for name in SCRIPTS]
+    html = (folder / "playground/index.html").read_text("utf-8")
     data = {
-        "stress": stress,
+        "stress": json.loads((folder / SERIES_FILE).read_bytes()),
         "models": [_describe_model(model) for model in MODELS],
         "flags": {flag: MEANINGS[flag] for flag in (OUTSIDE, BEYOND, MISFIT, STRESS)},
     }

@@ -123,7 +123,7 @@ def test_calls_need_the_token(serve, silent_call):
 def test_server_with_tls(handler, start_grpc, authority, tls_files):
     trusted = grpc.ssl_channel_credentials(authority.cert_pem.bytes())
     with (
-        start_grpc(handler, tls=Tls(tls_files / "both.pem")) as url,
+        start_grpc(handler, tls=Tls(tls_files / "both.pem", tls_files / "both.pem")) as url,
         grpc.secure_channel(url.removeprefix("grpcs://"), trusted) as channel,
     ):
         assert call(channel, "ServerLive").live
@@ -230,7 +230,7 @@ def test_end_of_a_connection_is_not_logged_as_an_error(store, caplog):
     lines = []
     service = Service(Handler(store, None, Traffic(RequestLog(lines.append))))
     with pytest.raises(asyncio.CancelledError):
-        asyncio.run(service._handle("ModelStreamInfer", None, context))
+        asyncio.run(service.handle("ModelStreamInfer", None, context))
     labels = {"transport": "grpc", "route": "ModelStreamInfer", "status": "CANCELLED"}
     assert service._traffic.registry.get_sample_value("isocharge_requests_total", labels) == 1
     assert not caplog.records

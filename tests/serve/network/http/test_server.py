@@ -348,9 +348,9 @@ def test_stop_refuses_unfinished_requests_and_ends_a_server_beside_at_once(store
     assert (status, error) == (503, "the server has stopped before it could answer; send the request again")
 
 
-@pytest.mark.parametrize(("certificate", "key"), [("cert.pem", "key.pem"), ("both.pem", None)])
+@pytest.mark.parametrize(("certificate", "key"), [("cert.pem", "key.pem"), ("both.pem", "both.pem")])
 def test_server_with_tls_and_token(store, start_http, tls_files, trusted, certificate, key):
-    tls = Tls(tls_files / certificate, key and tls_files / key)
+    tls = Tls(tls_files / certificate, tls_files / key)
     server = start_http(Handler(store, access=AccessCheck(token="sesame")), tls=tls)
     assert server.url.startswith("https://127.0.0.1:")
     client = http.client.HTTPSConnection(server.url.removeprefix("https://"), context=trusted, timeout=60)

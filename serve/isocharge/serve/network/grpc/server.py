@@ -5,13 +5,14 @@ No thread waits for the messages of an open call. A call that sends no messages 
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 
 import grpc
 import grpc.aio
 
 from isocharge.common.errors import ListenError
 from isocharge.serve.network.address import ServerLimits, Tls, url_host
-from isocharge.serve.network.grpc.service import Service
+from isocharge.serve.network.grpc.service import METHODS, SERVICE, Service
 from isocharge.serve.network.protocol.handler import Handler
 
 MAX_CALLS_PER_CONNECTION = 100
@@ -50,7 +51,8 @@ async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = 
     # waiting call instead of refusing the new call. grpcio would refuse the new call, so its own limit must be higher.
     server = grpc.aio.server(options=_options(limits), maximum_concurrent_rpcs=2 * limits.connections)
     service = Service(handler)
-    server.add_generic_rpc_handlers((service.handlers(),))
+    methods = {name: grpc.stream_stream_rpc_method_handler(partial(service.handle, name)) for name in METHODS}
+    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, methods),))
     try:
         if tls is None:
             scheme = "grpc"

@@ -14,7 +14,6 @@ All other messages are converted from and to the JSON objects of the HTTP routes
 
 import asyncio
 import time
-from functools import partial
 from importlib.resources import files
 from typing import Any
 
@@ -40,11 +39,10 @@ SERVICE = "inference.GRPCInferenceService"
 
 def _service_descriptor() -> Any:
     """Read the compiled protocol file, and return the descriptor of the service."""
-    compiled = files("isocharge.serve.network.grpc").joinpath("inference.binpb").read_bytes()
+    compiled = files(__package__).joinpath("inference.binpb").read_bytes()
+    (file_descriptor,) = FileDescriptorSet.FromString(compiled).file
     pool = DescriptorPool()
-    descriptor_set = FileDescriptorSet.FromString(compiled)
-    for file_descriptor in descriptor_set.file:
-        pool.Add(file_descriptor)
+    pool.Add(file_descriptor)
     return pool.FindServiceByName(SERVICE)
 
 
@@ -156,12 +154,7 @@ class Service:
         self._waiting: dict[asyncio.Timeout, None] = {}
         self._traffic.open.labels("grpc").set_function(lambda: self._open_count)
 
-    def handlers(self) -> grpc.GenericRpcHandler:
-        """Return the handlers of all methods in the form that grpcio requires."""
-        methods = {name: grpc.stream_stream_rpc_method_handler(partial(self._handle, name)) for name in METHODS}
-        return grpc.method_handlers_generic_handler(SERVICE, methods)
-
-    async def _handle(self, name: str, _messages: object, context: grpc.aio.ServicerContext) -> None:
+    async def handle(self, name: str, _messages: object, context: grpc.aio.ServicerContext) -> None:
         """Answer a call. Then count the call by its status, and log the call if there is a log.
 
         If an error has occurred, the call is ended with the status and the message of the error.
@@ -292,7 +285,7 @@ class Service:
         except Exception as error:  # every error is sent to the client
             _, status, message = refusal(error)
             response = response_type(error_message=message)
-        self._traffic.count("grpc", f"{STREAM_METHOD} message", status)  # `_handle` counts the whole stream as one call
+        self._traffic.count("grpc", f"{STREAM_METHOD} message", status)  # `handle` counts the whole stream as one call
         return response
 
     def _limit_open_calls(self) -> None:

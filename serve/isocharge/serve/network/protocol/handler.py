@@ -24,7 +24,7 @@ from isocharge.common.errors import TooLarge, UnknownPath, WrongMethod
 from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.browser_check import AccessCheck, header_values
 from isocharge.serve.network.metrics import Client, Exchange, Traffic
-from isocharge.serve.network.model_store import ModelStore, open_model_store
+from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol.response import Response, decompress, error_response, json_response
 from isocharge.serve.network.protocol.routes import ROUTES, UNKNOWN, Request, Route
 
@@ -123,7 +123,7 @@ class Application(ABC):
 
 
 _PATTERNS = [
-    (re.compile(template.format(model="(?P<model>[^/]*)", version="(?P<version>[^/]+)")), route)
+    (re.compile(template.format(model="(?P<name>[^/]*)", version="(?P<version>[^/]+)")), route)
     for route in ROUTES
     for template in route.paths
 ]
@@ -131,18 +131,16 @@ _PATTERNS = [
 
 
 @lru_cache
-def match_path(path: str) -> tuple[Route, str, str]:
-    """Return the route of a path, and the name and the version of the model in the path.
+def match_path(path: str) -> tuple[Route, dict[str, str]]:
+    """Return the route of a path, and the `name` and the `version` of the model that the path contains.
 
-    If the path contains no name or no version, the name or the version in the result is empty. If the server has no
-    route for the path, the route is `UNKNOWN`.
+    If the server has no route for the path, the route is `UNKNOWN`.
     """
     for pattern, route in _PATTERNS:
         path_match = pattern.fullmatch(path)
         if path_match is not None:
-            parameters = path_match.groupdict()
-            return route, parameters.get("model", ""), parameters.get("version", "")
-    return UNKNOWN, "", ""
+            return route, path_match.groupdict()
+    return UNKNOWN, {}
 
 
 class Handler(Application):
@@ -176,12 +174,12 @@ class Handler(Application):
         """Answer one request as `Application.answer`, count the request, and log the request if there is a log."""
         start_ns = time.perf_counter_ns()
         response = super().answer(method, path, headers, body)
-        route, model, version = match_path(path)
+        route, model = match_path(path)
         exchange = Exchange(
             transport="http",
             route=route.paths[0],  # all paths are counted under the first path
             status=response.status,
-            model=self.store.label(model, version),
+            model=self.store.label(**model),
             error=response.error,
             duration_us=(time.perf_counter_ns() - start_ns) / 1000,
             bytes_in=len(body),
@@ -193,10 +191,10 @@ class Handler(Application):
 
     def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
         """Check a request, and answer it with the function of its route."""
-        route, model, version = match_path(path)
+        route, model = match_path(path)
         # The token is checked before unknown paths are refused. A client without the token therefore cannot find out
         # which paths exist.
-        self.access.check(method, headers, needs_token=route.needs_token)
+        self.access.check(headers, needs_token=route.needs_token)
         if route is UNKNOWN:
             raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
         # A HEAD request is answered like a GET request. The server then sends the response without its body.
@@ -204,7 +202,7 @@ class Handler(Application):
         if method != route.method and not is_head_of_get:
             raise WrongMethod(f"{path}: expected the method {route.method}, got {method[:20]}", route.method)
         body = decompress(body, headers.get(b"content-encoding", b"").lower(), self.limits.body_bytes)
-        answer = route.respond(Request(self.store, self.limits, self.traffic, headers, body, model, version))
+        answer = route.respond(Request(self.store, self.limits, self.traffic, headers, body, **model))
         return answer if isinstance(answer, Response) else json_response(answer)
 
 
@@ -233,4 +231,4 @@ def asgi_app(
         >>> app = Starlette(routes=[Mount("/touch", asgi_app(token="s3cret"))])  # doctest: +SKIP
     """
     access = AccessCheck(allowed_hosts=allowed_hosts, token=token)
-    return Handler(open_model_store(models), access=access)
+    return Handler(ModelStore(models), access=access)

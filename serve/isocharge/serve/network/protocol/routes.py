@@ -45,7 +45,7 @@ class Request(NamedTuple):
         traffic: Counters of the requests to the server.
         headers: Value of each header by the name of the header in lower case.
         body: Body of the request.
-        model: Name of the model in the path. It is empty if the path contains no name.
+        name: Name of the model in the path. It is empty if the path contains no name.
         version: Version of the model in the path. It is empty if the path contains no version.
     """
 
@@ -54,13 +54,13 @@ class Request(NamedTuple):
     traffic: Traffic
     headers: Mapping[bytes, bytes]
     body: bytes
-    model: str = ""
+    name: str = ""
     version: str = ""
 
     @property
     def loaded(self) -> LoadedVersion:
         """Loaded version of the model in the path. ModelNotFound is raised if the version is not loaded."""
-        return self.store.get(self.model, self.version)
+        return self.store.get(self.name, self.version)
 
     def content(self, target_type: type[T]) -> T:
         """Convert the JSON object in the body to a type. Without a body, the object is empty."""
@@ -123,21 +123,21 @@ def _load(request: Request) -> dict[str, Any]:
         raise RequestError(
             "load: parameters are not supported; put the files into the model's folder and load it again"
         )
-    request.store.load(request.model)
+    request.store.load(request.name)
     return {}
 
 
 def _unload(request: Request) -> dict[str, Any]:
     request.content(dict)  # refuses a body that is not an object
-    request.store.unload(request.model)
+    request.store.unload(request.name)
     return {}
 
 
 def _show_statistics(request: Request) -> dict[str, Any]:
     """Return the counters of one version of a model, of all its versions, or of all versions of all models."""
-    if request.model:
+    if request.name:
         _ = request.loaded  # raises ModelNotFound
-    selected = request.store.versions_of(request.model or None, request.version)
+    selected = request.store.versions_of(request.name or None, request.version)
     rows = [
         {"name": loaded.metadata.name, "version": loaded.version, **loaded.statistics.to_json()} for loaded in selected
     ]
