@@ -88,10 +88,11 @@ def test_a_stream_that_is_stopped_keeps_its_files_and_a_replay_leaves_none(recor
     assert outputs.has_incomplete_file != is_live
 
 
-def test_file_that_exists_is_not_overwritten_and_nothing_else_is_left(tmp_path):
+@live_and_replayed
+def test_file_that_exists_is_not_overwritten_and_nothing_else_is_left(tmp_path, is_live):
     (tmp_path / "b.csv").write_text("mine")
     targets = [str(tmp_path / "a.jsonl"), str(tmp_path / "b.csv")]
-    with pytest.raises(OutputExists, match=r"b\.csv"), Outputs(targets, context()):
+    with pytest.raises(OutputExists, match=r"b\.csv"), Outputs(targets, context(is_live=is_live)):
         pass
     assert (tmp_path / "b.csv").read_text() == "mine"
     assert not (tmp_path / "a.jsonl").exists()

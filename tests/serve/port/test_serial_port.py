@@ -1,5 +1,6 @@
 """Sources of bytes: serial ports, TCP and UDP sockets, and files. Ports may be silent, disappear, or need requests."""
 
+import errno
 import os
 import socket
 import termios
@@ -7,6 +8,7 @@ import threading
 import time
 from contextlib import contextmanager, nullcontext
 from itertools import islice, pairwise
+from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
 
@@ -66,6 +68,15 @@ def test_chunk_has_the_bytes_unchanged_and_the_time_of_arrival(board):
 def test_port_that_cannot_be_opened_is_refused(url, message):
     with pytest.raises(PortError, match=f"^{url}: {message}"), Port(url):
         pass
+
+
+def test_port_in_a_folder_that_may_not_be_read_is_refused(monkeypatch):
+    def stat(_path, **_options):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "stat", stat)
+    with pytest.raises(PortError, match=r"^/closed/film: its folder cannot be read \(Permission denied\)"):
+        open_source("/closed/film")
 
 
 @pytest.mark.parametrize("make", [Port, open_source])

@@ -100,7 +100,7 @@ class McapFile(FileOutput):
             POSE_TOPIC: pose_stamped(values, time_ns),
         }
         sequence = self.records % (1 << 32)  # the number in the file has 32 bits
-        with as_output_errors(self._path):
+        with as_output_errors(self.path):
             for topic, message in messages.items():
                 if message is not None:
                     channel = self._channels[topic]
@@ -112,7 +112,7 @@ class McapFile(FileOutput):
 
     def close(self) -> None:
         """Write the index of the messages, and close the file. In a replay, also rename it to its final name."""
-        with as_output_errors(self._path):
+        with as_output_errors(self.path):
             try:
                 self._writer.finish()  # type: ignore[no-untyped-call]
             except BaseException:

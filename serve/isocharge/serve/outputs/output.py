@@ -197,6 +197,9 @@ class FileOutput:
 
     If the records come from a sensor, the file has its final name from the beginning. In a replay, the file has a
     temporary name until it is complete.
+
+    Attributes:
+        path: Path of the file.
     """
 
     def __init__(self, path: Path, *, is_live: bool) -> None:
@@ -210,7 +213,7 @@ class FileOutput:
             OutputExists: If the file exists already.
             OutputError: If the file cannot be created.
         """
-        self._path = path
+        self.path = path
         # When the stack is closed, it closes the file and, in a replay, gives the file its final name.
         self._stack = ExitStack()
         written_path = path if is_live else self._stack.enter_context(new_file(path))

@@ -9,6 +9,7 @@ from typing import Any, Self
 
 from isocharge.common.errors import InputError, shown
 from isocharge.serve.outputs.output import (
+    FileOutput,
     Output,
     OutputContext,
     OutputKind,
@@ -222,6 +223,8 @@ class Outputs:
                     return
             if self._is_discarded or target not in self._writers:
                 discard(output)
+                if self._is_discarded and self._context.is_live and isinstance(output, FileOutput):
+                    output.path.unlink()  # another output could not be opened, so the file has no records
             else:
                 output.close()
         except KeyboardInterrupt:  # in a replay, the file is then removed

@@ -85,7 +85,7 @@ class TextFile(FileOutput):
         self.write = TextOutput(self._write_text, lines).write
 
     def _write_text(self, text: str) -> None:
-        with as_output_errors(self._path):
+        with as_output_errors(self.path):
             self._file.write(text.encode())
 
 

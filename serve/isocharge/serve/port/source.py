@@ -396,6 +396,7 @@ def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> context
     Raises:
         InputError: If the file cannot be read, or is a recording, a table or another file that does not come from a
             board; or if a package that adds sources cannot open the URL.
+        PortError: If the folder of the path cannot be read.
     """
     if url == STDIN:
         return contextlib.nullcontext(FileSource(sys.stdin.fileno(), STDIN))
@@ -408,9 +409,13 @@ def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> context
     is_path = "://" not in url
     path = Path(url)
     deadline_s = time.monotonic() + wait
-    while is_path and not path.exists() and time.monotonic() < deadline_s:
-        time.sleep(RETRY_PAUSE_s)
-    if is_path and (path.is_file() or path.is_fifo()):  # false for a device, and if the path does not exist
+    try:
+        while is_path and not path.exists() and time.monotonic() < deadline_s:
+            time.sleep(RETRY_PAUSE_s)
+        is_file = is_path and (path.is_file() or path.is_fifo())  # false for a device, and if the path does not exist
+    except PermissionError as error:
+        raise PortError(f"{url}: its folder cannot be read ({error.strerror}); ask for the right to read it") from error
+    if is_file:
         return open_file(path)
     remaining_s = max(0.0, deadline_s - time.monotonic())
     return Port(url, wait=remaining_s, **port_settings)
