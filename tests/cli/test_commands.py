@@ -21,7 +21,6 @@ import pytest
 from isocharge.cli.demo import live_film
 from isocharge.cli.demo.command import demo_command
 from isocharge.cli.demo.full_demo import run_demo
-from isocharge.cli.demo.live_film import played_radius_mm
 from isocharge.cli.shared import terminal
 from isocharge.common.progress import report, track
 from isocharge.common.toml_text import to_toml
@@ -245,7 +244,6 @@ BAD = [
     ("serve predict SENSOR x.csv --models nope", "ModelError: nope: expected a folder of models"),
     ("serve predict SENSOR none.csv", "ChargeError: none.csv: cannot be read"),
     ("serve predict SENSOR -", "stdin"),
-    ("demo --sensor no-such-sensor", "no-such-sensor"),
 ]
 """Command lines and the messages with which they end with the exit code 2."""
 
@@ -272,6 +270,7 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
     figures, released, out = [], find_model(SENSOR), tmp_path / "first-light"
     for name, stub in {
         "N_SIMULATED_PRESSES": 40,
+        "FOLLOWED_FRAMES": 400,
         "solve_maps": partial(kept, solve_maps),
         "fit": lambda *_: None,
         "release": lambda _, folder, **__: load_model(shutil.copytree(released, folder / "1")),
@@ -279,7 +278,7 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
         **dict.fromkeys(("press", "draw_deflection", "draw_section", "draw_charge_map"), lambda *_: None),
     }.items():
         monkeypatch.setattr(f"isocharge.cli.demo.full_demo.{name}", stub)
-    run_demo(out, 2.0, SENSOR)
+    run_demo(out)
     table, err = capsys.readouterr()
     assert re.findall(r"^(\d)\. (\w+): ", err, re.M) == [
         *zip("1234", ("simulate", "train", "serve", "show"), strict=True)
@@ -295,19 +294,11 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
     np.testing.assert_allclose(felt.get_xydata(), pressed.get_xydata(), atol=0.5)
 
 
-def test_demo_plays_the_working_area_of_the_released_model_of_the_sensor():
-    """For a sensor without a released model, the presses lie within the default radius."""
-    assert played_radius_mm("three-25um-biaxial") == pytest.approx(8.0, rel=2e-3)
-    assert played_radius_mm("four-25um-biaxial-15mm") == pytest.approx(15.0, rel=2e-3)
-    assert played_radius_mm("no-such-sensor") == 8.0
-
-
-@pytest.mark.parametrize(("name", "sensor"), [(None, "three-25um-biaxial"), ("four-25um-biaxial", "four-25um-biaxial")])
-def test_live_demo_streams_the_chosen_sensor_to_its_model(monkeypatch, name, sensor):
+def test_live_demo_streams_a_virtual_sensor_to_its_model(monkeypatch):
     calls = []
     board = SimpleNamespace(url="socket://127.0.0.1:1")
-    monkeypatch.setattr(live_film, "ForwardMap", SimpleNamespace(build=lambda sensor, *_: sensor.name))
+    monkeypatch.setattr(live_film, "ForwardMap", SimpleNamespace(build=lambda sensor, *_, **__: sensor.name))
     monkeypatch.setattr(live_film, "virtual_sensor", lambda played: nullcontext(calls.append(played) or board))
     monkeypatch.setattr(live_film, "stream_command", lambda *words, **options: calls.append((words, options["live"])))
-    demo_command(live="8081", seconds=2.0, sensor=name)
-    assert calls == [sensor, ((sensor, board.url), "8081")]
+    demo_command(live="8081")
+    assert calls == [SENSOR, ((SENSOR, board.url), "8081")]

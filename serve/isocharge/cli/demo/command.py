@@ -21,22 +21,6 @@ def demo_command(
             help="Folder to make for the results. (default: demo-output)",
         ),
     ] = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option(
-            min=3.0,
-            max=1e6,
-            help="Duration of the live part, s. (default: 10; with --live until Ctrl-C)",
-        ),
-    ] = None,
-    sensor: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="Name of a built-in sensor. --live also needs a released model with this name. (default: "
-            "three-25um-biaxial)",
-        ),
-    ] = None,
     live: LiveOption = None,
     playground: Annotated[
         Path | None,
@@ -57,8 +41,7 @@ def demo_command(
     Example: isocharge demo -o first-light
     """
     if playground is not None:
-        other_options = (output, seconds, sensor, live)
-        if any(option is not None for option in other_options):
+        if output is not None or live is not None:
             raise InputError("expected --playground without another option, got another option with it")
         from isocharge.serve.viewer.playground_page import playground_html  # imported late, because the import is slow
 
@@ -69,13 +52,12 @@ def demo_command(
         return
 
     # The modules of both demos are imported late, because they need extras that may not be installed.
-    sensor_name = sensor or "three-25um-biaxial"
     if live is None:
         with require("train"):
             from isocharge.cli.demo.full_demo import run_demo
-        run_demo(output or Path("demo-output"), seconds or 10.0, sensor_name)
+        run_demo(output or Path("demo-output"))
         return
     with require("simulate", "http"):
         from isocharge.cli.demo.live_film import show_live_film
 
-        show_live_film(live, seconds, sensor_name)
+        show_live_film(live)

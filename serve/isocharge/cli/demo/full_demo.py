@@ -6,7 +6,7 @@ from typing import cast
 
 import numpy as np
 
-from isocharge.cli.demo.live_film import played_radius_mm
+from isocharge.cli.demo.live_film import DEMO_SENSOR
 from isocharge.cli.serve.stream import summary
 from isocharge.cli.shared.forward_maps import N_SIMULATED_PRESSES
 from isocharge.cli.shared.terminal import say, show_result, shown_progress, this_command
@@ -28,18 +28,19 @@ from isocharge.simulate.plots.film import (
 from isocharge.train import fit, release
 from isocharge.train.data.contact_errors import position_error
 
+FOLLOWED_FRAMES = 2000
+"""Number of frames of the live part. The virtual sensor sends 200 frames per second."""
 
-def run_demo(folder: Path, seconds: float, sensor_name: str) -> None:
+
+def run_demo(folder: Path) -> None:
     """Run the demo, print a table of its results, and write the dataset, the model and a picture into a new folder.
 
     Args:
         folder: The folder.
-        seconds: Duration of the live part, s.
-        sensor_name: Name of the simulated sensor and of the model that is trained.
     """
-    sensor = load_sensor(sensor_name)
+    sensor = load_sensor(DEMO_SENSOR)
     probe = Circle(1.0)
-    sweep = Sweep(played_radius_mm(sensor.name), samples=N_SIMULATED_PRESSES)
+    sweep = Sweep(samples=N_SIMULATED_PRESSES)
     with shown_progress(), new_folder(folder) as draft:
         say(f"1. simulate: {sensor.name}, circle of 1 mm, 0.05 to 2 N, within {sweep.radius:.3g} mm")
         # The forward map interpolates the charges of all presses. There is one map for each probe.
@@ -53,7 +54,7 @@ def run_demo(folder: Path, seconds: float, sensor_name: str) -> None:
         model = release(fit(dataset), draft / "models" / sensor.name, command=this_command())
         predictor = Predictor(model.folder)
         say("3. serve: a virtual sensor sends frames over a pseudo-terminal, the model answers live")
-        followed = _follow_live(forward_map, predictor, seconds)
+        followed = _follow_live(forward_map, predictor)
         say("4. show: one page of pictures")
         equilibrium = press(sensor.film, probe, (3.0, -2.0), 1.0)  # a press inside every working area
         draw_page(forward_map, equilibrium, followed, draft / "demo.png")
@@ -69,13 +70,12 @@ def run_demo(folder: Path, seconds: float, sensor_name: str) -> None:
     show_result(results, json=False)
 
 
-def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) -> Array:
+def _follow_live(forward_map: ForwardMap, predictor: Predictor) -> Array:
     """Play a virtual sensor, estimate its contacts from the frames at its port, and print the counts of the frames.
 
     Args:
         forward_map: Charges of the presses of the virtual sensor.
         predictor: The model that estimates the contacts.
-        seconds: Duration, s.
 
     Returns:
         The frames in which both the virtual sensor and the model have a contact, shape (n, 2, 3): the true and the
@@ -85,11 +85,10 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor, seconds: float) 
     followed = []
     with virtual_sensor(forward_map) as sensor, Port(sensor.url) as port:
         rate_Hz = sensor.script.rate_Hz
-        frame_count = round(seconds * rate_Hz)
         all_records = (record for chunk in port for record in touch.feed(chunk))
-        records = islice(all_records, frame_count)
+        records = islice(all_records, FOLLOWED_FRAMES)
         script = np.column_stack([sensor.script.x_mm, sensor.script.y_mm, sensor.script.force_N])
-        for record in track(records, "following", frame_count):
+        for record in track(records, "following", FOLLOWED_FRAMES):
             # The script that the virtual sensor repeats contains the true press of this frame.
             row = round(1e-6 * (record.t_device_us or 0) * rate_Hz) % len(script)
             if record.contact and sensor.script.touching[row]:
