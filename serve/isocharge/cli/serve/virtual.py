@@ -31,7 +31,6 @@ def virtual_command(
     sensor: SensorArgument,
     seconds: SecondsOption = None,
     rate: Annotated[float, typer.Option(metavar="HZ", min=1.0, max=5000.0, help="Frames per second, Hz.")] = 200.0,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of presses, noise and offsets.")] = 0,
     force_max: Annotated[
         float, typer.Option(min=0.05, help="Largest force of a random press, N; the smallest is 0.05 N.")
     ] = DEFAULT_PLAYED_FORCE_RANGE[1],
@@ -102,9 +101,8 @@ def virtual_command(
         )
     player = VirtualSensor(
         film_charges(forward_map),
-        scripted_presses or random_script(forward_map, seed, rate, force_max, rest),
-        noise=measure_function(load_amplifier(noise), len(forward_map.electrodes), rate, seed),
-        seed=seed,
+        scripted_presses or random_script(forward_map, rate, force_max, rest),
+        noise=measure_function(load_amplifier(noise), len(forward_map.electrodes), rate),
         encode=encode_frame if frames == "binary" else partial(encode_text, notation=frames),
         faults=settings.faults,
         link=link,

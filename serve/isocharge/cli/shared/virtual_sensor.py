@@ -14,29 +14,25 @@ PRESSES_S = 60.0
 
 def virtual_sensor(forward_map: ForwardMap) -> VirtualSensor:
     """Return the virtual sensor of the demos, which plays random presses over the whole area of a forward map."""
-    seed = 0
     rate_Hz = 200.0
     _min_force_N, max_force_N = DEFAULT_PLAYED_FORCE_RANGE
-    script = random_script(forward_map, seed, rate_Hz, max_force_N)
-    measure = measure_function(load_amplifier("reference"), len(forward_map.electrodes), rate_Hz, seed)
-    return VirtualSensor(film_charges(forward_map), script, noise=measure, seed=seed)
+    script = random_script(forward_map, rate_Hz, max_force_N)
+    measure = measure_function(load_amplifier("reference"), len(forward_map.electrodes), rate_Hz)
+    return VirtualSensor(film_charges(forward_map), script, noise=measure)
 
 
-def random_script(
-    forward_map: ForwardMap, seed: int, rate_Hz: float, max_force_N: float, rest_s: float = 1.0
-) -> Script:
+def random_script(forward_map: ForwardMap, rate_Hz: float, max_force_N: float, rest_s: float = 1.0) -> Script:
     """Return a script of presses that wander over the whole area of a forward map.
 
     Args:
         forward_map: Forward map. The presses stay within its area and its range of forces.
-        seed: Seed of the presses.
         rate_Hz: Frames per second, Hz.
         max_force_N: Largest force, N. It is reduced to the largest force of the forward map if necessary.
         rest_s: Time before the first press, s.
     """
     min_force_N, max_map_force_N = forward_map.domain.force_range
     return wander(
-        seed=seed,
+        seed=0,
         seconds=rest_s + PRESSES_S,
         rest_s=rest_s,
         rate_Hz=rate_Hz,
@@ -63,14 +59,15 @@ def film_charges(forward_map: ForwardMap) -> Charges:
     return charges
 
 
-def measure_function(amplifier: Amplifier, electrode_count: int, rate_Hz: float, seed: int) -> Noise:
+def measure_function(amplifier: Amplifier, electrode_count: int, rate_Hz: float) -> Noise:
     """Return the amplifier as the function that the virtual sensor calls to measure charges.
+
+    The drift and the noise continue from call to call.
 
     Args:
         amplifier: The amplifier.
         electrode_count: Number of electrodes.
         rate_Hz: Frames per second, Hz.
-        seed: Seed of the drift and the noise, which continue from call to call.
     """
-    measurement = amplifier.start(electrode_count, rate_Hz, np.random.default_rng(seed))
+    measurement = amplifier.start(electrode_count, rate_Hz, np.random.default_rng(0))
     return lambda charge_pC, _rng: measurement(charge_pC)

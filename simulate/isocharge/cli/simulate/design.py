@@ -10,7 +10,6 @@ from isocharge.cli.shared.options import (
     MapRadiusOption,
     NewFolderOption,
     NoiseOption,
-    SeedOption,
     SensorArgument,
     WorkersOption,
 )
@@ -53,7 +52,6 @@ def design_command(
     probe: ProbeOption = "circle:1.0",
     force: ForceOption = 1.0,
     noise: NoiseOption = "reference",
-    seed: SeedOption = 0,
     workers: WorkersOption = None,
 ) -> None:
     """Search for the electrode positions with the smallest position errors.
@@ -81,7 +79,6 @@ def design_command(
         noise=noise_model(noise),
         nuisances=NO_NUISANCES if known else Nuisances(),
         side=side,
-        seed=seed,
     )
     warn_of_stress(case.sensor.film, [footprint], force)
 
