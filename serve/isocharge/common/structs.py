@@ -24,10 +24,10 @@ import difflib
 import re
 import sys
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 from msgspec import Meta, Struct
@@ -113,11 +113,11 @@ def read_json(path: Path, description: str, error_class: type[InputError], targe
     return parse_json(data, str(path), error_class, target_type)
 
 
-def parse_toml(text: str | bytes, where: str, error_class: type[InputError], target_type: type[T]) -> T:
+def parse_toml(data: bytes, where: str, error_class: type[InputError], target_type: type[T]) -> T:
     """Parse a text in TOML, and convert its content to a type.
 
     Args:
-        text: The text.
+        data: The text in UTF-8.
         where: Name of the file, with which the error message begins.
         error_class: Class of the error that is raised.
         target_type: Type to which the content is converted.
@@ -126,10 +126,10 @@ def parse_toml(text: str | bytes, where: str, error_class: type[InputError], tar
         error_class: If the text is not TOML, or its content is wrong.
     """
     try:
-        decoded_text = text.decode() if isinstance(text, bytes) else text
-        if _DEEP_KEY.search(decoded_text):  # parsing such a key needs much memory
+        text = data.decode()
+        if _DEEP_KEY.search(text):  # parsing such a key needs much memory
             raise ValueError("a key of more than 32 parts")
-        content = tomllib.loads(decoded_text)
+        content = tomllib.loads(text)
     except (ValueError, RecursionError) as cause:
         raise error_class(f"{where}: not a TOML file: {cut(str(cause))}") from cause
     return convert(content, target_type, where, error_class)
@@ -238,9 +238,12 @@ def _describe_mistake(value: Any, expected_type: Any, error: msgspec.ValidationE
         expected = _describe_schema(msgspec.json.schema(expected_type))
         return f"{_prefix(path)}expected {expected}, got {shown(value)}"
     kind, name = wrong_key.groups()
-    if kind == "contains unknown":
-        return unknown_key(_join(path, name), name, map(str, item_types))
-    return f"key {_join(path, name)!r} is missing"
+    if kind == "missing required":
+        return f"key {_join(path, name)!r} is missing"
+    known_keys = [str(key) for key in item_types]
+    similar_keys = difflib.get_close_matches(cut(name), known_keys, n=1)
+    advice = f"did you mean {similar_keys[0]!r}? Known are" if similar_keys else "known are"
+    return f"unknown key {shown(_join(path, name))}; {advice} {cut(', '.join(known_keys))}"
 
 
 def _item_types(value: Any, expected_type: Any) -> dict[str | int, Any]:
@@ -263,8 +266,7 @@ def _item_types(value: Any, expected_type: Any) -> dict[str | int, Any]:
             if tag_key is not None:
                 types[tag_key] = Literal[tuple(tags)]
             if len(structs) == 1 or value.get(tag_key) == tag:
-                types_of_fields = get_type_hints(struct, include_extras=True)
-                types |= {field.encode_name: types_of_fields[field.name] for field in msgspec.structs.fields(struct)}
+                types |= {field.encode_name: field.type for field in msgspec.structs.fields(struct)}
     for member in members:
         arguments = get_args(member)
         if isinstance(value, Mapping) and get_origin(member) is dict:
@@ -273,20 +275,6 @@ def _item_types(value: Any, expected_type: Any) -> dict[str | int, Any]:
             is_uniform = len(arguments) == 1 or Ellipsis in arguments
             types |= enumerate(arguments[:1] * len(value) if is_uniform else arguments)
     return types
-
-
-def unknown_key(name: str, key: str, known: Iterable[str]) -> str:
-    """Return an error message about an unknown key, with the most similar known key as a suggestion.
-
-    Args:
-        name: Name of the key with the names of the tables that contain it, such as "film.radius".
-        key: Name of the key alone, such as "radius".
-        known: Names of the known keys.
-    """
-    known_keys = list(known)
-    similar_keys = difflib.get_close_matches(cut(key), known_keys, n=1)
-    advice = f"did you mean {similar_keys[0]!r}? Known are" if similar_keys else "known are"
-    return f"unknown key {shown(name)}; {advice} {cut(', '.join(known_keys))}"
 
 
 def _union_members(expected_type: Any) -> Iterator[Any]:

@@ -138,12 +138,6 @@ def create_stages(setup: Setup, *, needs_contact: bool = False) -> list[Stage]:
     return [stage(setup) for stage in STAGES if stage.needs_contact is needs_contact and stage.is_used(setup)]
 
 
-ANY_BOARD = Device(
-    name="any board", rules={stage.rule_class: stage.rule_class() for stage in STAGES if stage.is_default}
-)
-"""Settings of a board that has no device file."""
-
-
 def load_device(path: str | Path | None) -> Device:
     """Read a device file and return its settings, or return `ANY_BOARD` if the path is None.
 
@@ -176,6 +170,10 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     used_rules = [section for section in structs.asdict(sections).values() if isinstance(section, Rule) and section.on]
     rules = {type(rule): rule for rule in used_rules}
     return Device(sections.name, sections.front_end, sections.frames, sections.channels, rules, table, where)
+
+
+ANY_BOARD = device_from_table({}, "device")
+"""Settings of a board that has no device file."""
 
 
 def with_settings(device: Device, section: str, **settings: Any) -> Device:

@@ -50,20 +50,6 @@ class Script:
     force_N: Array
     rate_Hz: float
 
-    def __post_init__(self) -> None:
-        """Check that the arrays have one element for each frame, and that the frame rate is positive.
-
-        Raises:
-            SceneError: If the arrays have different shapes, more than one dimension or no elements, or if the frame
-                rate is not positive.
-        """
-        shapes = {self.x_mm.shape, self.y_mm.shape, self.force_N.shape}
-        if len(shapes) > 1 or self.force_N.ndim != 1 or self.force_N.size == 0 or not self.rate_Hz > 0.0:
-            raise SceneError(
-                "script: expected three arrays of one length above 0 and a positive rate, got the shapes "
-                f"{sorted(shapes)} and {self.rate_Hz} Hz"
-            )
-
     def __len__(self) -> int:
         """Return the number of frames."""
         return len(self.force_N)

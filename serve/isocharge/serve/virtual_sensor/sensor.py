@@ -120,6 +120,7 @@ class VirtualSensor:
     Attributes:
         script: The presses that are played.
         port_path: Path of the pseudo-terminal.
+        sent: Number of frames that were written.
         withheld: Number of frames that were discarded because they did not fit into the buffer of the port.
         lost: Number of frames that were not sent because of a fault.
         corrupted: Number of frames that were damaged by a fault.
@@ -181,8 +182,8 @@ class VirtualSensor:
         self.withheld = 0
         self.lost = 0
         self.corrupted = 0
+        self.sent = 0
         self.paused_s = 0.0
-        self._frame_count = 0
 
     @property
     def url(self) -> str:
@@ -194,11 +195,6 @@ class VirtualSensor:
         if self._writer is None:
             raise PortError("the virtual sensor does not play; use `with VirtualSensor(...) as sensor`")
         return str(self._link or self.port_path)
-
-    @property
-    def sent(self) -> int:
-        """Number of frames that were written."""
-        return self._frame_count - self.withheld - self.lost
 
     def frames(self) -> Iterator[bytes]:
         """Compute the frames of the script, and yield the bytes of each frame without waiting until the frame is due.
@@ -286,12 +282,12 @@ class VirtualSensor:
             if lateness_s > MAX_LATENESS_S:
                 self.paused_s += lateness_s
 
-            self._frame_count = frame_number + 1
+            port.discard_received()
             if not data:
                 self.lost += 1
-                continue
-            port.discard_received()
-            if not port.write_whole(data):
+            elif port.write_whole(data):
+                self.sent += 1
+            else:
                 self.withheld += 1
 
 

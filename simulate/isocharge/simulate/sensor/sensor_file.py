@@ -295,13 +295,13 @@ def sensor_to_toml(sensor: Sensor, comment: Iterable[str] = ()) -> str:
     """
     text = to_toml(sensor_to_dict(sensor), comment)
     try:
-        text.encode()
+        data = text.encode()
     except UnicodeEncodeError as error:
         raise SensorError(f"sensor {sensor.name!r}: a name cannot be encoded in UTF-8 ({error})") from error
 
     # Parse the text, which raises an error if the file would not be valid.
     where = f"sensor {sensor.name!r}"
-    sensor_from_dict(parse_toml(text, where, SensorError, dict[str, Any]), where)
+    sensor_from_dict(parse_toml(data, where, SensorError, dict[str, Any]), where)
     return text
 
 

@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from isocharge.cli.shared.forward_maps import DEFAULT_PROBE
-from isocharge.cli.shared.options import JsonOption, ModelsOption, NewFolderOption
-from isocharge.cli.shared.terminal import say, show_json, shown_progress, this_command
+from isocharge.cli.shared.options import ModelsOption, NewFolderOption
+from isocharge.cli.shared.terminal import say, shown_progress, this_command
 from isocharge.common.errors import InputError
 from isocharge.serve import find_model, read_presses
 from isocharge.simulate import Dataset, load_sensor, parse_probe, read_dataset
@@ -50,7 +50,6 @@ def report_command(
             help="Write a trial report in half a minute; its results are not meaningful. (default: a full report)",
         ),
     ] = False,
-    json: JsonOption = False,
 ) -> None:
     """Compare a model with other methods: error (mm, % of force) against time (us).
 
@@ -59,7 +58,7 @@ def report_command(
     PRESSES.csv were made.
 
     The report takes less than a minute for each dataset. Durations are measured, so do not run other programs at the
-    same time. The option --json prints report.json.
+    same time.
 
     Example: isocharge train report presses -o report
     """
@@ -75,7 +74,7 @@ def report_command(
 
     settings = QUICK if quick else Settings()
     with shown_progress():
-        record = write_report(
+        write_report(
             output,
             list(zip(loaded_datasets, model_folders, strict=True)),
             settings,
@@ -83,8 +82,6 @@ def report_command(
         )
 
     say(str(output / "report.md"))
-    if json:
-        show_json(record)
 
 
 def _read_dataset(path: Path, sensor: str | None, probe: str) -> Dataset:
