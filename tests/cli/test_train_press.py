@@ -78,7 +78,7 @@ class Script:
         return event
 
 
-STEADY = WatchResult(Phase.taken, press=SteadyPress(np.full(4, 500.0), 0.7, ()))
+STEADY = WatchResult(Phase.taken, press=SteadyPress(np.full(4, 500.0), 0.7))
 TARED = WatchResult(Phase.waiting)
 HELD = WatchResult(Phase.settling)
 

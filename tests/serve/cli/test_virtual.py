@@ -140,7 +140,7 @@ def test_charges_below_the_smallest_force_follow_the_power_law_of_a_membrane():
     ("words", "message", "code"),
     [
         (f"{SENSOR} --seconds 0.001 --link TMP/film", "OutputExists: TMP/film is already there", 1),
-        (f"{SENSOR} --seconds 0.001 --link TMP/no/film", "the link cannot be made", 2),
+        (f"{SENSOR} --seconds 0.001 --link TMP/no/film", "OutputError: TMP/no/film cannot be written: No such file", 1),
         ("five-25um-biaxial", "SensorError: no sensor 'five-25um-biaxial'", 2),
         (f"{SENSOR} --film 1 --probe triangle:4", "InputError: --film: expected a --probe like circle", 2),
     ],

@@ -57,7 +57,7 @@ from isocharge.serve import (
     open_source,
 )
 from isocharge.serve.flags import TARE
-from isocharge.serve.live.device import with_settings
+from isocharge.serve.live.device import switched_on
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
 from isocharge.serve.outputs.output import OutputContext
 from isocharge.serve.outputs.targets import Outputs, target_forms
@@ -232,9 +232,9 @@ def stream_command(
     predictor = load_latest()
     board = load_device(device)
     if track:
-        board = with_settings(board, "track", on=True)
+        board = switched_on(board, "track")
     if follow:
-        board = with_settings(board, "follow", on=True)
+        board = switched_on(board, "follow")
     touch = TouchStream(predictor, board, frame_id=name)
     recorder = Recorder(record, predictor.metadata.label, board.table, name) if record else None
     stream = RecordedStream(touch, recorder)

@@ -176,18 +176,14 @@ ANY_BOARD = device_from_table({}, "device")
 """Settings of a board that has no device file."""
 
 
-def with_settings(device: Device, section: str, **settings: Any) -> Device:
-    """Return a copy of the settings of a board in which one section is changed.
+def switched_on(device: Device, section: str) -> Device:
+    """Return a copy of the settings of a board in which the stage of one section is switched on.
 
-    The attribute `table` of the copy contains the same changes, because recordings store this attribute.
+    The attribute `table` of the copy contains the same change, because recordings store this attribute.
 
     Args:
         device: The settings of the board, which are not changed.
-        section: Name of the section that is changed.
-        settings: New values by the names of their keys. The other keys of the section keep their values.
-
-    Raises:
-        DeviceError: If a key is unknown, or a value is out of its range.
+        section: Name of the section. Its other keys keep their values.
     """
-    changed_section = {**device.table.get(section, {}), **settings}
+    changed_section = {**device.table.get(section, {}), "on": True}
     return device_from_table({**device.table, section: changed_section}, device.where)

@@ -26,7 +26,8 @@ from typing import Self
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import InputError, PortError, SceneError
+from isocharge.common.errors import PortError, SceneError
+from isocharge.common.files import as_output_errors
 from isocharge.serve.frames.binary import encode_frame
 from isocharge.serve.frames.frame import SEQ_MODULUS, T_US_MODULUS, Frame
 from isocharge.serve.virtual_sensor.script import Faults, Script, corrupt
@@ -174,7 +175,7 @@ class VirtualSensor:
         self._reset_counters()
         self._stop = threading.Event()
         self._writer: threading.Thread | None = None
-        self._port_stack = contextlib.ExitStack()  # closes the port and removes the link
+        self._port_stack = contextlib.ExitStack()  # closes the port and removes the link, if the context is active
         self.port_path = ""
 
     def _reset_counters(self) -> None:
@@ -239,21 +240,18 @@ class VirtualSensor:
         """Reset the counters, open the port, and start the thread that writes the frames.
 
         Raises:
-            InputError: If the link cannot be created.
+            OutputError: If the link cannot be created.
         """
         self._reset_counters()
         self._stop.clear()
         port = PseudoPort()
-        self._port_stack.callback(port.close)
-        if self._link:
-            try:
-                self._link.symlink_to(port.url)
-            except OSError as error:  # for example, a file with the name of the link exists already
-                self._port_stack.close()
-                raise InputError(
-                    f"{self._link}: the link cannot be made ({error.strerror}); choose another path"
-                ) from error
-            self._port_stack.callback(self._link.unlink, missing_ok=True)
+        with contextlib.ExitStack() as stack:  # closes the port if the link cannot be created
+            stack.callback(port.close)
+            if self._link:
+                with as_output_errors(self._link):
+                    self._link.symlink_to(port.url)
+                stack.callback(self._link.unlink, missing_ok=True)
+            self._port_stack = stack.pop_all()
         self.port_path = port.url
         self._writer = threading.Thread(target=self._play, args=(port,), name="virtual sensor", daemon=True)
         self._writer.start()
@@ -308,11 +306,10 @@ def _clean_charges(forward: Charges, script: Script) -> Array:
     touch_count = int(is_touch.sum())
     contacts = np.column_stack([script.x_mm, script.y_mm, script.force_N])  # shape (n, 3)
     touch_pC = forward(contacts[is_touch])
-    has_expected_shape = touch_pC.ndim == 2 and len(touch_pC) == touch_count
-    if not has_expected_shape or not np.isfinite(touch_pC).all():
+    if touch_pC.ndim != 2 or len(touch_pC) != touch_count or not np.isfinite(touch_pC).all():
         raise SceneError(
-            f"forward map: expected finite charges of shape ({touch_count}, electrodes), got shape "
-            f"{touch_pC.shape} with {np.count_nonzero(~np.isfinite(touch_pC))} not finite"
+            f"forward map: expected finite charges of shape ({touch_count}, electrodes), got shape {touch_pC.shape} "
+            f"with the sum {touch_pC.sum()}"
         )
     charge_pC = np.zeros((len(script), touch_pC.shape[1]))
     charge_pC[is_touch] = touch_pC
