@@ -36,7 +36,6 @@ from isocharge.cli.shared.port_hints import no_frames_advice_added, no_frames_hi
 from isocharge.cli.shared.terminal import (
     on_signal,
     say,
-    stdout_is_ready,
     stop_timer,
     unless_hung_up,
     until_stopped,
@@ -138,7 +137,6 @@ def command_outputs(targets: Sequence[str] | None, touch: TouchStream, *, is_liv
         with_film=touch.has_film,
         is_live=is_live,
         write_stdout=write_stdout,
-        stdout_is_ready=stdout_is_ready,
     )
     return Outputs(targets or ["json"], context)
 

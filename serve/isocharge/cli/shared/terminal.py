@@ -147,15 +147,6 @@ def write_stderr(line: str) -> None:
         discard_output(STDERR_FILENO)
 
 
-def stdout_is_ready() -> bool:
-    """Wait at most a tenth of a second until stdout is ready for a line, and return whether it is ready.
-
-    A pipe that is ready has room for `PIPE_BUF` bytes, which is more than the length of a record.
-    """
-    _readable, writable, _exceptional = select.select([], [STDOUT_FILENO], [], 0.1)
-    return bool(writable)
-
-
 def _write_all(descriptor: int, data: bytes) -> None:
     """Write all data to a file descriptor. If the descriptor is not ready, wait until it is ready."""
     while data:

@@ -63,7 +63,6 @@ class OutputContext:
         is_live: True if the records come from a sensor, which does not wait for the outputs. False if they come from a
             recording.
         write_stdout: Function that writes a text to standard output.
-        stdout_is_ready: Function that waits a short time and returns whether standard output would accept a line.
     """
 
     electrodes: tuple[str, ...]
@@ -71,7 +70,6 @@ class OutputContext:
     with_film: bool = False
     is_live: bool = False
     write_stdout: Callable[[str], object] = sys.stdout.write
-    stdout_is_ready: Callable[[], bool] = lambda: True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,17 +110,14 @@ class WriterQueue(Generic[T]):
         lost: Number of items that were dropped without being written.
     """
 
-    def __init__(self, write: Callable[[T], object], is_ready: Callable[[], bool] = lambda: True) -> None:
+    def __init__(self, write: Callable[[T], object]) -> None:
         """Start the thread.
 
         Args:
             write: Function that the thread calls with each item.
-            is_ready: Function that the thread calls before it writes an item. The function waits for a short time, and
-                returns whether the consumer accepts an item.
         """
         self.lost = 0
         self._write = write
-        self._is_ready = is_ready
         self._items: Queue[T | None] = Queue()  # None ends the thread
         self._is_abandoned = threading.Event()  # is set when the thread must write no further item
         self._error: Exception | None = None
@@ -181,8 +176,6 @@ class WriterQueue(Generic[T]):
         """Write items until the queue is closed and empty, or until `write` raises an exception."""
         try:
             while (item := self._items.get()) is not None:
-                while not (self._is_ready() or self._is_abandoned.is_set()):
-                    pass
                 if self._is_abandoned.is_set():
                     return
                 self._write(item)

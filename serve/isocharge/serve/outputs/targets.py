@@ -145,11 +145,9 @@ class Outputs:
                     raise output_error(error, target)  # noqa: B904  # the cause is set
                 raise
             queue: WriterQueue[PredictionRecord] | None = None
-            # A live stream must not wait for a slow consumer, so its records are written by another thread. Only
-            # standard output can report that its reader is slow.
+            # A live stream must not wait for a slow consumer, so its records are written by another thread.
             if self._context.is_live:
-                is_ready = self._context.stdout_is_ready if kind.is_standard_output else lambda: True
-                queue = WriterQueue(output.write, is_ready)
+                queue = WriterQueue(output.write)
             self._writers[target] = output.write if queue is None else queue.put
             self._stack.callback(self._close_or_discard, target, output, queue)
         return self
