@@ -160,8 +160,8 @@ class WrongMethod(RequestError):
         allowed: Names of the allowed methods, for the header `Allow`.
     """
 
-    def __init__(self, message: str, allowed: str) -> None:
-        super().__init__(message)
+    def __init__(self, path: str, method: str, allowed: str) -> None:
+        super().__init__(f"{path}: expected the method {allowed}, got {method[:20]}")
         self.allowed = allowed
 
 

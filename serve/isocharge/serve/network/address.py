@@ -182,10 +182,9 @@ def check_exposure(address: Address, token: str | None) -> None:
     Raises:
         InputError: If other machines can connect, but the server has no token.
     """
-    if token is not None or address.uds is not None or address.host == "localhost":
-        return
     ip = ip_address(address.host)
-    if ip is None or not ip.is_loopback:
+    is_loopback = address.host == "localhost" or (ip is not None and ip.is_loopback)
+    if token is None and address.uds is None and not is_loopback:
         raise InputError(f"{address.host} lets other machines in: give --token TOKEN, which they then must send")
 
 

@@ -122,8 +122,12 @@ class Statistics:
 
     def to_json(self) -> dict[str, Any]:
         """Return the counters as a JSON object with the names that Triton uses in its statistics."""
-        families = [family for metric in vars(self).values() for family in metric.collect()]
-        values = {sample.name: sample.value for family in families for sample in family.samples}
+        values = {
+            sample.name: sample.value
+            for metric in vars(self).values()
+            for family in metric.collect()
+            for sample in family.samples
+        }
         answered = int(values["isocharge_inference_seconds_count"])
         refused = int(values["isocharge_inferences_refused_total"])
         return {
@@ -182,11 +186,9 @@ class RequestLog(logging.Handler):
         self._write = write
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a line with a message of the module `logging`, and with the traceback of the message if it has one."""
-        message = {"logger": record.name, "message": record.getMessage()}
-        if record.exc_info and record.exc_info[0] is not None:
-            message["traceback"] = logging.Formatter().formatException(record.exc_info)
-        self.write_line(record.levelname.lower(), "message", message)
+        """Write a line with a message of the module `logging`. The message contains its traceback if it has one."""
+        properties = {"logger": record.name, "message": self.format(record)}
+        self.write_line(record.levelname.lower(), "message", properties)
 
     def write_line(self, level: str, event: str, properties: dict[str, Any]) -> None:
         """Write a line about an event, which begins with the present time."""

@@ -119,15 +119,15 @@ class WriterQueue(Generic[T]):
         self.lost = 0
         self._write = write
         self._items: Queue[T | None] = Queue()  # None ends the thread
-        self._is_abandoned = threading.Event()  # is set when the thread must write no further item
+        self._is_abandoned = False  # whether the thread must write no further item
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)  # a write may hang forever
         self._thread.start()
 
     @property
     def is_stuck(self) -> bool:
-        """Whether the queue is closed, but the thread is still waiting for the consumer to accept the last item."""
-        return self._is_abandoned.is_set() and self._thread.is_alive()
+        """Whether the thread of a closed queue is still waiting for the consumer to accept an item."""
+        return self._thread.is_alive()
 
     def put(self, item: T) -> None:
         """Append an item to the queue. If the queue is full, the oldest item is dropped.
@@ -159,7 +159,7 @@ class WriterQueue(Generic[T]):
         while self._thread.is_alive() and self._items.unfinished_tasks != earlier_count:
             earlier_count = self._items.unfinished_tasks
             self._thread.join(CLOSE_TIMEOUT_s)
-        self._is_abandoned.set()
+        self._is_abandoned = True
         self._thread.join(CLOSE_TIMEOUT_s)
         if self._items.unfinished_tasks > 0:
             self.lost += self._items.unfinished_tasks - 1  # the last task is the None
@@ -176,7 +176,7 @@ class WriterQueue(Generic[T]):
         """Write items until the queue is closed and empty, or until `write` raises an exception."""
         try:
             while (item := self._items.get()) is not None:
-                if self._is_abandoned.is_set():
+                if self._is_abandoned:
                     return
                 self._write(item)
                 self._items.task_done()

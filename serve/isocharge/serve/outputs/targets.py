@@ -175,7 +175,7 @@ class Outputs:
         Raises:
             Exception: In a replay, the error of any output. In a live stream, only an error of standard output.
         """
-        for target, write in self._writers.items():
+        for target, write in list(self._writers.items()):
             try:
                 write(record)
             except Exception as error:
@@ -192,9 +192,8 @@ class Outputs:
         reason = output_error(error, target)
         if not self._context.is_live or self._kinds[target].is_standard_output:
             raise reason
-        if target in self._writers:
+        if self._writers.pop(target, None) is not None:
             log.error("%s: stopped (%s); the records after that are missing", target, reason)
-        self._writers = {other: write for other, write in self._writers.items() if other != target}
         self.not_written[target] = None  # the number is unknown
 
     def close(self) -> None:

@@ -186,7 +186,7 @@ class LivePage(Application):
         if path != REQUEST_PATH:
             raise UnknownPath(f"nothing is served under {path[:200]!r}; the page is /")
         if method != "POST":
-            raise WrongMethod(f"{path}: expected the method POST, got {method[:20]}", "POST")
+            raise WrongMethod(path, method, "POST")
         request = parse_json(body, "", RequestError, Read | Action)  # type: ignore[arg-type]
         if isinstance(request, Read):
             return json_response(self._read(request))

@@ -193,7 +193,7 @@ class Connection(HttpToolsProtocol):
         self._allow(self._limits.header_seconds)
 
 
-class HttpServer:
+class HttpServer(uvicorn.Server):
     """HTTP server of an ASGI application.
 
     The server begins to listen when it is created, and answers requests while the method `run` is executed. The method
@@ -241,11 +241,11 @@ class HttpServer:
             timeout_graceful_shutdown=math.ceil(limits.grace_seconds),
             ssl_context_factory=(lambda *_: tls_context) if tls_context else None,
         )
-        self._server = _Server(config)
+        super().__init__(config)
         self.url = address.url(self._socket, secure=tls is not None)
-        traffic.open.labels("http").set_function(lambda: len(self._server.server_state.connections))
+        traffic.open.labels("http").set_function(lambda: len(self.server_state.connections))
 
-    def run(self, beside: AbstractAsyncContextManager[Any] | None = None) -> None:
+    def run(self, beside: AbstractAsyncContextManager[Any] | None = None) -> None:  # type: ignore[override]
         """Answer requests until `stop` is called, and then finish the requests that have already begun.
 
         Args:
@@ -254,9 +254,9 @@ class HttpServer:
         """
 
         async def serve() -> None:
-            async with AsyncExitStack() as self._server.beside:
-                await self._server.beside.enter_async_context(beside or nullcontext())
-                await self._server.serve([self._socket])
+            async with AsyncExitStack() as self._beside:
+                await self._beside.enter_async_context(beside or nullcontext())
+                await self.serve([self._socket])
 
         uvloop.run(serve())
 
@@ -265,23 +265,13 @@ class HttpServer:
 
         Any thread and any signal handler may call this method.
         """
-        self._server.force_exit = self._server.should_exit
-        self._server.should_exit = True
+        self.force_exit = self.should_exit
+        self.should_exit = True
 
     def close(self) -> None:
         """Close the socket on which the server listens."""
         self._socket.close()
         self._address.release()
-
-
-class _Server(uvicorn.Server):
-    """Server of uvicorn that does not handle signals, and ends connections whose deadline has passed.
-
-    Attributes:
-        beside: Contexts that are closed as soon as the server is to stop.
-    """
-
-    beside: AsyncExitStack
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -297,8 +287,8 @@ class _Server(uvicorn.Server):
         return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to close the contexts, and finish the open requests. Then refuse the requests that took too long."""
-        closing = asyncio.create_task(self.beside.aclose())
+        """Begin to close the context beside the server, and finish the open requests. Then refuse the others."""
+        closing = asyncio.create_task(self._beside.aclose())
         await super().shutdown(sockets)
         connections: Any = list(self.server_state.connections)
         for connection in connections:

@@ -70,13 +70,12 @@ class Application(ABC):
             raise ValueError(f"expected a scope of the type 'http', got {scope['type']!r}")
         # Stop reading as soon as the body is larger than allowed. The application then refuses the body.
         body = bytearray()
-        is_complete = False
-        while not is_complete and len(body) <= self.limits.body_bytes:
+        message: Message = {"more_body": True}
+        while message.get("more_body", False) and len(body) <= self.limits.body_bytes:
             message = await receive()
             if message["type"] == "http.disconnect":
                 return
             body += message.get("body", b"")
-            is_complete = not message.get("more_body", False)
         path = scope["path"].removeprefix(scope.get("root_path", ""))  # the root path is the path of a mounted program
         request = (scope["method"], path, scope["headers"], bytes(body), scope.get("client"))
         if path.startswith(self.blocking_paths):
@@ -200,7 +199,7 @@ class Handler(Application):
         # A HEAD request is answered like a GET request. The server then sends the response without its body.
         is_head_of_get = method == "HEAD" and route.method == "GET"
         if method != route.method and not is_head_of_get:
-            raise WrongMethod(f"{path}: expected the method {route.method}, got {method[:20]}", route.method)
+            raise WrongMethod(path, method, route.method)
         body = decompress(body, headers.get(b"content-encoding", b"").lower(), self.limits.body_bytes)
         answer = route.respond(Request(self.store, self.limits, self.traffic, headers, body, **model))
         return answer if isinstance(answer, Response) else json_response(answer)
