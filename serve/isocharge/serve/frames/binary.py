@@ -82,4 +82,4 @@ class BinaryParser(StuffedParser):
     """Parser of the binary frame."""
 
     def __init__(self) -> None:
-        super().__init__(DELIMITER, MAX_STUFFED_LENGTH, decode_frame, FORMAT)
+        super().__init__(FORMAT, DELIMITER, MAX_STUFFED_LENGTH, decode_frame)

@@ -225,8 +225,7 @@ class Columns:
         self.flags_column = flags_column
 
         # `TIMES_US` contains the unit of each clock, us, by the name of the clock, such as "t_ms".
-        clock_name = next((name for name in TIMES_US if name in names), None)
-        self.clock_column = None if clock_name is None else names.index(clock_name)
+        self.clock_column = next((names.index(name) for name in TIMES_US if name in names), None)
         self.clock_unit_us = 1.0
         if self.clock_column is not None:
             self.clock_unit_us = TIMES_US[names[self.clock_column]] * scales[self.clock_column]
@@ -263,21 +262,22 @@ class Parser(ABC):
     """Base class of all parsers, which convert bytes to frames.
 
     Attributes:
+        format: Description of the format, for the user.
+        seq_modulus: Value at which the `seq` of a frame wraps to 0.
+        t_us_modulus: Time at which the `t_us` of a frame wraps to 0, us.
         counts: Counters since the parser was created.
         unread_line: Latest line of text that does not have the layout of the frames; empty without such a line.
     """
 
-    def __init__(self, format: str, seq_modulus: int = SEQ_MODULUS, t_us_modulus: int = T_US_MODULUS) -> None:
+    def __init__(self, format: str) -> None:
         """Begin without stored bytes.
 
         Args:
             format: Description of the format, for the user.
-            seq_modulus: Value at which the `seq` of a frame wraps to 0.
-            t_us_modulus: Time at which the `t_us` of a frame wraps to 0, us.
         """
         self.format = format
-        self.seq_modulus = seq_modulus
-        self.t_us_modulus = t_us_modulus
+        self.seq_modulus = SEQ_MODULUS
+        self.t_us_modulus = T_US_MODULUS
         self.counts = FrameCounts()
         self.unread_line = ""
         self._tail = b""  # bytes of an unfinished frame
@@ -365,14 +365,14 @@ class DelimitedParser(Parser):
     A piece is a frame or a part of a frame, such as a line of text. Pieces that are too long are dropped.
 
     Args:
+        format: Description of the format, for the user.
         delimiter: The byte after each piece.
         max_length: Length of the longest piece that is not dropped, bytes.
-        parser_arguments: Arguments of `Parser`.
     """
 
-    def __init__(self, delimiter: bytes, max_length: int, *parser_arguments: Any) -> None:
+    def __init__(self, format: str, delimiter: bytes, max_length: int) -> None:
         """Begin without bytes. The class describes the arguments."""
-        super().__init__(*parser_arguments)
+        super().__init__(format)
         self._delimiter = delimiter
         self._max_length = max_length
 
@@ -408,17 +408,15 @@ class StuffedParser(DelimitedParser):
     """Parser of frames with byte stuffing. The bytes between two delimiters are expected to be one frame, or empty.
 
     Args:
+        format: Description of the format, for the user.
         delimiter: The byte after each frame.
         max_length: Length of the longest stuffed frame, bytes.
         decode: Function that decodes the bytes between two delimiters. It raises ValueError if they are not a frame.
-        parser_arguments: Arguments of `Parser`.
     """
 
-    def __init__(
-        self, delimiter: bytes, max_length: int, decode: Callable[[bytes], Frame], *parser_arguments: Any
-    ) -> None:
+    def __init__(self, format: str, delimiter: bytes, max_length: int, decode: Callable[[bytes], Frame]) -> None:
         """Begin without bytes. The class describes the arguments."""
-        super().__init__(delimiter, max_length, *parser_arguments)
+        super().__init__(format, delimiter, max_length)
         self._decode = decode
 
     def _parse_piece(self, piece: bytes) -> list[Frame]:

@@ -33,7 +33,7 @@ length of the datagram is wrong.
 import re
 import struct
 from functools import cached_property
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 from msgspec import Meta, field
 
@@ -206,8 +206,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
             raise WrongKey("fields", "names that differ", names)
         if not self.columns.channels:
             raise WrongKey("fields", "one or more that are channels", names)
-        _, _, clock_modulus = _parser_arguments(self)
-        if clock_modulus < 1:
+        if self.t_us_modulus < 1:
             raise WrongKey("fields", "a clock with a positive scale that counts microseconds or more", names)
 
         checksum_start = len(self.sync) + self.body.size  # position of the checksum, which is at the end of the frame
@@ -248,25 +247,18 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         return Columns(names, scales, flags_column)
 
     @cached_property
-    def three_byte_fields(self) -> tuple[tuple[int, bool], ...]:
-        """Fields of three bytes. Each element contains the position of a field and whether the field is signed.
+    def pattern(self) -> re.Pattern[bytes]:
+        """Regular expression of a whole frame.
 
-        Fields of three bytes are converted separately, because the module `struct` cannot read them as numbers. The
-        position of a field is its index in `fields`, which do not include padding.
-        """
-        return tuple((position, field.is_signed) for position, field in enumerate(self.fields) if field.size == 3)
-
-    @cached_property
-    def body_pattern(self) -> re.Pattern[bytes]:
-        """Regular expression of the bytes between the sync pattern and the checksum.
-
-        Padding for which the device file states a `value` must have this value. All other bytes are arbitrary.
+        A frame begins with the sync pattern. Padding for which the device file states a `value` must have this value.
+        All other bytes are arbitrary.
         """
         patterns = [
             re.escape(bytes.fromhex(field.value)) if field.value else b".{%d}" % field.size
             for field in self.fields_and_padding
         ]
-        return re.compile(b"".join(patterns), re.DOTALL)
+        checksum_pattern = b".{%d}" % self.selected_checksum.size
+        return re.compile(re.escape(self.sync) + b"".join(patterns) + checksum_pattern, re.DOTALL)
 
     def compute_checksum(self, frame_without_checksum: bytes) -> bytes:
         """Return the checksum of a frame as bytes in the order in which they are sent.
@@ -292,21 +284,37 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
                 is not a number.
             OverflowError: If the frame counter or the clock is infinite.
         """
-        if len(data) != self.length or not data.startswith(self.sync):
-            raise ValueError("the length or the sync pattern is wrong")
-        has_checksum = self.selected_checksum.size > 0
+        if not self.pattern.fullmatch(data):
+            raise ValueError("the length, the sync pattern or a constant byte is wrong")
         checksum_start = self.length - self.selected_checksum.size
-        if has_checksum and self.compute_checksum(data[:checksum_start]) != data[checksum_start:]:
+        if self.compute_checksum(data[:checksum_start]) != data[checksum_start:]:
             raise ChecksumError("the checksum is wrong")
-        if not self.body_pattern.match(data, len(self.sync)):
-            raise ValueError("a constant byte is wrong")
-        numbers: list[Any] = list(self.body.unpack_from(data, len(self.sync)))
-        for position, is_signed in self.three_byte_fields:  # `struct` has unpacked these fields as bytes
-            numbers[position] = int.from_bytes(numbers[position], self.byte_order, signed=is_signed)
+        numbers = [  # `struct` unpacks fields of three bytes as bytes
+            int.from_bytes(number, self.byte_order, signed=field.is_signed) if isinstance(number, bytes) else number
+            for field, number in zip(self.fields, self.body.unpack_from(data, len(self.sync)), strict=True)
+        ]
         return self.columns.frame(numbers)
+
+    @property
+    def description(self) -> str:
+        """Description of the format, for the user."""
+        names = ", ".join(field.name for field in self.fields)
+        return f"described frames of {self.length} bytes: {names}"
+
+    @property
+    def t_us_modulus(self) -> int:
+        """Time at which the clock wraps to 0, us. It has no meaning for frames without a clock."""
+        return round(self.fields[self.columns.clock_column or 0].modulus * self.columns.clock_unit_us)
 
     def parser(self) -> Parser:
         """Create a parser for frames with this layout and this framing."""
+        parser = self._create_parser()
+        parser.seq_modulus = self.fields[self.columns.seq_column or 0].modulus  # ignored without a counter
+        parser.t_us_modulus = self.t_us_modulus
+        return parser
+
+    def _create_parser(self) -> Parser:
+        """Create a parser for this framing, without the values at which the counter and the clock wrap to 0."""
         if self.framing == SYNC:
             return SyncParser(self)
         if self.framing == DATAGRAM:
@@ -315,29 +323,12 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         # SLIP and HDLC at most double the length. COBS adds 1 byte, and 1 more for every 254 bytes. The limit is not
         # exact, because it only prevents that an endless piece without a delimiter is stored.
         stuffing = STUFFINGS[self.framing]
-        max_length = 2 * self.length + 2
 
         def decode_stuffed(stuffed_frame: bytes) -> Frame:
             """Remove the byte stuffing from a frame, and decode the frame."""
             return self.decode(stuffing.decode(stuffed_frame))
 
-        return StuffedParser(stuffing.delimiter, max_length, decode_stuffed, *_parser_arguments(self))
-
-
-def _parser_arguments(layout: FrameLayout) -> tuple[str, int, int]:
-    """Return the arguments of `Parser` for a layout: the description of the format and the two moduli.
-
-    A layout without a counter or a clock has no such modulus, so `Parser` ignores the returned value.
-    """
-    names = ", ".join(field.name for field in layout.fields)
-    columns = layout.columns
-    seq_modulus = layout.fields[columns.seq_column or 0].modulus
-    clock_modulus = layout.fields[columns.clock_column or 0].modulus
-    return (
-        f"described frames of {layout.length} bytes: {names}",
-        seq_modulus,
-        round(clock_modulus * columns.clock_unit_us),
-    )
+        return StuffedParser(self.description, stuffing.delimiter, 2 * self.length + 2, decode_stuffed)
 
 
 class SyncParser(Parser):
@@ -345,7 +336,7 @@ class SyncParser(Parser):
 
     def __init__(self, layout: FrameLayout) -> None:
         """Begin without stored bytes."""
-        super().__init__(*_parser_arguments(layout))
+        super().__init__(layout.description)
         self.layout = layout
 
     def feed(self, data: bytes) -> list[Frame]:

@@ -112,7 +112,7 @@ class TextParser(DelimitedParser):
             meanings: Meaning of names that the device uses for its counter and its clock: for each such name, one of
                 `seq`, `t_us`, `t_ms` and `t_s`.
         """
-        super().__init__(b"\n", MAX_LINE_LENGTH, "text of a layout that is not clear yet")
+        super().__init__("text of a layout that is not clear yet", b"\n", MAX_LINE_LENGTH)
         self.layout: Layout | None = None
         self._columns = columns
         self._meanings = dict(meanings or {})

@@ -9,12 +9,13 @@ channels are adjacent and have the same type. The weights were fitted to random 
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.serve.frames.frame_layout import STRUCT_FORMATS, ByteOrder, FieldType
+from isocharge.serve.frames.frame import SEQ
+from isocharge.serve.frames.frame_layout import PADDING, STRUCT_FORMATS, ByteOrder, FieldType
 from isocharge.serve.recognition.framing import INTACT_SHARE, Bytes, usual_bytes
 
 CLOCKS = {1.0: ("t_s", 1.0), 1e3: ("t_ms", 1.0), 1e6: ("t_us", 1.0)} | {
@@ -22,6 +23,9 @@ CLOCKS = {1.0: ("t_s", 1.0), 1e3: ("t_ms", 1.0), 1e6: ("t_us", 1.0)} | {
     for tick_rate_Hz in (100.0, 1e4, 1e5, 32768.0, 31250.0, 500e3, 2e6, 4e6, 8e6, 16e6)
 }
 """Name of the field, and value of one tick in the unit of that name, by the tick rate of a clock, Hz."""
+
+CHANNEL = "channel"
+"""Name of all channels during the recognition."""
 
 PLAUSIBLE_MAGNITUDES = (1e-7, 1e8)
 """Smallest and largest typical magnitude of a floating-point channel."""
@@ -106,22 +110,20 @@ class Part(NamedTuple):
     Adjacent channels of one type form a group of channels.
 
     Attributes:
-        role: Meaning of the part: padding, frame counter, clock or channel.
+        name: Name of the field in a device file, but `CHANNEL` for all channels; empty for padding.
         type_name: Type of the number, as in device files.
         size: Number of bytes.
         score: Contribution of the part to the score of a division, bits. If the part begins a group of channels, the
             contribution of the group is not included.
         is_constant: Whether the part is a channel with a constant value. Such a channel does not begin a group.
-        name: Name of the field in a device file; empty for channels and padding.
         scale: Value of one tick of a clock, in the unit of its name.
     """
 
-    role: Literal["pad", "seq", "clock", "channel"]
+    name: str
     type_name: FieldType
     size: int
     score: float
     is_constant: bool = False
-    name: str = ""
     scale: float = 1.0
 
 
@@ -129,13 +131,10 @@ class Part(NamedTuple):
 def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[list[Part]]:
     """List the possible parts of a frame that begin at each byte.
 
-    A part is a single byte without a meaning (padding), or a number of one of the types in `STRUCT_FORMATS`. The first
-    byte of the frames is not yet known. A number may therefore begin near the end of the first `length` bytes of a row,
-    and end in the following bytes.
+    A part is a single byte without a meaning (padding), or a number of one of the types in `STRUCT_FORMATS`.
 
     Args:
-        rows: Bytes of two consecutive frames in each row, shape (n, 2 * length). The frames may begin at any position
-            of a row, but they begin at the same position in all rows.
+        rows: Bytes of the frames before the checksum, shape (n, length).
         order: Byte order of the numbers.
         frame_rate_Hz: Number of frames per second, Hz, from which the tick rate of a clock follows.
 
@@ -143,15 +142,15 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[
         For each of the `length` bytes, a list of parts, of which the first is padding.
     """
     _usual, is_constant = usual_bytes(rows)
-    row_length = rows.shape[1]
+    length = rows.shape[1]
     byte_step = 1 if order == "little" else -1  # reverses big-endian numbers, so that the lowest byte comes first
     parts_at_each_byte: list[list[Part]] = []
-    for position in range(row_length // 2):  # a row has the bytes of two frames
+    for position in range(length):
         pad_score = Weights.constant if is_constant[position] else Weights.noise
-        parts = [Part("pad", "pad", 1, pad_score)]  # one byte of padding
+        parts = [Part("", PADDING, 1, pad_score)]  # one byte of padding
         for type_name in STRUCT_FORMATS:  # such as "u16", whose size is 16 bits
             end = position + int(type_name[1:]) // 8
-            if end <= row_length:
+            if end <= length:
                 parts += _number_parts(rows[:, position:end][:, ::byte_step], type_name, frame_rate_Hz)
         parts_at_each_byte.append(parts)
     return parts_at_each_byte
@@ -173,16 +172,14 @@ def _number_parts(number_bytes: Bytes, type_name: FieldType, frame_rate_Hz: floa
     is_zero = is_constant & (usual == 0)
     size = len(is_constant)  # bytes
     if is_constant.all():
-        yield Part("channel", type_name, size, Weights.constant, is_constant=True)
+        yield Part(CHANNEL, type_name, size, Weights.constant, is_constant=True)
         return
-    is_float = type_name[0] == "f"
-    is_unsigned = type_name[0] == "u"
     values = _values(number_bytes, type_name)
     steps = np.diff(values)
     counter_steps = steps  # steps if the number is a counter or a clock, which may overflow
     magnitude = float(np.median(np.abs(values)))
     unit = 1.0  # smallest step that the number can represent
-    if is_float:
+    if type_name[0] == "f":
         min_magnitude, max_magnitude = PLAUSIBLE_MAGNITUDES
         if not min_magnitude < magnitude < max_magnitude:
             return
@@ -191,25 +188,24 @@ def _number_parts(number_bytes: Bytes, type_name: FieldType, frame_rate_Hz: floa
         low_zero_byte_count = np.argmin(is_zero)  # index of the lowest byte that is not always 0
         digit_byte_count = Weights.fraction * size - low_zero_byte_count
         unit = magnitude * 256.0**-digit_byte_count
-    if is_unsigned:
+    if type_name[0] == "u":
         half_range = 1 << (8 * size - 1)
         counter_steps = (steps + half_range) % (2 * half_range) - half_range  # a counter that overflows restarts at 0
-        magnitude = float(np.median(np.abs(values - half_range)))  # distance from the middle of the range
 
     clock = identify_clock(counter_steps, frame_rate_Hz)
     has_all_bytes = not _wraps_early(counter_steps, size)
     high_score = Weights.constant_high * (is_constant & ~is_zero).sum() if size == 3 else 0.0
     if has_all_bytes and is_counter(counter_steps, clock):
-        yield Part("seq", type_name, size, high_score, name="seq")  # the values of a counter need no bits
+        yield Part(SEQ, type_name, size, high_score)  # the values of a counter need no bits
     elif has_all_bytes and clock is not None:
         name, tick_duration = clock
         clock_score = high_score + _bits(counter_steps - np.median(counter_steps), unit, size)
-        yield Part("clock", type_name, size, clock_score, name=name, scale=tick_duration)
+        yield Part(name, type_name, size, clock_score, scale=tick_duration)
 
     # The magnitude is added to the steps, so that a type has a lower score if its values are close to 0 or, for an
     # unsigned type, close to the middle of its range.
     channel_score = Weights.channel + _bits(np.append(steps, magnitude), unit, size)
-    yield Part("channel", type_name, size, channel_score)
+    yield Part(CHANNEL, type_name, size, channel_score)
 
 
 def _wraps_early(steps: Array, size: int) -> bool:
@@ -239,7 +235,7 @@ def split_frame(
     after this position is computed once and stored.
 
     Args:
-        parts_at_each_byte: Parts that may begin at each byte before the checksum.
+        parts_at_each_byte: Parts that may begin at each byte before the checksum, and end before the checksum.
         sync_lengths: Possible lengths of the sync pattern, bytes; 0 if the frame has no sync pattern. If several
             lengths have the lowest score, the shortest of them is chosen.
 
@@ -260,17 +256,14 @@ def split_frame(
             previous_channel_type: Type of the channel that ends just before this byte; empty if no channel ends there.
 
         Returns:
-            The score and the parts of the division. The score is infinite if no division ends exactly at the last byte.
+            The score and the parts of the division.
         """
-        byte_count = len(parts_at_each_byte)
-        if position == byte_count:
+        if position == len(parts_at_each_byte):
             return 0.0, ()
-        if position > byte_count:  # the part before this position is too long
-            return np.inf, ()
         best_score = np.inf
         best_parts: tuple[Part, ...] = ()
         for part in parts_at_each_byte[position]:
-            channel_type = part.type_name if part.role == "channel" else ""
+            channel_type = part.type_name if part.name == CHANNEL else ""
             begins_group = channel_type not in ("", previous_channel_type)
             if begins_group and part.is_constant:
                 continue
@@ -283,14 +276,15 @@ def split_frame(
                 best_parts = (part, *rest_parts)
         return best_score, best_parts
 
-    # Of equal scores, `min` returns the one with the shortest pattern, which comes first.
-    best_sync_length = min(sync_lengths, key=lambda sync_length: best_division(sync_length, "")[0])
-    lowest_score, best_parts = best_division(best_sync_length, "")
-    return lowest_score, best_sync_length, best_parts
+    # Of equal scores, `min` returns the one with the shortest pattern.
+    lowest_score, best_sync_length = min((best_division(length, "")[0], length) for length in sync_lengths)
+    return lowest_score, best_sync_length, best_division(best_sync_length, "")[1]
 
 
 def _values(number_bytes: Bytes, type_name: str) -> Array:
     """Decode one number in all frames, and return its values, shape (n,).
+
+    Unsigned values are counted from the middle of their range, which does not change the differences between them.
 
     Args:
         number_bytes: Bytes of the number, the lowest first, shape (n, size).
@@ -300,10 +294,11 @@ def _values(number_bytes: Bytes, type_name: str) -> Array:
     if type_name[0] == "f":
         floats = np.ascontiguousarray(number_bytes).view(f"<f{size}")  # shape (n, 1)
         return floats[:, 0].astype(float)
+    value_count = 256.0**size
     values: Array = number_bytes @ 256.0 ** np.arange(size)
     if type_name[0] == "i":  # in two's complement, the upper half of the unsigned values stands for the negative values
-        values -= 256.0**size * (values >= 0.5 * 256.0**size)
-    return values
+        values = (values + 0.5 * value_count) % value_count
+    return values - 0.5 * value_count
 
 
 def _bits(steps: Array, unit: float, size: int) -> float:

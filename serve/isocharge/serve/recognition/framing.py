@@ -10,7 +10,7 @@ All checksums with a name are tried for every possible position of the first byt
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import product
 from math import gcd
@@ -47,34 +47,30 @@ MAX_CONSTANT_BYTES = 16
 
 
 class FrameDivision(NamedTuple):
-    """Division of a stream into windows of bytes, one window for each frame. All frames have the same length.
-
-    A window has the length of a frame. All windows begin at the same position within a frame, but this position need
-    not be the first byte of the frame.
+    """Division of a stream into frames of the same length.
 
     Attributes:
         framing: Kind of framing, as in device files.
         stream: All bytes of the stream, shape (n,).
-        window_starts: Positions in the stream at which the windows begin, shape (frames,).
-        length: Number of bytes in a window, which is the length of a frame.
+        starts: Positions in the stream that are at the same distance from the beginnings of the frames, shape
+            (frames,).
+        length: Number of bytes in a frame.
     """
 
     framing: Framing
     stream: Bytes
-    window_starts: NDArray[np.int64]
+    starts: NDArray[np.int64]
     length: int
 
-    def rows(self) -> Bytes:
-        """Return the bytes of each window and the same number of bytes after it, shape (frames, 2 * length).
+    def rows(self, distance: int = 0) -> Bytes:
+        """Return the bytes of each frame that is not too close to the end of the stream, shape (frames, length).
 
-        A window has the length of a frame. Two lengths are needed, because the position in a window at which the next
-        frame begins is unknown. Windows that are too close to the end of the stream are excluded.
+        Args:
+            distance: Distance of the beginnings of the frames from `starts`, bytes.
         """
-        row_length = 2 * self.length
-        has_whole_row = self.window_starts + row_length <= len(self.stream)
-        row_starts = self.window_starts[has_whole_row]
-        positions = row_starts[:, None] + np.arange(row_length)  # positions in the stream, shape (frames, 2 * length)
-        return np.asarray(self.stream[positions])
+        starts = self.starts + distance
+        whole_starts = starts[starts + self.length <= len(self.stream)]
+        return np.asarray(self.stream[whole_starts[:, None] + np.arange(self.length)])
 
 
 def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
@@ -91,11 +87,17 @@ def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
     return usual, share_of_frames >= INTACT_SHARE
 
 
-def possible_divisions(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[FrameDivision]:
-    """Yield all possible divisions of a stream into frames, from the most certain to the least certain division.
+def count_leading(are_true: NDArray[np.bool_]) -> int:
+    """Return the number of true elements before the first false element, at most `MAX_CONSTANT_BYTES`."""
+    return int(np.argmin([*are_true[:MAX_CONSTANT_BYTES], False]))
 
-    Datagrams of whole frames are the most certain division, followed by frames with byte stuffing. Frames that begin at
-    a repeated byte or pair of bytes are the least certain division.
+
+def possible_divisions(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Iterable[FrameDivision]]:
+    """Yield all possible divisions of a stream into frames with each kind of framing.
+
+    The kinds of framing are yielded from the most certain to the least certain kind. Datagrams of whole frames are the
+    most certain kind, followed by frames with byte stuffing. Frames that begin at a repeated byte or pair of bytes are
+    the least certain kind.
 
     Args:
         chunks: The bytes of the stream.
@@ -106,12 +108,11 @@ def possible_divisions(chunks: Sequence[bytes], *, are_datagrams: bool) -> Itera
         # The length of a frame divides the length of every datagram. It therefore also divides the greatest common
         # divisor of these lengths.
         divisible_length = gcd(*map(len, chunks))
-        for length in range(MIN_FRAME_BYTES, min(divisible_length, MAX_FRAME_BYTES) + 1):
-            if divisible_length % length == 0:
-                yield _adjacent_frames(DATAGRAM, data, length)
+        lengths = range(MIN_FRAME_BYTES, min(divisible_length, MAX_FRAME_BYTES) + 1)
+        yield [_adjacent_frames(DATAGRAM, data, length) for length in lengths if divisible_length % length == 0]
     for name, stuffing in STUFFINGS.items():
-        yield from _stuffed_frames(name, stuffing, data)
-    yield from _synchronised_frames(data)
+        yield _stuffed_frames(name, stuffing, data)
+    yield _synchronised_frames(data)
 
 
 def _adjacent_frames(framing: Framing, data: bytes, length: int) -> FrameDivision:
@@ -122,9 +123,7 @@ def _adjacent_frames(framing: Framing, data: bytes, length: int) -> FrameDivisio
         data: Bytes of the stream.
         length: Length of each frame, bytes.
     """
-    stream = np.frombuffer(data, np.uint8)
-    window_starts = np.arange(0, len(data), length)
-    return FrameDivision(framing, stream, window_starts, length)
+    return FrameDivision(framing, np.frombuffer(data, np.uint8), np.arange(0, len(data), length), length)
 
 
 def _stuffed_frames(name: Framing, stuffing: Stuffing, data: bytes) -> Iterator[FrameDivision]:
@@ -167,17 +166,15 @@ def _most_common_length(frames: Sequence[bytes]) -> tuple[int, int]:
     return Counter(map(len, frames)).most_common(1)[0]
 
 
-def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDivision]:
+def _synchronised_frames(data: bytes) -> Iterator[FrameDivision]:
     """Yield divisions of a stream into frames that begin at a repeated byte or a repeated pair of bytes.
 
     If a byte or a pair of bytes is the same in every frame, it repeats at a distance of one frame length. Frames are
-    therefore assumed to begin at every repetition of a byte or pair. The score of this assumption is the share of the
-    stream that these frames would cover. For each frame length, the byte or pair with the highest score is chosen. The
-    divisions with the highest scores are yielded.
+    therefore assumed to begin at every repetition of a byte or pair. For each frame length, the byte or pair whose
+    frames would cover the largest share of the stream is chosen.
 
     Args:
         data: Bytes of the stream.
-        max_lengths: Largest number of divisions.
     """
     # Positions of each byte and each pair of bytes after which it occurs again, by the distance to the next occurrence
     starts_by_distance: defaultdict[tuple[int, bytes, int], list[int]] = defaultdict(list)
@@ -198,16 +195,8 @@ def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDiv
         if is_frequent and is_best:
             best_starts[length] = starts
 
-    def best_first(length: int) -> tuple[float, int]:
-        """Return the key for sorting lengths by decreasing score, and equal scores by increasing length.
-
-        The scores are rounded to 0.1, so that of two lengths with about equal scores the shorter length comes first.
-        """
-        score = len(best_starts[length]) * length / len(data)
-        return -round(score, 1), length
-
-    for length in sorted(best_starts, key=best_first)[:max_lengths]:
-        yield FrameDivision(SYNC, np.frombuffer(data, np.uint8), np.array(best_starts[length]), length)
+    for length, starts in best_starts.items():
+        yield FrameDivision(SYNC, np.frombuffer(data, np.uint8), np.array(starts), length)
 
 
 ORDERS: tuple[ByteOrder, ...] = ("little", "big")
@@ -248,14 +237,12 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
     frames = [row.tobytes() for row in checked_rows]
     _usual, is_constant = usual_bytes(checked_rows)  # `is_constant` has the shape (length,)
     length = len(is_constant)
-    # Number of constant bytes at the beginning of the frames. It is the position of the first False.
-    leading_constant_count = int(np.argmin([*is_constant[:MAX_CONSTANT_BYTES], False]))
     for size in (4, 3, 2, 1):  # in bytes
         if is_constant[-size:].all():  # a checksum would differ from frame to frame
             continue
 
         # Try each position for the first covered byte, up to the first byte that is not constant.
-        last_possible_start = min(leading_constant_count, length - size - 2)  # the checksum covers at least two bytes
+        last_possible_start = min(count_leading(is_constant), length - size - 2)  # it covers at least two bytes
         names = [name for name, checksum in CHECKSUMS.items() if checksum.size == size]
         for order in ORDERS[:size]:  # a single byte has no byte order
             for start, name in product(range(last_possible_start + 1), names):

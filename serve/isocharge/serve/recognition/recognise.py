@@ -4,7 +4,6 @@ The format is the binary frames of isocharge, lines of text, or frames of fixed 
 """
 
 from collections.abc import Iterator, Sequence
-from itertools import groupby
 from operator import itemgetter
 from string import printable
 from typing import Any
@@ -12,19 +11,22 @@ from typing import Any
 import numpy as np
 from msgspec import structs, to_builtins
 
+from isocharge.common.arrays import Booleans
 from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.frames.frame import SEQ, Frame, Parser
 from isocharge.serve.frames.frame_layout import PADDING, SYNC, ByteOrder, Field, FrameLayout
 from isocharge.serve.frames.text import Layout, TextParser
-from isocharge.serve.recognition.fields import Part, Weights, identify_clock, is_counter, possible_parts, split_frame
+from isocharge.serve.recognition.fields import CHANNEL, Part, Weights, identify_clock, is_counter, possible_parts, split_frame
 from isocharge.serve.recognition.framing import (
     COVERED_SHARE,
     MAX_CONSTANT_BYTES,
     MAX_EXAMINED_BYTES,
     MIN_FRAMES,
     ORDERS,
+    Bytes,
     Check,
     FrameDivision,
+    count_leading,
     find_checks,
     possible_divisions,
     usual_bytes,
@@ -49,12 +51,10 @@ def described_frames_section(
     byte_count = sum(len(chunk) for chunk in chunks)
     examined_share = min(1.0, MAX_EXAMINED_BYTES / max(1, byte_count))  # 1 if there are no bytes
     examined_seconds = seconds * examined_share
-    # Divisions with the same framing follow each other, so `groupby` collects all of them in one group.
-    divisions = possible_divisions(chunks, are_datagrams=are_datagrams)
-    for _framing, divisions_of_framing in groupby(divisions, key=lambda division: division.framing):
+    for divisions in possible_divisions(chunks, are_datagrams=are_datagrams):
         scored_sections = [
             scored_section
-            for division in divisions_of_framing
+            for division in divisions
             for scored_section in _scored_sections(division, examined_seconds)
         ]
         if scored_sections:
@@ -73,52 +73,47 @@ def _scored_sections(division: FrameDivision, seconds: float) -> Iterator[tuple[
     descriptions with different frame lengths can therefore be compared.
 
     Args:
-        division: Division of the stream into windows. A window is a sequence of bytes with the length of a frame.
+        division: Division of the stream into frames.
         seconds: Time in which the stream arrived, s.
     """
     length = division.length
-    rows = division.rows()  # each row contains a window and the bytes of the next window
-    if len(rows) < MIN_FRAMES - 1:  # the last window has no row, because no window follows it
+    if len(division.rows()) < MIN_FRAMES:
         return
 
-    # Find the possible first bytes of a frame in a window. A frame with a sync pattern may begin at any byte that may
-    # belong to the pattern. With any other framing, the window begins with the frame.
+    # A frame with a sync pattern may begin at any byte that may belong to the pattern.
     has_sync = division.framing == SYNC
-    usual, is_constant = usual_bytes(rows[:, :length])
-    may_be_sync = is_constant & (usual != 0)  # shape (length,); zeros are mostly the high bytes of numbers
-    starts = [0]
-    if has_sync:
-        starts = np.flatnonzero(may_be_sync)[:MAX_CONSTANT_BYTES].tolist()
-
-    # Find the possible pairs of a first byte and a checksum.
-    starts_and_checks = [(start, check) for start in starts for check in find_checks(rows[:, start : start + length])]
-    has_check = bool(starts_and_checks)
+    distances = np.flatnonzero(_may_be_sync(division.rows()))[:MAX_CONSTANT_BYTES].tolist() if has_sync else [0]
+    possible_rows = [division.rows(distance) for distance in distances]
+    rows_and_checks = [(rows, check) for rows in possible_rows for check in find_checks(rows)]
 
     # For each byte order and each pair, find the division of the frame into parts with the lowest score.
     stream_bytes = len(division.stream)
-    covered_share = min(1.0, len(division.window_starts) * length / stream_bytes)  # share of the bytes inside frames
+    covered_share = min(1.0, len(division.starts) * length / stream_bytes)  # share of the bytes inside frames
     frame_rate_Hz = stream_bytes / length / seconds  # as if all bytes of the stream belonged to frames
     for order in ORDERS:
-        parts_in_window = possible_parts(rows, order, frame_rate_Hz)  # parts that may begin at each byte
-        if not has_check:  # try frames without a checksum
-            starts_and_checks = [(start, Check(0, order)) for start in starts]
-        for start, check in starts_and_checks:
-            parts_from_start = parts_in_window[start:] + parts_in_window[:start]  # from the first byte of the frame
+        for rows, check in rows_and_checks or [(rows, Check(0, order)) for rows in possible_rows]:
             # A checksum covers all bytes of a number or none.
-            parts_before_check = [
+            parts_at_each_byte = [
                 [part for part in parts if not offset < check.start < offset + part.size]
-                for offset, parts in enumerate(parts_from_start[: length - check.size])
+                for offset, parts in enumerate(possible_parts(rows[:, : length - check.size], order, frame_rate_Hz))
             ]
-            # The sync pattern has at most as many bytes as there are possible sync bytes from its beginning on.
-            max_sync_length = int(np.argmin([*np.roll(may_be_sync, -start)[:MAX_CONSTANT_BYTES], False]))
-            sync_lengths = range(1, max_sync_length + 1) if has_sync else [0]
-            score, sync_length, parts = split_frame(parts_before_check, sync_lengths)
-            has_channel = any(part.role == "channel" for part in parts)
+            sync_lengths = range(1, count_leading(_may_be_sync(rows)) + 1) if has_sync else [0]
+            score, sync_length, parts = split_frame(parts_at_each_byte, sync_lengths)
+            has_channel = any(part.name == CHANNEL for part in parts)
             if has_channel:
-                sync = np.roll(usual, -start)[:sync_length].tobytes()
+                sync = usual_bytes(rows)[0][:sync_length].tobytes()
                 # Each byte outside of all frames contributes `Weights.noise` bits.
                 bits_per_byte = covered_share * score / length + (1.0 - covered_share) * Weights.noise
                 yield bits_per_byte, _frames_section(division, sync, check, order, parts)
+
+
+def _may_be_sync(rows: Bytes) -> Booleans:
+    """Return whether each byte of the frames may belong to a sync pattern, shape (length,).
+
+    Such a byte is constant and not 0, because zeros are mostly the high bytes of numbers.
+    """
+    usual, is_constant = usual_bytes(rows)
+    return is_constant & (usual != 0)
 
 
 def _frames_section(
@@ -150,18 +145,16 @@ def _frames_section(
 def _fields(parts: Sequence[Part]) -> tuple[Field, ...]:
     """Convert the parts of a frame to fields and padding.
 
-    Channels are called ch1, ch2, and so on. A second counter or a second clock becomes padding, because a device file
-    can describe only one counter and one clock. Adjacent padding is joined.
+    Channels are called ch1, ch2, and so on. A second counter, or a second clock of the same name, becomes padding,
+    because the names of fields must differ. Adjacent padding is joined.
     """
     fields: list[Field] = []
-    channel_count = 0
-    roles = {"pad"}
+    names = [""]  # of padding, and of the previous parts
     for part in parts:
-        if part.role == "channel":
-            channel_count += 1
-            fields.append(Field(name=f"ch{channel_count}", type_name=part.type_name))
-        elif part.role not in roles:
-            roles.add(part.role)
+        names.append(part.name)
+        if part.name == CHANNEL:
+            fields.append(Field(name=f"ch{names.count(CHANNEL)}", type_name=part.type_name))
+        elif part.name not in names[:-1]:
             field = Field(name=part.name, type_name=part.type_name)
             fields.append(field if part.scale == 1.0 else structs.replace(field, scale=part.scale))
         else:
