@@ -58,7 +58,10 @@ def touched_blocks(values: Array, times_s: Array, min_noise: float = 0.0) -> tup
     block_times_s = medians[:, 0]
     steps_s = np.diff(block_times_s, prepend=0.0)  # longer than `BLOCK_S` if frames are rare or were lost
     levels = np.nan_to_num(medians[:, 1:])
-    noise = np.maximum(channel_noise(values), min_noise)
+    # Whole numbers have a rounding error between -0.5 and 0.5, whose standard deviation is 12**-0.5.
+    are_whole_numbers = ((values == np.round(values)) | ~np.isfinite(values)).all(axis=0)
+    smallest_noise = np.where(are_whole_numbers, max(12.0**-0.5, min_noise), min_noise)
+    noise = np.maximum(estimate_noise(values), smallest_noise)
     channels = tuple(map(str, range(len(noise))))
     detector = Touch(Setup(channels, Device(rules={TouchRule: BLOCK_RULE}), has_any_sign=True))
     is_contact = np.zeros(len(levels), dtype=bool)
@@ -141,22 +144,6 @@ def block_medians(values: Array, times_s: Array) -> Array:
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of a block without finite values
         medians = [np.nanmedian(block, axis=0) for block in complete_blocks]
     return np.reshape(medians, (-1, values.shape[1]))  # also without a block
-
-
-def channel_noise(values: Array) -> Array:
-    """Return the noise of each channel, at least the error of rounding if all values are whole numbers.
-
-    Rounding errors are distributed uniformly between -0.5 and 0.5, so that their standard deviation is 12**-0.5.
-
-    Args:
-        values: Values of the channels, shape (n, channels), any unit.
-
-    Returns:
-        The standard deviations, shape (channels,), in the unit of the values.
-    """
-    are_whole_numbers = ((values == np.round(values)) | ~np.isfinite(values)).all(axis=0)
-    rounding_noise = np.where(are_whole_numbers, 12.0**-0.5, 0.0)
-    return np.maximum(estimate_noise(values), rounding_noise)
 
 
 def estimate_noise(values: Array) -> Array:

@@ -117,7 +117,7 @@ def _choose_channels(
     noise = estimate_noise(values)
     noise[2 * np.isfinite(values).sum(axis=0) <= len(values)] = 0.0
     usual_noise = np.median(noise[noise > 0.0]) if noise.any() else 0.0
-    candidates = np.flatnonzero(noise >= min_noise_share * usual_noise).tolist()
+    candidates = np.flatnonzero(noise > min_noise_share * usual_noise).tolist()
     if not electrodes:
         electrodes = tuple(ELECTRODES[: len(candidates)])  # A, B, C, ...
     try:

@@ -19,12 +19,15 @@ class AutoParser(Parser):
     Args:
         columns: Names for the columns of a CSV; see `TextParser`.
         meanings: Meaning (`seq`, `t_us`, `t_ms` or `t_s`) of each name that the board uses; see `TextParser`.
+
+    Attributes:
+        candidates: Parsers of all formats; only the parser of the recognised format after the recognition.
     """
 
     def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
         """Begin with the parsers of all formats. The class describes the arguments."""
         super().__init__("nothing recognised yet")
-        self._candidates: tuple[Parser, ...] = (BinaryParser(), TextParser(columns, meanings))
+        self.candidates: tuple[Parser, ...] = (BinaryParser(), TextParser(columns, meanings))
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that end within `data`.
@@ -34,17 +37,17 @@ class AutoParser(Parser):
         of the counter and the clock are copied from the parser in each call, because the parser may determine them only
         after many frames.
         """
-        for parser in self._candidates:
+        for parser in self.candidates:
             frames = parser.feed(data)
             if frames:
-                self._candidates = (parser,)
+                self.candidates = (parser,)
                 self.counts = parser.counts
                 self.format = parser.format
                 self.seq_modulus = parser.seq_modulus
                 self.t_us_modulus = parser.t_us_modulus
                 return frames
             self.unread_line = parser.unread_line or self.unread_line
-        if len(self._candidates) > 1:  # a recognised parser counts its bytes itself
+        if len(self.candidates) > 1:  # a recognised parser counts its bytes itself
             self.counts.bytes_dropped += len(data)
         return []
 
@@ -54,7 +57,7 @@ class AutoParser(Parser):
         A format that was recognised stays recognised.
         """
         super().reset()
-        for candidate in self._candidates:
+        for candidate in self.candidates:
             candidate.reset()
 
 

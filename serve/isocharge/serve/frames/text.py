@@ -162,10 +162,22 @@ class TextParser(DelimitedParser):
             # The beginning of the first line may be missing. For example, "801.2" may have become the number "1.2".
             if is_first_line and parse_line(text).starts[:1] == (0,):
                 return self._reject(size)
-            frames = self._read_line(text, size)
-            return self._examine_line(text, size) if frames is None else frames
+            return self._parse_text(text, size)
         except ValueError:
             return self._reject(size)
+
+    def _parse_text(self, text: str, size: int) -> list[Frame]:
+        """Parse the text of a line, and return the frames that the line completes.
+
+        Args:
+            text: The line.
+            size: Number of bytes of the line.
+
+        Raises:
+            ValueError: If the line cannot be parsed.
+        """
+        frames = self._read_line(text, size)
+        return self._examine_line(text, size) if frames is None else frames
 
     def _meant(self, names: Sequence[str]) -> tuple[str, ...]:
         """Replace the names that the device uses for its counter and its clock by their meanings."""
@@ -219,58 +231,31 @@ class TextParser(DelimitedParser):
     def _recognise_layout(self, line: Line, size: int) -> list[Frame]:
         """Add a line to the collected lines. If their layout can now be recognised, return their frames.
 
-        Collected lines before the lines that determine the layout are counted as rejected.
-
         Args:
             line: The next line.
             size: Number of bytes of the line.
 
         Returns:
-            The frames of all equal cycles; an empty list if no layout is recognised yet.
+            The frames in the collected lines; an empty list if no layout is recognised yet.
         """
         self._collected_lines.append((line._replace(names=self._meant(line.names)), size))
         repeats = MESSAGE_REPEATS if line.is_prose else RECOGNITION_REPEATS
-        cycle_length = self._repeated_cycle_length(repeats)
-        repeated_lines = self._collected_lines[-repeats * cycle_length :] if cycle_length > 0 else []
-        frame_lines = _frame_lines([line for line, _ in repeated_lines], cycle_length)
+        frame_lines = _frame_lines([line for line, _ in self._collected_lines], repeats)
         if not frame_lines:
             # Keep as many lines as the longest cycles need, and reject the older lines.
             while len(self._collected_lines) > RECOGNITION_REPEATS * MAX_CYCLE_LINES:
                 self._reject(self._collected_lines.pop(0)[1])
             return []
 
-        for _, rejected_size in self._collected_lines[: -len(repeated_lines)]:
-            self._reject(rejected_size)
-        self._collected_lines = []
         layout = Layout(frame_lines)
         is_named = layout.name_unnamed(self._meant(self._columns))
         while self._headers and not is_named:
             is_named = layout.name_unnamed(self._meant(header_names(self._headers.pop(), layout.example)))
         self.layout = layout
         self._describe_layout(layout)
-        frames = []
-        for repeated_line, repeated_size in repeated_lines:
-            frames_of_line = self._read_line(repeated_line.text, repeated_size)
-            frames += self._reject(repeated_size) if frames_of_line is None else frames_of_line
-        return frames
-
-    def _repeated_cycle_length(self, repeats: int) -> int:
-        """Return the number of lines in a cycle, or 0 if the collected lines do not repeat regularly.
-
-        A cycle is a sequence of lines that repeats. It is recognised if the last lines consist of several equal cycles.
-        Lines are equal if their skeletons are equal. The length of the cycle is the distance from the last line to the
-        latest earlier line that is equal.
-
-        Args:
-            repeats: Number of equal cycles that are needed.
-        """
-        skeletons = [line.skeleton for line, _ in self._collected_lines]
-        *earlier_skeletons, last_skeleton = skeletons
-        if last_skeleton not in earlier_skeletons:
-            return 0
-        cycle_length = earlier_skeletons[::-1].index(last_skeleton) + 1
-        is_repeated = skeletons[-repeats * cycle_length :] == skeletons[-cycle_length:] * repeats
-        return cycle_length if is_repeated else 0
+        collected_lines = self._collected_lines
+        self._collected_lines = []
+        return [frame for line, line_size in collected_lines for frame in self._parse_text(line.text, line_size)]
 
     def _read_line(self, text: str, size: int) -> list[Frame] | None:
         """Return a list with the frame that a line completes.
@@ -336,18 +321,31 @@ def _decoded(line: bytes) -> str:
         return text
 
 
-def _frame_lines(lines: Sequence[Line], cycle_length: int) -> Sequence[Line]:
-    """Return the lines of one frame in repeated cycles of lines; empty if it is not clear which lines are frames.
+def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
+    """Return the lines of one frame; empty if the lines do not repeat, or if it is not clear which lines are frames.
+
+    A cycle is a sequence of lines that repeats. It is recognised if the last lines consist of several equal cycles.
+    Lines are equal if their skeletons are equal. The length of the cycle is the distance from the last line to the
+    latest earlier line that is equal.
 
     If every value has a name, a frame consists of all lines of a cycle. Otherwise, a frame is a single line, and the
     other lines of the cycle never change.
 
     Args:
-        lines: Lines of whole cycles; may be empty.
-        cycle_length: Number of lines in a cycle.
+        lines: The lines since the beginning.
+        repeats: Number of equal cycles that are needed.
     """
+    skeletons = [line.skeleton for line in lines]
+    *earlier_skeletons, last_skeleton = skeletons
+    if last_skeleton not in earlier_skeletons:
+        return []
+    cycle_length = earlier_skeletons[::-1].index(last_skeleton) + 1
+    if skeletons[-repeats * cycle_length :] != skeletons[-cycle_length:] * repeats:
+        return []
+
+    lines = lines[-repeats * cycle_length :]
     cycle = lines[:cycle_length]
-    if cycle_length <= 1:
+    if cycle_length == 1:
         return cycle
     if all(all(line.names) for line in cycle):
         first = _first_line(lines, cycle_length)

@@ -63,12 +63,14 @@ _PATTERNS = {
     "word": _WORD,
     "blanks": r"\s++",
     "optional blanks": r"\s*+",
-    "end": r"[\s,;]*+",
 }
 """Regular expressions of the parts of a line that may change from line to line. Numbers are in groups."""
 
 _CODES = {kind: chr(code) for code, kind in enumerate(_PATTERNS)}
 """Control characters that stand for these parts in a skeleton. A line with control characters is not parsed."""
+
+_END = r"[\s,;]*+"
+"""Regular expression of marks without a meaning at the end of a line."""
 
 _NUMBER_KINDS = ("time", "uptime", "hexadecimal", "number")
 
@@ -237,9 +239,6 @@ def parse_line(text: str, *, has_header: bool = False, counters: Collection[str]
     tokens = _tokens(text.rstrip(",; \t"), number_kind)
     if not has_header:
         tokens = _with_alternating_names(tokens)
-    number_tokens = [token for token in tokens if token.kind in _NUMBER_KINDS]
-    kinds = [token.kind for token in number_tokens]
-    begins_with_address = "hexadecimal" in kinds and "number" in kinds[kinds.index("hexadecimal") :]
     names, names_with_units = _names(tokens, counters)
 
     units = {"pC", *_CHARGE_UNITS}
@@ -259,10 +258,11 @@ def parse_line(text: str, *, has_header: bool = False, counters: Collection[str]
             skeleton += token.content
         else:
             skeleton += _CODES[number_kind if token.kind == "number" else token.kind]
-    starts = tuple(token.start for token in number_tokens)
+    starts = tuple(token.start for token in tokens if token.kind in _NUMBER_KINDS)
+    begins_with_address = re.search("hexadecimal.* number", " ".join(token.kind for token in tokens)) is not None
     is_prose = begins_with_address or word_count >= len(starts)
     words = tuple(token.name for token in tokens if token.kind not in ("mark", *_NUMBER_KINDS))
-    return Line(text, skeleton + _CODES["end"], tuple(names_with_units), starts, is_prose, words)
+    return Line(text, skeleton, tuple(names_with_units), starts, is_prose, words)
 
 
 def _has_decimal_commas(text: str) -> bool:
@@ -361,12 +361,12 @@ def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], 
     ]
     # The word `C` may be the name of an electrode, but a word behind several numbers is not a name.
     known_units = OTHER_CHARGE_UNITS if following_units.count("C") > 1 else _CHARGE_UNITS
-    # The first word after the previous number is a name, or the unit of the previous number.
-    preceding_units = [[token.name.strip("[]") for token in path[1:]] for path in _paths(tokens)]
-    units = [
-        next((unit for unit in (following, *preceding) if unit in known_units), "")
-        for following, preceding in zip(following_units, preceding_units, strict=True)
-    ]
+    units = []
+    for following_unit, path in zip(following_units, _paths(tokens), strict=True):
+        # The first word after the previous number is a name, or the unit of the previous number.
+        possible_units = (following_unit, *(token.name.strip("[]") for token in path[1:]))
+        unit = next((unit for unit in possible_units if unit in known_units), "")
+        units.append("coulomb" if unit == "C" else unit)  # `A_C` would be an electrode with the name C
 
     names = [name or outer_name for name, outer_name in zip(_unique(inner_names), _unique(outer_names), strict=True)]
     channels = [index for index, name in enumerate(names) if name not in TIMES_US]
@@ -380,10 +380,9 @@ def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], 
     alternating_names = [token.name for token in tokens if token.kind == "name"]
     if alternating_names:
         names = [_NAMES_OF_TIMES.get(kind) or alternating_names.pop(0) for kind in kinds]
-    full_units = ["coulomb" if unit == "C" else unit for unit in units]  # `A_C` would be an electrode with the name C
     names_with_units = [
         f"{name or f'ch{number}'}_{unit}" if unit and unit not in names else name
-        for number, (name, unit) in enumerate(zip(names, full_units, strict=True), start=1)
+        for number, (name, unit) in enumerate(zip(names, units, strict=True), start=1)
     ]
     return names, names_with_units
 
@@ -435,7 +434,7 @@ def _unique(names: list[str]) -> list[str]:
 def skeleton_pattern(line: Line) -> re.Pattern[str]:
     """Return the regular expression of all lines with the skeleton of a line. Each number is a group."""
     patterns = {_CODES[kind]: pattern for kind, pattern in _PATTERNS.items()}
-    return re.compile("".join(patterns.get(part) or re.escape(part) for part in line.skeleton))
+    return re.compile("".join(patterns.get(part) or re.escape(part) for part in line.skeleton) + _END)
 
 
 def line_values(pattern: re.Pattern[str], text: str) -> tuple[float, ...] | None:
@@ -485,7 +484,7 @@ def header_names(header: str, line: Line) -> tuple[str, ...]:
     """
     starts = [start for start, name in zip(line.starts, line.names, strict=True) if not name]
     separator = _separator(header)  # None: blanks
-    line_separator = "\t" if "\t" in line.text else _separator(line.skeleton.removesuffix(_CODES["end"]))
+    line_separator = "\t" if "\t" in line.text else _separator(line.skeleton)
     if separator is None and line_separator is not None:
         return ()
     columns = [column for column in header.split(separator) if column.strip()]

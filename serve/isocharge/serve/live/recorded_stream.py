@@ -159,7 +159,7 @@ class RecordedStream:
         if recorder is None:
             return
         self.recorder = recorder
-        self._opened_recorder.callback(recorder.close)
+        self._opened_recorder.push(recorder)
         self._stream.restart()
         self._is_recording_new = True
         present_label = self._stream.predictor.metadata.label

@@ -108,10 +108,6 @@ class Recorder:
 
     def __exit__(self, *_: object) -> None:
         """Close the file."""
-        self.close()
-
-    def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
     def chunk(self, chunk: Chunk, records: list[str]) -> None:

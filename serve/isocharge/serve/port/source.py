@@ -108,8 +108,8 @@ class Port:
         self._request = request
         self._wait = wait
         self.start_up_s = max(wait, silence_s, START_UP_s)
+        self._max_silence_s = self.start_up_s  # longest wait for the next byte
         self._line: SerialLine | UdpSocket | Requester | None = None
-        self._is_starting_up = True  # whether no byte has arrived since the port was opened
 
     def __enter__(self) -> Self:
         """Open the port, and discard the bytes in its buffer.
@@ -165,7 +165,7 @@ class Port:
                     "Linux, the group 'dialout')"
                 )
             raise PortError(f"{self.url}: cannot be opened{speed} ({error}); {hint}") from error
-        self._is_starting_up = True
+        self._max_silence_s = self.start_up_s
 
     def __exit__(self, *_: object) -> None:
         """Close the port when the context is left."""
@@ -193,7 +193,10 @@ class Port:
             try:
                 data = self._read()
             except PortLost as error:
-                data = self._read_after_reconnecting(error)
+                if not self._reconnect:
+                    raise
+                log.warning("%s; trying again until it is back", error)
+                data = self._read_after_reconnecting()
                 outage_s = time.monotonic() - wait_start_s
             if full_chunks < 2:
                 full_chunks = full_chunks + 1 if len(data) >= MAX_READ_BYTES else 0
@@ -223,21 +226,12 @@ class Port:
             return None
         return Chunk(data, time.time(), time.perf_counter_ns())
 
-    def _read_after_reconnecting(self, reason: PortLost) -> bytes:
+    def _read_after_reconnecting(self) -> bytes:
         """Open the port repeatedly until bytes arrive, and return these bytes.
 
         Opening a port restarts many boards. The pause before the next attempt is therefore doubled each time that an
         opened port sends nothing, up to `start_up_s`.
-
-        Args:
-            reason: Exception that states why the port was lost.
-
-        Raises:
-            PortLost: The exception `reason`, if the port must not be opened again (`reconnect` is false).
         """
-        if not self._reconnect:
-            raise reason
-        log.warning("%s; trying again until it is back", reason)
         pause_s = RETRY_PAUSE_s
         while True:
             self._close()
@@ -257,14 +251,14 @@ class Port:
             PortLost: If the port disappears, or no byte arrives in time.
             PortError: If the port is not open.
         """
-        timeout_s = self.start_up_s if self._is_starting_up else self._silence_s
-        data = self._receive(timeout_s)
+        data = self._receive(self._max_silence_s)
         if not data:
             speed_advice = f", and that {self._baud} baud is its speed" if has_speed(self.url) else ""
             raise PortLost(
-                f"{self.url}: no data for {timeout_s:g} s; check that the board is powered and sends{speed_advice}"
+                f"{self.url}: no data for {self._max_silence_s:g} s; check that the board is powered and sends"
+                f"{speed_advice}"
             )
-        self._is_starting_up = False
+        self._max_silence_s = self._silence_s
         line = self._line
         with contextlib.suppress(*READ_ERRORS):  # the next call reports the error
             while line and line.is_stream and len(data) < MAX_READ_BYTES and (waiting := line.receive(0.0)):

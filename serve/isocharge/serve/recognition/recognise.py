@@ -12,11 +12,19 @@ import numpy as np
 from msgspec import structs, to_builtins
 
 from isocharge.common.arrays import Booleans
-from isocharge.serve.frames.binary import BinaryParser
-from isocharge.serve.frames.frame import SEQ, Frame, Parser
+from isocharge.serve.frames.formats import AutoParser
+from isocharge.serve.frames.frame import SEQ, Frame
 from isocharge.serve.frames.frame_layout import PADDING, SYNC, ByteOrder, Field, FrameLayout
 from isocharge.serve.frames.text import Layout, TextParser
-from isocharge.serve.recognition.fields import CHANNEL, Part, Weights, identify_clock, is_counter, possible_parts, split_frame
+from isocharge.serve.recognition.fields import (
+    CHANNEL,
+    Part,
+    Weights,
+    identify_clock,
+    is_counter,
+    possible_parts,
+    split_frame,
+)
 from isocharge.serve.recognition.framing import (
     COVERED_SHARE,
     MAX_CONSTANT_BYTES,
@@ -53,9 +61,7 @@ def described_frames_section(
     examined_seconds = seconds * examined_share
     for divisions in possible_divisions(chunks, are_datagrams=are_datagrams):
         scored_sections = [
-            scored_section
-            for division in divisions
-            for scored_section in _scored_sections(division, examined_seconds)
+            scored_section for division in divisions for scored_section in _scored_sections(division, examined_seconds)
         ]
         if scored_sections:
             _, best_section = min(scored_sections, key=itemgetter(0))
@@ -92,11 +98,7 @@ def _scored_sections(division: FrameDivision, seconds: float) -> Iterator[tuple[
     frame_rate_Hz = stream_bytes / length / seconds  # as if all bytes of the stream belonged to frames
     for order in ORDERS:
         for rows, check in rows_and_checks or [(rows, Check(0, order)) for rows in possible_rows]:
-            # A checksum covers all bytes of a number or none.
-            parts_at_each_byte = [
-                [part for part in parts if not offset < check.start < offset + part.size]
-                for offset, parts in enumerate(possible_parts(rows[:, : length - check.size], order, frame_rate_Hz))
-            ]
+            parts_at_each_byte = possible_parts(rows[:, : length - check.size], order, frame_rate_Hz)
             sync_lengths = range(1, count_leading(_may_be_sync(rows)) + 1) if has_sync else [0]
             score, sync_length, parts = split_frame(parts_at_each_byte, sync_lengths)
             has_channel = any(part.name == CHANNEL for part in parts)
@@ -163,23 +165,10 @@ def _fields(parts: Sequence[Part]) -> tuple[Field, ...]:
     return tuple(fields)
 
 
-def is_text(chunks: Sequence[bytes], min_share: float = 0.85) -> bool:
-    """Return whether bytes are text, which is never a binary format.
-
-    Args:
-        chunks: The bytes.
-        min_share: Smallest share of printable characters in text. The other bytes may be damaged, letters that are not
-            ASCII, or control characters at the ends of the lines.
-    """
-    data = b"".join(chunks)
-    other_bytes = data.translate(None, delete=printable.encode() + b"\x1b")
-    return len(data) > 0 and len(other_bytes) <= (1.0 - min_share) * len(data)
-
-
 def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = False) -> dict[str, Any] | None:
     """Recognise the format of a board, and return the section `[frames]` that describes this format in a device file.
 
-    The function first tries the binary frames of isocharge, then lines of text, and then other frames of fixed length.
+    The function first tries the binary frames of isocharge and lines of text, and then other frames of fixed length.
     Bytes that are printable characters are never taken for binary frames.
 
     Args:
@@ -190,22 +179,22 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
     Returns:
         The section as a dictionary; None if no format is recognised.
     """
-    binary_frames, binary_share = _parse_all(BinaryParser(), chunks)
-    if len(binary_frames) >= MIN_FRAMES and binary_share > COVERED_SHARE:
-        return {"format": "binary"}
-
-    text_section = None
-    text_parser = TextParser()
-    all_text_frames, text_share = _parse_all(text_parser, chunks)
+    data = b"".join(chunks)
+    parser = AutoParser()
+    all_frames = parser.feed(data)
     # Use only the frames with as many values as the last frame. Earlier frames have another number of values if a
     # header later names one of the columns as counter or clock.
-    text_frames = [frame for frame in all_text_frames if len(frame.values) == len(all_text_frames[-1].values)]
-    if text_parser.layout is not None and len(text_frames) >= MIN_FRAMES:
-        frame_rate_Hz = len(text_frames) / seconds
-        text_section = {"format": "text"} | _text_keys(text_parser.layout, text_frames, frame_rate_Hz)
-        if text_share >= COVERED_SHARE:
-            return text_section
-    if is_text(chunks):
+    frames = [frame for frame in all_frames if len(frame.values) == len(all_frames[-1].values)]
+    is_covered = parser.counts.bytes_dropped <= (1.0 - COVERED_SHARE) * len(data)
+    text_section = None
+    if len(frames) >= MIN_FRAMES:
+        (recognised_parser,) = parser.candidates
+        if isinstance(recognised_parser, TextParser) and recognised_parser.layout is not None:
+            frame_rate_Hz = len(frames) / seconds
+            text_section = {"format": "text"} | _text_keys(recognised_parser.layout, frames, frame_rate_Hz)
+        if is_covered:
+            return text_section or {"format": "binary"}
+    if _is_text(data):
         return text_section
 
     # If most of the bytes are not lines of one layout, the board may send binary frames that resemble text in places.
@@ -213,16 +202,25 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
     return described_section or text_section
 
 
-def _parse_all(parser: Parser, chunks: Sequence[bytes]) -> tuple[list[Frame], float]:
-    """Parse all chunks, and return the frames and the share of the bytes that the parser did not drop."""
-    frames = [frame for chunk in chunks for frame in parser.feed(chunk)]
-    byte_count = sum(len(chunk) for chunk in chunks)
-    dropped_share = parser.counts.bytes_dropped / max(1, byte_count)
-    return frames, 1.0 - dropped_share
+def _is_text(data: bytes, min_share: float = 0.85) -> bool:
+    """Return whether bytes are text, which is never a binary format.
+
+    Args:
+        data: The bytes.
+        min_share: Smallest share of printable characters in text. The other bytes may be damaged, letters that are not
+            ASCII, or control characters at the ends of the lines.
+    """
+    other_bytes = data.translate(None, delete=printable.encode() + b"\x1b")
+    return len(other_bytes) <= (1.0 - min_share) * len(data)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) -> dict[str, Any]:
     """Return the keys that describe the counter, the clock and the columns of lines of text in a device file.
+
+    A counter increases by 1 from frame to frame, and a clock increases at one of the usual rates. A clock in ms that
+    increases by about 1 is recognised by its name, or because it repeats some values. If the parser has already
+    recognised a counter, the function does not search for another counter. The same applies to the clock.
 
     For values with names in each line, the keys `seq`, `t_us`, `t_ms` and `t_s` state the names that the board uses for
     its counter and its clock. For the other values, the key `columns` lists the names, which are copied from a header,
@@ -231,55 +229,34 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
 
     Args:
         layout: Layout of the lines.
-        frames: Frames that the lines contain.
+        frames: Frames that the lines contain, with the same number of values.
         frame_rate_Hz: Number of frames per second, Hz.
     """
     names = list(layout.names)
-    channels = [column for column, _ in layout.columns.channels]
     keys: dict[str, Any] = {}
-    for position, meaning in _meanings(frames, frame_rate_Hz).items():
-        column = channels[position]
-        if column not in layout.unnamed:
-            keys[meaning] = names[column]
-        names[column] = meaning
+    unnamed_channels: list[int] = []
+    has_counter = frames[-1].seq is not None
+    has_clock = frames[-1].t_us is not None
+    steps = np.diff([frame.values for frame in frames], axis=0)  # shape (n - 1, channels)
+    for (column, _), channel_steps in zip(layout.columns.channels, steps.T, strict=True):
+        name = names[column]
+        clock = identify_clock(channel_steps, frame_rate_Hz)
+        has_time_name = clock is not None and any(word in name.lower() for word in ("ms", "milli", "time"))
+        if not has_counter and not has_time_name and is_counter(channel_steps, clock):
+            names[column] = SEQ
+            has_counter = True
+        # A device file for lines of text cannot state another duration of a tick.
+        elif clock is not None and clock[1] == 1.0 and not has_clock:
+            names[column] = clock[0]
+            has_clock = True
+        elif not name:
+            unnamed_channels.append(column)
+        if column not in layout.unnamed and names[column] != name:
+            keys[names[column]] = name
 
     # Number the channels without names. Without names from a header, a counter or a clock, the columns need no names.
     if any(names[column] for column in layout.unnamed):
-        unnamed_channels = [column for column in channels if not names[column]]
         for number, column in enumerate(unnamed_channels, 1):
             names[column] = f"ch{number}"
         keys["columns"] = [names[column] for column in layout.unnamed]
     return keys
-
-
-@np.errstate(over="ignore", invalid="ignore")
-def _meanings(frames: Sequence[Frame], frame_rate_Hz: float) -> dict[int, str]:
-    """Determine which values of the frames are the frame counter and the clock.
-
-    A counter increases by 1 from frame to frame, and a clock increases at one of the usual rates. A clock in ms that
-    increases by about 1 is recognised by its name, or because it repeats some values. If the parser has already
-    recognised a counter, the function does not search for another counter. The same applies to the clock.
-
-    Args:
-        frames: Frames with the same number of values.
-        frame_rate_Hz: Number of frames per second, Hz.
-
-    Returns:
-        The meaning of a value by its position in a frame: `seq` for a counter, and `t_us`, `t_ms` or `t_s` for a clock.
-    """
-    meanings: dict[int, str] = {}
-    has_counter = frames[-1].seq is not None
-    has_clock = frames[-1].t_us is not None
-    steps = np.diff([frame.values for frame in frames], axis=0)  # shape (n - 1, values)
-    names = frames[-1].names or ("",) * len(steps.T)
-    for position, value_steps in enumerate(steps.T):
-        clock = identify_clock(value_steps, frame_rate_Hz)
-        has_time_name = clock is not None and any(word in names[position].lower() for word in ("ms", "milli", "time"))
-        if not has_counter and not has_time_name and is_counter(value_steps, clock):
-            meanings[position] = SEQ
-            has_counter = True
-        # A device file for lines of text cannot state another duration of a tick.
-        elif clock is not None and clock[1] == 1.0 and not has_clock:
-            meanings[position] = clock[0]
-            has_clock = True
-    return meanings
