@@ -127,13 +127,12 @@ def _choose_channels(
         return {}
     if positions is not None:  # perhaps with a channel that never changes, which is reported later
         return dict(zip(electrodes, positions, strict=True))
-    first = 0
-    if len(candidates) > len(electrodes):
-        # Compare the groups of adjacent channels by their largest noise over the smallest one, in powers of ten.
-        groups = np.lib.stride_tricks.sliding_window_view(np.log10(noise[candidates]), len(electrodes))
-        first = int(np.argmin(np.round(np.ptp(groups, axis=1))))
-    chosen = candidates[first : first + len(electrodes)]
-    return dict(zip(electrodes, chosen, strict=True)) if len(chosen) == len(electrodes) else {}
+    if len(candidates) < len(electrodes):
+        return {}
+    # Compare the groups of adjacent channels by their largest noise over the smallest one, in powers of ten.
+    groups = np.lib.stride_tricks.sliding_window_view(np.log10(noise[candidates]), len(electrodes))
+    first = int(np.argmin(np.round(np.ptp(groups, axis=1))))
+    return dict(zip(electrodes, candidates[first:], strict=False))
 
 
 def _rest_level(values: Array) -> float:

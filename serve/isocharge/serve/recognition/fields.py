@@ -31,25 +31,12 @@ PLAUSIBLE_MAGNITUDES = (1e-7, 1e8)
 """Smallest and largest typical magnitude of a floating-point channel."""
 
 
-def steady_step(steps: Array, max_deviation: float = 0.7) -> float:
-    """Return the mean of the regular steps of a counter or clock, or 0 if too few steps are regular.
+def identify(steps: Array, frame_rate_Hz: float, tolerance: float = 0.06) -> tuple[bool, tuple[str, float] | None]:
+    """Determine whether the values of consecutive frames are those of a frame counter or of a clock.
 
-    A step is regular if it is close to the median step. For example, a step across a lost frame is not regular.
-
-    Args:
-        steps: Differences of the values of consecutive frames, shape (n,).
-        max_deviation: Largest deviation of a regular step from the median step, relative to the median step.
-    """
-    median_step = np.median(steps)
-    is_regular = np.abs(steps - median_step) <= max_deviation * median_step
-    regular_steps = steps[is_regular]
-    if len(regular_steps) < INTACT_SHARE * len(steps):
-        return 0.0
-    return float(regular_steps.mean())
-
-
-def identify_clock(steps: Array, frame_rate_Hz: float, tolerance: float = 0.06) -> tuple[str, float] | None:
-    """Identify a clock by comparing its tick rate with the usual tick rates of boards.
+    A counter increases by 1. A clock has one of the usual tick rates of boards. At about 1000 frames per second, a
+    clock in ms also increases by 1, but it repeats at least 1 % of its values. A step is only used if it is close to
+    the median step. For example, a step across a lost frame is not used.
 
     Args:
         steps: Differences of the values of consecutive frames, shape (n,).
@@ -58,25 +45,19 @@ def identify_clock(steps: Array, frame_rate_Hz: float, tolerance: float = 0.06) 
             arrive in bursts.
 
     Returns:
-        The name of the field, which is `t_s`, `t_ms` or `t_us`, and the duration of one tick in the unit of this name.
-        None if the values are probably not those of a clock.
+        Whether the values are those of a counter. For values that may be those of a clock, also the name of the field,
+        which is `t_s`, `t_ms` or `t_us`, and the duration of one tick in the unit of this name; otherwise None.
     """
-    ticks_per_frame = steady_step(steps)
+    median_step = np.median(steps)
+    regular_steps = steps[np.abs(steps - median_step) <= 0.7 * median_step]
+    if len(regular_steps) < INTACT_SHARE * len(steps):
+        return False, None
+    ticks_per_frame = float(regular_steps.mean())
     tick_rate_Hz = ticks_per_frame * frame_rate_Hz
     deviation, nearest_tick_rate_Hz = min((abs(tick_rate_Hz / usual_Hz - 1.0), usual_Hz) for usual_Hz in CLOCKS)
-    return CLOCKS[nearest_tick_rate_Hz] if deviation < tolerance else None
-
-
-def is_counter(steps: Array, clock: tuple[str, float] | None) -> bool:
-    """Return whether the values of consecutive frames are those of a frame counter, which increases by 1.
-
-    At about 1000 frames per second, a clock in ms also increases by 1, but it repeats at least 1 % of its values.
-
-    Args:
-        steps: Differences of the values of consecutive frames, shape (n,).
-        clock: Result of `identify_clock`.
-    """
-    return steady_step(steps) == 1.0 and (clock is None or bool(np.mean(steps == 0.0) < 0.01))
+    clock = CLOCKS[nearest_tick_rate_Hz] if deviation < tolerance else None
+    is_counter = ticks_per_frame == 1.0 and (clock is None or bool(np.mean(steps == 0.0) < 0.01))
+    return is_counter, clock
 
 
 class Weights:
@@ -192,10 +173,10 @@ def _number_parts(number_bytes: Bytes, type_name: FieldType, frame_rate_Hz: floa
         half_range = 1 << (8 * size - 1)
         counter_steps = (steps + half_range) % (2 * half_range) - half_range  # a counter that overflows restarts at 0
 
-    clock = identify_clock(counter_steps, frame_rate_Hz)
+    is_counter, clock = identify(counter_steps, frame_rate_Hz)
     has_all_bytes = not _wraps_early(counter_steps, size)
     high_score = Weights.constant_high * (is_constant & ~is_zero).sum() if size == 3 else 0.0
-    if has_all_bytes and is_counter(counter_steps, clock):
+    if has_all_bytes and is_counter:
         yield Part(SEQ, type_name, size, high_score)  # the values of a counter need no bits
     elif has_all_bytes and clock is not None:
         name, tick_duration = clock
@@ -294,11 +275,12 @@ def _values(number_bytes: Bytes, type_name: str) -> Array:
     if type_name[0] == "f":
         floats = np.ascontiguousarray(number_bytes).view(f"<f{size}")  # shape (n, 1)
         return floats[:, 0].astype(float)
-    value_count = 256.0**size
+    half_range = 0.5 * 256.0**size
     values: Array = number_bytes @ 256.0 ** np.arange(size)
     if type_name[0] == "i":  # in two's complement, the upper half of the unsigned values stands for the negative values
-        values = (values + 0.5 * value_count) % value_count
-    return values - 0.5 * value_count
+        values = (values + half_range) % (2.0 * half_range)
+    values -= half_range
+    return values
 
 
 def _bits(steps: Array, unit: float, size: int) -> float:

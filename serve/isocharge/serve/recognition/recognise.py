@@ -20,8 +20,7 @@ from isocharge.serve.recognition.fields import (
     CHANNEL,
     Part,
     Weights,
-    identify_clock,
-    is_counter,
+    identify,
     possible_parts,
     split_frame,
 )
@@ -115,7 +114,8 @@ def _may_be_sync(rows: Bytes) -> Booleans:
     Such a byte is constant and not 0, because zeros are mostly the high bytes of numbers.
     """
     usual, is_constant = usual_bytes(rows)
-    return is_constant & (usual != 0)
+    may_be_sync: Booleans = is_constant & (usual != 0)
+    return may_be_sync
 
 
 def _frames_section(
@@ -240,9 +240,9 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
     steps = np.diff([frame.values for frame in frames], axis=0)  # shape (n - 1, channels)
     for (column, _), channel_steps in zip(layout.columns.channels, steps.T, strict=True):
         name = names[column]
-        clock = identify_clock(channel_steps, frame_rate_Hz)
+        is_counter, clock = identify(channel_steps, frame_rate_Hz)
         has_time_name = clock is not None and any(word in name.lower() for word in ("ms", "milli", "time"))
-        if not has_counter and not has_time_name and is_counter(channel_steps, clock):
+        if is_counter and not has_counter and not has_time_name:
             names[column] = SEQ
             has_counter = True
         # A device file for lines of text cannot state another duration of a tick.
