@@ -57,9 +57,8 @@ def press_film(film: ForwardMap, presses: Sequence[Press], end_s: float) -> tupl
         rows += [(time_s, position.real, position.imag, force_N) for time_s, force_N in corners]
     rows.append((end_s, 0.0, 0.0, 0.0))
     script = VirtualScript(presses=tuple(rows)).script(RATE_Hz)
-    charge = np.zeros((len(script), len(film.electrodes)))
-    contact = np.column_stack([script.x_mm, script.y_mm, script.force_N])
-    charge[script.touching] = film_charges(film)(contact[script.touching])
+    charge = np.zeros((len(script.contact), len(film.electrodes)))
+    charge[script.touching] = film_charges(film)(script.contact[script.touching])
     return script, charge
 
 
@@ -115,8 +114,7 @@ def stream_records(
 def contact_errors(script: Script, records: list[PredictionRecord]) -> Array:
     """Return the errors (x, y, F) in the frames with full force, shape (n, 3), mm and N; NaN without a contact."""
     answers = np.array([(record.x_mm, record.y_mm, record.force_N) for record in records], dtype=float)
-    truth = np.column_stack([script.x_mm, script.y_mm, script.force_N])
-    return (answers - truth)[script.force_N >= 1.0]
+    return (answers - script.contact)[script.contact[:, 2] >= 1.0]
 
 
 def accuracy(
@@ -148,7 +146,7 @@ def accuracy(
     delays_ms = [1e3 / RATE_Hz * int(is_contact[first:].argmax()) for first in first_frames]
     return {
         "position_mm": percentiles(error_mm[~np.isnan(error_mm)], PERCENTILES, 3),
-        "saturated_share": round(float(is_saturated[is_contact & (script.force_N >= 1.0)].mean()), 4),
+        "saturated_share": round(float(is_saturated[is_contact & (script.contact[:, 2] >= 1.0)].mean()), 4),
         "first_reading_ms": percentiles(delays_ms, PERCENTILES, 3),
     }
 

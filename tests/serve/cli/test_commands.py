@@ -192,8 +192,9 @@ def resting(film):
     """Play a board that nobody touches."""
 
     def play(**options):
-        force_N = np.append(np.zeros(59_999), 1.0)
-        return VirtualSensor(film.charges, Script(0.0 * force_N, 0.0 * force_N, force_N, 500.0), **options)
+        contact = np.zeros((60_000, 3))
+        contact[-1, 2] = 1.0
+        return VirtualSensor(film.charges, Script(contact, 500.0), **options)
 
     return play
 

@@ -120,13 +120,13 @@ def test_virtual_solves_the_film_only_up_to_the_scripted_distance_and_force(tmp_
 
 def test_random_presses_stay_below_the_yield_point_of_the_film_by_default(monkeypatch):
     """A probe of 1 mm radius yields the built-in films at 0.87 N."""
-    assert wander(seed=1).force_N.max() <= 0.8
+    assert wander(seed=1).contact[:, 2].max() <= 0.8
     domain = Domain(8.0, (0.05, 2.0))
     forward_map = SimpleNamespace(domain=domain, electrodes=("A",), charges=lambda contact: 100.0 * contact[:, 2:])
     played_scripts = []
     monkeypatch.setattr(virtual_sensor, "VirtualSensor", lambda _, script, **__: played_scripts.append(script))
     virtual_sensor.virtual_sensor(forward_map)
-    assert 0.05 < played_scripts[0].force_N.max() <= 0.8
+    assert 0.05 < played_scripts[0].contact[:, 2].max() <= 0.8
 
 
 def test_charges_below_the_smallest_force_follow_the_power_law_of_a_membrane():

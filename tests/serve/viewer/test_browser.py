@@ -36,7 +36,7 @@ def sensor(film, touch):
     """A sensor of presses that stand still, with pauses that are long enough for a tare, played again and again."""
     rows = [row for press in PRESSES for row in ((np.nan, np.nan, 0.0), press)]
     counts = [round(PAUSE_S * RATE_HZ), round(PRESS_S * RATE_HZ)] * len(PRESSES)
-    presses = Script(*np.repeat(rows, counts, axis=0).T, RATE_HZ)
+    presses = Script(np.repeat(rows, counts, axis=0), RATE_HZ)
     with VirtualSensor(film.charges, presses, noise=lambda charge_pC, _: charge_pC * touch.is_set()) as sensor:
         yield sensor
 

@@ -15,10 +15,11 @@ def script():
 
 def test_wander_stays_inside_radius_and_forces(script):
     on = script.touching
-    assert 6.0 < np.hypot(script.x_mm[on], script.y_mm[on]).max() <= 8.0
-    assert script.force_N[on].min() == pytest.approx(0.05)
-    assert 1.0 < script.force_N[on].max() <= 2.0 * (1 + 1e-12)
-    assert np.isnan([script.x_mm[~on], script.y_mm[~on]]).all()
+    x_mm, y_mm, force_N = script.contact[on].T
+    assert 6.0 < np.hypot(x_mm, y_mm).max() <= 8.0
+    assert force_N.min() == pytest.approx(0.05)
+    assert 1.0 < force_N.max() <= 2.0 * (1 + 1e-12)
+    assert np.isnan(script.contact[~on, :2]).all()
 
 
 @pytest.mark.parametrize(
@@ -38,10 +39,10 @@ def test_load_script_reads_a_toml_file(tmp_path):
     play = load_script(path)
     assert play.faults == Faults(lose_share=0.1)
     script = play.script(100.0)
-    assert (len(script), script.rate_Hz) == (220, 100.0)
-    assert np.isnan(script.x_mm[:101]).all()
-    assert (script.x_mm[160], script.y_mm[160], script.force_N[160]) == pytest.approx((2.0, 2.0, 0.5))
-    assert script.force_N[105] == pytest.approx(0.25)
+    assert (script.contact.shape, script.rate_Hz) == ((220, 3), 100.0)
+    assert np.isnan(script.contact[:101, 0]).all()
+    assert script.contact[160] == pytest.approx([2.0, 2.0, 0.5])
+    assert script.contact[105, 2] == pytest.approx(0.25)
     path.write_text("")
     assert load_script(path).script(100.0) is None
 

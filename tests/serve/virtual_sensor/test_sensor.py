@@ -16,7 +16,7 @@ from isocharge.serve import BinaryParser, Faults, Port, Script, VirtualSensor, e
 
 
 def steady(n=10, rate_Hz=200.0):
-    return Script(np.zeros(n), np.zeros(n), np.ones(n), rate_Hz)
+    return Script(np.tile([0.0, 0.0, 1.0], (n, 1)), rate_Hz)
 
 
 def sent(sensor, count):
@@ -33,7 +33,7 @@ def test_frames_contain_the_repeated_script_with_offset_and_amplifier(film):
         seen.append(charge_pC)
         return charge_pC + np.arange(first, first + len(charge_pC))[:, None]
 
-    script = Script(np.array([1.0, np.nan]), np.array([2.0, np.nan]), np.array([0.5, 0.0]), 1000.0)
+    script = Script(np.array([[1.0, 2.0, 0.5], [np.nan, np.nan, 0.0]]), 1000.0)
     frames = sent(VirtualSensor(film.charges, script, noise=noise, offset_pC=[10.0, 20.0, 30.0]), 1200)
     clean = np.tile([film.charge_pC([1.0], [2.0], [0.5])[0] + [10.0, 20.0, 30.0], [10.0, 20.0, 30.0]], (600, 1))
     np.testing.assert_allclose([frame.values for frame in frames], clean + np.arange(1200)[:, None], rtol=1e-6)

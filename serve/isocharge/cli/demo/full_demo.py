@@ -87,7 +87,7 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor) -> Array:
         rate_Hz = sensor.script.rate_Hz
         all_records = (record for chunk in port for record in touch.feed(chunk))
         records = islice(all_records, FOLLOWED_FRAMES)
-        script = np.column_stack([sensor.script.x_mm, sensor.script.y_mm, sensor.script.force_N])
+        script = sensor.script.contact
         for record in track(records, "following", FOLLOWED_FRAMES):
             # The script that the virtual sensor repeats contains the true press of this frame.
             row = round(1e-6 * (record.t_device_us or 0) * rate_Hz) % len(script)

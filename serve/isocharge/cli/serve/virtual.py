@@ -88,9 +88,9 @@ def virtual_command(
             raise InputError(f"--film: expected a --probe like circle:1.0, whose radius is drawn, too, got {probe!r}")
         played_sensor, footprint = virtual_film(played_sensor, footprint, film)
     if scripted_presses is not None and scripted_presses.touching.any():  # the map must contain the presses
-        distance_mm = np.hypot(scripted_presses.x_mm, scripted_presses.y_mm)
-        radius = max(DEFAULT_RADIUS, ROUNDING_MARGIN * float(np.nanmax(distance_mm)))
-        force_max = max(force_max, ROUNDING_MARGIN * float(scripted_presses.force_N.max()))
+        x_mm, y_mm, force_N = scripted_presses.contact.T
+        radius = max(DEFAULT_RADIUS, ROUNDING_MARGIN * float(np.nanmax(np.hypot(x_mm, y_mm))))
+        force_max = max(force_max, ROUNDING_MARGIN * float(force_N.max()))
     with shown_progress(), solving_executor(played_sensor.film) as executor:
         forward_map = ForwardMap.build(
             played_sensor,

@@ -1,7 +1,6 @@
 """Scripts of a virtual sensor.
 
-A script file contains presses and faults of the transmission. A `Script` contains the position and the force of the
-press in each frame.
+A script file contains presses and faults of the transmission. A `Script` contains the contact of each frame.
 """
 
 from dataclasses import dataclass
@@ -36,28 +35,21 @@ ROW_DESCRIPTION = "[seconds, x_mm, y_mm, force_N] with a force from 0"
 
 @dataclass(frozen=True)
 class Script:
-    """Position and force of the press in each frame of a virtual sensor.
+    """Presses of a virtual sensor.
 
     Attributes:
-        x_mm: Position, shape (n,), mm; NaN while nothing touches.
-        y_mm: Position, shape (n,), mm; NaN while nothing touches.
-        force_N: Force, shape (n,), N; 0 while nothing touches.
+        contact: Contact (x, y, F) in each frame, shape (n, 3), mm and N. While nothing touches, the force is 0 and the
+            position is NaN.
         rate_Hz: Number of frames per second, Hz.
     """
 
-    x_mm: Array
-    y_mm: Array
-    force_N: Array
+    contact: Array
     rate_Hz: float
-
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return len(self.force_N)
 
     @property
     def touching(self) -> Booleans:
         """Whether something touches the film in each frame, shape (n,)."""
-        return self.force_N > 0.0
+        return self.contact[:, 2] > 0.0
 
 
 class Faults(Settings, frozen=True, kw_only=True):
@@ -116,13 +108,12 @@ def _interpolate(rows: Array, t_s: Array, rate_Hz: float, min_force_N: float = 0
         rate_Hz: Number of frames per second, Hz.
         min_force_N: Smallest force while something touches, N.
     """
-    row_time_s, row_x_mm, row_y_mm, row_force_N = rows.T
-    force_N = np.interp(t_s, row_time_s - row_time_s[0], row_force_N)
-    is_touch = force_N > 0.0
-    position_mm = np.interp(t_s, row_time_s - row_time_s[0], row_x_mm + 1j * row_y_mm)
-    position_mm[~is_touch] = complex(np.nan, np.nan)  # a position is only defined while something touches
-    force_N[is_touch] = force_N[is_touch].clip(min=min_force_N)
-    return Script(position_mm.real, position_mm.imag, force_N, rate_Hz)
+    row_time_s, *columns = rows.T
+    contact = np.column_stack([np.interp(t_s, row_time_s - row_time_s[0], column) for column in columns])
+    is_touch = contact[:, 2] > 0.0
+    contact[~is_touch, :2] = np.nan  # a position is only defined while something touches
+    contact[is_touch, 2] = contact[is_touch, 2].clip(min=min_force_N)
+    return Script(contact, rate_Hz)
 
 
 def load_script(path: Path) -> VirtualScript:

@@ -294,7 +294,7 @@ def _clean_charges(forward: Charges, script: Script) -> Array:
 
     Args:
         forward: Forward map: function from contacts (x, y, force), shape (k, 3), to charges, shape (k, electrodes), pC.
-        script: Position and force in each of n frames.
+        script: Contacts of n frames.
 
     Returns:
         Charges, shape (n, electrodes), pC; zero in frames in which nothing touches.
@@ -304,13 +304,12 @@ def _clean_charges(forward: Charges, script: Script) -> Array:
     """
     is_touch = script.touching
     touch_count = int(is_touch.sum())
-    contacts = np.column_stack([script.x_mm, script.y_mm, script.force_N])  # shape (n, 3)
-    touch_pC = forward(contacts[is_touch])
+    touch_pC = forward(script.contact[is_touch])
     if touch_pC.ndim != 2 or len(touch_pC) != touch_count or not np.isfinite(touch_pC).all():
         raise SceneError(
             f"forward map: expected finite charges of shape ({touch_count}, electrodes), got shape {touch_pC.shape} "
             f"with the sum {touch_pC.sum()}"
         )
-    charge_pC = np.zeros((len(script), touch_pC.shape[1]))
+    charge_pC = np.zeros((len(script.contact), touch_pC.shape[1]))
     charge_pC[is_touch] = touch_pC
     return charge_pC
