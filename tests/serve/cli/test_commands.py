@@ -66,15 +66,15 @@ def test_check_options_position_std_and_force_std(measured, models, command):
     assert values["model"] == "linear/1"
 
 
-def test_check_of_many_presses_shows_the_worst(measured, models, command):
-    """Of forces that are off by the same share these are the largest, for their noise is the least share."""
+def test_check_shows_each_press(measured, models, command):
     words = ["serve", "check", "linear", measured(count=100, known="force_N", scale=0.97), "--models", models]
     _, out, err = command(*words)
     assert "ignored columns: ['day']" in err
     values = json.loads(command(*words, "--json")[1])
-    worst = sorted(sorted(values["each"], key=lambda row: row["force_N"])[-40:], key=lambda row: row["line"])
     form = "{line} {x_mm:.5g} {y_mm:.5g} {force_N:.5g} - {force_error_percent:.5g} none -"
-    assert [" ".join(line.split()) for line in out.splitlines()[2:42]] == [form.format(**row) for row in worst]
+    assert [" ".join(line.split()) for line in out.splitlines()[2:102]] == [
+        form.format(**row) for row in values["each"]
+    ]
     assert values["chi_squared_per_degree"] == pytest.approx(values["chi_squared"] / 100)
     assert values["force_scale"] == pytest.approx(1.0 / 0.97, rel=1e-4)
     for name in ("chi_squared_per_degree", "force_scale"):
