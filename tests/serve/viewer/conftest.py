@@ -63,7 +63,7 @@ def start_page(film):
 
         def start(token=None, **settings):
             access = AccessCheck(token=token)
-            page = LivePage(describe_film("a film", film.metadata()), access=access, **settings)
+            page = LivePage(describe_film("a film", film.metadata()), access, **settings)
             return Client(page, stack.enter_context(serve_page(page, Address())))
 
         yield start

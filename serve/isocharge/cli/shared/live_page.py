@@ -151,7 +151,7 @@ def live_page(
         from isocharge.serve.viewer.live_page import LivePage, serve_page
 
     access = AccessCheck(address.host, allow_host or (), token=token)
-    page = LivePage(describe_film(name, metadata), is_recording=is_recording, access=access)
+    page = LivePage(describe_film(name, metadata), access, is_recording=is_recording)
 
     def show_warning(record: logging.LogRecord) -> None:
         page.update(note={"text": record.getMessage(), "at": time.time()})

@@ -119,13 +119,7 @@ class LivePage(Application):
 
     limits = PAGE_LIMITS
 
-    def __init__(
-        self,
-        description: dict[str, Any],
-        *,
-        is_recording: bool = False,
-        access: AccessCheck | None = None,
-    ) -> None:
+    def __init__(self, description: dict[str, Any], access: AccessCheck, *, is_recording: bool = False) -> None:
         """Create a page without samples.
 
         For a recording, all samples are stored, and each browser may select a position in the recording. For a live
@@ -133,16 +127,15 @@ class LivePage(Application):
 
         Args:
             description: Description of the film, as `describe_film` returns it.
+            access: Check of the token, and of the web page that has sent a request.
             is_recording: Whether the stream is a recording.
-            access: Check of the token, and of the web page that has sent a request. By default, requests need no token,
-                and only requests for IP addresses and for `localhost` are accepted.
         """
         self._electrodes = tuple(description["electrodes"])
         dtype = sample_type(self._electrodes)
         self.tape: Tape = RecordedTape(dtype) if is_recording else Tape(dtype)
         self.act: Callable[[Action], None] | None = None
         self.traffic = Traffic()
-        self._access = access or AccessCheck()
+        self._access = access
         self._markers: deque[tuple[float, str]] = deque(maxlen=MAX_MARKERS)
         self._state: dict[str, Any] = {}
         self._state_lock = Lock()  # the thread of the stream and the thread of the server change the state

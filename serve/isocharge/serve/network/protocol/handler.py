@@ -197,8 +197,8 @@ class Handler(Application):
         if route is UNKNOWN:
             raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
         # A HEAD request is answered like a GET request. The server then sends the response without its body.
-        is_head_of_get = method == "HEAD" and route.method == "GET"
-        if method != route.method and not is_head_of_get:
+        answered_method = "GET" if method == "HEAD" else method
+        if answered_method != route.method:
             raise WrongMethod(path, method, route.method)
         body = decompress(body, headers.get(b"content-encoding", b"").lower(), self.limits.body_bytes)
         answer = route.respond(Request(self.store, self.limits, self.traffic, headers, body, **model))

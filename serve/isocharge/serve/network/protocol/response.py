@@ -97,10 +97,6 @@ def error_response(error: Exception) -> Response:
     return response._replace(error=type(error).__name__)
 
 
-ENCODINGS = (b"gzip", b"x-gzip", b"deflate")
-"""Supported encodings of a body. The encoding `deflate` of HTTP is the zlib format."""
-
-
 def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
     """Decompress the body of a request.
 
@@ -116,7 +112,7 @@ def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
     """
     if encoding in (b"", b"identity"):
         return body
-    if encoding not in ENCODINGS:
+    if encoding not in (b"gzip", b"x-gzip", b"deflate"):  # the encoding `deflate` of HTTP is the zlib format
         name = errors.shown(encoding.decode("latin-1"))
         raise errors.UnknownEncoding(f"Content-Encoding: expected gzip, deflate or identity, got {name}")
     decompressor = zlib.decompressobj(zlib.MAX_WBITS | 32)  # recognises gzip and deflate
