@@ -39,7 +39,9 @@ def tension_change(film: Film, film_warming_K: float, ring_warming_K: float) -> 
         return np.zeros(3)
     free_strain = np.array(film.expansion) * film_warming_K  # along the axes 1 and 2 of the film
     elastic_strain = np.append(film.ring_expansion * ring_warming_K - free_strain, 0.0)
-    change_in_film_axes = film.young * (elastic_strain @ elasticity(film, film.axis))
+    # The sum of the products is the same in both directions if the expansion and the stiffness are, unlike a matrix
+    # product, which may round both sums differently.
+    change_in_film_axes = film.young * (elastic_strain * elasticity(film, film.axis)).sum(axis=1)
     return rotate_stress(change_in_film_axes, film.axis)
 
 
@@ -59,11 +61,10 @@ def warmed(sensor: Sensor, film_warming_K: float, ring_warming_K: float = 0.0) -
     """
     film = sensor.film
     change_11, change_22, change_12 = tension_change(film, film_warming_K, ring_warming_K).tolist()
-    warm_film = replace(film, pretension=film.pretension + 0.5 * (change_11 + change_22))
-    if not film.expands_evenly:  # otherwise only the mean of the pretension changes
-        # The deviator of the pretension consists of half of the difference between the pretensions along x and y, and
-        # of the shear.
-        half_difference, shear = film.deviator
-        deviator = (half_difference + 0.5 * (change_11 - change_22), shear + change_12)
-        warm_film = replace(warm_film, deviator=deviator)
-    return replace(sensor, film=warm_film)
+    # The deviator of the pretension consists of half of the difference between the pretensions along x and y, and of
+    # the shear.
+    half_difference, shear = film.deviator
+    deviator = (half_difference + 0.5 * (change_11 - change_22), shear + change_12)
+    return replace(
+        sensor, film=replace(film, pretension=film.pretension + 0.5 * (change_11 + change_22), deviator=deviator)
+    )

@@ -286,4 +286,4 @@ def _point_derivatives(derivatives: Array, points: Complexes) -> Complexes:
         points: Film points x + iy of the nodes of every element, shape (n_element, n_local), in film radii.
     """
     # Sum over the nodes, which are the last axis of `derivatives` and the column of points of each element.
-    return np.asarray((derivatives @ points[..., None])[..., 0])
+    return (derivatives @ points[..., None])[..., 0]

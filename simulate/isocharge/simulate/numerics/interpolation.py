@@ -68,7 +68,7 @@ def chebyshev_nodes(count: int, low: float, high: float) -> Array:
     Returns:
         Nodes in ascending order, shape (count,). The nodes do not include the ends of the interval.
     """
-    return np.asarray(0.5 * (low + high) + 0.5 * (high - low) * chebpts1(count))
+    return 0.5 * (low + high) + 0.5 * (high - low) * chebpts1(count)
 
 
 def divide_intervals(ends: Array, count: int) -> Array:

@@ -123,21 +123,13 @@ class Film:
         Returns:
             Ratios, same shape, dimensionless. They are less than 1 on the film and 1 on the rim.
         """
-        return np.asarray(np.abs(points) / self.rim_distance(np.angle(points)))
+        return np.abs(points) / self.rim_distance(np.angle(points))
 
     @property
     def rim(self) -> Complexes:
         """Points x + iy of the rim for drawings, one for each degree from 0 to 360, anticlockwise, shape (361,), mm."""
         angle = np.radians(np.arange(361.0))
         return np.asarray(self.rim_distance(angle) * np.exp(1j * angle))
-
-    @property
-    def expands_evenly(self) -> bool:
-        """Whether a change of the temperature changes the pretension equally in all directions."""
-        if self.expansion is None:
-            return True
-        along, across = self.expansion
-        return along == across and self.young_ratio == 1.0
 
     @property
     def has_back_pressure(self) -> bool:

@@ -256,15 +256,10 @@ def cautions(equilibrium: Equilibrium) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-REPORTED_GROUPS = ("squared_amplitude", "load", "tension", "bending")
-"""Attributes of `DimensionlessGroups` that the JSON output contains."""
-
-
 def summary(equilibrium: Equilibrium) -> dict[str, Any]:
     """Return the results of a solved press as a dictionary for JSON output.
 
-    The dictionary contains the deflection, the theory, the estimated error, the outcome of the solve, the dimensionless
-    groups and the warnings.
+    The dictionary contains the deflection, the theory, the estimated error, the outcome of the solve and the warnings.
 
     Args:
         equilibrium: The solved press.
@@ -278,10 +273,5 @@ def summary(equilibrium: Equilibrium) -> dict[str, Any]:
         "residual": equilibrium.residual,
         "seconds": equilibrium.seconds,
         "estimated_error": plain_values(estimated_error(equilibrium)),
-        "groups": {
-            **{name: getattr(equilibrium.groups, name) for name in REPORTED_GROUPS},
-            "poisson": equilibrium.film.poisson,
-            "bending_length": bending_length(equilibrium.film, equilibrium.force),
-        },
         "warnings": list(cautions(equilibrium)),
     }

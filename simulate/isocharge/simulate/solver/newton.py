@@ -7,7 +7,7 @@ to the tangent matrix, but not to the residual. Because of the stabilising tensi
 direction of the energy. The tension is proportional to the residual and vanishes near the equilibrium, so Newton's
 method still converges quadratically.
 
-The iteration stops after `MAX_ITERATIONS` steps, or if the steps no longer become smaller (`PATIENCE`).
+The iteration stops after `MAX_ITERATIONS` steps.
 """
 
 from dataclasses import dataclass, replace
@@ -32,12 +32,6 @@ UNSTABILISED_BELOW = 1e-2
 
 MAX_ITERATIONS = 60
 """Largest number of Newton steps. Typical presses need five to ten steps."""
-
-PATIENCE = 8
-"""Number of recent steps that are compared with all earlier steps.
-
-The iteration stops if the smallest recent step is not smaller than half of the smallest earlier step.
-"""
 
 ROUND_OFF = 1e-9
 """Size below which a Newton step is caused by rounding errors only.
@@ -117,23 +111,20 @@ def solve_newton(
     """
     free = assembly(elastic.mesh.template, elastic.unknowns_per_node, False).free[:, :3]
     iterate = _Iterate(elastic, free, first_field)
-    step_sizes: list[float] = []
     for iteration in range(MAX_ITERATIONS + 1):
         relative_residual = iterate.relative_residual
         if not np.isfinite(relative_residual):
             return iterate.result(iteration, "failed", "the residual is not a finite number")
         if relative_residual <= tolerance:
             return iterate.result(iteration, "converged", f"converged in {iteration} steps")
-        if iteration == MAX_ITERATIONS or _has_stalled(step_sizes):
+        if iteration == MAX_ITERATIONS:
             return iterate.result(iteration, "failed", f"no progress any more after {iteration} steps")
 
         # Compute the Newton step.
         stabilising_tension = _stabilising_tension(elastic, relative_residual)
         solve = factor_tangent(elastic, iterate.field, stabilising_tension)
         step = solve(-iterate.residual)
-        step_size = iterate.size_of(step)
-        step_sizes.append(step_size)
-        if step_size <= ROUND_OFF:
+        if iterate.size_of(step) <= ROUND_OFF:
             return iterate.result(iteration, "converged", f"converged to round-off in {iteration} steps")
 
         # Close to the equilibrium, take the full step if it halves the residual. Otherwise search for the step length.
@@ -197,21 +188,6 @@ class _Iterate:
         return NewtonResult(
             field=self.field, status=status, message=message, iterations=iterations, residual=self.relative_residual
         )
-
-
-def _has_stalled(step_sizes: list[float]) -> bool:
-    """Return whether the sizes of the steps no longer decrease.
-
-    The sizes stagnate, for example, if the film has no stiffness in some direction.
-
-    Args:
-        step_sizes: Sizes of all previous steps, in the order of the steps.
-    """
-    if len(step_sizes) <= 2 * PATIENCE:
-        return False
-    recent = step_sizes[-PATIENCE:]
-    earlier = step_sizes[:-PATIENCE]
-    return min(recent) > 0.5 * min(earlier)
 
 
 def _stabilising_tension(elastic: ElasticFilm, relative_residual: float) -> float:
