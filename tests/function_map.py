@@ -24,8 +24,8 @@ class FunctionMap:
     def charges(self, contact):
         return self.function(contact)
 
-    def derivatives(self, contact):
-        return differences(self.function, contact, self.steps)
+    def linearised(self, contact):
+        return self.function(contact), differences(self.function, contact, self.steps)
 
 
 def round_map(centres, domain):

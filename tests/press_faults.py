@@ -15,8 +15,7 @@ from drawn_contacts import draw_contacts
 from isocharge.common.arrays import Array, Booleans
 from isocharge.serve import Predictor
 from isocharge.serve.flags import STRESS
-from isocharge.simulate import Circle, ForwardMap, Sensor, load_sensor, noise_model, parse_probe
-from isocharge.simulate.forward.charge_spline import with_fast_derivatives
+from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Sensor, load_sensor, noise_model, parse_probe
 from isocharge.simulate.forward.whole_film import whole_film_map
 from isocharge.simulate.identifiability.mirror_region import has_mirror
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
@@ -197,7 +196,7 @@ def whole_film_shares(model: str, presses: int, seed: int, edges_mm: Sequence[fl
     sensor = sensor_from_dict(predictor.metadata.sensor)
     probe = parse_probe(predictor.metadata.probes[0])
     radius_mm = round(math.sqrt(predictor.validity.inscribed_radius_squared_mm2), 3)
-    inner_map = with_fast_derivatives(ForwardMap.build(sensor, probe, radius_mm, FORCE_RANGE_N))
+    inner_map = ChargeSpline.of(ForwardMap.build(sensor, probe, radius_mm, FORCE_RANGE_N))
     outer_map = whole_film_map(sensor, probe, FORCE_RANGE_N)
 
     def ring(inner_mm: float, outer_mm: float) -> RingShares:

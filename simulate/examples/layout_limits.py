@@ -12,22 +12,31 @@ from dataclasses import replace
 import matplotlib.pyplot as plt
 import numpy as np
 
-from isocharge.simulate import Circle, Electrode, ForwardMap, limits_at, load_sensor, noise_model, working_area
+from isocharge.simulate import (
+    ChargeSpline,
+    Circle,
+    Electrode,
+    ForwardMap,
+    limits_at,
+    load_sensor,
+    noise_model,
+    working_area,
+)
 from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
 
 centres = {"A": (9.0, 0.0), "B": (0.0, 9.0), "C": (-9.0, 0.0), "D": (0.0, -9.0)}
 squares = tuple(Electrode.of_square(name, centre, 3.0) for name, centre in centres.items())
 sensor = replace(load_sensor("four-25um-biaxial"), name="mine", electrodes=squares)
 noise = noise_model("reference")
-forward_map = ForwardMap.build(sensor, Circle(1.0), radius=8.0, force_range=(0.05, 2.0))
+charge_map = ChargeSpline.of(ForwardMap.build(sensor, Circle(1.0), radius=8.0, force_range=(0.05, 2.0)))
 
 distance, angle = np.meshgrid(np.linspace(0.0, 8.0, 17), np.linspace(0.0, 2.0 * np.pi, 73))
 x = (distance * np.cos(angle)).ravel()
 y = (distance * np.sin(angle)).ravel()
-limits = limits_at(forward_map, np.column_stack([x, y, np.ones_like(x)]), noise)
+limits = limits_at(charge_map, np.column_stack([x, y, np.ones_like(x)]), noise)
 for at, position, relative in zip(distance[0, ::2], limits.position[:17:2], limits.force[:17:2], strict=True):
     print(f"{at:.0f} mm from the centre, 1 N: limits {position:.3f} mm, {100 * relative:.2f} % of the force")
-area = working_area(forward_map, noise, search_pairs=False)
+area = working_area(charge_map, noise, search_pairs=False)
 print(area.summary)
 
 figure, axes = plt.subplots(figsize=(6.6, 5.6), layout="constrained")

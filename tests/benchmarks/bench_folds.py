@@ -26,9 +26,8 @@ from isocharge.serve.model.charge_file import read_charge_map
 from isocharge.serve.record.record import OtherContact, TrackedContact
 from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.tracking.tracker import Tracker, TrackRule
-from isocharge.simulate import noise_model
+from isocharge.simulate import ChargeSpline, noise_model
 from isocharge.simulate.forward.charge_map import ChargeMap
-from isocharge.simulate.forward.charge_spline import with_fast_derivatives
 from isocharge.train.data.contact_errors import position_error
 
 RISE_TIME_s = 0.03
@@ -59,7 +58,8 @@ def sides(film: ChargeMap, contact: np.ndarray) -> np.ndarray:
     The determinant of the derivatives changes its sign at a fold.
     """
     in_map = film.domain.to_contact(into_unit_domain(film.domain.to_unit(contact)))
-    return np.sign(np.linalg.det(film.derivatives(in_map)))
+    _, derivatives = film.linearised(in_map)
+    return np.sign(np.linalg.det(derivatives))
 
 
 def draw_slide(
@@ -119,7 +119,7 @@ def main() -> None:
         raise SystemExit(f"{asked.model}: no charges.npz: its map does not fold; give the model of the lines above")
     tracker = Tracker(Setup(metadata.electrodes, Device(rules={TrackRule: TrackRule()}), predictor=predictor))
     radius = charges.domain.radius
-    film = with_fast_derivatives(model_film(predictor, radius + MAP_MARGIN_mm))
+    film = ChargeSpline.of(model_film(predictor, radius + MAP_MARGIN_mm))
 
     slides = []
     for _ in range(asked.slides):

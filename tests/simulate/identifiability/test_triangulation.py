@@ -38,8 +38,8 @@ def test_triangulation_agrees_with_least_squares_of_scipy():
 
     def contour_distances(unknown):
         contact = np.array([[*unknown[:2], np.exp(unknown[2])]])
-        slope = np.linalg.norm(charge_map.derivatives(contact)[..., :2], axis=2)
-        return ((charge_map.charges(contact) - charge) / slope)[0]
+        predicted, derivatives = charge_map.linearised(contact)
+        return ((predicted - charge) / np.linalg.norm(derivatives[..., :2], axis=2))[0]
 
     best = least_squares(contour_distances, [2.0, -1.0, np.log(0.8)], xtol=1e-12, ftol=1e-12)
     np.testing.assert_allclose(fix.contact[0, :2], best.x[:2], atol=5e-3)

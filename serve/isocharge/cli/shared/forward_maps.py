@@ -82,13 +82,13 @@ def sweep_radius(
         except ValueError as error:
             raise InputError(f"--radius: expected a number of mm or 'auto', got {text!r}") from error
     # imported late, because these imports load the solver and the noise levels
-    from isocharge.simulate import noise_model, working_area
+    from isocharge.simulate import ChargeSpline, noise_model, working_area
     from isocharge.simulate.identifiability.identification import map_to_search
 
     radii = []
     for probe in probes:
         forward_map = map_to_search(sensor, probe, force, executor)  # covers the largest possible working area
-        area = working_area(forward_map, noise or noise_model("reference"))
+        area = working_area(ChargeSpline.of(forward_map), noise or noise_model("reference"))
         say(f"{probe.notation}: {area.summary}")
         radii.append(area.radius)
     smallest_radius = min(radii)

@@ -216,11 +216,6 @@ class ChargeSeries:
         charge_pC, _ = self.linearised(contact)
         return charge_pC
 
-    def derivatives(self, contact: Array) -> Array:
-        """Compute the derivatives of the charges with respect to (x, y, ln F); see `linearised`."""
-        _, by_contact = self.linearised(contact)
-        return by_contact
-
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Compute the charges of contacts on the calibrated film, and the derivatives of the charges.
 

@@ -5,7 +5,7 @@ The module also contains functions that check the shapes and values of contacts 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,24 +42,6 @@ class ChargeMap(Protocol):
             Charges, shape (n, n_electrode), pC.
         """
 
-    def derivatives(self, contact: Array) -> Array:
-        """Compute the derivatives of the charges with respect to x, y and ln F.
-
-        Args:
-            contact: Contacts (x, y, F), shape (n, 3), mm and N.
-
-        Returns:
-            Derivatives, shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
-        """
-
-
-@runtime_checkable
-class LinearisedMap(ChargeMap, Protocol):
-    """Charge map with a method that computes charges and derivatives together.
-
-    One call of the method is faster than separate calls for the charges and the derivatives.
-    """
-
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Compute the charges that contacts cause, and the derivatives of the charges with respect to x, y and ln F.
 
@@ -67,25 +49,8 @@ class LinearisedMap(ChargeMap, Protocol):
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            The result of `charges`, and the result of `derivatives`.
+            Charges, shape (n, n_electrode), pC. Derivatives, shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
         """
-
-
-def linearised(charge_map: ChargeMap, contact: Array) -> tuple[Array, Array]:
-    """Compute the charges that contacts cause, and the derivatives of the charges with respect to x, y and ln F.
-
-    If the map has a method `linearised`, the method computes charges and derivatives together, which is faster.
-
-    Args:
-        charge_map: Map that computes the charges.
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-
-    Returns:
-        Charges, shape (n, n_electrode), pC. Derivatives, shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
-    """
-    if isinstance(charge_map, LinearisedMap):
-        return charge_map.linearised(contact)
-    return charge_map.charges(contact), charge_map.derivatives(contact)
 
 
 @dataclass(frozen=True)
@@ -107,11 +72,8 @@ class _RestrictedMap:
     def charges(self, contact: Array) -> Array:
         return self.unrestricted.charges(contact)
 
-    def derivatives(self, contact: Array) -> Array:
-        return self.unrestricted.derivatives(contact)
-
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        return linearised(self.unrestricted, contact)
+        return self.unrestricted.linearised(contact)
 
 
 def within(charge_map: ChargeMap, radius: float) -> ChargeMap:

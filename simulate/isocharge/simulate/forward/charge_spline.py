@@ -20,7 +20,6 @@ from scipy.sparse.linalg import splu
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import LIMIT_TOLERANCE, Domain
 from isocharge.common.errors import SceneError
-from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.readout import contact_charges
 from isocharge.simulate.mechanics.theory import amplitude_squared
@@ -138,21 +137,6 @@ class ChargeSpline:
         weights = self.force_weights(np.log(contact[:, 2]))
         return np.asarray(np.einsum("nk,nke->ne", weights, self.table(contact[:, :2])))
 
-    def derivatives(self, contact: Array) -> Array:
-        """Compute the derivatives of the charges with respect to x, y and ln F.
-
-        Args:
-            contact: Presses (x, y, F), shape (n, 3), mm and N.
-
-        Returns:
-            Derivatives, shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
-
-        Raises:
-            SceneError: If a press lies outside the domain.
-        """
-        _, derivatives = self.linearised(contact)
-        return derivatives
-
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Compute charges and derivatives together.
 
@@ -205,16 +189,6 @@ class ChargeSpline:
         """
         weights = lagrange_values(np.log(self.force), log_force)
         return np.asarray(weights * amplitude_squared(self.film, np.exp(log_force))[:, None])
-
-
-def with_fast_derivatives(charge_map: ChargeMap) -> ChargeMap:
-    """Replace a forward map by splines, because splines compute derivatives faster.
-
-    The fit takes a few seconds. A charge map of another class is returned unchanged.
-    """
-    if isinstance(charge_map, ForwardMap):
-        return ChargeSpline.of(charge_map)
-    return charge_map
 
 
 def _force_nodes(forward_map: ForwardMap) -> Array:

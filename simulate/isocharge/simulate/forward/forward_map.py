@@ -291,15 +291,18 @@ class ForwardMap:
         steps = np.multiply(STEPS, [footprint_scale, footprint_scale, 1.0])
         return differences(self._unchecked_charges, contact, steps)
 
+    def linearised(self, contact: Array) -> tuple[Array, Array]:
+        """Compute the charges of presses, and their derivatives with respect to x, y and ln F; see `derivatives`.
+
+        A `ChargeSpline` computes both much faster.
+        """
+        return self.charges(contact), self.derivatives(contact)
+
     def stress_charges_by_force(self, position: Array) -> Array:
         """Compute the charges that the stress causes at given positions, for all forces of the family at once.
 
         The result includes neither the crosstalk nor the charges that the contact pressure causes. The probe keeps its
         own orientation.
-
-        The method uses a second map, the stacked map, which saves time. The stacked map has a single force, and its
-        table contains the stresses under all forces of the family as separate stress fields. The interpolation between
-        distances and the location of the points in the mesh are therefore done only once for all forces.
 
         Args:
             position: Positions (x, y) in the domain, shape (n, 2), mm.
@@ -307,22 +310,11 @@ class ForwardMap:
         Returns:
             Charges, shape (n, n_force, n_electrode), pC.
         """
-        if self.probe.grows:  # the mesh depends on the force
-            return np.stack([one.stress_charges_by_force(position)[:, 0] for one in self._maps_by_force], axis=1)
-
-        # Integrate all fields of the stacked map. All fields have the symmetry of the stress.
-        n_force = self.family.force.size
-        first_force = self.family.force[0]
-        contact = contacts_at(position, first_force)
-        chunk_size = max(1, CHUNK_SIZE // n_force)  # a press of the stacked map has n_force fields
-        charges = self._stacked_forces.field_charges(contact, EVEN_FIELD.repeat(n_force), chunk_size=chunk_size)
-
-        # The stacked map multiplies all fields by the stress unit of the first force. Replace it by the unit of the
-        # force to which the field belongs. The stress unit is proportional to the squared amplitude.
-        film = self.sensor.film
-        unit_ratio = amplitude_squared(film, self.family.force) / amplitude_squared(film, first_force)
-        charge_by_force = charges.swapaxes(1, 2)  # shape (n, n_force, n_electrode)
-        return np.asarray(charge_by_force * unit_ratio[:, None])
+        charges_by_force = [
+            one.field_charges(contacts_at(position, one.family.force[0]), EVEN_FIELD)[..., 0]
+            for one in self._maps_by_force
+        ]
+        return np.stack(charges_by_force, axis=1)
 
     @cached_property
     def _maps_by_force(self) -> "list[ForwardMap]":
@@ -338,21 +330,6 @@ class ForwardMap:
             )
             for index, force in enumerate(self.family.force.tolist())
         ]
-
-    @cached_property
-    def _stacked_forces(self) -> "ForwardMap":
-        """Forward map whose table contains the stress under each force of the family as a separate stress field.
-
-        The map itself has a single force. The table has single precision.
-        """
-        n_distance = self.family.distance.size
-        n_force = self.family.force.size
-        n_turn = self.family.turns.rotation.size
-        stress = self.table.reshape(n_distance, n_force, n_turn, -1, 3)
-        force_as_field = np.moveaxis(stress, 1, 3)  # shape (n_distance, n_turn, n_node, n_force, 3)
-        table = force_as_field.reshape(n_distance * n_turn, -1)
-        family = replace(self.family, force=self.family.force[:1])
-        return replace(self, family=family, table=table.astype(np.float32))
 
     def _unchecked_charges(self, contact: Array, orientation: Array | float = 0.0) -> Array:
         """Compute the charges of presses that lie in the domain or slightly outside the domain.
@@ -371,13 +348,7 @@ class ForwardMap:
         charge += contact_charges(self.sensor, self.probe, contact, orientation)
         return self.sensor.calibration.read(charge)
 
-    def field_charges(
-        self,
-        contact: Array,
-        is_odd: Booleans,
-        orientation: Array | float = 0.0,
-        chunk_size: int = CHUNK_SIZE,
-    ) -> Array:
+    def field_charges(self, contact: Array, is_odd: Booleans, orientation: Array | float = 0.0) -> Array:
         """Compute the charges of each stress field in the table.
 
         The result includes neither the crosstalk nor the charges that the contact pressure causes. The presses are
@@ -389,7 +360,6 @@ class ForwardMap:
                 (n_field,). A row of the table contains the values of all fields at one node, then those at the next
                 node.
             orientation: Rotation of the probe in addition to its own orientation, shape (n,) or a number, rad.
-            chunk_size: Number of presses that are evaluated at once.
 
         Returns:
             Charges, shape (n, n_electrode, n_field), pC.
@@ -401,8 +371,8 @@ class ForwardMap:
         charges = np.empty((len(contact), len(self.electrodes), is_odd.size))
         pieces = ElectrodePieces.of(self.sensor)
         with single_threaded_blas():  # faster for the many small matrices of a chunk
-            for start in range(0, len(contact), chunk_size):
-                chunk = slice(start, start + chunk_size)
+            for start in range(0, len(contact), CHUNK_SIZE):
+                chunk = slice(start, start + CHUNK_SIZE)
                 rules = pieces.rules(self.probe, position[chunk])
                 charges[chunk] = self.integrate_fields(
                     position[chunk], contact[chunk, 2], orientation[chunk], is_odd, pieces, rules

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.forward.charge_map import ChargeMap, linearised
+from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.noise import NoiseModel
 
 
@@ -77,7 +77,7 @@ def limits_at(charge_map: ChargeMap, contact: Array, noise: NoiseModel) -> Crame
     Returns:
         The limits of the three parameters x, y and ln F of each contact.
     """
-    charge, jacobian = linearised(charge_map, contact)
+    charge, jacobian = charge_map.linearised(contact)
     return cramer_rao(charge, jacobian, noise)
 
 

@@ -12,7 +12,7 @@ from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.common.structs import plain_values
 from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count
-from isocharge.simulate.forward.charge_spline import with_fast_derivatives
+from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.mirror_region import MirrorRegion, mirror_region
@@ -141,7 +141,7 @@ class Identification:
             noise: Noise of the readings. The white noise must be positive.
             error: Largest Cramer-Rao position error that is allowed in the working area, mm.
         """
-        charges = with_fast_derivatives(forward_map)
+        charges = ChargeSpline.of(forward_map)
 
         # The limits are computed for the smallest and the largest force, and for 1 N if 1 N lies between both.
         min_force, max_force = charges.domain.force_range

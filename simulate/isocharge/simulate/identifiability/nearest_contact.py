@@ -22,7 +22,7 @@ import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.contact_domain import Domain, into_unit_domain
-from isocharge.simulate.forward.charge_map import ChargeMap, linearised
+from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.numerics.disk import INNER_RADIUS, ROUNDING
 
 ResidualFunction = Callable[[Integers, Array], tuple[Array, Array]]
@@ -186,7 +186,7 @@ def explain(
             Residuals, shape (k, n_electrode). Their derivatives with respect to the unit coordinates, shape (k, 3,
             n_electrode).
         """
-        predicted, slopes = linearised(charge_map, _to_contact(domain, unit_coordinates))
+        predicted, slopes = charge_map.linearised(_to_contact(domain, unit_coordinates))
         derivatives = -slopes * half_width / sigma[rows][..., None]
         return (charge[rows] - predicted) / sigma[rows], derivatives.swapaxes(1, 2)
 

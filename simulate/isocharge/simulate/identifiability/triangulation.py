@@ -8,14 +8,12 @@ contact with these lengths as standard deviations of the charges.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import ChargeError, SceneError
-from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count, linearised
-from isocharge.simulate.forward.charge_spline import with_fast_derivatives
+from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count
 from isocharge.simulate.identifiability.nearest_contact import explain, starting_contacts
 
 ROUNDS = 3
@@ -59,8 +57,8 @@ class Triangulation:
     """Estimator that determines a contact as the point at which its contours meet.
 
     Attributes:
-        charge_map: Map that computes the charges of contacts. A forward map is replaced by splines, whose fit takes a
-            few seconds. If the force of the presses is known, the map has this single force.
+        charge_map: Map that computes the charges of contacts. A `ChargeSpline` is much faster than a forward map. If
+            the force of the presses is known, the map has this single force.
         tolerance: Largest spread at which contours meet, mm. Contours that meet at two positions that are not farther
             apart than the tolerance meet at one position.
 
@@ -75,11 +73,6 @@ class Triangulation:
         check_electrode_count(len(self.charge_map.electrodes))
         if not 0.0 < self.tolerance < np.inf:
             raise SceneError(f"tolerance: expected a positive length, got {self.tolerance} mm")
-
-    @cached_property
-    def _charges(self) -> ChargeMap:
-        """Charge map that computes derivatives fast."""
-        return with_fast_derivatives(self.charge_map)
 
     def locate(self, charge: Array) -> Fix:
         """Estimate the contacts of presses.
@@ -101,7 +94,7 @@ class Triangulation:
         # Search from several starting points for each press, which do not lie close together.
         largest_charge = np.abs(charge).max(axis=1, keepdims=True, initial=1.0)
         equal_sigma = np.broadcast_to(largest_charge, charge.shape)
-        starts = starting_contacts(self._charges, charge, equal_sigma, starts=STARTS)
+        starts = starting_contacts(self.charge_map, charge, equal_sigma, starts=STARTS)
         contacts, spreads = self._descend(np.repeat(charge, STARTS, axis=0), starts.reshape(-1, 3))
         contacts = contacts.reshape(starts.shape)
         spreads = spreads.reshape(starts.shape[:2])
@@ -129,9 +122,9 @@ class Triangulation:
         """
         distance = np.empty_like(charge)
         for _ in range(ROUNDS):
-            _, derivatives = linearised(self._charges, contact)
+            _, derivatives = self.charge_map.linearised(contact)
             gradient_length = np.linalg.norm(derivatives[..., :2], axis=2)
             # The lower bound keeps the distance finite where a charge has an extremum.
             slope = np.maximum(gradient_length, MIN_RELATIVE_SLOPE * gradient_length.max(axis=1, keepdims=True))
-            contact, distance = explain(self._charges, charge, slope, contact)
+            contact, distance = explain(self.charge_map, charge, slope, contact)
         return contact, np.sqrt(np.mean(distance**2, axis=1))

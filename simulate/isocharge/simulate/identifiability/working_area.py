@@ -26,7 +26,7 @@ import numpy as np
 import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array
-from isocharge.simulate.forward.charge_map import ChargeMap, LinearisedMap, check_electrode_count, linearised
+from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.nearest_contact import local_minima
 from isocharge.simulate.noise import NoiseModel
@@ -79,7 +79,7 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
     angle = np.pi * np.arange(4) / 4.0
     half_width = 0.5 * FOLD_WIDTH * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     sides = np.stack([position[:, None] + half_width, position[:, None] - half_width])
-    charge, jacobian = linearised(charge_map, contacts(sides))
+    charge, jacobian = charge_map.linearised(contacts(sides))
     scaled_jacobian = jacobian / noise.sigma(charge)[..., None]
     first, second = scaled_jacobian.reshape(*sides.shape[:3], -1, 3)
     products = np.einsum("...ei,...ej->...ij", first, second)
@@ -311,9 +311,8 @@ def working_area(
     the position error first exceeds its limit, and the distance of the nearest fold. The other two are the radius of
     the nearest ambiguous pair, and the radius of the domain.
 
-    A forward map is first replaced by splines, because splines are faster. Any other charge map, such as a fit to
-    measured charges, is evaluated for about 400,000 contacts. Without the search for ambiguous pairs, the charge map is
-    evaluated for about 130,000 contacts.
+    The charge map is evaluated for about 400,000 contacts, or for about 130,000 contacts without the search for
+    ambiguous pairs. Use a `ChargeSpline` instead of a forward map, which would take minutes.
 
     Args:
         charge_map: Map that computes the charges of contacts.
@@ -325,10 +324,6 @@ def working_area(
         SceneError: If the map has fewer than three electrodes.
     """
     check_electrode_count(len(charge_map.electrodes))
-    if not isinstance(charge_map, LinearisedMap):
-        from isocharge.simulate.forward.charge_spline import with_fast_derivatives  # imports the solver
-
-        charge_map = with_fast_derivatives(charge_map)
     search_radius = charge_map.domain.radius
     min_force, max_force = charge_map.domain.force_range
     middle_force = float(np.sqrt(min_force * max_force))
