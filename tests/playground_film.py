@@ -7,6 +7,7 @@ import base64
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -14,7 +15,7 @@ from scipy.fft import dctn
 
 from isocharge.simulate import Circle, ForwardMap, load_sensor
 from isocharge.simulate.forward.forward_map import EVEN_FIELD
-from isocharge.simulate.forward.readout import ElectrodePieces, PieceRule
+from isocharge.simulate.forward.readout import PieceRule
 from isocharge.simulate.mesh.conformal_map import automorphism_onto
 from isocharge.simulate.sensor.sensor_file import film_to_dict
 
@@ -65,16 +66,11 @@ def stress_sum(forward_map, contact, points_mm):
     """Return s11 + s22, MPa, as charges of electrodes of one point with the weights 1, 1 and 0 of the stresses."""
     n_point = points_mm.size
     index = np.arange(n_point)
-    pieces = ElectrodePieces(
-        corners=np.repeat(points_mm.reshape(-1, 1), 4, axis=1),
-        line_area=np.ones(n_point),
-        electrode=index,
-        charge_per_stress=np.tile([1.0, 1.0, 0.0], (n_point, 1)),
-    )
     rules = [PieceRule(np.zeros_like(index), index, points_mm.reshape(-1, 1), np.ones((n_point, 1)))]
+    pieces = SimpleNamespace(electrode=index, kind=np.zeros_like(index), rules=lambda *_: rules)
     x, y, force = np.array(contact)[:, None]
-    charge = forward_map.integrate_fields(x + 1j * y, force, np.zeros(1), EVEN_FIELD, pieces, rules)
-    return charge[0, :, 0].reshape(points_mm.shape)
+    pressed = forward_map.pressed(x + 1j * y, force, np.zeros(1), EVEN_FIELD, np.array([[1.0, 1.0, 0.0]]))
+    return pressed.charges(pieces)[0, :, 0].reshape(points_mm.shape)
 
 
 def table(values):

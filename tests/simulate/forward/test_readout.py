@@ -22,6 +22,7 @@ from isocharge.simulate import (
 from isocharge.simulate.forward.readout import (
     MAP_COUNTS,
     NEAR_DISTANCE,
+    STRESS_WEIGHTS,
     ElectrodePieces,
     contact_charges,
     stress_charge,
@@ -42,12 +43,13 @@ TRIANGLE = Electrode("T", ((-12.0, 4.0), (-8.0, 4.0), (-10.0, 8.0)))
 def charge_of(sensor: Sensor, stress, per_side: int = 12) -> np.ndarray:
     """Charges under a made-up stress field, a function of x and y that returns (s11, s22, s12)."""
     pieces = ElectrodePieces.of(sensor)
+    charge_per_stress = STRESS_WEIGHTS[sensor.readout] * sensor.piezo.charge_per_stress
     charge = np.zeros(len(sensor.electrodes))
     for rule in pieces.rules(PROBE, np.zeros(1), (per_side, per_side)):
         values = np.stack(np.broadcast_arrays(*stress(rule.points.real, rule.points.imag)))
-        pair_charge = np.einsum("ckp,kp,kc->k", values, rule.area, pieces.charge_per_stress[rule.piece])
+        pair_charge = np.einsum("ckp,kp,kc->k", values, rule.area, charge_per_stress[pieces.kind[rule.piece]])
         np.add.at(charge, pieces.electrode[rule.piece], pair_charge)
-    return charge
+    return sensor.gains * charge
 
 
 def contact_charge(sensor: Sensor, probe: Probe, at: tuple[float, float], force: float) -> np.ndarray:

@@ -40,7 +40,6 @@ def test_identification_to_dict_can_be_written_as_json(identification):
     assert numbers["noise"] == {"name": "reference", "white_pC": 1.0, "gain": 0.002}
     area = numbers["working_area"]
     assert (area["radius_mm"], area["why"], area["fold_radius_mm"]) == (5.0, "searched", None)
-    assert len(numbers["by_distance"]["distance_mm"]) == len(numbers["by_distance"]["worst_position_mm_at_1_N"])
 
 
 def test_statistics_agree_with_random_positions(film, identification):

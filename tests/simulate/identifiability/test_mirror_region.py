@@ -45,8 +45,9 @@ def region_of(electrodes):
 
 def test_electrodes_on_one_circle_mirror_the_film_by_inversion():
     region = region_of(CIRCLE)
-    is_inside = 100.0 / region.distance < 7.8
-    is_outside = 100.0 / region.distance > 8.3
+    distance = 0.5 * (region.edges[1:] + region.edges[:-1])
+    is_inside = 100.0 / distance < 7.8
+    is_outside = 100.0 / distance > 8.3
     assert is_inside.sum() > 20
     assert (region.share[is_inside] >= 0.8).all()  # the lightest press has an image below 0.05 N far outside
     assert (region.share[is_outside] == 0.0).all()

@@ -10,7 +10,7 @@ interpolates its stress fields between forces in the same way. The interpolation
 further error.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy  # scipy.interpolate is imported when it is used
@@ -23,7 +23,7 @@ from isocharge.common.errors import SceneError
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.readout import contact_charges
 from isocharge.simulate.mechanics.theory import amplitude_squared
-from isocharge.simulate.numerics.disk import contacts_at, log_spaced_forces, sunflower
+from isocharge.simulate.numerics.disk import contacts_at, sunflower
 from isocharge.simulate.numerics.interpolation import chebyshev_nodes, lagrange_values
 from isocharge.simulate.numerics.polygon import to_corners
 from isocharge.simulate.sensor.film import Film
@@ -73,8 +73,6 @@ class ChargeSpline:
         force: Forces at which splines were fitted, shape (n_force,), N.
         table: Spline in x and y that returns the scaled charges, shape (n_force, n_electrode), pC. A scaled charge is a
             charge divided by the squared amplitude of the press.
-        error: Largest difference between a charge of the splines and that of the forward map, relative to the largest
-            charge of the same press, dimensionless.
     """
 
     electrodes: tuple[str, ...]
@@ -82,7 +80,6 @@ class ChargeSpline:
     domain: Domain
     force: Array
     table: "scipy.interpolate.NdBSpline"
-    error: float
 
     @classmethod
     def of(cls, forward_map: ForwardMap, radius: float | None = None, spacing: float | None = None) -> "ChargeSpline":
@@ -110,16 +107,13 @@ class ChargeSpline:
 
         sensor = forward_map.sensor
         force = _force_nodes(forward_map)
-        # The error is unknown (NaN) until the finished splines are compared with the forward map.
-        spline = cls(
+        return cls(
             electrodes=forward_map.electrodes,
             film=sensor.film,
             domain=domain,
             force=force,
             table=_fit_disk(forward_map, force, domain.radius, spacing),
-            error=np.nan,
         )
-        return replace(spline, error=_largest_error(spline, forward_map))
 
     def charges(self, contact: Array) -> Array:
         """Compute the touch charges of presses.
@@ -224,7 +218,7 @@ def _scaled_charges(forward_map: ForwardMap, force: Array, position: Array) -> A
     """
     sensor = forward_map.sensor
     solved_force = forward_map.family.force
-    solved_charge = forward_map.stress_charges_by_force(position)
+    solved_charge = forward_map.charges_by_force(position)[..., 0].swapaxes(0, 1)  # shape (n, n_force, n_electrode)
     solved_charge /= amplitude_squared(sensor.film, solved_force)[:, None]
 
     # A sensor with d33 has more spline forces than solved forces. Interpolate the charges to the spline forces.
@@ -297,26 +291,3 @@ def _fit_positions(cells: int) -> Array:
     edge_count = int(2.0 * np.pi * cells) + 8
     edge_positions = to_corners(np.exp(2j * np.pi * np.arange(edge_count) / edge_count))
     return np.concatenate([sunflower(inner_count), edge_positions])
-
-
-def _largest_error(spline: ChargeSpline, forward_map: ForwardMap) -> float:
-    """Compute the largest relative error of a spline at evenly distributed presses.
-
-    The presses differ from the presses to which the spline was fitted.
-
-    Args:
-        spline: Finished spline whose error is computed.
-        forward_map: Forward map that the spline approximates.
-
-    Returns:
-        The largest error of a charge, relative to the largest charge of the same press, dimensionless.
-    """
-    count = 400
-    position = spline.domain.radius * sunflower(count)
-    # Multiples of the golden ratio, modulo 1, distribute the logarithms of the forces evenly.
-    force = log_spaced_forces(np.arange(float(count)) * 0.618 % 1.0, spline.domain.force_range)
-    contact = np.column_stack([position, force])
-    true_charge = forward_map.charges(contact)
-    error = np.abs(spline.charges(contact) - true_charge).max(axis=1)
-    largest_charge = np.abs(true_charge).max(axis=1)
-    return float((error / largest_charge).max())

@@ -10,10 +10,9 @@ integrals of the interpolated field over the electrodes. The positions of the el
 accuracy of the interpolation. When a map is built, its charges are compared with those of direct solves.
 """
 
-from collections.abc import Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 
 import numpy as np
 
@@ -37,11 +36,11 @@ from isocharge.simulate.forward.family import (
     spread_check_presses,
 )
 from isocharge.simulate.forward.readout import (
+    STRESS_WEIGHTS,
     ElectrodePieces,
-    PieceRule,
+    PressedFilm,
     PressMeshes,
     contact_charges,
-    integrate_fields,
 )
 from isocharge.simulate.mechanics.theory import Theory, amplitude_squared
 from isocharge.simulate.mesh.blocks import Resolution
@@ -298,38 +297,31 @@ class ForwardMap:
         """
         return self.charges(contact), self.derivatives(contact)
 
-    def stress_charges_by_force(self, position: Array) -> Array:
-        """Compute the charges that the stress causes at given positions, for all forces of the family at once.
+    def charges_by_force(self, position: Array, is_odd: Booleans = EVEN_FIELD) -> Array:
+        """Compute the charges of each stress field in the table at given positions, for all forces of the family.
 
-        The result includes neither the crosstalk nor the charges that the contact pressure causes. The probe keeps its
-        own orientation.
+        Each force has a map of its own, for the footprint that the probe has under this force. The result includes
+        neither the crosstalk nor the charges that the contact pressure causes. The probe keeps its own orientation.
 
         Args:
             position: Positions (x, y) in the domain, shape (n, 2), mm.
+            is_odd: See `field_charges`.
 
         Returns:
-            Charges, shape (n, n_force, n_electrode), pC.
+            Charges, shape (n_force, n, n_electrode, n_field), pC.
         """
-        charges_by_force = [
-            one.field_charges(contacts_at(position, one.family.force[0]), EVEN_FIELD)[..., 0]
-            for one in self._maps_by_force
-        ]
-        return np.stack(charges_by_force, axis=1)
-
-    @cached_property
-    def _maps_by_force(self) -> "list[ForwardMap]":
-        """Forward map of each force of the family, for the footprint that the probe has under this force."""
-        n_distance, n_force = self.family.distance.size, self.family.force.size
-        table = self.table.reshape(n_distance, n_force, -1, self.table.shape[1]).swapaxes(0, 1)
-        return [
-            replace(
+        n_column = self.table.shape[1]
+        table = self.table.reshape(self.family.distance.size, self.family.force.size, -1, n_column)
+        charges = []
+        for index, force in enumerate(self.family.force.tolist()):
+            map_of_force = replace(
                 self,
                 probe=self.probe.under(force),
                 family=replace(self.family, force=np.array([force])),
-                table=table[index].reshape(-1, self.table.shape[1]),
+                table=table[:, index].reshape(-1, n_column),
             )
-            for index, force in enumerate(self.family.force.tolist())
-        ]
+            charges.append(map_of_force.field_charges(contacts_at(position, force), is_odd))
+        return np.stack(charges)
 
     def _unchecked_charges(self, contact: Array, orientation: Array | float = 0.0) -> Array:
         """Compute the charges of presses that lie in the domain or slightly outside the domain.
@@ -365,55 +357,33 @@ class ForwardMap:
             Charges, shape (n, n_electrode, n_field), pC.
         """
         if self.probe.grows:
-            return self._field_charges_of_growing_footprint(contact, is_odd)
+            # The mesh depends on the footprint. Therefore, the charges are computed at each force of the family,
+            # divided by the squared amplitude, and interpolated between the forces.
+            film = self.sensor.film
+            force = self.family.force
+            weights = lagrange_values(np.log(force), np.log(contact[:, 2]))
+            weights *= amplitude_squared(film, contact[:, 2])[:, None] / amplitude_squared(film, force)
+            # Sum over the forces of the family (index k), for each press (n), electrode (e) and field (f).
+            return np.asarray(np.einsum("nk,knef->nef", weights, self.charges_by_force(contact[:, :2], is_odd)))
+
         position = to_complex(contact[:, :2])
         orientation = np.broadcast_to(orientation, len(contact))
         charges = np.empty((len(contact), len(self.electrodes), is_odd.size))
         pieces = ElectrodePieces.of(self.sensor)
+        charge_per_stress = STRESS_WEIGHTS[self.sensor.readout] * self.sensor.piezo.charge_per_stress
         with single_threaded_blas():  # faster for the many small matrices of a chunk
             for start in range(0, len(contact), CHUNK_SIZE):
                 chunk = slice(start, start + CHUNK_SIZE)
-                rules = pieces.rules(self.probe, position[chunk])
-                charges[chunk] = self.integrate_fields(
-                    position[chunk], contact[chunk, 2], orientation[chunk], is_odd, pieces, rules
+                pressed = self.pressed(
+                    position[chunk], contact[chunk, 2], orientation[chunk], is_odd, charge_per_stress
                 )
-        return charges
+                charges[chunk] = pressed.charges(pieces)
+        return self.sensor.gains[:, None] * charges
 
-    def _field_charges_of_growing_footprint(self, contact: Array, is_odd: Booleans) -> Array:
-        """Compute the charges of each stress field for a probe whose footprint grows with the force.
-
-        The mesh depends on the footprint. Therefore, the charges are computed at each force of the family, for the
-        footprint under this force. The charges are divided by the squared amplitude, and interpolated between the
-        forces.
-
-        Args:
-            contact: Presses (x, y, F), shape (n, 3), mm and N.
-            is_odd: See `field_charges`.
-
-        Returns:
-            Charges, shape (n, n_electrode, n_field), pC.
-        """
-        film, force = self.sensor.film, self.family.force
-        weights = lagrange_values(np.log(force), np.log(contact[:, 2]))
-        weights *= amplitude_squared(film, contact[:, 2])[:, None] / amplitude_squared(film, force)
-        charges_by_force = []
-        for index, forward_map in enumerate(self._maps_by_force):
-            contact_at_force = contact.copy()
-            contact_at_force[:, 2] = force[index]
-            charges_by_force.append(forward_map.field_charges(contact_at_force, is_odd))
-        # Sum over the forces of the family (index k), for each press (n), electrode (e) and field (f).
-        return np.asarray(np.einsum("nk,knef->nef", weights, charges_by_force))
-
-    def integrate_fields(
-        self,
-        position: Complexes,
-        force: Array,
-        orientation: Array,
-        is_odd: Booleans,
-        pieces: ElectrodePieces,
-        rules: Iterable[PieceRule],
-    ) -> Array:
-        """Interpolate the stress fields of one chunk of presses, and integrate the fields to obtain the charges.
+    def pressed(
+        self, position: Complexes, force: Array, orientation: Array, is_odd: Booleans, charge_per_stress: Array
+    ) -> PressedFilm:
+        """Interpolate the stress fields under several presses, and convert them into charge per area.
 
         Args:
             position: Positions x + iy, shape (n,), mm.
@@ -421,41 +391,21 @@ class ForwardMap:
             orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
             is_odd: Whether each field of the table is odd with respect to a reflection in the direction of the press,
                 shape (n_field,).
-            pieces: Pieces of the electrodes.
-            rules: Integration points of the pairs of a press and a piece.
-
-        Returns:
-            Charges, shape (n, n_electrode, n_field), pC.
+            charge_per_stress: Charge per area and stress (s11, s22, s12) of each kind of piece, shape (n_kind, 3),
+                pC/N.
         """
+        film = self.sensor.film
         direction = np.angle(position)  # from the centre of the film to the press, rad
         # The stress refers to the probe or, if the probe is axisymmetric, to the direction of the press.
         rotation = np.zeros_like(direction) if self.probe.is_axisymmetric else orientation - direction
-        weights = self.family.weights(position, force, rotation)
-        nodal_fields = weights.astype(self.table.dtype) @ self.table  # in the precision of the table
-        scaled_charge = integrate_fields(
-            nodal_fields,
-            self.meshes_under(position, rotation),
-            direction + rotation + self.probe.angle,
-            is_odd,
-            pieces,
-            rules,
-        )
-
-        # Multiply by the unit of the scaled stress in the table.
-        film = self.sensor.film
-        stress_unit = film.young * amplitude_squared(film, force)
-        return np.asarray(scaled_charge * stress_unit[:, None, None])
-
-    def meshes_under(self, position: Complexes, rotation: Array) -> PressMeshes:
-        """Return the meshes under several presses.
-
-        Args:
-            position: Positions x + iy, shape (n,), mm.
-            rotation: Rotation of the probe relative to the direction of each press, shape (n,), rad.
-        """
-        film = self.sensor.film
-        direction = np.angle(position)
         template = template_for(self.resolution, self.probe.topology, not film.is_axisymmetric)
         oval = film_oval(film, direction)
         placement = Placement.of(template, self.probe, np.abs(position), film.radius, self.layer, rotation, oval)
-        return PressMeshes(template, placement, direction, film.radius)
+        meshes = PressMeshes(template, placement, direction, film.radius)
+
+        # Interpolate the stress in the precision of the table, and multiply by the unit of the scaled stress.
+        stress_unit = film.young * amplitude_squared(film, force)
+        weights = self.family.weights(position, force, rotation) * stress_unit[:, None]
+        fields = weights.astype(self.table.dtype) @ self.table
+        frame_angle = direction + rotation + self.probe.angle
+        return PressedFilm.of(position, self.probe, meshes, fields, frame_angle, is_odd, charge_per_stress)

@@ -12,7 +12,7 @@ charge under load minus the charge without load. The charge of a uniform pretens
 """
 
 import cmath
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -55,6 +55,13 @@ With longer sides, the error of a charge exceeds 1e-4. It is 9e-4 for 8 units, a
 """
 
 
+STRESS_WEIGHTS = {"area": np.ones((1, 3)), "edge": np.eye(3)[:2]}
+"""Weights of the stresses s11, s22 and s12 in the charges of each readout, with one row for each kind of piece.
+
+The edge readout has two kinds of pieces: lines on the left and right edges, and lines on the lower and upper edges.
+"""
+
+
 class PieceRule(NamedTuple):
     """Integration points on pieces of electrodes, for pairs of a press and a piece.
 
@@ -81,22 +88,19 @@ class ElectrodePieces:
             corners are equal. In a line, the first and the last corner are equal, and so are the second and the third.
         line_area: Area that a line represents, shape (n_piece,), mm^2. Zero for a quadrilateral.
         electrode: Index of the electrode to which each piece belongs, shape (n_piece,).
-        charge_per_stress: Charge per area and stress (s11, s22, s12) of each piece, shape (n_piece, 3), pC/N.
+        kind: Index of the weights of each piece in the rows of `STRESS_WEIGHTS`, shape (n_piece,).
     """
 
     corners: Complexes
     line_area: Array
     electrode: Integers
-    charge_per_stress: Array
+    kind: Integers
 
     @classmethod
     def covering(
         cls, electrodes: Sequence[Electrode], readout: Readout = "area", rotation: float = 0.0
     ) -> "ElectrodePieces":
         """Return the pieces of electrodes at their nominal positions.
-
-        The electrodes of a layout have no piezoelectric coefficients. The attribute `charge_per_stress` therefore
-        contains the weights of s11, s22 and s12 in the mean stress.
 
         Args:
             electrodes: Electrodes of a layout, at least one.
@@ -108,24 +112,18 @@ class ElectrodePieces:
             for index, electrode in enumerate(electrodes)
             for piece in (_edge_lines(electrode, rotation) if readout == "edge" else _area_pieces(electrode))
         ]
-        index_of_piece, corners, line_area, components = (np.array(column) for column in zip(*pieces, strict=True))
-        return cls(to_complex(corners), line_area, index_of_piece, components)
+        index_of_piece, corners, line_area, kind = (np.array(column) for column in zip(*pieces, strict=True))
+        return cls(to_complex(corners), line_area, index_of_piece, kind)
 
     @classmethod
     def of(cls, sensor: Sensor) -> "ElectrodePieces":
-        """Return the pieces of the electrodes of a sensor, with the weights of its readout.
+        """Return the pieces of the electrodes of a sensor at their calibrated positions.
 
         Args:
-            sensor: Sensor with the electrodes, the readout, the gains and the piezoelectric coefficients.
+            sensor: Sensor with the electrodes, the readout and the calibration.
         """
         nominal = cls.covering(sensor.electrodes, sensor.readout, sensor.calibration.rotation)
-        return replace(
-            nominal,
-            corners=to_complex(sensor.calibration.place(to_corners(nominal.corners))),
-            charge_per_stress=sensor.gains[nominal.electrode, None]
-            * sensor.piezo.charge_per_stress
-            * nominal.charge_per_stress,
-        )
+        return replace(nominal, corners=to_complex(sensor.calibration.place(to_corners(nominal.corners))))
 
     def rules(self, probe: Probe, position: Complexes, counts: tuple[int, int] = MAP_COUNTS) -> Iterator[PieceRule]:
         """Compute the integration points of all pieces under several presses.
@@ -204,6 +202,7 @@ def stress_charge(sensor: Sensor, equilibrium: Equilibrium, counts: tuple[int, i
         Charges, shape (n_electrode,), pC.
     """
     pieces = ElectrodePieces.of(sensor)
+    charge_per_stress = STRESS_WEIGHTS[sensor.readout] * sensor.piezo.charge_per_stress
     charge = np.zeros(len(sensor.electrodes))
     for rule in pieces.rules(equilibrium.probe, np.array([complex(*equilibrium.at)]), counts):
         # `touch_stress` expects one list of points.
@@ -211,9 +210,9 @@ def stress_charge(sensor: Sensor, equilibrium: Equilibrium, counts: tuple[int, i
         stress = stress_of_points.reshape(*rule.points.shape, 3)
         # Sum over the points (index p) and then over the stress components (c) of each pair of press and piece (k).
         integral = np.einsum("kpc,kp->kc", stress, rule.area)
-        pair_charge = np.einsum("kc,kc->k", integral, pieces.charge_per_stress[rule.piece])
+        pair_charge = np.einsum("kc,kc->k", integral, charge_per_stress[pieces.kind[rule.piece]])
         np.add.at(charge, pieces.electrode[rule.piece], pair_charge)
-    return charge
+    return sensor.gains * charge
 
 
 def contact_charges(sensor: Sensor, probe: Probe, contact: Array, orientation: Array | float = 0.0) -> Array:
@@ -272,23 +271,23 @@ def thermal_charge(sensor: Sensor, step: float) -> Array:
     return sensor.calibration.read(sensor.gains * areas * (sensor.piezo.pyro * step + tension_charge))
 
 
-def _area_pieces(electrode: Electrode) -> Iterator[tuple[Array, float, Array]]:
+def _area_pieces(electrode: Electrode) -> Iterator[tuple[Array, float, int]]:
     """Divide the area of an electrode into quadrilaterals.
 
     Args:
         electrode: Electrode over whose area the stress is averaged.
 
     Yields:
-        Nominal corners (x, y), shape (4, 2), mm. The area of the line, which is zero. Weights of s11, s22 and s12.
+        Nominal corners (x, y), shape (4, 2), mm. The area of the line, which is zero. The kind of the piece.
     """
     for polygon in electrode.collecting_polygons:
         # The quadrilaterals share the first corner. If a corner is missing, the last one is repeated.
         n_corner = len(polygon)
         for second in range(1, n_corner - 1, 2):
-            yield polygon[[0, second, second + 1, min(second + 2, n_corner - 1)]], 0.0, np.ones(3)
+            yield polygon[[0, second, second + 1, min(second + 2, n_corner - 1)]], 0.0, 0
 
 
-def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[tuple[Array, float, Array]]:
+def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[tuple[Array, float, int]]:
     """Return the lines of the edge readout (Mirbagheri et al., 2007, equation 3).
 
     The stress s11 is averaged over the left and right edges of the turned electrode, and the stress s22 over its lower
@@ -308,9 +307,8 @@ def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[tuple[Array, 
         middle = 0.5 * (start + end)
         turned_edge = complex(*(end - start)) * cmath.rect(1.0, rotation)
         is_lower_or_upper = abs(turned_edge.real) > abs(turned_edge.imag)
-        components = np.array([0.0, 1.0, 0.0] if is_lower_or_upper else [1.0, 0.0, 0.0])
         for first, last in ((start, middle), (middle, end)):
-            yield np.array([first, last, last, first]), 0.25 * electrode.area, components
+            yield np.array([first, last, last, first]), 0.25 * electrode.area, int(is_lower_or_upper)
 
 
 @dataclass(frozen=True)
@@ -350,43 +348,77 @@ class PressMeshes:
         return element, basis_values.reshape(*points.shape, mesh.xi.size), is_mirrored
 
 
-def integrate_fields(
-    fields: Array,
-    meshes: PressMeshes,
-    frame_angle: Array,
-    is_odd: Booleans,
-    pieces: ElectrodePieces,
-    rules: Iterable[PieceRule],
-) -> Array:
-    """Integrate stress fields over the electrodes to obtain charges.
+@dataclass(frozen=True)
+class PressedFilm:
+    """Charge per area that several presses cause, at the nodes of the mesh under each press.
 
-    Args:
-        fields: Scaled stresses of all fields at the nodes of every element for each press, shape (n, n_element *
-            n_local * n_field * 3), dimensionless. The values of all fields at one node are adjacent.
+    Attributes:
+        position: Positions x + iy of the presses, shape (n,), mm.
+        probe: Probe of the presses.
         meshes: Meshes under the presses.
-        frame_angle: Angle of axis 1 of the stress fields from the x axis, shape (n,), rad.
-        is_odd: Whether each field is odd, shape (n_field,). A reflection in the direction of the press leaves an even
-            field unchanged, and changes the sign of an odd field.
-        pieces: Pieces of the electrodes.
-        rules: Integration points of the pairs of a press and a piece.
-
-    Returns:
-        Charges divided by the unit of the scaled stress, shape (n, n_electrode, n_field), pC/MPa.
+        density: Charge per area that each stress field causes, for points of the meshed part of the film and for points
+            that are reflected into it, shape (2, n_kind, n, n_element, n_local, n_field), pC/mm^2. The second axis is
+            the kind of a piece; see `STRESS_WEIGHTS`.
     """
-    # At reflected points, s12 of an even field changes its sign, and s11 and s22 of an odd field change theirs.
-    changes_sign = np.stack([is_odd, is_odd, ~is_odd], axis=1)  # shape (n_field, 3)
-    nodal_fields = fields.reshape(len(fields), meshes.template.n_element, -1, changes_sign.size)
-    charge = np.zeros((len(fields), pieces.electrode.max() + 1, is_odd.size))
-    for rule in rules:
-        element, basis_values, is_mirrored = meshes.locate(rule.press, rule.points)
-        element_fields = nodal_fields[rule.press[:, None], element]  # shape (n_pair, n_point, n_local, n_field * 3)
-        stress = (basis_values[..., None, :].astype(fields.dtype) @ element_fields)[..., 0, :]
 
-        # Integrate the stress of each pair with and without the change of its sign at reflected points.
-        weights = np.stack([rule.area, np.where(is_mirrored, -rule.area, rule.area)], axis=1)
-        integrals = (weights @ stress).reshape(-1, 2, *changes_sign.shape)
-        integral = np.where(changes_sign, integrals[:, 1], integrals[:, 0])  # shape (n_pair, n_field, 3)
-        film_integral = rotate_stress(integral, frame_angle[rule.press, None])
-        pair_charge = (film_integral @ pieces.charge_per_stress[rule.piece][..., None])[..., 0]
-        np.add.at(charge, (rule.press, pieces.electrode[rule.piece]), pair_charge)
-    return charge
+    position: Complexes
+    probe: Probe
+    meshes: PressMeshes
+    density: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        position: Complexes,
+        probe: Probe,
+        meshes: PressMeshes,
+        fields: np.ndarray,
+        frame_angle: Array,
+        is_odd: Booleans,
+        charge_per_stress: Array,
+    ) -> "PressedFilm":
+        """Convert the stress fields under several presses into charge per area.
+
+        Args:
+            position: Positions x + iy of the presses, shape (n,), mm.
+            probe: Probe of the presses.
+            meshes: Meshes under the presses.
+            fields: Stresses of all fields at the nodes of every element for each press, shape (n, n_element * n_local
+                * n_field * 3), MPa. The values of all fields at one node are adjacent.
+            frame_angle: Angle of axis 1 of the stress fields from the x axis, shape (n,), rad.
+            is_odd: Whether each field is odd, shape (n_field,). A reflection in the direction of the press leaves an
+                even field unchanged, and changes the sign of an odd field.
+            charge_per_stress: Charge per area and stress (s11, s22, s12) of each kind of piece, shape (n_kind, 3),
+                pC/N.
+        """
+        # At reflected points, s12 of an even field changes its sign, and s11 and s22 of an odd field change theirs.
+        reflected_sign = np.where(is_odd[:, None], [-1.0, -1.0, 1.0], [1.0, 1.0, -1.0])
+        sign = np.stack([np.ones_like(reflected_sign), reflected_sign])  # shape (2, n_field, 3)
+        frame_coefficients = rotate_stress(np.eye(3), frame_angle[:, None]) @ charge_per_stress.T
+        # The indices are the press (n), field (f), stress component (c), reflection (m) and kind of piece (k).
+        coefficients = np.einsum("mfc,nck->nfcmk", sign, frame_coefficients).astype(fields.dtype)
+        n, n_field, _, _, n_kind = coefficients.shape
+        stress = fields.reshape(n, -1, n_field, 3).swapaxes(1, 2)  # shape (n, n_field, n_node, 3)
+        density = stress @ coefficients.reshape(n, n_field, 3, -1)  # shape (n, n_field, n_node, 2 * n_kind)
+        shape = (2, n_kind, n, meshes.template.n_element, -1, n_field)
+        return cls(position, probe, meshes, density.transpose(3, 0, 2, 1).reshape(shape))
+
+    def charges(self, pieces: ElectrodePieces) -> Array:
+        """Integrate the charge per area over electrodes.
+
+        Args:
+            pieces: Pieces of the electrodes.
+
+        Returns:
+            Charges without gains and crosstalk, shape (n, n_electrode, n_field), pC.
+        """
+        n_field = self.density.shape[-1]
+        charge = np.zeros((self.position.size, pieces.electrode.max() + 1, n_field))
+        for rule in pieces.rules(self.probe, self.position):
+            element, basis_values, is_mirrored = self.meshes.locate(rule.press, rule.points)
+            kind = pieces.kind[rule.piece, None]
+            density = self.density[is_mirrored.astype(np.intp), kind, rule.press[:, None], element]
+            node_weights = (rule.area[..., None] * basis_values).reshape(len(kind), 1, -1)
+            pair_charge = node_weights.astype(density.dtype) @ density.reshape(len(kind), -1, n_field)
+            np.add.at(charge, (rule.press, pieces.electrode[rule.piece]), pair_charge[:, 0])
+        return charge

@@ -177,19 +177,10 @@ class Identification:
             },
             "mirror_region": None if self.mirror is None else self.mirror.to_dict(),
             "limits_in_working_area": [limits.statistics() for limits in self.inner_maps],
-            "by_distance": self._errors_by_distance(),
             "folds_mm": area.folds.round(3),
             "twins": self._listed_pairs(),
         }
         return dict(plain_values(table))
-
-    def _errors_by_distance(self) -> dict[str, Array]:
-        """Return arrays for JSON: the distances of the rings, and the median and the largest error on each ring."""
-        errors = {"distance_mm": self.maps[0].rings.distance}
-        for limits in self.maps:
-            errors[f"median_position_mm_at_{limits.force:g}_N"] = np.median(limits.position, axis=1)
-            errors[f"worst_position_mm_at_{limits.force:g}_N"] = np.max(limits.position, axis=1)
-        return errors
 
     def _listed_pairs(self) -> list[dict[str, Any]]:
         """Return the first `MAX_LISTED_PAIRS` ambiguous pairs as dictionaries for JSON."""

@@ -99,18 +99,13 @@ class MirrorRegion:
         return np.linspace(self.inner, self.outer, len(self.share) + 1)
 
     @property
-    def distance(self) -> Array:
-        """Distance from the centre of the film to the middle of each ring, shape (n_ring,), mm."""
-        return 0.5 * (self.edges[1:] + self.edges[:-1])
-
-    @property
     def total_share(self) -> float:
         """Share of the presses outside the working area whose charges agree with those of a press inside it.
 
         The weight of a press is the area of its sector.
         """
-        # The area of a sector is proportional to the distance from the centre.
-        return float(np.average(self.share.mean(axis=1), weights=self.distance))
+        # The area of a sector is proportional to the difference of the squared radii of its edges.
+        return float(np.average(self.share.mean(axis=1), weights=np.diff(self.edges**2)))
 
     @property
     def summary(self) -> str:
@@ -127,13 +122,12 @@ class MirrorRegion:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the mirror region as a dictionary for JSON, with the mean share on each ring."""
+        """Return the mirror region as a dictionary for JSON."""
         return {
             "share": self.total_share,
             "from_mm": self.inner,
             "to_mm": self.outer,
             "force_N": self.forces[[0, -1]].tolist(),
-            "by_distance": {"distance_mm": self.distance.tolist(), "share": self.share.mean(axis=1).tolist()},
             "words": self.summary,
         }
 

@@ -27,7 +27,7 @@ from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.working_area import working_area
 from isocharge.simulate.layout.case import GAP, NO_NUISANCES, RIM_DISTANCE, DesignCase
-from isocharge.simulate.layout.stress_fields import PressedFilm, rows_of, solve_fields
+from isocharge.simulate.layout.stress_fields import electrode_rows, pressed_film, rows_of, solve_fields
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.sensor.sensor import Electrode, Sensor
 
@@ -196,13 +196,14 @@ class Search:
         Returns:
             Layout with its power mean.
         """
-        pressed = PressedFilm.interpolate(self.fields, presses)
-        kept_rows = pressed.rows(self.case.kept_electrodes)
+        pressed = pressed_film(self.fields, presses)
+        kept_rows = electrode_rows(pressed, self.case.kept_electrodes)
         side = self.case.square_side
 
         def square_rows(positions: Array) -> Array:
             """Return the rows of squares at positions of shape (n, 2), shape (n_press, n, 6)."""
-            return pressed.rows([Electrode.of_square("A", (x, y), side) for x, y in positions.tolist()])
+            squares = [Electrode.of_square("A", (x, y), side) for x, y in positions.tolist()]
+            return electrode_rows(pressed, squares)
 
         def log_mean(new_rows: Array) -> float:
             """Return the logarithm of the power mean for rows of the new squares, shape (n_press, n_new, 6)."""

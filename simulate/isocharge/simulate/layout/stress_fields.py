@@ -8,7 +8,7 @@ press does not depend on the electrodes, so the same stress fields are used for 
 import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,11 +16,10 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.common.contact_domain import Domain
 from isocharge.simulate.forward.family import NodeCount
 from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.forward.readout import ElectrodePieces, PressMeshes
+from isocharge.simulate.forward.readout import ElectrodePieces, PressedFilm
 from isocharge.simulate.mechanics.theory import rotate_stress
 from isocharge.simulate.numerics.polygon import to_complex, to_corners
 from isocharge.simulate.sensor.film import Surface
-from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Electrode, Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress, touch_stress
@@ -34,6 +33,9 @@ COLUMNS = ("charge", "x", "y", "ln force", "probe radius", "pretension")
 The columns are the charge (pC) and its derivatives with respect to x and y (pC/mm), ln F (pC), the probe radius (pC/mm)
 and the pretension (pC/MPa).
 """
+
+COLUMN_IS_ODD = np.array([column == "y" for column in COLUMNS])
+"""Whether each column is odd about the direction of the press, shape (6,)."""
 
 STEPS = (0.02, 0.02, 0.05, 0.02, 0.1)
 """Steps of the finite differences of the stress, in the order of the derivatives in `COLUMNS`.
@@ -62,7 +64,7 @@ def solve_fields(
         executor: Executor that runs the solves; None for this process.
 
     Returns:
-        Forward map whose table contains the stress fields in MPa instead of the scaled stress.
+        Forward map whose table contains the scaled stress and its derivatives with single precision.
 
     Raises:
         SolveError: If a press has no equilibrium.
@@ -89,80 +91,34 @@ def rows_of(fields: ForwardMap, presses: Array, electrodes: Sequence[Electrode])
         One row with the columns `COLUMNS` for each press and electrode, shape (n, n_electrode, 6).
     """
     chunks = np.array_split(presses, math.ceil(len(presses) / PRESS_CHUNK))
-    return np.concatenate([PressedFilm.interpolate(fields, chunk).rows(electrodes) for chunk in chunks])
+    return np.concatenate([electrode_rows(pressed_film(fields, chunk), electrodes) for chunk in chunks])
 
 
-@dataclass(frozen=True)
-class PressedFilm:
-    """Charge per area that several presses cause, at the nodes of the mesh under each press.
+def pressed_film(fields: ForwardMap, presses: Array) -> PressedFilm:
+    """Interpolate the stress fields at the positions of presses, and convert the stress to charge per area.
 
-    Attributes:
-        presses: Positions x + iy of the presses, shape (n,), mm.
-        probe: Probe of the presses.
-        meshes: Meshes under the presses.
-        density: Charge per area (pC/mm^2) and its derivatives, with the columns `COLUMNS`, in the meshed half of the
-            film and in its mirror image, shape (2, n, n_element, n_local, 6). The derivatives with respect to the
-            position are along and across the direction of the press.
+    Args:
+        fields: Stress fields that `solve_fields` returns, in a domain that contains the presses.
+        presses: Positions (x, y) of the presses, shape (n, 2), mm.
     """
+    position = to_complex(presses)
+    force = np.full(len(presses), fields.family.force[0])
+    charge_per_stress = fields.sensor.piezo.charge_per_stress[None]
+    return fields.pressed(position, force, np.zeros(len(presses)), COLUMN_IS_ODD, charge_per_stress)
 
-    presses: Complexes
-    probe: Probe
-    meshes: PressMeshes
-    density: np.ndarray
 
-    @classmethod
-    def interpolate(cls, fields: ForwardMap, presses: Array) -> "PressedFilm":
-        """Interpolate the stress fields at the positions of presses, and convert the stress to charge per area.
-
-        The meshes cover half of the film. The charge per area is therefore computed twice: for points of the meshed
-        half, and for points that are reflected into it.
-
-        Args:
-            fields: Stress fields that `solve_fields` returns, in a domain that contains the presses.
-            presses: Positions (x, y) of the presses, shape (n, 2), mm.
-        """
-        position = to_complex(presses)
-        direction = np.angle(position)
-        press_weights = fields.family.weights(position, np.full(len(presses), fields.family.force[0]), np.zeros(1))
-        meshes = fields.meshes_under(position, np.zeros(1))
-
-        # One matrix product interpolates the stress and converts it into charge per area, for all nodes.
-        charge_per_stress = fields.sensor.piezo.charge_per_stress
-        coefficients = rotate_stress(np.eye(3), direction[:, None]) @ charge_per_stress  # shape (n, 3)
-        n_solved = len(fields.table)
-        table = np.moveaxis(fields.table.reshape(n_solved, -1, 3), 2, 1).reshape(3 * n_solved, -1)
-        # At reflected points, the shear stress has the opposite sign.
-        both_coefficients = np.stack([coefficients, coefficients * [1.0, 1.0, -1.0]])
-        weights = press_weights[:, :, None] * both_coefficients[:, :, None]  # shape (2, n, n_solved, 3)
-        flat_weights = weights.reshape(2 * len(presses), -1).astype(np.float32)
-        density = flat_weights @ table
-        density = density.reshape(2, len(presses), meshes.template.n_element, -1, len(COLUMNS))
-        # At reflected points, the derivative for a movement across the direction of the press has the opposite sign.
-        density[1, ..., COLUMNS.index("y")] *= -1.0
-        return cls(position, fields.probe, meshes, density)
-
-    def rows(self, electrodes: Sequence[Electrode]) -> Array:
-        """Compute the charges of electrodes and their derivatives for all presses; see `rows_of`."""
-        rows = np.zeros((len(self.presses), len(electrodes), len(COLUMNS)))
-        if not electrodes:
-            return rows
-        pieces = ElectrodePieces.covering(electrodes)
-        for rule in pieces.rules(self.probe, self.presses):
-            n_pair = len(rule.press)
-            element, basis_values, is_mirrored = self.meshes.locate(rule.press, rule.points)
-            density = self.density[is_mirrored.astype(np.intp), rule.press[:, None], element]
-            node_weights = rule.area[..., None] * basis_values
-            flat_weights = node_weights.reshape(n_pair, 1, -1).astype(np.float32)
-            pair_rows = flat_weights @ density.reshape(n_pair, -1, len(COLUMNS))
-            np.add.at(rows, (rule.press, pieces.electrode[rule.piece]), pair_rows[:, 0])
-
-        # Rotate the derivatives along and across the direction of each press into derivatives with respect to x and y.
-        x_column = COLUMNS.index("x")
-        y_column = COLUMNS.index("y")
-        derivative = (rows[..., x_column] + 1j * rows[..., y_column]) * np.exp(1j * self.meshes.direction)[:, None]
-        rows[..., x_column] = derivative.real
-        rows[..., y_column] = derivative.imag
-        return rows
+def electrode_rows(pressed: PressedFilm, electrodes: Sequence[Electrode]) -> Array:
+    """Compute the charges of electrodes and their derivatives for several presses; see `rows_of`."""
+    if not electrodes:
+        return np.empty((pressed.position.size, 0, len(COLUMNS)))
+    rows = pressed.charges(ElectrodePieces.covering(electrodes))
+    # Rotate the derivatives along and across the direction of each press into derivatives with respect to x and y.
+    x_column = COLUMNS.index("x")
+    y_column = COLUMNS.index("y")
+    derivative = (rows[..., x_column] + 1j * rows[..., y_column]) * np.exp(1j * pressed.meshes.direction)[:, None]
+    rows[..., x_column] = derivative.real
+    rows[..., y_column] = derivative.imag
+    return rows
 
 
 def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
@@ -175,7 +131,8 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
         surface: Surface at which the stress is read: the middle, the top or the bottom of the film.
 
     Returns:
-        Stress (s11, s22, s12) and its derivatives in the order of `COLUMNS`, shape (n_element, n_local, 6, 3), MPa.
+        Stress (s11, s22, s12) and its derivatives in the order of `COLUMNS`, divided by the unit of the scaled stress,
+        shape (n_element, n_local, 6, 3).
     """
     mesh = solved.mesh
     film = solved.film
@@ -220,4 +177,4 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
             difference = touch_stress(last, nodes, surface) - touch_stress(first, nodes, surface)
             change = difference.reshape(stress.shape)
         columns.append(change / (2.0 * step))
-    return np.stack(columns, axis=2)
+    return np.stack(columns, axis=2) / (film.young * solved.groups.squared_amplitude)
