@@ -12,8 +12,6 @@ import venv
 
 import pytest
 import yaml
-from pyarrow import table
-from pyarrow.parquet import write_table
 
 from kept import ROOT
 from processes import finished
@@ -29,7 +27,6 @@ COMMANDS_OF_EXTRAS = {
     "cluster": "simulate sweep --help",
     "design": "simulate design --help",
     "record": "serve stream three-25um-biaxial --port frames.txt --output touch.mcap",
-    "parquet": "serve predict three-25um-biaxial charges.parquet",
     "all": "simulate design --help",
 }
 """A command that imports the packages of each extra. It runs in an install with this extra only."""
@@ -219,7 +216,6 @@ def test_the_wheel_with_an_extra_runs_the_readme_and_a_command_of_the_extra(whee
     bin_folder = install([f"{wheel}[{extra}]"], tmp_path, 3000, constraints)
     check_example(bin_folder, tmp_path, "README.md", 0)
     (tmp_path / "frames.txt").write_text("942.9,910.4,690.8\n" * 200)
-    write_table(table({"A": [942.9], "B": [910.4], "C": [690.8]}), tmp_path / "charges.parquet")
     done = run(bin_folder, "isocharge", *COMMANDS_OF_EXTRAS[extra].split(), cwd=tmp_path, timeout=600)
     assert done.returncode == 0, done.stderr
 

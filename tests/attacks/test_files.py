@@ -92,8 +92,7 @@ def _load_device(path):
 
 
 def _read_charges(path):
-    with path.open(encoding="utf-8-sig", newline="") as lines:
-        assert np.isfinite(read_charges(lines, ("A", "B", "C"), "charges")).all()
+    assert np.isfinite(read_charges(path, ("A", "B", "C"))).all()
 
 
 KINDS = {

@@ -12,7 +12,7 @@ import pytest
 from boards import received
 from isocharge.cli.serve.doctor import brief_report, device_text
 from isocharge.cli.shared.terminal import say, show, show_json, show_result, warnings_to_stderr
-from isocharge.common.errors import IsochargeError
+from isocharge.common.errors import ChargeError, IsochargeError
 from isocharge.serve import (
     Chunk,
     Predictor,
@@ -21,11 +21,12 @@ from isocharge.serve import (
     TouchStream,
     device_from_table,
     load_model,
-    read_charges,
 )
 from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import find_model
+from isocharge.serve.presses.number_columns import CHARGE_RULE
+from isocharge.serve.presses.table_file import CsvTable
 from isocharge.serve.record.formats import csv_header
 from isocharge.serve.record.record import RECORD_FIELDS
 
@@ -157,7 +158,8 @@ def read_device_file(names):
 
 def read_csv_header(names):
     header = ",".join(["A", "B", "C", *names])
-    read_charges([header, "1,2,3,4,5,6"], ("A", "B", "C"), names[0])
+    table = CsvTable([header, "1,2,3,4,5,6"], names[0], ("A", "B", "C"), ChargeError, "")
+    table.read(dict.fromkeys("ABC", CHARGE_RULE), {}, 1)
 
 
 GOOD_PROPS = load_model(find_model("three-25um-biaxial")).metadata.to_props()

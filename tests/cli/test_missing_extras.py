@@ -29,8 +29,6 @@ OPTIONS = {
     "demo --live 0": "simulate,http",
     "serve stream three-25um-biaxial --port - --live 0": "http",
     "serve stream three-25um-biaxial --port - --output touch.mcap": "record",
-    "serve check three-25um-biaxial presses.parquet": "parquet",
-    "serve predict three-25um-biaxial charges.parquet": "parquet",
 }
 """Extra that a command line needs for one of its options."""
 

@@ -1,23 +1,10 @@
-"""Commands that read a file of presses: names of rows and columns in messages, and long files."""
+"""Commands that read a file of presses: names of columns in messages, and long files."""
 
-import pyarrow
 import pytest
-from pyarrow.parquet import write_table
 
 from isocharge.cli.train import calibrate as calibrate_module
 from isocharge.common.defaults import MAX_BATCH
 from isocharge.serve import Predictor
-
-
-def test_presses_of_a_parquet_file_are_named_by_their_rows(command, tmp_path):
-    """The check of a film names the presses that do not count by their rows, counted from 1 without a header."""
-    contact_columns = {"x_mm": [2.0, 40.0], "y_mm": [0.0, 0.0], "force_N": [0.5, 0.5]}
-    columns = contact_columns | {name: [500.0, 500.0] for name in "ABCD"}
-    write_table(pyarrow.table(columns), tmp_path / "p.parquet")
-    code, out, err = command("serve", "check", "four-25um-biaxial", tmp_path / "p.parquet")
-    assert (code, err) == (1, "")
-    assert out.split()[:2] == ["each:", "row"]
-    assert "(row 2)" in out
 
 
 def test_a_missing_column_of_a_training_is_named(refused, tmp_path, monkeypatch):

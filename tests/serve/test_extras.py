@@ -15,7 +15,6 @@ from processes import finished
         ("simulate", "scipy"),
         ("train", "torch"),
         ("grpc", "google.protobuf"),
-        ("parquet", "pyarrow.parquet"),
     ],
 )
 def test_missing_package_of_an_extra(extra, module):

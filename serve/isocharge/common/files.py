@@ -13,7 +13,7 @@ import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO, TextIO
+from typing import TextIO
 
 from isocharge.common.errors import IsochargeError, OutputError, OutputExists
 
@@ -29,23 +29,6 @@ def sha256_of(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file for reading, and refuse pipes, devices and folders.
-
-    The function does not wait for the writer of a pipe.
-
-    Args:
-        path: The file.
-
-    Raises:
-        OSError: If the file cannot be opened, or is a pipe, a device or a folder. The attribute `strerror` of the
-            exception states the reason.
-    """
-    if not stat.S_ISREG(path.stat().st_mode):
-        raise OSError(errno.EINVAL, "not a regular file", str(path))
-    return path.open("rb")
-
-
 def read_whole(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
     """Read all bytes of a regular file.
 
@@ -57,7 +40,9 @@ def read_whole(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
         OSError: If the file cannot be read, is not a regular file, or is larger than `max_bytes`. The attribute
             `strerror` of the exception states the reason.
     """
-    with open_regular(path) as file:
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    with path.open("rb") as file:
         data = file.read(max_bytes + 1)
     if len(data) > max_bytes:
         raise OSError(errno.EFBIG, f"larger than {max_bytes} bytes", str(path))

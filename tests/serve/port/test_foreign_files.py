@@ -1,9 +1,7 @@
-"""Recordings, records, tables, MCAP and Parquet files given as a port, whose messages state the right command."""
+"""Recordings, records, tables and MCAP files given as a port, whose messages state the right command."""
 
-import pyarrow as pa
 import pytest
 from mcap.writer import Writer
-from pyarrow.parquet import write_table
 
 from isocharge.common.errors import InputError, RecordingError
 from isocharge.serve import Port, Recorder, Recording, open_source
@@ -28,10 +26,6 @@ def table(text):
     return lambda path: path.write_text(text)
 
 
-def parquet(path):
-    write_table(pa.table({"A": [1.0]}), path)
-
-
 FOREIGN = {
     "touch.rec": (recording, r"got a recording; play it with: isocharge serve replay \S*touch.rec$"),
     "touch.jsonl": (
@@ -39,10 +33,6 @@ FOREIGN = {
         r"got records of `serve stream`; .*--record touch\.rec",
     ),
     "touch.mcap": (mcap, "got an MCAP file; .*isocharge serve replay touch.rec"),
-    "presses.parquet": (
-        parquet,
-        "got a Parquet file; .*isocharge serve predict MODEL",
-    ),
     "measured.txt": (
         table("x_mm,y_mm,force_N,A,B,C\n1,2,3,4,5,6\n"),
         "got a table of presses; .*isocharge serve predict MODEL .*--port - <",

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from isocharge.common.arrays import LARGEST
 from isocharge.common.errors import ChargeError, OutputError, PressError
 from isocharge.serve import MeasuredPresses, read_charges, read_presses, write_presses
-from isocharge.serve.prediction.table import read_charge_file
 from isocharge.serve.presses import measured_presses
 from isocharge.serve.presses.measured_presses import PRESS_RULES, read_press_list
 from isocharge.serve.presses.table_file import csv_text
@@ -210,10 +209,11 @@ TEXT = f"# Größe\nx_mm,y_mm,force_N,A,B,C\n{ROW}"
         (TEXT[8:].encode("utf-16-le"), r"line 1: the byte 0x00 is not text in UTF-8: .* iconv -f UTF-16"),
         (TEXT.encode("latin-1"), r"line 1: the byte 0xf6 is not text in UTF-8: .*WINDOWS-1252"),
         (f"{TEXT[8:]}{ROW * 5000}1,2,3,4,5,ü".encode("cp1252"), "line 5003: the byte 0xfc"),
+        (b"PAR1\x15\x04\x15\x00", r"presses\.csv: expected a CSV file, got a Parquet file; convert it to CSV"),
         (b"PK\x03\x04\xff\xff", "the byte 0xff is not text in UTF-8: export the file as CSV in UTF-8"),
     ],
 )
-@pytest.mark.parametrize("read", [read_presses, read_charge_file])
+@pytest.mark.parametrize("read", [read_presses, read_charges])
 def test_headers_in_other_encodings_are_refused(write, read, data, message):
     with pytest.raises((PressError, ChargeError), match=message) as caught:
         read(write(data), NAMES)
@@ -223,8 +223,7 @@ def test_headers_in_other_encodings_are_refused(write, read, data, message):
 def test_two_byte_order_marks_of_utf_8_are_accepted(write):
     path = write(b"\xef\xbb\xbf" * 2 + TEXT.encode())
     assert len(read_presses(path, NAMES)) == 1
-    np.testing.assert_array_equal(read_charge_file(path, NAMES), [[4, 5, 6]])
-    assert read_charges(["\ufeffA,B,C\n", "1,2,3\n"], NAMES, "text").tolist() == [[1, 2, 3]]
+    np.testing.assert_array_equal(read_charges(path, NAMES), [[4, 5, 6]])
 
 
 # Round trips
@@ -254,22 +253,20 @@ def some_presses(draw):
     )
 
 
-@pytest.mark.parametrize("suffix", ["csv", "parquet", "PARQUET"])
 @given(presses=some_presses())
 @settings(derandomize=True, max_examples=40)
-def test_written_presses_are_read_back(suffix, presses, tmp_path_factory):
+def test_written_presses_are_read_back(presses, tmp_path_factory):
     """With the names of the electrodes, and with every other column as an electrode."""
-    path = tmp_path_factory.getbasetemp() / f"written.{suffix}"
+    path = tmp_path_factory.getbasetemp() / "written.csv"
     write_presses(path, presses)
     for read in (read_presses(path, presses.electrodes), read_presses(path)):
         assert read.electrodes == presses.electrodes
         np.testing.assert_equal(read.columns, presses.columns)
 
 
-@pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_presses_that_would_not_be_read_are_not_written(suffix, tmp_path, monkeypatch):
+def test_presses_that_would_not_be_read_are_not_written(tmp_path, monkeypatch):
     presses = presses_of(np.ones((2, 3)), NAMES)
-    path = tmp_path / f"p.{suffix}"
+    path = tmp_path / "p.csv"
     with pytest.raises(PressError, match=r"expected 1 to 1,000,000 presses to write, got 0"):
         write_presses(path, presses[:0])
     monkeypatch.setattr(measured_presses, "MAX_ROWS", 1)
@@ -277,7 +274,7 @@ def test_presses_that_would_not_be_read_are_not_written(suffix, tmp_path, monkey
         write_presses(path, presses)
     assert not path.exists()
     with pytest.raises(OutputError, match=r"nowhere.*cannot be written"):
-        write_presses(tmp_path / "nowhere" / f"p.{suffix}", presses[:1])
+        write_presses(tmp_path / "nowhere" / "p.csv", presses[:1])
 
 
 def test_a_charge_that_would_not_be_read_is_refused():

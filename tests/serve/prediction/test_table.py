@@ -18,8 +18,16 @@ from isocharge.serve.model.contact import MISFIT_LIMIT, inside_polygon
 NAMES = ("A", "B", "C")
 
 
-def read(text):
-    return read_charges(io.StringIO(text, newline=""), NAMES, "presses.csv")
+@pytest.fixture
+def read(tmp_path):
+    """Read the charges of a text as a file `presses.csv`."""
+
+    def read(text):
+        path = tmp_path / "presses.csv"
+        path.write_bytes(text.encode())
+        return read_charges(path, NAMES)
+
+    return read
 
 
 EXPORTS = {
@@ -43,14 +51,13 @@ EXPORTS = {
 
 
 @pytest.mark.parametrize("export", EXPORTS)
-def test_charges_are_the_same_from_the_exports_of_other_programs(export):
+def test_charges_are_the_same_from_the_exports_of_other_programs(export, read):
     np.testing.assert_array_equal(read(EXPORTS[export]), [[502.3, 244.8, 215.8], [423.2, 695.6, 507.8]])
 
 
-def test_further_columns_are_ignored_with_a_message(caplog):
-    text = io.StringIO("x_mm,A,B,,C,x_mm\nhere,1,2,?,3,\n")
-    np.testing.assert_array_equal(read_charges(text, NAMES, "presses.csv"), [[1, 2, 3]])
-    assert caplog.messages == ["presses.csv: ignored columns: ['x_mm', '', 'x_mm']"]
+def test_further_columns_are_ignored_with_a_message(caplog, read, tmp_path):
+    np.testing.assert_array_equal(read("x_mm,A,B,,C,x_mm\nhere,1,2,?,3,\n"), [[1, 2, 3]])
+    assert caplog.messages == [f"{tmp_path / 'presses.csv'}: ignored columns: ['x_mm', '', 'x_mm']"]
 
 
 @pytest.mark.parametrize(
@@ -77,7 +84,7 @@ def test_further_columns_are_ignored_with_a_message(caplog):
         ("A,B,C\n" + ",".join("1" * 20_000), "line 2: expected 3 cells"),
     ],
 )
-def test_wrong_charge_tables_are_refused_with_a_short_message(text, message):
+def test_wrong_charge_tables_are_refused_with_a_short_message(text, message, read):
     with pytest.raises(ChargeError, match=message) as caught:
         read(text)
     assert len(str(caught.value)) < 600

@@ -8,8 +8,7 @@ import typer
 
 from isocharge.cli.shared.options import DeviceOption, ModelArgument, ModelsOption
 from isocharge.cli.shared.terminal import until_stopped
-from isocharge.serve import Predictor, table_records, write_contacts
-from isocharge.serve.prediction.table import read_charge_file
+from isocharge.serve import Predictor, read_charges, table_records, write_contacts
 
 
 def predict_command(
@@ -18,8 +17,8 @@ def predict_command(
         Path,
         typer.Argument(
             metavar="FILE.csv",
-            help="CSV or Parquet file with the electrodes' names in the header and a press in each row, charges in pC; "
-            "further columns are ignored. The file name - reads CSV from stdin.",
+            help="CSV file with the electrodes' names in the header and a press in each row, charges in pC; further "
+            "columns are ignored. The file name - reads stdin.",
         ),
     ],
     json: Annotated[
@@ -41,7 +40,7 @@ def predict_command(
         from isocharge.serve.live.device import load_device, predictor_for  # imports all stages of a stream
 
         predictor = predictor_for(load_device(device), predictor)
-    charge_pC = read_charge_file(file, predictor.metadata.electrodes)
+    charge_pC = read_charges(file, predictor.metadata.electrodes)
     with until_stopped():
         if json:
             for record in table_records(charge_pC, predictor):

@@ -1,8 +1,7 @@
 """Chunks of bytes, and files, pipes and the standard input as sources of chunks.
 
-A user may give a file as a port by mistake, for example a recording, records, a table of presses, an MCAP file or a
-Parquet file. The parsers of text would misread the numbers in such files as charges from a board, so these files are
-refused.
+A user may give a file as a port by mistake, for example a recording, records, a table of presses or an MCAP
+file. The parsers of text would misread the numbers in such files as charges from a board, so these files are refused.
 """
 
 import codecs
@@ -29,7 +28,6 @@ HEAD_BYTES = 4096
 RECORDING_START = b'{"isocharge_recording"'
 RECORD_KEYS = (b'"frame_id"', b'"charge_pC"', b'"tare_pC"')
 MCAP_START = b"\x89MCAP"
-PARQUET_START = b"PAR1"
 
 PRESS_COLUMNS = {"x_mm", "y_mm", "force_N", "charge_pC.A", "flags"}
 """Columns that only tables of presses and records have."""
@@ -119,8 +117,6 @@ def foreign_kind(name: str, head: bytes) -> str:
             "an MCAP file; MCAP files hold results, and isocharge only writes them; play the recording that was made "
             "beside it with `isocharge serve replay touch.rec`"
         )
-    if head.startswith(PARQUET_START):
-        return f"a Parquet file; compute its contacts with: isocharge serve predict MODEL {quoted_name}"
     columns = {column.strip(' "') for column in re.split("[,;|\t]", first_line.decode("utf-8", "replace").strip())}
     is_table = not columns.isdisjoint(PRESS_COLUMNS)
     if is_table and name != STDIN:

@@ -6,7 +6,7 @@ no contact is reported for the row.
 """
 
 import csv
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TextIO
@@ -19,8 +19,8 @@ from isocharge.common.errors import ChargeError
 from isocharge.serve.model.contact import Contact
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.model.session import N_WITHOUT_CORRELATION
-from isocharge.serve.presses.number_table import CHARGE_RULE, NumberTable, TableSource
-from isocharge.serve.presses.table_file import CsvTable, open_table
+from isocharge.serve.presses.number_columns import CHARGE_RULE
+from isocharge.serve.presses.table_file import open_table
 from isocharge.serve.record.formats import cell_text
 from isocharge.serve.record.record import NO_CONTACT, PredictionRecord
 
@@ -28,31 +28,11 @@ MAX_CHARGE_ROWS = 10_000_000
 """Largest number of rows of a file of charges."""
 
 
-def read_charges(lines: Iterable[str], electrodes: tuple[str, ...], where: str) -> Array:
-    """Read the charges from the lines of a CSV text.
+def read_charges(path: Path, electrodes: tuple[str, ...]) -> Array:
+    """Read the charges from a CSV file.
 
     Args:
-        lines: Lines of the text. Lines may end in CRLF. Blank lines and lines that begin with # are ignored.
-        electrodes: Names of the columns that are read. The text may contain other columns.
-        where: Name of the file, for error messages.
-
-    Returns:
-        Charges in the order of `electrodes`, shape (n, electrodes), pC.
-
-    Raises:
-        ChargeError: If a column is missing or occurs twice, a cell is not a finite number, or there are more rows than
-            `MAX_CHARGE_ROWS`.
-    """
-    table = CsvTable(lines, TableSource(electrodes, where, ChargeError, _expected_header(electrodes)))
-    return _read_electrode_charges(table, electrodes)
-
-
-def read_charge_file(path: Path, electrodes: tuple[str, ...]) -> Array:
-    """Read the charges from a CSV or Parquet file.
-
-    Args:
-        path: The file. It is read as Parquet if its name ends in `.parquet`, and as CSV otherwise. The path `-` is
-            standard input.
+        path: The file. The path `-` is standard input.
         electrodes: Names of the columns that are read. The file may contain other columns.
 
     Returns:
@@ -61,33 +41,11 @@ def read_charge_file(path: Path, electrodes: tuple[str, ...]) -> Array:
     Raises:
         ChargeError: If the file cannot be read, a column is missing or occurs twice, a cell is not a finite number, or
             there are more rows than `MAX_CHARGE_ROWS`.
-        MissingExtra: If the file is Parquet and pyarrow is not installed.
     """
-    with open_table(path, electrodes, ChargeError, _expected_header(electrodes)) as table:
-        return _read_electrode_charges(table, electrodes)
-
-
-def _expected_header(electrodes: tuple[str, ...]) -> str:
-    """Return a description of the header that a file of charges must have, for error messages."""
-    return f"a header with one column for each of the electrodes {electrodes} and charges in pC"
-
-
-def _read_electrode_charges(table: NumberTable, electrodes: tuple[str, ...]) -> Array:
-    """Read the charges of the given electrodes from an open table.
-
-    Args:
-        table: The table. Its header must contain the names of the electrodes.
-        electrodes: Names of the electrodes.
-
-    Returns:
-        Charges in the order of `electrodes`, shape (n, electrodes), pC.
-
-    Raises:
-        ChargeError: If a column is missing or occurs twice, a cell is not a finite number, or there are more rows than
-            `MAX_CHARGE_ROWS`.
-    """
+    expected_header = f"a header with one column for each of the electrodes {electrodes} and charges in pC"
     charge_rule = replace(CHARGE_RULE, may_be_empty=False)  # a model needs the charges of all electrodes
-    columns = table.read(dict.fromkeys(electrodes, charge_rule), {}, MAX_CHARGE_ROWS)
+    with open_table(path, electrodes, ChargeError, expected_header) as table:
+        columns = table.read(dict.fromkeys(electrodes, charge_rule), {}, MAX_CHARGE_ROWS)
     return np.column_stack([columns.values[name] for name in electrodes])
 
 

@@ -1,8 +1,8 @@
 """Presses on a film, together with the charges that were measured during each press.
 
-For each press, the position, the force or both may also be known. A file of presses is a CSV or Parquet file with the
-columns `x_mm`, `y_mm`, `force_N` and one column for the charges of each electrode in pC. The columns may be in any
-order. An empty cell stands for an unknown value. The file may have three further columns:
+For each press, the position, the force or both may also be known. A file of presses is a CSV file with the columns
+`x_mm`, `y_mm`, `force_N` and one column for the charges of each electrode in pC. The columns may be in any order. An
+empty cell stands for an unknown value. The file may have three further columns:
 
     position_std_mm   standard deviation of x and of y, mm
     force_std         standard deviation of the force relative to the force: 0.01 is 1 %
@@ -21,8 +21,8 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.errors import PressError, cut, error_prefix, shown
 from isocharge.common.files import as_output_errors, write_whole
-from isocharge.serve.presses.number_table import CHARGE_RULE, MAX_COLUMNS, ColumnRule, NumberColumns, NumberTable
-from isocharge.serve.presses.table_file import csv_text, is_parquet, open_table, parquet_bytes
+from isocharge.serve.presses.number_columns import CHARGE_RULE, ColumnRule, NumberColumns
+from isocharge.serve.presses.table_file import MAX_COLUMNS, CsvTable, csv_text, open_table
 
 POSITION_STD_MM = 0.1
 """Default standard deviation of a position, mm. It is typical of a stage that is set by hand."""
@@ -65,10 +65,10 @@ class MeasuredPresses:
         position_std_mm: Standard deviation of x and of y, shape (n,), mm.
         force_std: Standard deviation of the force relative to the force, shape (n,), dimensionless.
         electrodes: Names of the electrodes, in the order of the charges.
-        lines: Number of the line of each press in a CSV file, or number of the row in a Parquet file, for messages. If
-            the presses do not come from a file, they are numbered from 1.
+        lines: Number of the line of each press in a file, for messages. Presses that do not come from a file are
+            numbered from 1.
         ignored: Names of the columns of the file that were not read.
-        row_noun: What `lines` counts, for messages: "line", "row" or "press".
+        row_noun: What `lines` counts, for messages: "line" or "press".
 
     Raises:
         PressError: If the arrays have inconsistent shapes, or a value is not allowed. For a wrong value, the message
@@ -135,11 +135,11 @@ class MeasuredPresses:
 
     @property
     def row_words(self) -> str:
-        """Lines or rows of the presses for a message, such as "line 3" or "lines 3, 4, 7".
+        """Numbers of the presses for a message, such as "line 3" or "lines 3, 4, 7".
 
         Only the first ones are listed.
         """
-        plural = {"line": "lines", "row": "rows", "press": "presses"}[self.row_noun]
+        plural = {"line": "lines", "press": "presses"}[self.row_noun]
         return f"{self.row_noun if len(self) == 1 else plural} {cut(', '.join(map(str, self.lines)))}"
 
     @property
@@ -214,8 +214,7 @@ def read_presses(
     """Read a file of measured presses.
 
     Args:
-        path: The file, with up to `MAX_ROWS` presses. It is read as Parquet if its name ends in `.parquet`, and
-            otherwise as CSV in UTF-8, with or without a byte order mark.
+        path: The file, with up to `MAX_ROWS` presses.
         electrodes: Names of the electrodes, in the requested order of the charges. If None, all columns without another
             meaning are electrodes.
         position_std_mm: Standard deviation of x and of y for presses for which the file states none, mm.
@@ -224,7 +223,6 @@ def read_presses(
     Raises:
         PressError: If the file cannot be used. The message names the file, the line and the column, and states what was
             expected, what was given and what the user can do.
-        MissingExtra: If the file is Parquet and pyarrow is not installed.
     """
     path = Path(path)
     default_stds = {"position_std_mm": position_std_mm, "force_std": force_std}
@@ -256,25 +254,24 @@ def read_presses(
             electrodes=electrode_names,
             lines=tuple(columns.row_numbers),
             ignored=tuple(name for name in table.header if name not in columns.values),
-            row_noun=columns.row_noun,
         )
 
 
 def _read_rows(
-    table: NumberTable, required: Mapping[str, ColumnRule], optional: Mapping[str, ColumnRule]
+    table: CsvTable, required: Mapping[str, ColumnRule], optional: Mapping[str, ColumnRule]
 ) -> NumberColumns:
-    """Read columns of a file of presses; see `NumberTable.read`.
+    """Read columns of a file of presses; see `CsvTable.read`.
 
     Raises:
         PressError: If the file has no press, or the header or a cell is wrong.
     """
     columns = table.read(required, optional, MAX_ROWS)
     if len(columns.row_numbers) == 0:
-        raise table.source.error(": expected one press or more below the header, got none")
+        raise table.error(": expected one press or more below the header, got none")
     return columns
 
 
-def _electrode_columns(table: NumberTable) -> tuple[str, ...]:
+def _electrode_columns(table: CsvTable) -> tuple[str, ...]:
     """Return the names of all columns without another meaning, which are assumed to be electrodes.
 
     Args:
@@ -292,15 +289,13 @@ def read_press_list(path: Path) -> Array:
     """Read the positions and forces of the presses that a machine will make, in the order of the rows of a file.
 
     Args:
-        path: CSV or Parquet file with the columns x_mm, y_mm and force_N; see `read_presses`. All other columns are
-            ignored.
+        path: CSV file with the columns x_mm, y_mm and force_N; see `read_presses`. All other columns are ignored.
 
     Returns:
         Position and force (x, y, F) of each press, shape (n, 3), mm and N. Empty cells of the file are NaN.
 
     Raises:
         PressError: If the file cannot be read, or a row is not a press. The message names the line and the column.
-        MissingExtra: If the file is Parquet and pyarrow is not installed.
     """
     path = Path(path)
     with open_table(path, CONTACT, PressError, f"a header with {', '.join(CONTACT)}") as table:
@@ -316,20 +311,18 @@ def write_presses(path: Path, presses: MeasuredPresses) -> None:
     All numbers are written with all digits, so `read_presses` reads the same numbers from the file.
 
     Args:
-        path: The file. Its format is Parquet if its name ends in `.parquet`, and otherwise CSV.
+        path: The file.
         presses: The presses.
 
     Raises:
         PressError: If there are no presses, or more than `MAX_ROWS` presses.
         OutputError: If the file cannot be written.
-        MissingExtra: If the format is Parquet and pyarrow is not installed.
     """
     if not 0 < len(presses) <= MAX_ROWS:
         raise PressError(f"{path}: expected 1 to {MAX_ROWS:,} presses to write, got {len(presses):,}")
     path = Path(path)
-    data = parquet_bytes(presses.columns) if is_parquet(path) else csv_text(presses.columns).encode()
     with as_output_errors(path):
-        write_whole(path, data)
+        write_whole(path, csv_text(presses.columns).encode())
 
 
 def _check_electrodes(electrodes: Collection[str]) -> None:

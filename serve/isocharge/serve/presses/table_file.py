@@ -1,47 +1,42 @@
-"""Files with columns of numbers: Parquet if the name of the file ends in `.parquet`, and CSV otherwise.
+"""Files with columns of numbers, as CSV text.
 
-The columns of CSV text are separated by commas, semicolons, tabs or bars. The header is the first row that contains a
-name with a meaning; rows above it are ignored. The decimal mark is a point or a comma, and the same in the whole file.
-A number such as `1,064` may be 1.064 or 1064. A file in which no number determines the decimal mark is therefore
-refused. A point is always the decimal mark if commas separate the columns.
+The columns are separated by commas, semicolons, tabs or bars. The header is the first row that contains a name with a
+meaning; rows above it are ignored. The decimal mark is a point or a comma, and the same in the whole file. A number
+such as `1,064` may be 1.064 or 1064. A file in which no number determines the decimal mark is therefore refused. A
+point is always the decimal mark if commas separate the columns.
 
 A row that begins with # is a comment. Blank rows, and a row below the header that has the units mm, N and pC in the
 columns to read, are ignored. Blanks before and after a name or a number are also ignored. The texts `nan` and `inf` are
 not accepted.
-
-Of a Parquet file, only the requested columns are decoded. A requested column may contain integers, floating-point
-numbers or decimal numbers of any width. Null and NaN stand for empty cells. The other columns of the file may have any
-type.
 """
 
 import csv
 import io
+import logging
 import math
 import re
 from array import array
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from itertools import chain, islice
 from pathlib import Path
 from pty import STDIN_FILENO
-from typing import BinaryIO
+from typing import NoReturn
 
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import InputError, IsochargeError, cut, require, shown
-from isocharge.common.files import bounded_lines, open_regular
-from isocharge.serve.presses.number_table import ColumnRule, NumberColumns, NumberTable, TableSource
+from isocharge.common.errors import InputError, IsochargeError, shown
+from isocharge.common.files import bounded_lines
+from isocharge.serve.presses.number_columns import ColumnRule, NumberColumns
+
+log = logging.getLogger(__name__)
 
 STDIN = Path("-")
 """Path that stands for standard input, from which CSV text is read."""
 
-SUFFIX = ".parquet"
-"""End of the names of Parquet files."""
-
-MAX_METADATA_SIZE = 16 << 20
-"""Largest size of a text in the metadata, bytes, and largest number of elements of a list in the metadata."""
-
+MAX_COLUMNS = 1_000
+"""Largest number of columns of a file."""
 
 _SEPARATORS = ",;\t|"
 """Characters that may separate the columns."""
@@ -55,40 +50,123 @@ _MAX_LINES_TO_HEADER = 100
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:([.,])[0-9]*)?|([.,])[0-9]+)(?:[eE][-+]?[0-9]+)?")
 """Number with or without a decimal mark, which is a group."""
 
+_PARQUET_START = "PAR1"
+"""Beginning of a Parquet file."""
+
 _WRONG_BYTE = re.compile("[\0\udc80-\udcff]")
 """Zero byte, or a byte that is not UTF-8, which the error handler `surrogateescape` replaces by a surrogate."""
 
 _THOUSANDS = re.compile(r"[-+]?[1-9][0-9]{0,2}[.,][0-9]{3}")
 """Number whose mark may be a separator of thousands."""
 
+_UNITS_AT_END = {"length": "[µμnmc]?m", "force": "(?:[µμmk]?n|m?k?gf?)", "charge": "[µμfpn]?c"}
+"""Patterns of units in lower case that may stand at the end of the name of a column, by their quantity."""
 
-class CsvTable(NumberTable):
-    """Table of numbers that is read from a CSV text."""
 
-    def __init__(self, lines: Iterable[str], source: TableSource) -> None:
+class CsvTable:
+    """Table of numbers that is read from a CSV text. The columns can be read only once.
+
+    Attributes:
+        header: Names of the columns. Names without a meaning have no blanks at their ends.
+    """
+
+    def __init__(
+        self, lines: Iterable[str], where: str, names: Collection[str], error_class: type[InputError], expected: str
+    ) -> None:
         """Find and read the header.
 
         Args:
             lines: Lines of the text.
-            source: Name of the file, its known columns, and the class of errors.
+            where: Name of the file, for error messages.
+            names: Names of columns that have a meaning.
+            error_class: Class of the error that is raised for every mistake in the file.
+            expected: Description of the expected header, for error messages.
 
         Raises:
-            InputError: If the file is empty, is not CSV text in UTF-8, or has too many columns.
+            error_class: If the file is empty, is not CSV text in UTF-8, or has too many columns.
         """
-        checked_lines = _checked_lines(lines, source)
+        self._where = where
+        self._names = names
+        self._error_class = error_class
+        self._expected = expected
+        checked_lines = self._checked_lines(lines)
         first_lines = list(islice(checked_lines, _MAX_LINES_TO_HEADER))
-        lines_above, self._separator = _find_header(first_lines, source.names)
-        lines_below = chain(first_lines[lines_above:], checked_lines)
-        self._rows = _numbered_rows(lines_below, lines_above, self._separator, source)
+        lines_above, self._separator = _find_header(first_lines, names)
+        self._rows = self._numbered_rows(chain(first_lines[lines_above:], checked_lines), lines_above)
         header_row = next(self._rows, None)
         if header_row is None:
-            raise source.error(f": empty; expected {source.expected}")
-        super().__init__(header_row[1], source)
+            raise self.error(f": empty; expected {expected}")
+        _, header = header_row
+        if len(header) > MAX_COLUMNS:
+            raise self.error(f": expected at most {MAX_COLUMNS:,} columns, got {len(header):,}")
+        self.header = tuple(name if name in names else name.strip() for name in header)
         self._mark = ""  # decimal mark; empty until it is known
         self._is_mark_certain = False
 
+    def error(self, message: str) -> InputError:
+        """Return an error whose message consists of the name of the file and the given text."""
+        return self._error_class(f"{self._where}{message}")
+
+    def read(
+        self, required: Mapping[str, ColumnRule], optional: Mapping[str, ColumnRule], max_rows: int
+    ) -> NumberColumns:
+        """Read all required columns and the optional columns that the file contains, and check their values.
+
+        A warning lists all other columns of the file, which are ignored.
+
+        Args:
+            required: Rules of the required columns, by the names of the columns.
+            optional: Rules of the optional columns, by the names of the columns.
+            max_rows: Largest number of rows that is accepted.
+
+        Returns:
+            The required columns, and then the optional columns.
+
+        Raises:
+            InputError: If a required column is missing, if one of these columns occurs twice, if the name of a
+                column is almost that of a column that the file does not contain, such as `a (pC)` for `A`, if the file
+                is damaged or has more than `max_rows` rows, or if a cell violates the rule of its column.
+        """
+        known_rules = {**required, **optional}
+        self.refuse_similar_names((name for name in self.header if name not in known_rules), known_rules)
+        missing_names = [name for name in required if name not in self.header]
+        if missing_names:
+            self._refuse_header("missing", missing_names)
+        chosen_rules = {name: rule for name, rule in known_rules.items() if name in self.header}
+        repeated_names = [name for name in chosen_rules if self.header.count(name) > 1]
+        if repeated_names:
+            self._refuse_header("repeated", repeated_names)
+        ignored_names = [name for name in self.header if name not in chosen_rules]
+        if ignored_names:
+            log.warning("%s: ignored columns: %s", self._where, shown(ignored_names))
+        columns = self._read_columns(chosen_rules, max_rows)
+        columns.check(chosen_rules, f"{self._where}, ", self._error_class)
+        return columns
+
+    def refuse_similar_names(self, columns: Iterable[str], names: Iterable[str]) -> None:
+        """Refuse a column whose name differs from that of a missing column by case, brackets, blanks or its unit.
+
+        Args:
+            columns: Names of the columns of the file that are checked.
+            names: Names of columns that have a meaning.
+
+        Raises:
+            InputError: If a column has such a name.
+        """
+        absent_names = {
+            spelling: name
+            for name in names
+            if name not in self.header
+            for spelling in _spellings(name) | _spellings(f"{name}_pC")
+        }
+        for column in columns:
+            for spelling in _spellings(column) & absent_names.keys():
+                name = absent_names[spelling]
+                advice = f"rename {shown(column)} to {shown(name)} and check its unit, or remove the column"
+                self._refuse_header(f"{advice}; missing", [name])
+
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
-        """Convert the cells of the requested columns to numbers, row by row.
+        """Convert the cells of the requested columns to numbers, row by row, without checking the numbers.
 
         Raises:
             InputError: If there are too many rows, a row has the wrong number of cells, a cell is not a finite number,
@@ -102,7 +180,7 @@ class CsvTable(NumberTable):
             if index == 0 and _is_row_of_units([cells[i] for i in column_indices.values() if i < len(cells)]):
                 continue
             if len(line_numbers) == max_rows:  # this row is one row too many
-                self._refuse_row_count(max_rows)
+                raise self.error(f": expected at most {max_rows:,} presses, got more; split the file")
             self._check_cell_count(line_number, cells)
             line_numbers.append(line_number)
             for name, column_index in column_indices.items():
@@ -111,7 +189,7 @@ class CsvTable(NumberTable):
                 if number is None:
                     has_other_mark = self._mark != "" and any(mark in cell for mark in ",." if mark != self._mark)
                     advice = f"; the decimal mark is {self._mark!r}" if has_other_mark else ""
-                    raise self.source.error(
+                    raise self.error(
                         f", line {line_number}, column {shown(name)}: expected {rules[name].description}, got "
                         f"{shown(cell)}{advice}"
                     )
@@ -121,13 +199,13 @@ class CsvTable(NumberTable):
                 fractions = [text for text in texts if text.startswith(f"0{self._mark}")]
                 self._is_mark_certain = any(map(_NUMBER.fullmatch, fractions))
         if self._mark and not self._is_mark_certain:
-            raise self.source.error(
+            raise self.error(
                 f": every number with the mark {self._mark!r} may have a decimal mark or a separator of thousands; "
                 "write commas between the columns, decimal points and no separators of thousands"
             )
         rows = np.asarray(numbers, dtype=np.float64).reshape(len(line_numbers), len(column_indices))
         values = dict(zip(column_indices, rows.T, strict=True))
-        return NumberColumns(values, line_numbers, "line")
+        return NumberColumns(values, line_numbers)
 
     def _number(self, text: str) -> float | None:
         """Return the number in a cell: NaN for an empty cell, and None for a cell without a finite number.
@@ -166,10 +244,78 @@ class CsvTable(NumberTable):
         """
         additional_cells = cells[len(self.header) :]
         if len(cells) < len(self.header) or any(cell.strip() for cell in additional_cells):
-            raise self.source.error(
+            raise self.error(
                 f", line {line_number}: expected {len(self.header)} cells as in the header, got "
                 f"{len(cells)}: {shown(cells)}"
             )
+
+    def _refuse_header(self, reason: str, names: Sequence[str]) -> NoReturn:
+        """Raise the error for a wrong header.
+
+        Args:
+            reason: What is wrong with some names, for the error message.
+            names: These names.
+
+        Raises:
+            InputError: Always.
+        """
+        raise self.error(
+            f": expected {self._expected}, got the header {shown(list(self.header))}; {reason}: {shown(names)}"
+        )
+
+    def _checked_lines(self, lines: Iterable[str]) -> Iterator[str]:
+        """Yield the lines of a text without a byte order mark.
+
+        Args:
+            lines: Lines of the text, each with its line end.
+
+        Raises:
+            InputError: If the lines are not text in UTF-8, or a line is too long.
+        """
+        line_number = 0
+        try:
+            for line_number, line in enumerate(lines, start=1):
+                if line_number == 1 and line.startswith(_PARQUET_START):
+                    raise self.error(
+                        ": expected a CSV file, got a Parquet file; convert it to CSV, for example in Python with "
+                        "pandas.read_parquet(FILE).to_csv(NEW, index=False)"
+                    )
+                is_plain = line.isascii() and "\0" not in line  # is fast to check, and true for most lines
+                wrong_byte = None if is_plain else _WRONG_BYTE.search(line)
+                if wrong_byte:  # the file is binary, or text in another encoding
+                    raise self.error(
+                        f", line {line_number}: the byte 0x{ord(wrong_byte[0]) & 0xFF:02x} is not text in UTF-8: "
+                        "export the file as CSV in UTF-8; convert other text with: iconv -f UTF-16 (or WINDOWS-1252) "
+                        "-t UTF-8 FILE > NEW.csv"
+                    )
+                yield line.removeprefix("\ufeff") if line_number == 1 else line
+        except InputError:  # is a ValueError, too
+            raise
+        except ValueError as cause:  # the next line is too long
+            raise self.error(f", line {line_number + 1}: not CSV text in UTF-8 ({cause})") from cause
+
+    def _numbered_rows(self, lines: Iterable[str], lines_above: int) -> Iterator[tuple[int, list[str]]]:
+        """Yield the line number and the cells of each row that is neither blank nor a comment.
+
+        The first line of the file has the number 1. If a row extends over several lines, the line number is the number
+        of its last line.
+
+        Args:
+            lines: Lines of the text, each with its line end.
+            lines_above: Number of lines above these lines.
+
+        Raises:
+            InputError: If the lines are not CSV text.
+        """
+        reader = csv.reader(lines, delimiter=self._separator, strict=True)
+        try:
+            for cells in reader:
+                first_cell = cells[0].strip() if cells else ""
+                is_comment = first_cell.startswith("#") and first_cell not in self._names
+                if any(cell.strip() for cell in cells) and not is_comment:
+                    yield lines_above + reader.line_num, cells
+        except csv.Error as cause:
+            raise self.error(f", line {lines_above + reader.line_num}: not CSV text ({cause})") from cause
 
 
 def csv_text(columns: Mapping[str, Array]) -> str:
@@ -191,62 +337,6 @@ def _is_row_of_units(cells: list[str]) -> bool:
     """Return whether cells are the units of charges and other known columns, with or without brackets."""
     units = {cell.strip().strip("[]()") for cell in cells}
     return "pC" in units and units <= _UNITS
-
-
-def _checked_lines(lines: Iterable[str], source: TableSource) -> Iterator[str]:
-    """Yield the lines of a text without a byte order mark.
-
-    Args:
-        lines: Lines of the text, each with its line end.
-        source: Name of the file and class of the error, for error messages.
-
-    Raises:
-        InputError: If the lines are not text in UTF-8, or a line is too long.
-    """
-    line_number = 0
-    try:
-        for line_number, line in enumerate(lines, start=1):
-            is_plain = line.isascii() and "\0" not in line  # is fast to check, and true for most lines
-            wrong_byte = None if is_plain else _WRONG_BYTE.search(line)
-            if wrong_byte:  # the file is binary, or text in another encoding
-                raise source.error(
-                    f", line {line_number}: the byte 0x{ord(wrong_byte[0]) & 0xFF:02x} is not text in UTF-8: export "
-                    "the file as CSV in UTF-8; convert other text with: iconv -f UTF-16 (or WINDOWS-1252) -t UTF-8 "
-                    "FILE > NEW.csv"
-                )
-            yield line.removeprefix("\ufeff") if line_number == 1 else line
-    except InputError:  # is a ValueError, too
-        raise
-    except ValueError as cause:  # the next line is too long
-        raise source.error(f", line {line_number + 1}: not CSV text in UTF-8 ({cause})") from cause
-
-
-def _numbered_rows(
-    lines: Iterable[str], lines_above: int, separator: str, source: TableSource
-) -> Iterator[tuple[int, list[str]]]:
-    """Yield the line number and the cells of each row that is neither blank nor a comment.
-
-    The first line of the file has the number 1. If a row extends over several lines, the line number is the number of
-    its last line.
-
-    Args:
-        lines: Lines of the text, each with its line end.
-        lines_above: Number of lines above these lines.
-        separator: Character between the columns.
-        source: Name of the file, its known columns, and the class of errors.
-
-    Raises:
-        InputError: If the lines are not CSV text.
-    """
-    reader = csv.reader(lines, delimiter=separator, strict=True)
-    try:
-        for cells in reader:
-            first_cell = cells[0].strip() if cells else ""
-            is_comment = first_cell.startswith("#") and first_cell not in source.names
-            if any(cell.strip() for cell in cells) and not is_comment:
-                yield lines_above + reader.line_num, cells
-    except csv.Error as cause:
-        raise source.error(f", line {lines_above + reader.line_num}: not CSV text ({cause})") from cause
 
 
 def _find_header(lines: list[str], names: Collection[str]) -> tuple[int, str]:
@@ -278,113 +368,20 @@ def _find_header(lines: list[str], names: Collection[str]) -> tuple[int, str]:
     return best
 
 
-class ParquetTable(NumberTable):
-    """Table of numbers that is read from a Parquet file."""
-
-    def __init__(self, file: BinaryIO, source: TableSource) -> None:
-        """Read the metadata of the file, which must remain open until the columns have been read.
-
-        Raises:
-            InputError: If the file is not Parquet, is damaged, or has too many columns.
-        """
-        from pyarrow.parquet import ParquetFile
-
-        with _pyarrow_errors_converted(source):
-            self._parquet = ParquetFile(
-                file,
-                thrift_string_size_limit=MAX_METADATA_SIZE,
-                thrift_container_size_limit=MAX_METADATA_SIZE,
-            )
-            self._schema = self._parquet.schema_arrow
-            header = self._schema.names
-        super().__init__(header, source)
-
-    def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
-        """Decode the requested columns.
-
-        Raises:
-            InputError: If there are too many rows, if the type of a column is not a number type, or if the file is
-                damaged.
-        """
-        import pyarrow
-        from pyarrow import types
-
-        row_count = self._parquet.metadata.num_rows
-        if row_count > max_rows:
-            self._refuse_row_count(max_rows)
-        fields = {name: self._schema.field(self.header.index(name)) for name in rules}
-        # A column of nulls is an empty column.
-        is_of_type = (types.is_integer, types.is_floating, types.is_decimal, types.is_null)
-        for name, field in fields.items():
-            if not any(check(field.type) for check in is_of_type):
-                raise self.source.error(
-                    f", column {shown(name)}: expected numbers ({rules[name].description}), got a column of type "
-                    f"{cut(str(field.type))}; convert it to float64"
-                )
-        with _pyarrow_errors_converted(self.source):
-            table = self._parquet.read([field.name for field in fields.values()], use_threads=False)
-            values = {
-                name: np.asarray(table.column(field.name).cast(pyarrow.float64(), safe=False).to_numpy())
-                for name, field in fields.items()
-            }
-            if any(len(column) != row_count for column in values.values()):
-                raise ValueError(f"the columns do not have {row_count:,} rows as stated in the metadata")
-        return NumberColumns(values, range(1, row_count + 1), "row")
-
-
-def parquet_bytes(columns: Mapping[str, Array]) -> bytes:
-    """Return the bytes of a Parquet file with columns of numbers. NaN is written as null.
-
-    Args:
-        columns: Columns by their names, each of shape (n,), float64.
-
-    Raises:
-        MissingExtra: If pyarrow is not installed.
-    """
-    with require("parquet"):
-        import pyarrow
-        from pyarrow.parquet import write_table
-
-    # The option `from_pandas` converts NaN to null.
-    arrow_columns = {name: pyarrow.array(values, from_pandas=True) for name, values in columns.items()}
-    file = io.BytesIO()
-    write_table(pyarrow.table(arrow_columns), file)
-    return file.getvalue()
+def _spellings(name: str) -> set[str]:
+    """Return the letters and digits of a name in lower case, and the same with the quantity instead of a unit."""
+    with_quantity = name.casefold()
+    for quantity, unit in _UNITS_AT_END.items():
+        with_quantity = re.sub(rf"[\W_]{unit}[\W_]*$", quantity, with_quantity)
+    return {re.sub(r"[\W_]+", "", text) for text in (name.casefold(), with_quantity)}
 
 
 @contextmanager
-def _pyarrow_errors_converted(source: TableSource) -> Iterator[None]:
-    """If pyarrow raises an exception for a damaged file in the `with` block, raise a given error instead.
+def open_table(path: Path, names: Collection[str], error_class: type[InputError], expected: str) -> Iterator[CsvTable]:
+    """Open a CSV file for the `with` block, and read its header.
 
     Args:
-        source: Name of the file and class of the error, for the error message.
-
-    Raises:
-        InputError: If the block raises one of the exceptions of pyarrow.
-    """
-    from pyarrow import ArrowException
-
-    try:
-        yield
-    except (ArrowException, OSError, ValueError, MemoryError, OverflowError) as cause:
-        reason = cut(" ".join(str(cause).split()))
-        raise source.error(f": not a Parquet file, or a damaged one ({reason}); write it again, or as CSV") from cause
-
-
-def is_parquet(path: Path) -> bool:
-    """Return whether the name of a file ends in `.parquet`, in any mixture of capital and small letters."""
-    return path.suffix.lower() == SUFFIX
-
-
-@contextmanager
-def open_table(
-    path: Path, names: Collection[str], error_class: type[InputError], expected: str
-) -> Iterator[NumberTable]:
-    """Open a file for the `with` block, and read its header.
-
-    Args:
-        path: The file. A Parquet file must be a regular file. A CSV file must be text in UTF-8, with or without a byte
-            order mark. The path `-` is standard input.
+        path: The file, which is text in UTF-8, with or without a byte order mark. The path `-` is standard input.
         names: Names of columns that have a meaning.
         error_class: Class of the error that is raised for every mistake in the file.
         expected: Description of the expected header, for error messages.
@@ -394,27 +391,19 @@ def open_table(
 
     Raises:
         error_class: If the file cannot be read, either when it is opened or when the block reads the columns.
-        MissingExtra: If the file is Parquet and pyarrow is not installed.
     """
     is_stdin = path == STDIN
-    source = TableSource(names, "stdin" if is_stdin else str(path), error_class, expected)
-    kind = "Parquet" if is_parquet(path) else "CSV"
+    where = "stdin" if is_stdin else str(path)
+    file_or_descriptor = STDIN_FILENO if is_stdin else path
     try:
-        if is_parquet(path):
-            with require("parquet"):
-                import pyarrow  # noqa: F401 - a missing package is reported before a missing file
-            with open_regular(path) as file:
-                yield ParquetTable(file, source)
-        else:
-            file_or_descriptor = STDIN_FILENO if is_stdin else path
-            # The CSV reader handles the line ends. The table refuses bytes that are not UTF-8.
-            with open(
-                file_or_descriptor, encoding="utf-8", errors="surrogateescape", newline="", closefd=not is_stdin
-            ) as text:
-                yield CsvTable(bounded_lines(text), source)
+        # The CSV reader handles the line ends. The table refuses bytes that are not UTF-8.
+        with open(
+            file_or_descriptor, encoding="utf-8", errors="surrogateescape", newline="", closefd=not is_stdin
+        ) as text:
+            yield CsvTable(bounded_lines(text), where, names, error_class, expected)
     except IsochargeError:  # some errors of isocharge, such as OutputError, inherit from OSError
         raise
     except OSError as cause:
         raise error_class(
-            f"{source.where}: cannot be read ({cause.strerror or cause}); expected a {kind} file of presses"
+            f"{where}: cannot be read ({cause.strerror or cause}); expected a CSV file of presses"
         ) from cause
