@@ -60,7 +60,7 @@ def test_session_reports_its_errors_and_continues_with_saved_presses(problem, sy
     session = rig.session
     error = session.result.film_error
     assert f"errors of {error.position_mm:.2g} mm and {error.force_percent:.2g} %" in session.summary[0]
-    assert [presses.lines for presses in rig.saved] == [(1,), (1, 2), (1, 2, 3)]
+    assert [presses.lines for presses in rig.saved] == [(2,), (2, 3), (2, 3, 4)]
     assert not session.enough
     continued = PressSession(problem, save=rig.saved.append, presses=rig.saved[2], until=10.0)
     np.testing.assert_equal(continued.presses.columns, session.presses.columns)
@@ -85,7 +85,7 @@ def test_undo_removes_the_last_press(problem, synthetic, plan):
     first_two = session.presses.charge_pC[:2]
     assert session.undo() == 3
     np.testing.assert_array_equal(rig.saved[-1].charge_pC, first_two)
-    assert session.presses.lines == (1, 2)
+    assert session.presses.lines == (2, 3)
     session.undo()
     session.undo()
     assert len(rig.saved[-1]) == 0
@@ -99,7 +99,7 @@ def test_press_whose_stated_place_is_wrong_is_named(problem, synthetic, plan):
     rig = ExactRig(problem, synthetic, plan, 5)
     charge = rig.charge(np.array([2.0, 3.0, 1.0]))
     rig.session.take(charge, np.array([5.0, 0.0, 1.0]))
-    assert rig.session.result.bad_lines == (6,)
+    assert rig.session.result.bad_lines == (7,)
     assert rig.session.summary[1].startswith("Press 6, 1.00 N at (5.0, 0.0) mm, does not agree with the others")
 
 

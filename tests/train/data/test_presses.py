@@ -81,7 +81,7 @@ def test_a_simulated_dataset_with_one_force_is_refused(dataset):
 
 
 def test_a_measured_dataset_is_refused_where_simulated_presses_are_expected(dataset):
-    with pytest.raises(DatasetError, match=r"expected simulated presses, got a measured dataset.*fit_presses"):
+    with pytest.raises(DatasetError, match=r"expected simulated presses, got a measured dataset.*train fit PRESSES"):
         TrainingData.of(replace(dataset, manifest={}))
 
 

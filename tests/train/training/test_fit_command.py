@@ -1,14 +1,11 @@
 """The command `train fit` with a dataset: what it imports, and how it warns of presses without forces."""
 
-import json
-import shutil
 import sys
 
 import numpy as np
 import pytest
 
 from isocharge.cli.train import fit as fit_command
-from isocharge.common.errors import PressError
 from isocharge.serve import load_model
 from processes import finished
 
@@ -42,33 +39,6 @@ finally:
     metadata = load_model(version_folder).metadata
     assert metadata.yield_force_N == pytest.approx(0.866, abs=0.01)
     assert metadata.unnoticed.to_mm == pytest.approx(42.8, abs=0.01)
-
-
-def test_a_measured_dataset_is_trained_as_presses_alone(dataset_folder, dataset, tmp_path, command, monkeypatch):
-    """A measured dataset has no settings of a simulator."""
-    shutil.copytree(dataset_folder, tmp_path / "measured")
-    manifest = tmp_path / "measured" / "manifest.json"
-    table = json.loads(manifest.read_text())
-    del table["solver"]
-    manifest.write_text(json.dumps(table))
-    given = []
-
-    def refuse(presses, sensor_name, _, *, probes):
-        given.extend((presses, sensor_name, probes))
-        raise PressError("no training in this test")
-
-    monkeypatch.setattr(fit_command, "fit_presses", refuse)
-    _, _, err = command("train", "fit", tmp_path / "measured", "-o", tmp_path / "model")
-    assert "no training in this test" in err
-    presses, sensor_name, probes = given
-    np.testing.assert_array_equal(presses.charge_pC, dataset.samples.charge_pC)
-    assert presses.electrodes == ("A", "B", "C")
-    assert sensor_name == dataset.sensor.name
-    assert probes == ("circle:1.0",)
-
-    (tmp_path / "c.toml").write_text("[training]\nhold_out = 0.3\n")
-    words = ("train", "fit", tmp_path / "measured", "--config", tmp_path / "c.toml", "-o", tmp_path / "model")
-    assert "training.hold_out has no effect on measured presses" in command(*words)[2]
 
 
 def test_each_caution_about_a_file_of_presses_is_printed_once(tmp_path, command):

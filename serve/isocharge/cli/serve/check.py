@@ -11,7 +11,7 @@ from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.prediction.press_check import check_presses
 from isocharge.serve.presses.measured_presses import read_presses
 
-SHOWN = ("x_mm", "y_mm", "force_N", "position_error_mm", "force_error_percent", "flags", "left_out")
+SHOWN = ("line", "x_mm", "y_mm", "force_N", "position_error_mm", "force_error_percent", "flags", "left_out")
 """Values of a press in the table."""
 
 
@@ -45,8 +45,7 @@ def check_command(
         each_press = result.pop("each")
         summaries = {name: result.pop(name) for name in ("position_mm", "force_percent")}
         errors = {name: summary for name, summary in summaries.items() if summary is not None}
-        row_noun = check.errors.presses.row_noun
-        rows = [{row_noun: press["line"]} | {name: press[name] for name in SHOWN} for press in each_press]
+        rows = [{name: press[name] for name in SHOWN} for press in each_press]
         result = {"each": rows, "errors": errors} | result
         if check.std_factor is not None:
             result["std_factor"] = f"{check.std_factor.statement}, if they were not used for the model"

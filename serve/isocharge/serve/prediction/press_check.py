@@ -206,7 +206,7 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
         notes += _remedies(errors, is_selected, position, force)
     notes += _exclusion_notes(errors, predictor.validity)
     if is_bad.any():
-        notes.append(f"{errors.presses[is_bad].row_words}: nothing like the other presses, left out; look at it")
+        notes.append(f"{errors.presses[is_bad].line_words}: nothing like the other presses, left out; look at it")
     if fits is not None:
         notes += _common_notes(agreement)
     return PressCheck(
@@ -364,7 +364,7 @@ def _exclusion_notes(errors: PressErrors, validity: Validity) -> Iterator[str]:
     for reason in sorted(set(reasons.tolist()) - {""}):  # a press that is compared has an empty reason
         excluded = errors.presses[reasons == reason]
         explanation = domain if reason == NOT_TRAINED else reason
-        yield f"{len(excluded)} of {len(reasons)} presses do not count: {explanation} ({excluded.row_words})"
+        yield f"{len(excluded)} of {len(reasons)} presses do not count: {explanation} ({excluded.line_words})"
 
 
 def _common_notes(agreement: Agreement) -> Iterator[str]:

@@ -68,7 +68,6 @@ class MeasuredPresses:
         lines: Number of the line of each press in a file, for messages. Presses that do not come from a file are
             numbered from 1.
         ignored: Names of the columns of the file that were not read.
-        row_noun: What `lines` counts, for messages: "line" or "press".
 
     Raises:
         PressError: If the arrays have inconsistent shapes, or a value is not allowed. For a wrong value, the message
@@ -82,7 +81,6 @@ class MeasuredPresses:
     electrodes: tuple[str, ...]
     lines: tuple[int, ...]
     ignored: tuple[str, ...] = ()
-    row_noun: str = "line"
 
     def __post_init__(self) -> None:
         _check_electrodes(self.electrodes)
@@ -134,13 +132,12 @@ class MeasuredPresses:
         return replace(self, charge_pC=self.charge_pC[:, column_indices], electrodes=names)
 
     @property
-    def row_words(self) -> str:
+    def line_words(self) -> str:
         """Numbers of the presses for a message, such as "line 3" or "lines 3, 4, 7".
 
         Only the first ones are listed.
         """
-        plural = {"line": "lines", "press": "presses"}[self.row_noun]
-        return f"{self.row_noun if len(self) == 1 else plural} {cut(', '.join(map(str, self.lines)))}"
+        return f"{'line' if len(self) == 1 else 'lines'} {cut(', '.join(map(str, self.lines)))}"
 
     @property
     def columns(self) -> dict[str, Array]:
@@ -175,15 +172,15 @@ class MeasuredPresses:
         rules = PRESS_RULES | dict.fromkeys(self.electrodes, CHARGE_RULE)
         for name in UNCERTAINTY:
             rules[name] = replace(rules[name], may_be_empty=False)
-        columns = NumberColumns(self.columns, self.lines, self.row_noun)
+        columns = NumberColumns(self.columns, self.lines)
         columns.check(rules, where="", error_class=PressError)  # the caller knows the file, if there is one
 
         _refuse_half_positions(columns)
         has_no_charge = np.isnan(self.charge_pC).all(axis=1)
         if has_no_charge.any():
             raise PressError(
-                f"{self.row_noun} {self.lines[has_no_charge.argmax()]}: expected a charge of one electrode or more, "
-                f"got none; fill it in or remove the {self.row_noun}"
+                f"line {self.lines[has_no_charge.argmax()]}: expected a charge of one electrode or more, got none; "
+                "fill it in or remove the line"
             )
 
 
@@ -199,8 +196,8 @@ def _refuse_half_positions(columns: NumberColumns) -> None:
     is_half = np.isnan(columns.values["x_mm"]) != np.isnan(columns.values["y_mm"])
     if is_half.any():
         raise PressError(
-            f"{columns.row_noun} {columns.row_numbers[is_half.argmax()]}: expected both x_mm and y_mm, or two empty "
-            "cells, got one of them; give the other"
+            f"line {columns.lines[is_half.argmax()]}: expected both x_mm and y_mm, or two empty cells, got one of "
+            "them; give the other"
         )
 
 
@@ -241,7 +238,7 @@ def read_presses(
         columns = _read_rows(table, dict.fromkeys(electrode_names, CHARGE_RULE), PRESS_RULES)
 
     # Columns that the file does not have are filled with NaN. Missing standard deviations get their default values.
-    unknown_values = np.full(len(columns.row_numbers), np.nan)
+    unknown_values = np.full(len(columns.lines), np.nan)
     values = {name: columns.values.get(name, unknown_values) for name in (*electrode_names, *PRESS_RULES)}
     for name, std in default_stds.items():
         values[name] = np.where(np.isnan(values[name]), std, values[name])
@@ -252,7 +249,7 @@ def read_presses(
             position_std_mm=values["position_std_mm"],
             force_std=values["force_std"],
             electrodes=electrode_names,
-            lines=tuple(columns.row_numbers),
+            lines=tuple(columns.lines),
             ignored=tuple(name for name in table.header if name not in columns.values),
         )
 
@@ -266,7 +263,7 @@ def _read_rows(
         PressError: If the file has no press, or the header or a cell is wrong.
     """
     columns = table.read(required, optional, MAX_ROWS)
-    if len(columns.row_numbers) == 0:
+    if len(columns.lines) == 0:
         raise table.error(": expected one press or more below the header, got none")
     return columns
 

@@ -49,17 +49,15 @@ CHARGE_RULE = ColumnRule("a charge in pC")
 
 @dataclass(frozen=True)
 class NumberColumns:
-    """Columns of numbers, and the positions of their rows in the file.
+    """Columns of numbers, and the lines of a file from which their rows were read.
 
     Attributes:
         values: The columns by their names, each of shape (n,); NaN for an empty cell.
-        row_numbers: Number of each row, such as that of its line in a file.
-        row_noun: What the row numbers count, for messages.
+        lines: Number of the line of each row.
     """
 
     values: Mapping[str, Array]
-    row_numbers: Sequence[int]
-    row_noun: str = "line"
+    lines: Sequence[int]
 
     def check(self, rules: Mapping[str, ColumnRule], where: str, error_class: type[InputError]) -> None:
         """Check that all values comply with the rules of their columns.
@@ -70,7 +68,7 @@ class NumberColumns:
             error_class: Class of the error that is raised.
 
         Raises:
-            error_class: If a value violates its rule. The message names the first wrong row, the column, the rule and
+            error_class: If a value violates its rule. The message names the first wrong line, the column, the rule and
                 the value.
         """
         violations_of_columns = [rules[name].violations(column) for name, column in self.values.items()]
@@ -83,6 +81,5 @@ class NumberColumns:
         value = float(self.values[name][row])
         text = "an empty cell" if np.isnan(value) else f"{value:.15g}"
         raise error_class(
-            f"{where}{self.row_noun} {self.row_numbers[row]}, column {shown(name)}: expected "
-            f"{rules[name].description}, got {text}"
+            f"{where}line {self.lines[row]}, column {shown(name)}: expected {rules[name].description}, got {text}"
         )

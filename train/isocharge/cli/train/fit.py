@@ -25,7 +25,6 @@ from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import Sensor, load_sensor, parse_probe, read_dataset
 from isocharge.train import FitConfig, Fitted, TrainingConfig, TrainingData, fit, fit_presses, load_config, release
 from isocharge.train.data.channel_noise import misfit_noise
-from isocharge.train.data.presses import is_measured, measured_presses_of
 
 
 def fit_command(
@@ -43,9 +42,9 @@ def fit_command(
         Path | None,
         typer.Argument(
             metavar="DATASET|PRESSES.csv",
-            help="A dataset folder of `isocharge simulate sweep` or of measured presses, or a CSV file of measured "
-            "presses with the columns x_mm, y_mm, force_N and the names of the channels (pC). The file needs 500 or "
-            "more presses. (default: --sensor)",
+            help="A dataset folder of `isocharge simulate sweep`, or a CSV file of measured presses with the columns "
+            "x_mm, y_mm, force_N and the names of the channels (pC). The file needs 500 or more presses. (default: "
+            "--sensor)",
         ),
     ] = None,
     sensor: Annotated[
@@ -108,18 +107,11 @@ def fit_command(
         raise InputError("expected either a DATASET folder or --sensor SENSOR, got neither")
     elif dataset.is_dir():
         _refuse_options(context, "a dataset folder")
-        loaded_dataset = read_dataset(dataset)
-        electrodes = loaded_dataset.sensor.electrode_names
-        if is_measured(loaded_dataset):
-            _refuse_settings(config, fit_config)
-            presses = measured_presses_of(loaded_dataset)
-            probes = loaded_dataset.samples.probes
-            train = partial(fit_presses, presses, loaded_dataset.sensor.name, probes=probes)
-        else:
-            training_data = TrainingData.of(loaded_dataset)
-            if training_data.yield_force_N is not None:
-                say(f"caution: PVDF yields beyond {training_data.yield_force_N:g} N, and a dent stays")
-            train = partial(fit, training_data)
+        training_data = TrainingData.of(read_dataset(dataset))
+        electrodes = training_data.sensor.electrode_names
+        if training_data.yield_force_N is not None:
+            say(f"caution: PVDF yields beyond {training_data.yield_force_N:g} N, and a dent stays")
+        train = partial(fit, training_data)
     else:  # a file or a pipe
         _refuse_options(context, "measured presses", "probe", "position_std_mm", "force_std")
         _refuse_settings(config, fit_config)

@@ -214,7 +214,7 @@ def _outside_words(presses: MeasuredPresses, problem: CalibrationProblem) -> str
     domain = problem.solved_domain
     low, high = domain.force_range
     return (
-        f"{presses.row_words}: a calibration takes presses within "
+        f"{presses.line_words}: a calibration takes presses within "
         f"{domain.radius:.3g} mm of the centre (--radius) and of {low:.2g} to {high:.2g} N"
     )
 
@@ -246,7 +246,7 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
     cautions = []
     film = estimation.film
     if estimation.is_bad.any():
-        cautions.append(f"{presses[estimation.is_bad].row_words}: does not agree with the other presses; left out")
+        cautions.append(f"{presses[estimation.is_bad].line_words}: does not agree with the other presses; left out")
     errors = estimation.hypothesis.errors
     if errors.noise.gain > MAX_USUAL_NOISE:
         cautions.append(

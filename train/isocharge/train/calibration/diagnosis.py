@@ -106,9 +106,8 @@ def check_places(presses: MeasuredPresses, film: Film) -> None:
     if outside_rows.size:
         row = outside_rows[0]
         raise PressError(
-            f"{presses.row_noun} {presses.lines[row]}: a press at ({places[row, 0]:g}, {places[row, 1]:g}) mm "
-            f"is off the film, whose radius there is {rim_distance[row]:.4g} mm; positions are in mm from the film's "
-            "centre"
+            f"line {presses.lines[row]}: a press at ({places[row, 0]:g}, {places[row, 1]:g}) mm is off the film, "
+            f"whose radius there is {rim_distance[row]:.4g} mm; positions are in mm from the film's centre"
         )
     largest_distance = np.fmax.reduce(distance, initial=0.0)  # ignores NaN
     if 0.0 < largest_distance < MIN_LARGEST_DISTANCE_MM:

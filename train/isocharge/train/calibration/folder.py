@@ -378,7 +378,7 @@ def usable_held_out(
     is_learned = have_charges_of(held_out.charge_pC, presses.charge_pC)
     if is_learned.any():
         raise PressError(
-            f"{held_out[is_learned].row_words}: expected held-out presses that are not among "
+            f"{held_out[is_learned].line_words}: expected held-out presses that are not among "
             "those of the calibration, got the same charges; take them out of one of the files"
         )
     is_known = np.isfinite(held_out.charge_pC).all(axis=1) & np.isfinite(held_out.contact).any(axis=1)

@@ -48,7 +48,7 @@ def calibration_picture(result: CalibrationResult) -> Figure:
     residual_axes.axhline(1.0, color=INK, lw=0.8, ls="--")  # the expected size
     residual_axes.set(
         title="residuals of the presses",
-        xlabel=f"{result.presses.row_noun} of the press",
+        xlabel="line of the press",
         ylabel="residual, relative to its expected size",
     )
     return figure

@@ -86,7 +86,8 @@ class PressSession:
 
     Attributes:
         problem: The calibration problem, which defines the possible films and their estimate before the presses.
-        presses: All presses so far, in the order in which they were made. Their line numbers begin at 1.
+        presses: All presses so far, in the order in which they were made. Their line numbers begin at 2, below the
+            header of a file.
         result: Result of the calibration by these presses; None without presses, or if no film explains the presses.
         refusal: Reason why no film explains the presses; empty if a film explains the presses or if there are none.
     """
@@ -125,7 +126,7 @@ class PressSession:
         self._save = save
         self._until = until
         self._stds = {"position_std_mm": position_std_mm, "force_std": force_std}
-        no_presses = MeasuredPresses(
+        presses = presses or MeasuredPresses(
             contact=np.empty((0, 3)),
             charge_pC=np.empty((0, len(problem.electrodes))),
             position_std_mm=np.empty(0),
@@ -133,7 +134,7 @@ class PressSession:
             electrodes=problem.electrodes,
             lines=(),
         )
-        self._fit(presses or no_presses)
+        self._fit(replace(presses, lines=tuple(range(2, len(presses) + 2))))
 
     def __len__(self) -> int:
         return len(self.presses)
@@ -186,7 +187,7 @@ class PressSession:
             charge_pC=np.vstack([presses.charge_pC, charge]),
             position_std_mm=np.append(presses.position_std_mm, self._stds["position_std_mm"]),
             force_std=np.append(presses.force_std, self._stds["force_std"]),
-            lines=(*presses.lines, len(presses) + 1),
+            lines=(*presses.lines, len(presses) + 2),
         )
         self._change(extended_presses)
 
@@ -226,7 +227,7 @@ class PressSession:
         self._fit(presses)
 
     def _fit(self, presses: MeasuredPresses) -> None:
-        """Number the presses from 1, and fit the film to the presses.
+        """Fit the film to presses.
 
         If no film explains the presses, `result` becomes None, and `refusal` becomes the reason. Without presses,
         `result` becomes None, and `refusal` becomes empty.
@@ -234,7 +235,7 @@ class PressSession:
         Args:
             presses: All presses of the session.
         """
-        self.presses = replace(presses, lines=tuple(range(1, len(presses) + 1)), row_noun="press")
+        self.presses = presses
         self.result = None
         self.refusal = ""
         self._proposed = None
@@ -263,9 +264,9 @@ class PressSession:
             return ()
         error_sentence = self.result.summary[0]
         bad_sentences = [
-            f"Press {number}, {describe_press(self.presses.contact[number - 1])}, does not agree with the others "
-            "and is left out. Were its position and its force as stated?"
-            for number in self.result.bad_lines
+            f"Press {line - 1}, {describe_press(self.presses.contact[line - 2])}, does not agree with the others and "
+            "is left out. Were its position and its force as stated?"
+            for line in self.result.bad_lines
         ]
         return (error_sentence, *bad_sentences)
 

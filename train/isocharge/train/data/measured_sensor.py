@@ -197,9 +197,8 @@ def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compare
     row = int(distance.argmax())
     if distance[row] > FARTHEST * usual_distance:
         raise PressError(
-            f"{presses.row_noun} {presses.lines[row]}, column {shown(name)}: expected a value of the size of the "
-            f"others, whose median is {np.median(values):.3g}, got {values[row]:.6g}; correct it, or remove the "
-            f"{presses.row_noun}"
+            f"line {presses.lines[row]}, column {shown(name)}: expected a value of the size of the others, whose "
+            f"median is {np.median(values):.3g}, got {values[row]:.6g}; correct it, or remove the line"
         )
 
 

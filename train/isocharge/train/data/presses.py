@@ -18,7 +18,7 @@ from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import DatasetError, PressError, cut, shown
 from isocharge.common.files import sha256_of
 from isocharge.common.structs import Positive, convert
-from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM, MeasuredPresses
+from isocharge.serve.presses.measured_presses import CONTACT, MeasuredPresses
 from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor
 from isocharge.simulate.numerics.disk import log_spaced_forces
 from isocharge.train.data.channel_noise import Noise
@@ -297,21 +297,6 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
     samples = Samples(x_mm, y_mm, force_N, probe_column, orientation_deg, complete_presses.charge_pC)
     sha256 = presses_sha256(complete_presses)
     return Dataset(sensor, samples, manifest={}, sha256=sha256)  # measured presses have no settings of a simulator
-
-
-def measured_presses_of(dataset: Dataset) -> MeasuredPresses:
-    """Return the presses of a measured dataset with the default standard deviations. The lines are numbered from 0."""
-    samples = dataset.samples
-    count = len(samples)
-    return MeasuredPresses(
-        contact=LabelledPresses.of(samples).contact,
-        charge_pC=samples.charge_pC,
-        position_std_mm=np.full(count, POSITION_STD_MM),
-        force_std=np.full(count, FORCE_STD),
-        electrodes=tuple(dataset.sensor.electrode_names),
-        lines=tuple(range(count)),
-        row_noun="sample",
-    )
 
 
 def have_charges_of(charge: Array, others: Array) -> Booleans:

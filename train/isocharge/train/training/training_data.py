@@ -70,7 +70,7 @@ class TrainingData:
         if is_measured(dataset):
             raise DatasetError(
                 "expected simulated presses, got a measured dataset, whose manifest has no settings of a simulator; "
-                "train with `isocharge train fit DATASET`, or with `fit_presses` in Python"
+                "write the presses as CSV, and train with `isocharge train fit PRESSES.csv`"
             )
         presses = presses_of(dataset)
         first_force_N = presses.contact[0, 2]
