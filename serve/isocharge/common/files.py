@@ -4,13 +4,12 @@ A file or folder that is written appears under its name only when it is complete
 """
 
 import errno
-import fcntl
 import hashlib
 import os
 import secrets
 import shutil
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
@@ -231,7 +230,9 @@ def new_folder(path: Path) -> Iterator[Path]:
             temporary_path.mkdir(parents=True)
             yield temporary_path
     finally:
-        remove_empty(missing_parents)  # they are only empty after an error; otherwise they contain the new folder
+        for parent in missing_parents:  # they are only empty after an error; otherwise they contain the new folder
+            if parent.is_dir() and not any(parent.iterdir()):
+                parent.rmdir()
 
 
 def _temporary_path(path: Path) -> Path:
@@ -258,17 +259,6 @@ def as_output_errors(path: Path) -> Iterator[None]:
         raise OutputError(f"{path} cannot be written: {error.strerror or error}; choose another output") from error
 
 
-def remove_empty(folders: Iterable[Path]) -> None:
-    """Remove those of the given folders that contain neither files nor folders.
-
-    Args:
-        folders: The folders. Inner folders must come before outer folders. Paths that do not exist are ignored.
-    """
-    for folder in folders:
-        if folder.is_dir() and not any(folder.iterdir()):
-            folder.rmdir()
-
-
 def flush_to_disk(path: Path) -> None:
     """Flush a file or a folder to disk, so that its content survives a power failure.
 
@@ -282,28 +272,3 @@ def flush_to_disk(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Lock a folder for the `with` block, so that no other process can lock the folder.
-
-    The operating system unlocks the folder if this process is killed.
-
-    Args:
-        folder: The folder, which must exist.
-
-    Raises:
-        OutputExists: If another process has locked the folder.
-    """
-    descriptor = os.open(folder, os.O_RDONLY)  # a folder cannot be opened for writing
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises an error at once instead of waiting
-        except BlockingIOError as error:
-            raise OutputExists(
-                f"another process is at work in {folder}; wait for it, or choose another output"
-            ) from error
-        yield
-    finally:
-        os.close(descriptor)  # also unlocks the folder

@@ -11,13 +11,13 @@ import pytest
 from tests.train.calibration.conftest import FEW_VALUES, rig
 from tests.train.short_training import short_training
 
-from isocharge.common.errors import ModelError, OutputExists, PressError
+from isocharge.common.errors import ModelError, PressError
 from isocharge.serve import Predictor, read_presses
 from isocharge.simulate import NoiseModel, load_sensor
 from isocharge.train import CalibrationProblem, calibrate
 from isocharge.train.calibration import calibrate as calibrate_module
 from isocharge.train.calibration import estimator, film_network
-from isocharge.train.calibration.folder import calibration_folder, read_earlier, write_calibration
+from isocharge.train.calibration.folder import check_calibration_folder, read_earlier, write_calibration
 from kept import kept
 
 QUICK = short_training(32, 16, 300, 50, 1_000)
@@ -71,18 +71,6 @@ def test_folder_contains_the_presses_the_sensor_and_the_estimate(written, proble
         assert (written.path / name).read_bytes() == (version / name).read_bytes()
 
 
-def test_stale_files_are_mended(written, problem, tmp_path):
-    path = tmp_path / "film"
-    shutil.copytree(written.path, path)
-    (path / "card.md").write_text("stale")
-    (path / ".2.draft").write_text("half written")
-    with calibration_folder(path, problem):
-        with pytest.raises(OutputExists, match="another process"), calibration_folder(path, problem):
-            pass
-        assert (path / "card.md").read_bytes() == (path / "1" / "card.md").read_bytes()
-        assert not (path / ".2.draft").exists()
-
-
 def test_network_is_trained_with_the_noise_of_the_presses(written, tmp_path):
     film = replace(written.result.film, noise=NoiseModel("presses", 1.0, 0.016))
     result = replace(written.result, estimation=replace(written.result.estimation, film=film))
@@ -128,10 +116,8 @@ def test_unsuitable_folders_are_refused_and_left_as_they_are(written, problem, t
     with pytest.raises(ModelError, match="expected a new folder or one of an earlier calibration"):
         write_calibration(written.result, tmp_path / "mine")
     other = CalibrationProblem(load_sensor("three-25um-biaxial"), problem.probe)
-    with pytest.raises(ModelError), calibration_folder(written.path, other):
-        pass
-    with pytest.raises(RuntimeError), calibration_folder(tmp_path / "new" / "film", problem):
-        raise RuntimeError
+    with pytest.raises(ModelError):
+        check_calibration_folder(written.path, other.electrodes)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]
     with pytest.raises(PressError, match=r"calibration\.json"):
         read_earlier(tmp_path / "mine", problem)

@@ -1,6 +1,5 @@
 """`isocharge train calibrate`: calibrate a film with measured presses, and write a model of this film."""
 
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -27,7 +26,7 @@ from isocharge.simulate import load_sensor, parse_probe
 from isocharge.train import CalibrationProblem, CalibrationResult, ProposedPress, calibrate, next_presses
 from isocharge.train.calibration.calibrate import solve_even
 from isocharge.train.calibration.folder import (
-    calibration_folder,
+    check_calibration_folder,
     read_earlier,
     result_table,
     usable_held_out,
@@ -98,11 +97,12 @@ def calibrate_command(
     if file is None and output is not None:
         raise InputError("--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out")
     problem = CalibrationProblem(load_sensor(sensor), parse_probe(probe), radius=radius, stress_limit=stress_limit)
+    if output is not None:
+        check_calibration_folder(output, problem.electrodes)
     result: CalibrationResult | None = None  # None if only presses are proposed
     std_factor: StdFactor | None = None  # None without held-out presses
     proposed_presses: list[ProposedPress] = []
     with (
-        calibration_folder(output, problem) if output is not None else nullcontext(),
         shown_progress(),
         executor_for() as executor,
     ):

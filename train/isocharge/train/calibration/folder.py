@@ -10,9 +10,7 @@
     FOLDER/sensor.toml, calibration.json, card.md, calibration.png    copies of the files of the last version
 
 A further calibration in the same folder becomes its next version. A server loads the new version when it reloads its
-models. Programs only read the version folders, and the copies above the version folders are for people. Before each
-calibration, the copies are written again from the last version, because an earlier process may have been killed before
-it wrote the copies.
+models. Programs only read the version folders, and the copies above the version folders are for people.
 
 The file `calibration.json` contains the value and the standard deviation of each unknown, in the unit of the property
 of the same name. The unit of an offset is pC, and coefficients have no unit. `correlations` is the lower triangle of
@@ -21,10 +19,8 @@ digits. The correlations of an unknown whose standard deviation is zero are zero
 """
 
 import json
-import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Executor
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -35,7 +31,7 @@ from msgspec.structs import replace as replace_setting
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, PressError, cut
-from isocharge.common.files import as_output_errors, locked, remove_empty, write_whole
+from isocharge.common.files import write_whole
 from isocharge.common.structs import Text, plain_values, read_json
 from isocharge.serve.model.charge_file import FILE as CHARGES
 from isocharge.serve.model.charge_file import charge_map_bytes
@@ -238,61 +234,6 @@ def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
         raise ModelError(f"{folder}: expected a new folder or one of an earlier calibration; choose another --output")
 
 
-@contextmanager
-def calibration_folder(folder: Path, problem: CalibrationProblem) -> Iterator[None]:
-    """Lock a folder for a calibration while a `with` block runs (context manager).
-
-    Before the block, drafts that a killed process left behind are removed. In addition, the readable files of the last
-    version are copied to the folder again. After the block, the folder and its newly created parent folders are removed
-    if they are empty.
-
-    Args:
-        folder: The folder, which is created if it does not exist.
-        problem: The calibration problem, which defines the electrodes.
-
-    Raises:
-        ModelError: If the folder cannot be used for a calibration because of its name or content.
-        OutputExists: If another process writes a calibration to the folder.
-        OutputError: If the folder cannot be written.
-    """
-    check_calibration_folder(folder, problem.electrodes)
-    folder_and_new_parents = [folder, *(parent for parent in folder.parents if not parent.exists())]
-    with as_output_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            with locked(folder):
-                for draft in folder.glob(".*.draft"):
-                    shutil.rmtree(draft, ignore_errors=True)  # removes the draft if it is a folder
-                    draft.unlink(missing_ok=True)  # removes the draft if it is a file
-                _copy_last_version(folder)
-                yield
-        finally:
-            remove_empty(folder_and_new_parents)
-
-
-def _copy_last_version(folder: Path) -> None:
-    """Copy the readable files of the last version to the folder of the calibration.
-
-    Args:
-        folder: Folder of the calibration, which contains the version folders.
-    """
-    calibrated_versions = _calibrated_versions(folder)
-    if not calibrated_versions:
-        return
-    last_version = calibrated_versions[-1]
-    for name in (SENSOR, PICTURE, CARD, RESULT):
-        write_whole(folder / name, (last_version / name).read_bytes())
-
-
-def _calibrated_versions(folder: Path) -> list[Path]:
-    """Return the version folders that contain a calibration, in ascending order of the version.
-
-    Args:
-        folder: Folder of the calibration, which contains the version folders.
-    """
-    return [version for version in version_folders(folder).values() if (version / RESULT).is_file()]
-
-
 def write_calibration(
     result: CalibrationResult,
     folder: Path,
@@ -355,7 +296,8 @@ def write_calibration(
         version=max(version_folders(folder), default=0) + 1,
         command=command,
     )
-    _copy_last_version(folder)
+    for name in (SENSOR, PICTURE, CARD, RESULT):
+        write_whole(folder / name, (released_model.folder / name).read_bytes())
     return released_model.folder
 
 
@@ -426,9 +368,9 @@ def read_earlier(folder: Path, problem: CalibrationProblem) -> FilmEstimate:
     Raises:
         PressError: If the folder contains no calibration, or a calibration of another problem.
     """
-    versions = _calibrated_versions(folder)
-    path = (versions[-1] if versions else folder) / RESULT
-    return read_film(path, problem).drifted()
+    calibrated_versions = [version for version in version_folders(folder).values() if (version / RESULT).is_file()]
+    *_, version = folder, *calibrated_versions
+    return read_film(version / RESULT, problem).drifted()
 
 
 def _film_section(result: CalibrationResult, made_with: Mapping[str, Any]) -> str:
