@@ -18,13 +18,8 @@ def source_text(name: str, **values: object) -> str:
 
 
 def c_float(value: float) -> str:
-    """Return the shortest C literal that represents a finite float32 number exactly."""
+    """Return the shortest C literal of a finite number that is rounded to single precision."""
     return str(np.float32(value)) + "f"
-
-
-def c_double(value: float) -> str:
-    """Return the shortest C literal that represents a finite double exactly."""
-    return repr(float(value))
 
 
 def c_array(name: str, values: NDArray[Any]) -> str:
@@ -33,7 +28,7 @@ def c_array(name: str, values: NDArray[Any]) -> str:
     Args:
         name: Name of the array.
         values: Array of any shape, written row by row; int8 numbers become `signed char`, uint32 numbers `unsigned`,
-            and all others `float`.
+            and all others `float`, to which they are rounded.
     """
     number_type = {"int8": "signed char", "uint32": "unsigned"}.get(values.dtype.name, "float")
     as_text = c_float if number_type == "float" else str

@@ -15,7 +15,7 @@ from isocharge.common.files import new_folder, refuse_existing, write_whole
 from isocharge.serve.live.device import ANY_BOARD, STAGES
 from isocharge.serve.model.model_folder import load_model
 from isocharge.serve.signal_chain.stage import NOT_IN_C, Device, Setup, SUM_TOLERANCE_s
-from isocharge.train.export_c.c_text import c_comment, c_double, source_text
+from isocharge.train.export_c.c_text import c_comment, source_text
 from isocharge.train.export_c.model_source import model_header, model_source, self_test
 from isocharge.train.model_release.onnx_graph import read_graph
 
@@ -77,10 +77,10 @@ def _c_literal(value: Any) -> str:
         value: The number, truth value or array.
     """
     if isinstance(value, np.ndarray):
-        return "{" + ", ".join(map(c_double, value)) + "}"
+        return "{" + ", ".join(map(_c_literal, value)) + "}"
     if isinstance(value, int):  # truth values are integers as well
         return str(int(value))
-    return c_double(value)
+    return repr(float(value))  # the shortest literal of a double
 
 
 SKETCH = "isocharge_sketch"

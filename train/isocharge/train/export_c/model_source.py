@@ -72,12 +72,12 @@ def layer_source(name: str, weight: Array, bias: Array | None = None, *, is_hidd
     n_input, n_output = weight.shape
 
     # The arrays: the weights, the scales if the weights are integers, and the bias if it is constant
-    values, scale = round_to_int8(_to_single_precision(weight))
+    values, scale = round_to_int8(weight.astype(np.float32))
     arrays = [c_array(f"{name}_weights", values)]
     if scale is not None:
         arrays.append(c_array(f"{name}_scale", scale))
     if bias is not None:
-        arrays.append(c_array(f"{name}_bias", _to_single_precision(bias)))
+        arrays.append(c_array(f"{name}_bias", bias))
 
     # C expression for output j. At first, y[j] contains the sum of the products for this output. If the weights are
     # integers, the sum is multiplied by the scale of its column.
@@ -235,7 +235,7 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
         largest_logarithm=c_float(LARGEST_LOGARITHM),
         known=ANGLES.stop,
         answers=ANGLES.stop + network.features.n_electrode,
-        table=c_array("COSINES", COSINES_TO_CORRELATIONS.astype(np.float32)),
+        table=c_array("COSINES", COSINES_TO_CORRELATIONS),
         cosines=len(COSINES_TO_CORRELATIONS),
         first=ANGLES.start,
         misfit_unit=c_float(MISFIT_LIMIT),
@@ -290,7 +290,7 @@ def self_test(golden: Golden, metadata: ModelMetadata) -> str:
     answers = np.concatenate([golden.outputs[name] for name in COLUMNS], axis=1).astype(np.float32)
     contacts = Contacts(*answers.T)
     flags = [sum(FLAG_BITS[flag] for flag in words) for words in Validity.of(metadata).batch_flags(contacts)]
-    floors = np.array([floor for name in COLUMNS for floor in golden.tolerance.floor[name]], np.float32)
+    floors = np.concatenate([golden.tolerance.floor[name] for name in COLUMNS])
     return source_text(
         "self_test.c",
         vectors=len(answers),
@@ -315,15 +315,8 @@ def _features_source(features: ChargeFeatures) -> str:
         arrays["MEAN"] = features.mean
         template = "features_signed.c"
     n_electrode = features.n_electrode
-    texts = [
-        c_array(name, np.broadcast_to(_to_single_precision(values), n_electrode)) for name, values in arrays.items()
-    ]
+    texts = [c_array(name, np.broadcast_to(values, n_electrode)) for name, values in arrays.items()]
     return source_text(template, arrays="\n".join(texts), electrodes=n_electrode)
-
-
-def _to_single_precision(values: Array) -> Singles:
-    """Convert values to single precision."""
-    return np.asarray(values, dtype=np.float32)
 
 
 def _convert_to_differences(weight: Array) -> Array:
