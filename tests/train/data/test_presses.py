@@ -32,14 +32,14 @@ def positions_of(contact):
     return {tuple(position) for position in contact[:, :2]}
 
 
-def test_domain_is_that_of_the_manifest_or_of_the_samples(dataset):
+def test_domain_is_that_of_the_manifest(dataset):
     assert domain_of(dataset) == Domain(8.0, (0.05, 2.0))
-    samples = dataset.samples
-    largest_distance = np.hypot(samples.x_mm, samples.y_mm).max()
-    force_range = (samples.force_N.min(), samples.force_N.max())
-    assert domain_of(replace(dataset, manifest={})) == Domain(largest_distance, force_range)
-    with pytest.raises(DatasetError, match="do not hold the samples"):
-        domain_of(replace(dataset, manifest={"ranges": {"radius_mm": 5.0}}))
+    for ranges, message in (
+        ({"radius_mm": 5.0, "force_N": [0.05, 2.0]}, "radius_mm 5 .* do not hold the samples, which reach 7.99"),
+        ({"radius_mm": 8.0}, "manifest ranges.*force_N"),
+    ):
+        with pytest.raises(DatasetError, match=message):
+            domain_of(replace(dataset, manifest={"ranges": ranges}))
 
 
 def with_one_charge(dataset, value):

@@ -3,7 +3,6 @@
 import json
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -67,7 +66,7 @@ def test_every_method_is_in_the_table_with_its_error_near_the_cramer_rao_limit(r
         assert entry["single_press_us"] > 0.0
 
 
-def test_model_is_tested_on_positions_and_with_the_noise_of_its_own_training(dataset, monkeypatch):
+def test_model_is_tested_on_positions_and_with_the_noise_of_its_own_training(dataset):
     metadata = load_model(find_model(NAME)).metadata
     for sha256, hold_out, share in (("other", 0.02, 0.1), (dataset.sha256, 0.02, 0.02), (dataset.sha256, 0.5, 0.1)):
         trained = structs.replace(
@@ -76,11 +75,9 @@ def test_model_is_tested_on_positions_and_with_the_noise_of_its_own_training(dat
             made_with={"config": {"training": {"hold_out": hold_out}}},
             noise=ModelNoise(name="bench", white_pC=3.0, gain=0.01),
         )
-        monkeypatch.setattr(evaluation, "Predictor", lambda _, trained=trained: SimpleNamespace(metadata=trained))
-        prepared = evaluation.DatasetEvaluation.prepare(dataset, find_model(NAME), SMALL)
-        held_out_count = len(prepared.held_out_presses)
-        assert held_out_count / (held_out_count + len(prepared.presses)) == pytest.approx(share, abs=0.005)
-        assert prepared.noise == NoiseModel("bench", 3.0, 0.01)
+        presses, held_out = evaluation.split_presses(dataset, find_model(NAME), trained)
+        assert len(held_out) / (len(held_out) + len(presses)) == pytest.approx(share, abs=0.005)
+        assert evaluation.noise_of(trained) == NoiseModel("bench", 3.0, 0.01)
 
 
 def test_presses_without_an_estimate_are_left_out_of_the_errors():
@@ -159,7 +156,7 @@ def test_unsuitable_datasets_and_models_are_refused(dataset, tmp_path, change, m
 def test_model_of_presses_alone_is_not_tested_on_its_own_presses(dataset):
     metadata = structs.replace(load_model(find_model(NAME)).metadata, sensor={"name": "pad"})
     with pytest.raises(ModelError, match="got a model of presses alone, which has learned from all presses"):
-        evaluation._check_same_sensor(metadata, measured(dataset, (1.0, 1.0)))
+        evaluation.check_same_sensor(metadata, measured(dataset, (1.0, 1.0)))
 
 
 def test_limit_of_an_inaccurate_series_is_left_out_with_the_reason(dataset, tmp_path):

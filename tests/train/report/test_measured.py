@@ -8,12 +8,12 @@ import pytest
 from tests.train.measured import measured_presses
 
 from isocharge.common.errors import PressError
-from isocharge.serve import Predictor, check_presses, find_model
+from isocharge.serve import Predictor, check_presses, find_model, load_model
 from isocharge.serve.presses.table_file import csv_text
 from isocharge.simulate import Calibration, Circle, Domain, load_sensor, noise_model
 from isocharge.train.data.presses import dataset_of, draw_contacts, position_ranks
 from isocharge.train.report import QUICK, write_report
-from isocharge.train.report.evaluation import DatasetEvaluation
+from isocharge.train.report.evaluation import split_presses
 
 NAME = "three-25um-biaxial"
 PROBE = Circle(1.0)
@@ -63,11 +63,12 @@ def test_presses_of_the_calibrations_of_a_model_are_not_held_out(presses, tmp_pa
     held_out = presses[position_ranks(presses.contact) < 0.2]
 
     (model_folder / "presses.csv").write_text(csv_text(held_out[np.arange(50)].columns))
-    evaluation = DatasetEvaluation.prepare(dataset, model_folder, QUICK)
-    np.testing.assert_array_equal(evaluation.held_out_presses.charge, held_out.charge_pC[50:])
+    model = load_model(model_folder).metadata
+    _, tested = split_presses(dataset, model_folder, model)
+    np.testing.assert_array_equal(tested.charge, held_out.charge_pC[50:])
 
     earlier_version = tmp_path / NAME / "2"  # a calibration continues the earlier ones
     earlier_version.mkdir()
     (earlier_version / "presses.csv").write_text(csv_text(held_out.columns))
     with pytest.raises(PressError, match="measure more presses"):
-        DatasetEvaluation.prepare(dataset, model_folder, QUICK)
+        split_presses(dataset, model_folder, model)

@@ -79,6 +79,12 @@ class LabelledPresses:
         """Distance of each press from the centre, shape (n,), mm."""
         return np.hypot(self.contact[:, 0], self.contact[:, 1])
 
+    @property
+    def domain(self) -> Domain:
+        """Smallest disk around the centre, and smallest range of forces, that contain all presses."""
+        force = self.contact[:, 2]
+        return Domain(float(self.distance.max()), (float(force.min()), float(force.max())))
+
     def within(self, radius: float) -> "LabelledPresses":
         """Return the presses whose distance from the centre is at most `radius`, mm."""
         return self[self.distance <= radius]
@@ -130,33 +136,28 @@ def draw_contacts(rng: np.random.Generator, domain: Domain, count: int) -> Array
 class _Ranges(Struct):
     """Ranges of the contacts in a manifest."""
 
-    radius_mm: Positive | None = None
-    force_N: tuple[Positive, Positive] | None = None
+    radius_mm: Positive
+    force_N: tuple[Positive, Positive]
 
 
 def domain_of(dataset: Dataset) -> Domain:
-    """Return the working area and the range of forces of a dataset.
-
-    Both ranges are read from the manifest. A range that the manifest does not state is computed from the samples.
+    """Return the working area and the range of forces of a simulated dataset, which its manifest states.
 
     Args:
         dataset: The dataset.
 
     Raises:
-        DatasetError: If the ranges in the manifest are not numbers or do not contain the samples.
+        DatasetError: If the ranges in the manifest are missing, are not numbers or do not contain the samples.
     """
-    presses = LabelledPresses.of(dataset.samples)
-    force = presses.contact[:, 2]
     ranges = convert(dataset.manifest.get("ranges", {}), _Ranges, "manifest ranges", DatasetError)
-    sample_radius = float(presses.distance.max())
-    sample_forces = (float(force.min()), float(force.max()))
-    radius = ranges.radius_mm or sample_radius
-    min_force, max_force = ranges.force_N or sample_forces
-    domain = Domain(radius, (min_force, max_force))
+    domain = Domain(ranges.radius_mm, ranges.force_N)
+    presses = LabelledPresses.of(dataset.samples)
     if not domain.contains(presses.contact).all():
+        needed = presses.domain
+        min_force, max_force = needed.force_range
         raise DatasetError(
-            f"manifest ranges: radius_mm {radius:g} and force_N [{min_force:g}, {max_force:g}] do not hold the "
-            f"samples, which reach {sample_radius:g} mm and {sample_forces[0]:g} to {sample_forces[1]:g} N"
+            f"manifest ranges: radius_mm {domain.radius:g} and force_N {domain.force_range} do not hold the samples, "
+            f"which reach {needed.radius:g} mm and {min_force:g} to {max_force:g} N"
         )
     return domain
 

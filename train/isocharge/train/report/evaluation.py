@@ -33,7 +33,6 @@ from isocharge.train.data.presses import (
     HELD_PARTS,
     LabelledPresses,
     check_enough,
-    domain_of,
     have_charges_of,
     is_measured,
     presses_of,
@@ -116,13 +115,8 @@ METHOD_BUILDERS: tuple[Callable[[FittingTask], Method], ...] = (triangulation, l
 """Functions that fit the methods of all reports. A function raises TrainingError if there are too few presses."""
 
 
-def model_method(folder: Path) -> Method:
-    """Return the model in a version folder as a method.
-
-    Args:
-        folder: Version folder of the model.
-    """
-    predictor = Predictor(folder)
+def model_method(predictor: Predictor) -> Method:
+    """Return a model as a method."""
 
     def estimate(charge: Array) -> Array:
         """Estimate contacts (x, y, F), shape (n, 3), mm and N."""
@@ -216,128 +210,127 @@ class Section:
     left_out: list[str]
 
 
-@dataclass(frozen=True)
-class DatasetEvaluation:
-    """Prepared evaluation of a model and of all other methods on one dataset.
+def evaluate_dataset(dataset: Dataset, model_folder: Path, settings: Settings) -> Section:
+    """Measure the errors and the speed of a model and of all other methods on one dataset.
 
-    Attributes:
-        dataset: The presses of the dataset that the model covers.
-        model_folder: Version folder of the evaluated model.
-        presses: The presses to which the methods are fitted.
-        held_out_presses: The presses at other positions, on which the methods are tested.
-        noise: Noise of simulated test presses, which also weights the charges of measured presses.
+    Args:
+        dataset: The dataset.
+        model_folder: Version folder of the model.
         settings: Settings of the report.
+
+    Raises:
+        DatasetError: If the methods cannot be fitted to the dataset.
+        ModelError: If the model is for another sensor than the dataset.
+        PressError: If there are too few measured presses, or the model was calibrated from all that are held out.
     """
+    predictor = Predictor(model_folder)
+    model = predictor.metadata
+    check_same_sensor(model, dataset)
+    covered = _covered_presses(dataset, model)
+    presses, test = split_presses(covered, model_folder, model)
+    domain = LabelledPresses.of(covered.samples).domain
+    measured = is_measured(dataset)
+    noise = noise_of(model)  # it also weights the charges of measured presses
+    if not measured:
+        test = test.repeated(settings.presses)
+        test = replace(test, charge=test.noisy(noise, SEED))
 
-    dataset: Dataset
-    model_folder: Path
-    presses: LabelledPresses
-    held_out_presses: LabelledPresses
-    noise: NoiseModel
-    settings: Settings
-
-    @classmethod
-    def prepare(cls, dataset: Dataset, model_folder: Path, settings: Settings) -> "DatasetEvaluation":
-        """Select the presses that the model covers, and hold out a part of them for the test.
-
-        In a simulated dataset, a tenth of the positions is held out. A training on the same dataset also holds these
-        positions out. If the training of the model has held fewer positions out, only those are held out here, too.
-        Measured datasets are smaller. In them, a fifth of the positions is held out, except presses that a calibration
-        of the model has used.
-
-        Args:
-            dataset: The dataset.
-            model_folder: Version folder of the model.
-            settings: Settings of the report.
-
-        Returns:
-            The evaluation, which has not started yet.
-
-        Raises:
-            DatasetError: If the methods cannot be fitted to the dataset.
-            ModelError: If the model is for another sensor than the dataset.
-            PressError: If there are too few measured presses, or the model was calibrated from all that are held out.
-        """
-        model = Predictor(model_folder).metadata
-        _check_same_sensor(model, dataset)
-        samples = dataset.samples
-        min_force, max_force = model.force_range_N
-        is_covered = inside_polygon(samples.x_mm, samples.y_mm, np.array(model.working_area_mm))
-        is_covered &= (samples.force_N >= min_force) & (samples.force_N <= max_force)
-        if not is_covered.any():
-            raise DatasetError(
-                f"expected presses in the working area of the model {model.label} and of its forces, {min_force:g} to "
-                f"{max_force:g} N, got none among {len(samples)} presses; choose another model with --model"
+    methods = [model_method(predictor)]
+    limits: dict[str, float] = {}
+    failure_reasons = []
+    try:
+        train, validation = split_by_position(presses, TrainingConfig().hold_out)
+        charge_map = fit_charge_series(domain, dataset.sensor.electrode_names, train, validation)
+        task = FittingTask(presses, charge_map, noise)
+        methods += [build_method(task) for build_method in METHOD_BUILDERS]
+        # The limit follows from the derivatives of the series, and the noise of measured presses is unknown.
+        if not measured and charge_map.charge_std >= noise.gain:
+            failure_reasons.append(
+                f"Cramér-Rao limit: a series that is fitted to {len(train)} presses has an error of "
+                f"{100.0 * charge_map.charge_std:.2g} % of a charge, more than the noise; simulate more presses"
             )
-        # The ranges in the manifest are those of all presses. Those of the covered presses follow from the samples.
-        manifest = {name: entry for name, entry in dataset.manifest.items() if name != "ranges"}
-        covered = replace(dataset, samples=samples[is_covered], manifest=manifest)
-        if is_measured(dataset):
-            check_enough(len(covered.samples), len(samples), dataset.sensor.name)
-            presses, held_out = split_by_position(presses_of(covered, FEWEST_PLACES), 1.0 / HELD_PARTS)
-            learned_charge = _calibration_charges(model_folder, model)
-            is_learned = have_charges_of(held_out.charge, learned_charge)
-            if is_learned.all():
-                raise PressError(
-                    f"expected held-out presses that the model {model.label} has not learned, got only presses of its "
-                    "calibrations; measure more presses"
-                )
-            held_out = held_out[~is_learned]
-        else:
-            hold_out = TrainingConfig().hold_out
-            if model.dataset_sha256 == dataset.sha256:
-                hold_out = min(hold_out, model.made_with["config"]["training"]["hold_out"])
-            presses, held_out = split_by_position(presses_of(covered), hold_out)
-        return cls(covered, model_folder, presses, held_out, _noise_of(model), settings)
+        elif not measured:
+            cramer_rao = limits_at(charge_map, test.contact, noise)
+            limits = {
+                "position_rms_mm": rounded(rms(cramer_rao.position)),
+                "force_rms_percent": rounded(100.0 * rms(cramer_rao.force)),
+            }
+    except TrainingError as error:
+        failure_reasons.append(str(error))
+    return Section(
+        sensor=dataset.sensor.name,
+        measured=measured,
+        probes=list(covered.samples.probes),
+        radius_mm=domain.radius,
+        force_N=domain.force_range,
+        noise=None if measured else noise.name,
+        dataset_sha256=dataset.sha256,
+        fitted_presses=len(presses),
+        test_presses=len(test),
+        limits=limits,
+        methods=measure_methods(methods, test, settings.seconds),
+        left_out=failure_reasons,
+    )
 
-    def measure(self) -> Section:
-        """Fit all methods, and measure their errors and their speed."""
-        domain = domain_of(self.dataset)
-        test = self.held_out_presses
-        measured = is_measured(self.dataset)
-        if not measured:
-            test = test.repeated(self.settings.presses)
-            test = replace(test, charge=test.noisy(self.noise, SEED))
 
-        methods = [model_method(self.model_folder)]
-        limits: dict[str, float] = {}
-        failure_reasons = []
-        try:
-            train, validation = split_by_position(self.presses, TrainingConfig().hold_out)
-            charge_map = fit_charge_series(domain, self.dataset.sensor.electrode_names, train, validation)
-            task = FittingTask(self.presses, charge_map, self.noise)
-            methods += [build_method(task) for build_method in METHOD_BUILDERS]
-            # The limit follows from the derivatives of the series, and the noise of measured presses is unknown.
-            if not measured and charge_map.charge_std >= self.noise.gain:
-                failure_reasons.append(
-                    f"Cramér-Rao limit: a series that is fitted to {len(train)} presses has an error of "
-                    f"{100.0 * charge_map.charge_std:.2g} % of a charge, more than the noise; simulate more presses"
-                )
-            elif not measured:
-                cramer_rao = limits_at(charge_map, test.contact, self.noise)
-                limits = {
-                    "position_rms_mm": rounded(rms(cramer_rao.position)),
-                    "force_rms_percent": rounded(100.0 * rms(cramer_rao.force)),
-                }
-        except TrainingError as error:
-            failure_reasons.append(str(error))
-        return Section(
-            sensor=self.dataset.sensor.name,
-            measured=measured,
-            probes=list(self.dataset.samples.probes),
-            radius_mm=domain.radius,
-            force_N=domain.force_range,
-            noise=None if measured else self.noise.name,
-            dataset_sha256=self.dataset.sha256,
-            fitted_presses=len(self.presses),
-            test_presses=len(test),
-            limits=limits,
-            methods=measure_methods(methods, test, self.settings.seconds),
-            left_out=failure_reasons,
+def _covered_presses(dataset: Dataset, model: ModelMetadata) -> Dataset:
+    """Select the presses in the working area and in the range of forces of a model.
+
+    Raises:
+        DatasetError: If there are none.
+        PressError: If there are too few measured presses.
+    """
+    samples = dataset.samples
+    min_force, max_force = model.force_range_N
+    is_covered = inside_polygon(samples.x_mm, samples.y_mm, np.array(model.working_area_mm))
+    is_covered &= (samples.force_N >= min_force) & (samples.force_N <= max_force)
+    if not is_covered.any():
+        raise DatasetError(
+            f"expected presses in the working area of the model {model.label} and of its forces, {min_force:g} to "
+            f"{max_force:g} N, got none among {len(samples)} presses; choose another model with --model"
         )
+    covered_samples = samples[is_covered]
+    if is_measured(dataset):
+        check_enough(len(covered_samples), len(samples), dataset.sensor.name)
+    return replace(dataset, samples=covered_samples)
 
 
-def _noise_of(model: ModelMetadata) -> NoiseModel:
+def split_presses(
+    dataset: Dataset, model_folder: Path, model: ModelMetadata
+) -> tuple[LabelledPresses, LabelledPresses]:
+    """Split presses into those to which methods are fitted, and those that are held out for the test.
+
+    In a simulated dataset, a tenth of the positions is held out. A training on the same dataset also holds these
+    positions out. If the training of the model has held fewer positions out, only those are held out here, too.
+    Measured datasets are smaller. In them, a fifth of the positions is held out, except presses that a calibration of
+    the model has used.
+
+    Args:
+        dataset: The presses of a dataset that the model covers.
+        model_folder: Version folder of the model.
+        model: Metadata of the model.
+
+    Raises:
+        DatasetError: If the methods cannot be fitted to the dataset.
+        PressError: If the model was calibrated from all presses that are held out.
+    """
+    if not is_measured(dataset):
+        hold_out = TrainingConfig().hold_out
+        if model.dataset_sha256 == dataset.sha256:
+            hold_out = min(hold_out, model.made_with["config"]["training"]["hold_out"])
+        return split_by_position(presses_of(dataset), hold_out)
+
+    presses, held_out = split_by_position(presses_of(dataset, FEWEST_PLACES), 1.0 / HELD_PARTS)
+    is_learned = have_charges_of(held_out.charge, _calibration_charges(model_folder, model))
+    if is_learned.all():
+        raise PressError(
+            f"expected held-out presses that the model {model.label} has not learned, got only presses of its "
+            "calibrations; measure more presses"
+        )
+    return presses, held_out[~is_learned]
+
+
+def noise_of(model: ModelMetadata) -> NoiseModel:
     """Return the noise for which a model was trained; `reference` for a training without noise or with measured noise.
 
     Measured noise has different parameters for each electrode.
@@ -359,7 +352,7 @@ def _calibration_charges(model_folder: Path, model: ModelMetadata) -> Array:
     return np.concatenate([np.empty((0, len(model.electrodes))), *charges])
 
 
-def _check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
+def check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
     """Raise an error if a model was not trained for the sensor of a dataset.
 
     For measured presses, the names of the electrodes must be equal, because a calibrated model has another film. A

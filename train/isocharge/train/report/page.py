@@ -13,7 +13,7 @@ from isocharge.common.progress import track
 from isocharge.serve.benchmark import machine
 from isocharge.simulate import Dataset
 from isocharge.simulate.plots.figure import FELT, INK, new_figure, save_picture
-from isocharge.train.report.evaluation import SEED, DatasetEvaluation, MethodRecord, Section, Settings
+from isocharge.train.report.evaluation import SEED, MethodRecord, Section, Settings, evaluate_dataset
 from isocharge.train.training.fit import threads_and_seed
 
 RECORDED_PACKAGES = ("isocharge", "numpy", "scipy", "onnxruntime")
@@ -197,9 +197,10 @@ def write_report(
     """
     refuse_existing(folder)
     settings = settings or Settings()
-    evaluations = [DatasetEvaluation.prepare(dataset, model_folder, settings) for dataset, model_folder in subjects]
     with threads_and_seed(1, SEED):  # all methods are timed with one thread
-        sections = [evaluation.measure() for evaluation in track(evaluations, "datasets")]
+        sections = [
+            evaluate_dataset(dataset, model_folder, settings) for dataset, model_folder in track(subjects, "datasets")
+        ]
 
     this_machine = machine(RECORDED_PACKAGES)
     record = {
