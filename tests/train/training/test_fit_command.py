@@ -5,7 +5,6 @@ import sys
 import numpy as np
 import pytest
 
-from isocharge.cli.train import fit as fit_command
 from isocharge.serve import load_model
 from processes import finished
 
