@@ -50,7 +50,7 @@ REMOVED = None
 FAULTS = {
     "older": ("format_version", 4, "format_version: expected 5, got 4; .* calibrate again with its presses"),
     "no version": ("format_version", REMOVED, "key 'format_version' is missing; .* calibrate again with its presses"),
-    "sensor": ("sensor", "mine", "sensor: expected four-25um-biaxial, as in this calibration, got mine"),
+    "sensor": ("described_sensor.name", "mine", "expected the sensor file .*, got one with another name"),
     "probe": ("probe", "circle:2", "probe: expected circle:1"),
     "radius": ("radius_mm", 10.0, "radius_mm: expected 8"),
     "missing": ("unknowns.young", REMOVED, "unknowns: expected pretension, young, .*, got pretension"),

@@ -142,7 +142,7 @@ NAN = float("nan")
         (",,1", "take", (NAN, NAN, 1.0)),
         ("?", "take", (NAN, NAN, NAN)),
         ("U", "undo", None),
-        ("quit", "quit", None),
+        ("q", "quit", None),
     ],
 )
 def test_typed_answer_is_read(text, reply, contact):

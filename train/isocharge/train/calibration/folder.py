@@ -70,7 +70,6 @@ class _CalibrationFile(Struct, frozen=True):
     """Entries of calibration.json that `read_film` uses."""
 
     format_version: Annotated[int, Meta(ge=5, le=5, description="5")]
-    sensor: Text
     probe: Text
     radius_mm: Number
     force_range_N: tuple[Number, Number]
@@ -94,7 +93,6 @@ def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any
     rounded = np.clip(np.round(correlations, DIGITS), -1.0, 1.0)
     return {
         "format_version": 5,  # the version that `_CalibrationFile` reads
-        "sensor": problem.sensor.name,
         "probe": problem.probe.rotated_notation,
         "radius_mm": problem.radius,
         "force_range_N": list(problem.force_range),
@@ -151,7 +149,6 @@ def _check_same_problem(path: Path, content: _CalibrationFile, problem: Calibrat
     """Raise PressError if a file belongs to another calibration problem."""
     layout = problem.prior.layout
     for key, expected, got in (
-        ("sensor", problem.sensor.name, content.sensor),
         ("probe", problem.probe.rotated_notation, content.probe),
         ("radius_mm", problem.radius, content.radius_mm),
         ("force_range_N", problem.force_range, content.force_range_N),

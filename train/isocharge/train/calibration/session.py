@@ -38,7 +38,7 @@ EXPECTED_ANSWER = (
 Reply = Literal["take", "undo", "quit"]
 """Action that a person requests."""
 
-REPLIES: dict[str, Reply] = {"": "take", "take": "take", "u": "undo", "undo": "undo", "q": "quit", "quit": "quit"}
+REPLIES: dict[str, Reply] = {"": "take", "u": "undo", "q": "quit"}
 """Actions by the word that a person types to request the action."""
 
 

@@ -62,7 +62,8 @@ class OutsidePresses:
         """
         pool = presses[presses.distance > domain.radius]
         if outside is not None:
-            pool = pool.joined(outside)
+            contact = np.concatenate([pool.contact, outside.contact])
+            pool = LabelledPresses(contact, np.concatenate([pool.charge, outside.charge]))
         pool = pool[np.random.default_rng(seed).permutation(len(pool))]
         train = pool[: len(pool) // 2]
         test = pool[len(pool) // 2 :]

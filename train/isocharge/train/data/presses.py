@@ -89,11 +89,6 @@ class LabelledPresses:
         """Return the presses whose distance from the centre is at most `radius`, mm."""
         return self[self.distance <= radius]
 
-    def joined(self, other: "LabelledPresses") -> "LabelledPresses":
-        """Return these presses, followed by other presses of the same kind."""
-        contact = np.concatenate([self.contact, other.contact])
-        return LabelledPresses(contact, np.concatenate([self.charge, other.charge]))
-
     def repeated(self, min_count: int) -> "LabelledPresses":
         """Return at least `min_count` presses, by repeating all presses in their order.
 
@@ -240,24 +235,18 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
         Contacts and charges of the presses.
 
     Raises:
-        DatasetError: If the dataset has too few presses, positions or electrodes. The error is also raised if a number
-            is not finite, if a force is not positive, or if the charge of an electrode never varies.
+        DatasetError: If the dataset has too few presses, positions or electrodes, if a force is not positive, or if the
+            charge of an electrode never varies.
     """
     presses = LabelledPresses.of(dataset.samples)
-    numbers = np.column_stack([presses.contact, presses.charge])
-    is_usable = np.isfinite(numbers).all(axis=1) & (presses.contact[:, 2] > 0.0)
-    if not is_usable.all():
-        row = int(np.argmin(is_usable))
-        raise DatasetError(
-            f"sample {row}: expected finite numbers and a positive force, got the contact "
-            f"{presses.contact[row].tolist()} (mm, mm, N) and {presses.charge[row].tolist()} pC"
-        )
+    row = presses.contact[:, 2].argmin()
+    if presses.contact[row, 2] <= 0.0:
+        raise DatasetError(f"sample {row}: expected a positive force, got {presses.contact[row, 2]:g} N")
 
     n_position = place_count(presses.contact)
-    fewest_positions = min(fewest, FEWEST_PLACES)  # a few presses cannot have more positions than presses
-    if len(presses) < fewest or n_position < fewest_positions:
+    if len(presses) < fewest or n_position < FEWEST_PLACES:
         raise DatasetError(
-            f"expected at least {fewest} presses at {fewest_positions} positions, got {len(presses)} at "
+            f"expected at least {fewest} presses at {FEWEST_PLACES} positions, got {len(presses)} at "
             f"{n_position}; sweep or measure more (of a described film, `isocharge train calibrate` needs only a few)"
         )
 
