@@ -23,7 +23,7 @@ from isocharge.train.calibration.estimator import Estimation, estimate
 from isocharge.train.calibration.film_charges import PROBE_RADIUS, STEP, FilmCharges, solve_even_map
 from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.press_data import PressData
-from isocharge.train.calibration.problem import CalibrationProblem
+from isocharge.train.calibration.problem import CalibrationProblem, domain_words
 from isocharge.train.calibration.result import CalibrationResult
 
 MAX_SOLVED_FILMS = 4
@@ -96,7 +96,10 @@ def calibrate(
     outside_words = ""
     used_presses = ordered_presses
     if is_outside.any():
-        outside_words = _outside_words(ordered_presses[is_outside], problem)
+        outside_words = (
+            f"{ordered_presses[is_outside].line_words}: a calibration takes presses "
+            f"{domain_words(problem.solved_domain)} (--radius)"
+        )
         used_presses = ordered_presses[~is_outside]
         if len(ordered_presses) == 1 or _is_uninformative(used_presses):
             raise PressError(outside_words)
@@ -207,16 +210,6 @@ def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
     is_missing = charges.prior.is_imperfection & charges.prior.changes_stress
     missing = np.where(is_missing, values - charges.values, 0.0)
     return bool(np.linalg.norm(jacobian @ missing) < VISIBLE_ASYMMETRY * np.linalg.norm(charge))
-
-
-def _outside_words(presses: MeasuredPresses, problem: CalibrationProblem) -> str:
-    """Return words that name presses outside the domain."""
-    domain = problem.solved_domain
-    low, high = domain.force_range
-    return (
-        f"{presses.line_words}: a calibration takes presses within "
-        f"{domain.radius:.3g} mm of the centre (--radius) and of {low:.2g} to {high:.2g} N"
-    )
 
 
 def _is_uninformative(presses: MeasuredPresses) -> bool:

@@ -44,7 +44,7 @@ from isocharge.simulate.sensor.sensor_file import sensor_to_dict, sensor_to_toml
 from isocharge.simulate.solver.assembly import single_threaded_blas
 from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.film_network import compact_charges, training_data
-from isocharge.train.calibration.problem import CalibrationProblem
+from isocharge.train.calibration.problem import CalibrationProblem, domain_words
 from isocharge.train.calibration.result import CalibrationResult
 from isocharge.train.data.presses import have_charges_of
 from isocharge.train.model_release.release import release
@@ -323,11 +323,10 @@ def usable_held_out(
     is_known = np.isfinite(held_out.charge_pC).all(axis=1) & np.isfinite(held_out.contact).any(axis=1)
     usable = held_out[is_known & ~domain.is_outside(held_out.contact)]
     if len(usable) < FEWEST_HELD_OUT:
-        low, high = domain.force_range
         raise PressError(
-            f"expected at least {FEWEST_HELD_OUT} held-out presses within {domain.radius:g} mm of the centre, of "
-            f"{low:g} to {high:g} N, with all charges and a known place or force, got {len(usable)} of "
-            f"{len(held_out)}; measure more, or calibrate without held-out presses"
+            f"expected at least {FEWEST_HELD_OUT} held-out presses {domain_words(domain)}, with all charges and a "
+            f"known place or force, got {len(usable)} of {len(held_out)}; measure more, or calibrate without held-out "
+            "presses"
         )
     return usable
 

@@ -97,3 +97,9 @@ class CalibrationProblem:
         largest_radius = self.sensor.film.inner_radius - RIM_MARGIN * reach
         radius = min(self.radius + POSITION_MARGIN_MM, max(self.radius, largest_radius))
         return Domain(radius, (low / FORCE_MARGIN, high * FORCE_MARGIN))
+
+
+def domain_words(domain: Domain) -> str:
+    """Describe a domain, for example as "within 8 mm of the centre and of 0.05 to 2 N"."""
+    low, high = domain.force_range
+    return f"within {domain.radius:.3g} mm of the centre and of {low:.2g} to {high:.2g} N"

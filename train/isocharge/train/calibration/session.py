@@ -22,7 +22,7 @@ from isocharge.train.calibration.calibrate import calibrate, solve_even
 from isocharge.train.calibration.contact_error import ProposedPress, next_presses
 from isocharge.train.calibration.estimator import FEW_PRESSES
 from isocharge.train.calibration.film_charges import FilmCharges
-from isocharge.train.calibration.problem import CalibrationProblem
+from isocharge.train.calibration.problem import CalibrationProblem, domain_words
 from isocharge.train.calibration.result import CalibrationResult
 
 ENOUGH = 0.5
@@ -203,10 +203,9 @@ class PressSession:
             raise PressError("expected both x and y, or ? for both, got one of them")
         domain = self.problem.solved_domain
         if domain.is_outside(contact[None]).any():
-            min_force, max_force = domain.force_range
             raise PressError(
-                f"expected a press within {domain.radius:.3g} mm of the centre and of {min_force:.2g} to "
-                f"{max_force:.2g} N, got {describe_press(contact)}; press there, or give the real values in mm and N"
+                f"expected a press {domain_words(domain)}, got {describe_press(contact)}; press there, or give the "
+                "real values in mm and N"
             )
 
     def undo(self) -> int:
