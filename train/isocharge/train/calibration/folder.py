@@ -96,7 +96,7 @@ def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any
         "probe": problem.probe.rotated_notation,
         "radius_mm": problem.radius,
         "force_range_N": list(problem.force_range),
-        "noise": vars(film.noise),
+        "noise": film.noise,
         "unknowns": {
             name: {"value": value, "std": one_std}
             for name, value, one_std in zip(layout.names, film.values, std, strict=True)
@@ -350,8 +350,21 @@ def with_guarantee(fitted: Fitted, held_out: MeasuredPresses) -> Fitted:
 
 
 def result_table(result: CalibrationResult) -> dict[str, Any]:
-    """Convert a calibration result into the content of calibration.json."""
-    return result.to_dict() | film_table(result.problem, result.film)
+    """Return the content of calibration.json, which describes the result of a calibration."""
+    estimation = result.estimation
+    return {
+        "presses": len(result.presses),
+        "left_out_lines": result.bad_lines,
+        "reduced_chi2": estimation.chi2 / max(estimation.redundancy, 1.0),
+        "press_chi2": estimation.press_chi2.round(3),
+        "error_left": result.film_error,
+        "error_left_before": result.film_error_before,
+        "error_of_noise": result.sensitivity.noise_error,
+        "properties": result.properties,
+        "summary": result.summary,
+        "cautions": result.cautions,
+        **film_table(result.problem, result.film),
+    }
 
 
 def read_earlier(folder: Path, problem: CalibrationProblem) -> FilmEstimate:

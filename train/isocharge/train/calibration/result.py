@@ -2,9 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
-from isocharge.common.structs import plain_values
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.simulate import Probe, Sensor
 from isocharge.train.calibration.contact_error import ContactError, ContactSensitivity
@@ -130,19 +128,3 @@ class CalibrationResult:
             f"about {100.0 * self.film.noise.gain:.2g} % and {self.film.noise.white:.2g} pC."
         )
         return tuple(sentences)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Convert the errors and the properties into a dictionary for JSON, in which a missing residual is None."""
-        table = {
-            "presses": len(self.presses),
-            "left_out_lines": self.bad_lines,
-            "reduced_chi2": self.estimation.chi2 / max(self.estimation.redundancy, 1.0),
-            "press_chi2": self.estimation.press_chi2.round(3),
-            "error_left": vars(self.film_error),
-            "error_left_before": vars(self.film_error_before),
-            "error_of_noise": vars(self.sensitivity.noise_error),
-            "properties": {name: vars(one) for name, one in self.properties.items()},
-            "summary": self.summary,
-            "cautions": self.cautions,
-        }
-        return dict(plain_values(table))
