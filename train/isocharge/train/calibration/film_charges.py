@@ -80,14 +80,12 @@ class FilmCharges:
 
     def charges(self, values: Array, contact: Array) -> Array:
         """Compute the charges of presses on a film with given properties, shape (n, n_electrode), pC."""
-        charge, _ = self.linearised(values, contact)
+        solved_charge, stress_derivatives = self._solved_charges(self._electrodes(values), contact)
+        charge, _ = self._changed(values, solved_charge, stress_derivatives)
         return charge
 
     def linearised(self, values: Array, contact: Array) -> tuple[Array, Array]:
         """Compute the charges of presses on a film, and their derivatives with respect to the properties.
-
-        The first-order change by the properties that change the stress is applied to the logarithm of a charge, unless
-        the charge is negative or changes its sign.
 
         Args:
             values: Properties of the film, shape (n_property,).
@@ -99,14 +97,7 @@ class FilmCharges:
         """
         sensor = self._electrodes(values)
         solved_charge, stress_derivatives = self._solved_charges(sensor, contact)
-        solved, changed = self._mechanics(self.values), self._mechanics(values)
-        charge_change = np.zeros_like(solved_charge)
-        for name, derivative in stress_derivatives.items():
-            charge_change += (changed[name] - solved[name]) * derivative
-        log_change = np.divide(charge_change, solved_charge, out=np.zeros_like(solved_charge), where=solved_charge > 0)
-        is_logarithmic = (solved_charge > 0.0) & (np.abs(log_change) < MAX_LOG_CHANGE)
-        factor = np.exp(np.where(is_logarithmic, log_change, 0.0))
-        charge = np.where(is_logarithmic, solved_charge * factor, solved_charge + charge_change)
+        charge, factor = self._changed(values, solved_charge, stress_derivatives)
 
         derivatives = {**stress_derivatives, "crosstalk": solved_charge.sum(axis=1, keepdims=True) - solved_charge}
         for name in UNEVEN_TENSIONS:  # shares of the pretension
@@ -120,6 +111,31 @@ class FilmCharges:
             for one in self.prior.properties
         ]
         return charge, factor[:, :, None] * np.stack(columns, axis=2)
+
+    def _changed(
+        self, values: Array, solved_charge: Array, stress_derivatives: dict[str, Array]
+    ) -> tuple[Array, Array]:
+        """Apply the first-order change by the properties that change the stress.
+
+        The change is applied to the logarithm of a charge, unless the charge is negative or changes its sign.
+
+        Args:
+            values: Properties of the film, shape (n_property,).
+            solved_charge: Charges of the solved film, shape (n, n_electrode), pC.
+            stress_derivatives: See `_solved_charges`.
+
+        Returns:
+            Charges, shape (n, n_electrode), pC, and the factors by which the derivatives change, of the same shape.
+        """
+        solved, changed = self._mechanics(self.values), self._mechanics(values)
+        charge_change = np.zeros_like(solved_charge)
+        for name, derivative in stress_derivatives.items():
+            charge_change += (changed[name] - solved[name]) * derivative
+        log_change = np.divide(charge_change, solved_charge, out=np.zeros_like(solved_charge), where=solved_charge > 0)
+        is_logarithmic = (solved_charge > 0.0) & (np.abs(log_change) < MAX_LOG_CHANGE)
+        factor = np.where(is_logarithmic, np.exp(np.where(is_logarithmic, log_change, 0.0)), 1.0)
+        charge = np.where(is_logarithmic, solved_charge * factor, solved_charge + charge_change)
+        return charge, factor
 
     def contact_slopes(self, values: Array, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to (x, y, ln F), shape (n, n_electrode, 3).
