@@ -207,7 +207,7 @@ def test_errors_that_are_announced_after_noisy_presses_contain_the_noise(fit, pr
     ("change", "message"),
     [
         (lambda p: replace(p, contact=np.full_like(p.contact, np.nan))[np.arange(3)], None),
-        (lambda p: replace(p, contact=p.contact + np.array([20.0, 0.0, 0.0])), r"\(--radius\) and of .* N; is it"),
+        (lambda p: replace(p, contact=p.contact + np.array([20.0, 0.0, 0.0])), r"and of .* N \(--radius\); is it"),
         (lambda p: replace(p, contact=p.contact[::-1].copy()), "no film of 'four-25um-biaxial' explains these 12"),
     ],
     ids=["unknown", "outside", "mixed up"],
