@@ -76,21 +76,20 @@ def output_kind(target: str) -> OutputKind:
             return kind
 
     # No built-in kind accepts the target. Try the kinds of other packages, and collect their forms for the message.
-    added_forms = []
+    forms = [target_forms()]
     for entry_point in entry_points(group=ENTRY_POINTS):
         try:
             added_kind: OutputKind = entry_point.load()
             if added_kind.accepts(target):
                 return added_kind
-            added_forms.append(added_kind.form)
+            forms.append(added_kind.form)
         except Exception as error:  # also if the entry point is no `OutputKind`
             raise InputError(
                 f"output {entry_point.name} ({entry_point.value}): cannot be used for {shown(target)} "
                 f"({type(error).__name__}: {error}); correct or remove the package that adds it"
             ) from error
 
-    forms = ", ".join([target_forms(), *added_forms])
-    raise InputError(f"output {shown(target)}: expected one of the forms {forms}")
+    raise InputError(f"output {shown(target)}: expected one of the forms {', '.join(forms)}")
 
 
 class Outputs:
@@ -144,10 +143,8 @@ class Outputs:
                 if isinstance(error, Exception):
                     raise output_error(error, target)  # noqa: B904  # the cause is set
                 raise
-            queue: WriterQueue[PredictionRecord] | None = None
             # A live stream must not wait for a slow consumer, so its records are written by another thread.
-            if self._context.is_live:
-                queue = WriterQueue(output.write)
+            queue = WriterQueue(output.write) if self._context.is_live else None
             self._writers[target] = output.write if queue is None else queue.put
             self._stack.callback(self._close_or_discard, target, output, queue)
         return self

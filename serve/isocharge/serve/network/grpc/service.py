@@ -92,10 +92,10 @@ def _numbers(tensor: Any) -> list[Any] | None:
     """
     contents = {field.name: list(values) for field, values in tensor.contents.ListFields()}
     expected = f"{tensor.datatype.lower()}_contents"
-    others = contents.keys() - {expected}
-    if others and tensor.datatype in DATATYPES:
-        raise RequestError(f"input {tensor.name!r:.50}: expected only {expected}, got {', '.join(sorted(others))}")
-    return contents.get(expected)
+    numbers = contents.pop(expected, None)
+    if contents and tensor.datatype in DATATYPES:
+        raise RequestError(f"input {tensor.name!r:.50}: expected only {expected}, got {', '.join(contents)}")
+    return numbers
 
 
 def _unsupported_parameters(tensor: Any) -> dict[str, bool]:
