@@ -5,7 +5,7 @@ from mcap.writer import Writer
 
 from isocharge.common.errors import InputError, RecordingError
 from isocharge.serve import Port, Recorder, Recording, open_source
-from isocharge.serve.port.file_source import Chunk, FileSource, check_file
+from isocharge.serve.port.file_source import Chunk, FileSource
 from isocharge.serve.record.formats import csv_header
 from isocharge.serve.record.record import RECORD_FIELDS
 
@@ -55,8 +55,8 @@ def test_lines_with_the_names_of_a_table_are_read_from_stdin_but_a_recording_is_
     """The error of the file advises this."""
     path = tmp_path / "board.csv"
     path.write_text("A,B,C,flags\n1,2,3,0\n")
-    with pytest.raises(InputError, match="--port - <"):
-        check_file(path)
+    with pytest.raises(InputError, match="--port - <"), open_source(str(path)):
+        pass
     with path.open("rb") as file:
         assert next(iter(FileSource(file.fileno(), "-"))).data == path.read_bytes()
     recording(tmp_path / "touch.rec")

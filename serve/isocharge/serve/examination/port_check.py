@@ -18,7 +18,6 @@ from isocharge.serve.examination.board_health import (
     held_press_sentences,
     measure_channel_health,
     transmission_sentences,
-    unit_sentences,
 )
 from isocharge.serve.examination.listening import BAUDS, Capture, ReceivedData, listen, read_frames
 from isocharge.serve.examination.press_detector import find_held_press, find_touch
@@ -209,7 +208,14 @@ def examine_received(
     if held_press.tau_s is not None:
         table = {"leak": {"tau_s": held_press.tau_s}} | table  # keeps a section that the device file already has
     missing += channel_count_sentences(capture, device, len(channels), electrodes)
-    missing += unit_sentences(unit)
+    if unit != "pC":
+        product = (
+            "it is the product of the volts of one unit and the feedback capacitance in pF; " if unit == "V" else ""
+        )
+        missing.append(
+            f"the channels seem to be in {unit}: state the charge of one unit in pC with --pc-per-unit NUMBER; "
+            f"{product}the number is negative if the amplifier inverts, and 1 if the channels are already in pC"
+        )
     if not touch:  # the offset, the noise and the drift of a pressed film say nothing about the board
         missing += channel_sentences(channels, unit, device)
     first_frame = capture.frames[0]

@@ -172,9 +172,8 @@ class DeviceClock:
         """
         previous_arrival_s = self._chunk_arrival_s
         self._chunk_arrival_s = arrival_s
-        is_first_arrival = previous_arrival_s is None
-        is_repeated = previous_arrival_s == arrival_s
-        if self._fitted_us is None or is_first_arrival or is_repeated:  # the first arrival may be that of a file
+        is_new_arrival = previous_arrival_s not in (None, arrival_s)  # the first arrival may be that of a file
+        if self._fitted_us is None or not is_new_arrival:
             return  # the provisional fit of `stamp` remains
 
         delay_s = arrival_s - self._predict(self._device_us)  # positive if the chunk arrived later than predicted

@@ -308,27 +308,23 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
     def parser(self) -> Parser:
         """Create a parser for frames with this layout and this framing."""
-        parser = self._create_parser()
+        if self.framing == SYNC:
+            parser: Parser = SyncParser(self)
+        elif self.framing == DATAGRAM:
+            parser = DatagramParser(self)
+        else:
+            stuffing = STUFFINGS[self.framing]
+
+            def decode_stuffed(stuffed_frame: bytes) -> Frame:
+                """Remove the byte stuffing from a frame, and decode the frame."""
+                return self.decode(stuffing.decode(stuffed_frame))
+
+            # SLIP and HDLC at most double the length. COBS adds 1 byte, and 1 more for every 254 bytes. The limit is
+            # not exact, because it only prevents that an endless piece without a delimiter is stored.
+            parser = StuffedParser(self.description, stuffing.delimiter, 2 * self.length + 2, decode_stuffed)
         parser.seq_modulus = self.fields[self.columns.seq_column or 0].modulus  # ignored without a counter
         parser.t_us_modulus = self.t_us_modulus
         return parser
-
-    def _create_parser(self) -> Parser:
-        """Create a parser for this framing, without the values at which the counter and the clock wrap to 0."""
-        if self.framing == SYNC:
-            return SyncParser(self)
-        if self.framing == DATAGRAM:
-            return DatagramParser(self)
-
-        # SLIP and HDLC at most double the length. COBS adds 1 byte, and 1 more for every 254 bytes. The limit is not
-        # exact, because it only prevents that an endless piece without a delimiter is stored.
-        stuffing = STUFFINGS[self.framing]
-
-        def decode_stuffed(stuffed_frame: bytes) -> Frame:
-            """Remove the byte stuffing from a frame, and decode the frame."""
-            return self.decode(stuffing.decode(stuffed_frame))
-
-        return StuffedParser(self.description, stuffing.delimiter, 2 * self.length + 2, decode_stuffed)
 
 
 class SyncParser(Parser):

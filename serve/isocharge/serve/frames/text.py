@@ -84,16 +84,18 @@ class Layout:
 
     def set_names(self, names: Sequence[str]) -> None:
         """Store the names of all values, and find the columns of the frame counter, the clock and the channels."""
-        self.names = tuple(names)
-        scales = (1.0,) * len(self.names)  # values in text have no scale
-        self.columns = Columns(self.names, scales, words=self._words)
+        self.names = names
+        scales = (1.0,) * len(names)  # values in text have no scale
+        self.columns = Columns(names, scales, words=self._words)
 
     def name_unnamed(self, names: Sequence[str]) -> bool:
         """Give names to the values that have none in the lines, and return whether the number of names fits."""
         if not names or len(names) != len(self.unnamed):
             return False
-        name_at_index = dict(zip(self.unnamed, names, strict=True))
-        self.set_names([name_at_index.get(index, name) for index, name in enumerate(self.names)])
+        all_names = list(self.names)
+        for index, name in zip(self.unnamed, names, strict=True):
+            all_names[index] = name
+        self.set_names(all_names)
         return True
 
 
@@ -162,22 +164,9 @@ class TextParser(DelimitedParser):
             # The beginning of the first line may be missing. For example, "801.2" may have become the number "1.2".
             if is_first_line and parse_line(text).starts[:1] == (0,):
                 return self._reject(size)
-            return self._parse_text(text, size)
+            return self._read_line(text, size)
         except ValueError:
             return self._reject(size)
-
-    def _parse_text(self, text: str, size: int) -> list[Frame]:
-        """Parse the text of a line, and return the frames that the line completes.
-
-        Args:
-            text: The line.
-            size: Number of bytes of the line.
-
-        Raises:
-            ValueError: If the line cannot be parsed.
-        """
-        frames = self._read_line(text, size)
-        return self._examine_line(text, size) if frames is None else frames
 
     def _meant(self, names: Sequence[str]) -> tuple[str, ...]:
         """Replace the names that the device uses for its counter and its clock by their meanings."""
@@ -255,22 +244,21 @@ class TextParser(DelimitedParser):
         self._describe_layout(layout)
         collected_lines = self._collected_lines
         self._collected_lines = []
-        return [frame for line, line_size in collected_lines for frame in self._parse_text(line.text, line_size)]
+        return [frame for line, line_size in collected_lines for frame in self._read_line(line.text, line_size)]
 
-    def _read_line(self, text: str, size: int) -> list[Frame] | None:
-        """Return a list with the frame that a line completes.
-
-        The list is empty if the line completes no frame. The result is None if the line does not have the recognised
-        layout, or if no layout is recognised yet. If a line of a cycle is lost, the other lines of the cycle are
-        rejected.
+    def _read_line(self, text: str, size: int) -> list[Frame]:
+        """Return the frames that a line completes. If a line of a cycle is lost, reject the other lines of the cycle.
 
         Args:
             text: The line.
             size: Number of bytes of the line.
+
+        Raises:
+            ValueError: If the line cannot be parsed.
         """
         layout = self.layout
         if layout is None:
-            return None
+            return self._examine_line(text, size)
         for position, pattern in enumerate(layout.patterns):
             values = line_values(pattern, text)
             if values is None:
@@ -288,7 +276,7 @@ class TextParser(DelimitedParser):
             for frame in frames:
                 self._update_seq_modulus(frame.seq or 0)
             return frames
-        return None
+        return self._examine_line(text, size)
 
     def _drop_cycle(self) -> None:
         """Drop the lines of an unfinished cycle, and count them as rejected."""

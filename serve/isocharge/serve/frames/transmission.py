@@ -13,7 +13,6 @@ CRC algorithms (Cook, https://reveng.sourceforge.io/crc-catalogue/).
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import reduce
 from operator import xor
 from typing import Literal, NamedTuple
@@ -89,8 +88,7 @@ STUFFINGS: dict[Literal["cobs", "slip", "hdlc"], Stuffing] = {
 """Every kind of byte stuffing, by its name in a device file."""
 
 
-@dataclass(frozen=True)
-class Checksum:
+class Checksum(NamedTuple):
     """A checksum.
 
     Attributes:

@@ -11,7 +11,7 @@ import shlex
 import stat
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -79,20 +79,6 @@ def check_bytes(name: str, head: bytes) -> None:
         raise InputError(f"{name}: expected a port, or a file of bytes from a board, got {kind}")
 
 
-def check_file(path: Path) -> None:
-    """Raise an error if a file on the disk does not contain the bytes that a board sends.
-
-    The first bytes of a pipe cannot be read twice, so only `FileSource` checks them.
-
-    Raises:
-        InputError: If the file is of another kind.
-    """
-    with suppress(OSError):  # reading the file reports the error
-        if path.is_file():
-            with path.open("rb") as file:
-                check_bytes(str(path), file.read(HEAD_BYTES))
-
-
 def foreign_kind(name: str, head: bytes) -> str:
     """Return the kind of a file that does not come from a board, with advice; empty if it may come from a board.
 
@@ -142,10 +128,18 @@ class FileSource:
     is_live = False
 
     def __init__(self, descriptor: int, name: str) -> None:
-        """Store the file descriptor and the name."""
+        """Store the file descriptor and the name, and check the first bytes of a file on a disk.
+
+        The first bytes of a pipe cannot be read twice. They are checked when the first chunk is read.
+
+        Raises:
+            InputError: If the file on the disk does not come from a board.
+        """
         self._descriptor = descriptor
         self._name = name
         self.is_on_disk = stat.S_ISREG(os.fstat(descriptor).st_mode)
+        if self.is_on_disk:
+            check_bytes(name, os.pread(descriptor, HEAD_BYTES, 0))
 
     def __iter__(self) -> Iterator[Chunk]:
         """Yield chunks until the file ends.
@@ -179,7 +173,6 @@ def open_file(path: Path) -> Iterator[FileSource]:
     Raises:
         InputError: If the file cannot be read, or does not come from a board.
     """
-    check_file(path)
     try:
         file = path.open("rb", buffering=0)
     except OSError as error:

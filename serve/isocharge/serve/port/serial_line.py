@@ -67,18 +67,6 @@ SOCKET_SCHEMES = ("tcp://", "socket://", "rfc2217://")
 """First characters of the URLs that need a port number."""
 
 
-def _keep_ready_signal(descriptor: int) -> None:
-    """Make the system leave the signal DTR of a terminal set when the terminal is closed.
-
-    Args:
-        descriptor: File descriptor of the terminal.
-    """
-    attributes = termios.tcgetattr(descriptor)
-    control_modes = 2  # index in the attributes
-    attributes[control_modes] &= ~termios.HUPCL
-    termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
-
-
 class OtherReader(OSError):
     """Bytes arrived at a line, but another program has read them."""
 
@@ -120,12 +108,12 @@ class SerialLine:
         with suppress(AttributeError, io.UnsupportedOperation):
             self._descriptor = int(self._serial.fileno())
         self.is_stream = self._descriptor is not None  # pyserial returns all bytes that have arrived
+        # Make the system leave the signal DTR of a terminal set when the terminal is closed.
         if self._descriptor is not None and os.isatty(self._descriptor):
-            _keep_ready_signal(self._descriptor)
-
-    def reset_input_buffer(self) -> None:
-        """Discard the bytes that have arrived and were not read."""
-        self._serial.reset_input_buffer()
+            attributes = termios.tcgetattr(self._descriptor)
+            control_modes = 2  # index in the attributes
+            attributes[control_modes] &= ~termios.HUPCL
+            termios.tcsetattr(self._descriptor, termios.TCSANOW, attributes)
 
     def write(self, data: bytes) -> None:
         """Send bytes to the board."""
@@ -318,11 +306,6 @@ class UdpSocket:
         self.is_stream = False
         self._peer: tuple[str, int] | None = None  # sender of the latest datagram
         self._has_warned = False  # whether a warning about a second sender was given
-
-    def reset_input_buffer(self) -> None:
-        """Discard the datagrams that have arrived and were not read."""
-        while self._is_ready(0.0):
-            self._socket.recv(MAX_READ_BYTES)
 
     def receive(self, timeout_s: float) -> bytes:
         """Wait for a datagram that is not empty, and return it.

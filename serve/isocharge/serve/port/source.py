@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any, Protocol, Self
 
 from isocharge.common.errors import InputError, IsochargeError, PortError, PortLost
-from isocharge.serve.port.file_source import STDIN, Chunk, FileSource, check_file, open_file
+from isocharge.serve.port.file_source import STDIN, Chunk, FileSource, open_file
 from isocharge.serve.port.serial_line import (
     MAX_READ_BYTES,
     OPEN_ERRORS,
@@ -142,19 +142,17 @@ class Port:
         if is_path and not Path(self.url).exists():
             raise PortError(f"{self.url}: there is no such port: plug the board in, check the name, or wait for it")
         if is_path and Path(self.url).is_file():
-            check_file(Path(self.url))
-            raise InputError(
-                f"{self.url}: expected a port, got a file; only `isocharge serve stream` reads the bytes of a board "
-                "from a file"
-            )
+            with open_file(Path(self.url)):  # raises another error for a file that does not come from a board
+                raise InputError(
+                    f"{self.url}: expected a port, got a file; only `isocharge serve stream` reads the bytes of a "
+                    "board from a file"
+                )
         try:
             if self.url.startswith(UDP_SCHEME):
                 self._line = UdpSocket(self.url)
             else:
-                self._line = SerialLine(self.url, self._baud)
-            self._line.reset_input_buffer()  # needed for a socket; opening a terminal has discarded the bytes already
-            if self._request is not None and isinstance(self._line, SerialLine):
-                self._line = Requester(self._line, self._request)  # no other kind of line needs requests
+                line = SerialLine(self.url, self._baud)  # discards the bytes in the buffer of the port
+                self._line = line if self._request is None else Requester(line, self._request)
         except OPEN_ERRORS as error:
             self._close()
             speed = f" at {self._baud} baud" if is_path else ""
@@ -221,10 +219,20 @@ class Port:
             PortLost: If the port disappears.
             PortError: If the port is not open.
         """
-        data = self._receive(timeout_s)
-        if not data:
-            return None
-        return Chunk(data, time.time(), time.perf_counter_ns())
+        if self._line is None:
+            raise PortError(f"{self.url}: the port is not open; use `with Port(...) as port`")
+        try:
+            data = self._line.receive(timeout_s)
+        except OtherReader as error:
+            raise PortLost(
+                f"{self.url}: another program reads this port, too, and takes some of its bytes; end that program (on "
+                f"Linux, `fuser {self.url}` shows its number)"
+            ) from error
+        except READ_ERRORS as error:
+            raise PortLost(
+                f"{self.url}: the port disappeared while it was read ({error}); check the plug and the cable"
+            ) from error
+        return Chunk(data, time.time(), time.perf_counter_ns()) if data else None
 
     def _read_after_reconnecting(self) -> bytes:
         """Open the port repeatedly until bytes arrive, and return these bytes.
@@ -251,46 +259,20 @@ class Port:
             PortLost: If the port disappears, or no byte arrives in time.
             PortError: If the port is not open.
         """
-        data = self._receive(self._max_silence_s)
-        if not data:
+        chunk = self.read(self._max_silence_s)
+        if chunk is None:
             speed_advice = f", and that {self._baud} baud is its speed" if has_speed(self.url) else ""
             raise PortLost(
                 f"{self.url}: no data for {self._max_silence_s:g} s; check that the board is powered and sends"
                 f"{speed_advice}"
             )
         self._max_silence_s = self._silence_s
+        data = chunk.data
         line = self._line
         with contextlib.suppress(*READ_ERRORS):  # the next call reports the error
             while line and line.is_stream and len(data) < MAX_READ_BYTES and (waiting := line.receive(0.0)):
                 data += waiting
         return data
-
-    def _receive(self, timeout_s: float) -> bytes:
-        """Wait for bytes, and return them.
-
-        Args:
-            timeout_s: Longest time to wait, s.
-
-        Returns:
-            The bytes; empty if no bytes arrive in time.
-
-        Raises:
-            PortError: If the port is not open.
-            PortLost: If the port disappears.
-        """
-        if self._line is None:
-            raise PortError(f"{self.url}: the port is not open; use `with Port(...) as port`")
-        try:
-            return self._line.receive(timeout_s)
-        except OtherReader as error:
-            raise PortLost(
-                f"{self.url}: another program reads this port, too, and takes some of its bytes; end that program (on "
-                f"Linux, `fuser {self.url}` shows its number)"
-            ) from error
-        except READ_ERRORS as error:
-            raise PortLost(
-                f"{self.url}: the port disappeared while it was read ({error}); check the plug and the cable"
-            ) from error
 
 
 def has_speed(url: str) -> bool:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.frames.frame import SEQ
 from isocharge.serve.frames.frame_layout import PADDING, STRUCT_FORMATS, ByteOrder, FieldType
 from isocharge.serve.recognition.framing import INTACT_SHARE, Bytes, usual_bytes
@@ -109,7 +109,7 @@ class Part(NamedTuple):
 
 
 @np.errstate(all="ignore")
-def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[list[Part]]:
+def possible_parts(rows: Bytes, order: ByteOrder, checksum_start: int, frame_rate_Hz: float) -> list[list[Part]]:
     """List the possible parts of a frame that begin at each byte.
 
     A part is a single byte without a meaning (padding), or a number of one of the types in `STRUCT_FORMATS`.
@@ -117,12 +117,14 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[
     Args:
         rows: Bytes of the frames before the checksum, shape (n, length).
         order: Byte order of the numbers.
+        checksum_start: First byte that the checksum covers.
         frame_rate_Hz: Number of frames per second, Hz, from which the tick rate of a clock follows.
 
     Returns:
         For each of the `length` bytes, a list of parts, of which the first is padding.
     """
-    _usual, is_constant = usual_bytes(rows)
+    usual, is_constant = usual_bytes(rows)
+    is_zero = is_constant & (usual == 0)
     length = rows.shape[1]
     byte_step = 1 if order == "little" else -1  # reverses big-endian numbers, so that the lowest byte comes first
     parts_at_each_byte: list[list[Part]] = []
@@ -131,13 +133,23 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[
         parts = [Part("", PADDING, 1, pad_score)]  # one byte of padding
         for type_name in STRUCT_FORMATS:  # such as "u16", whose size is 16 bits
             end = position + int(type_name[1:]) // 8
-            if end <= length:
-                parts += _number_parts(rows[:, position:end][:, ::byte_step], type_name, frame_rate_Hz)
+            is_covered_in_part = position < checksum_start < end  # a checksum covers all bytes of a number or none
+            if end > length or is_covered_in_part:
+                continue
+            if is_constant[position:end].all():
+                parts.append(Part(CHANNEL, type_name, end - position, Weights.constant, is_constant=True))
+                continue
+            number_bytes = rows[:, position:end][:, ::byte_step]
+            number_is_constant = is_constant[position:end][::byte_step]
+            number_is_zero = is_zero[position:end][::byte_step]
+            parts += _number_parts(number_bytes, number_is_constant, number_is_zero, type_name, frame_rate_Hz)
         parts_at_each_byte.append(parts)
     return parts_at_each_byte
 
 
-def _number_parts(number_bytes: Bytes, type_name: FieldType, frame_rate_Hz: float) -> Iterator[Part]:
+def _number_parts(
+    number_bytes: Bytes, is_constant: Booleans, is_zero: Booleans, type_name: FieldType, frame_rate_Hz: float
+) -> Iterator[Part]:
     """Yield the possible parts of a frame for bytes that contain a number of a given type.
 
     Every number may be a channel. A number may also be the frame counter or a clock if its steps, the differences
@@ -146,15 +158,12 @@ def _number_parts(number_bytes: Bytes, type_name: FieldType, frame_rate_Hz: floa
 
     Args:
         number_bytes: Bytes of the number, the lowest first, shape (n, size).
+        is_constant: Whether each byte is constant, shape (size,).
+        is_zero: Whether each byte is always 0, shape (size,).
         type_name: Type of the number, such as "u16", "i16" or "f32".
         frame_rate_Hz: Number of frames per second, Hz.
     """
-    usual, is_constant = usual_bytes(number_bytes)  # each of shape (size,)
-    is_zero = is_constant & (usual == 0)
     size = len(is_constant)  # bytes
-    if is_constant.all():
-        yield Part(CHANNEL, type_name, size, Weights.constant, is_constant=True)
-        return
     values = _values(number_bytes, type_name)
     steps = np.diff(values)
     counter_steps = steps  # steps if the number is a counter or a clock, which may overflow

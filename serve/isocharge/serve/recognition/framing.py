@@ -136,8 +136,8 @@ def _stuffed_frames(name: Framing, stuffing: Stuffing, data: bytes) -> Iterator[
         stuffing: Delimiter and functions of the byte stuffing.
         data: Bytes of the stream.
     """
-    whole_frames = data.split(stuffing.delimiter)[1:-1]  # the first and the last frame may be incomplete
-    encoded_frames = [frame for frame in whole_frames if frame]  # nothing is between two adjacent delimiters
+    # The first and the last frame may be incomplete, and nothing is between two adjacent delimiters.
+    encoded_frames = [frame for frame in data.split(stuffing.delimiter)[1:-1] if frame]
     decoded_frames = []
     for encoded_frame in encoded_frames:
         with suppress(ValueError):  # the frame is damaged, because no encoder produces it

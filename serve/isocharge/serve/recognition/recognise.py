@@ -14,7 +14,7 @@ from msgspec import structs, to_builtins
 from isocharge.common.arrays import Booleans
 from isocharge.serve.frames.formats import AutoParser
 from isocharge.serve.frames.frame import SEQ, Frame
-from isocharge.serve.frames.frame_layout import PADDING, SYNC, ByteOrder, Field, FrameLayout
+from isocharge.serve.frames.frame_layout import PADDING, SYNC, Field, FrameLayout
 from isocharge.serve.frames.text import Layout, TextParser
 from isocharge.serve.recognition.fields import (
     CHANNEL,
@@ -55,21 +55,22 @@ def described_frames_section(
         seconds: Time in which the bytes arrived, s. The unit of a clock is derived from this time.
         are_datagrams: Whether each chunk is a datagram.
     """
-    byte_count = sum(len(chunk) for chunk in chunks)
+    byte_count = sum(map(len, chunks))
     examined_share = min(1.0, MAX_EXAMINED_BYTES / max(1, byte_count))  # 1 if there are no bytes
     examined_seconds = seconds * examined_share
     for divisions in possible_divisions(chunks, are_datagrams=are_datagrams):
-        scored_sections = [
-            scored_section for division in divisions for scored_section in _scored_sections(division, examined_seconds)
+        scored_layouts = [
+            scored_layout for division in divisions for scored_layout in _scored_layouts(division, examined_seconds)
         ]
-        if scored_sections:
-            _, best_section = min(scored_sections, key=itemgetter(0))
-            return best_section
+        if scored_layouts:
+            _, best_layout = min(scored_layouts, key=itemgetter(0))
+            section: dict[str, Any] = to_builtins(best_layout)
+            return section
     return None
 
 
-def _scored_sections(division: FrameDivision, seconds: float) -> Iterator[tuple[float, dict[str, Any]]]:
-    """Yield the score of each possible description of the frames, together with its section `[frames]`.
+def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[float, FrameLayout]]:
+    """Yield the score of each possible description of the frames, together with the description.
 
     At most one description is yielded for each combination of a first byte, a checksum and a byte order. Descriptions
     without a checksum are tried only if no checksum fits. Descriptions without a channel are not yielded.
@@ -97,15 +98,25 @@ def _scored_sections(division: FrameDivision, seconds: float) -> Iterator[tuple[
     frame_rate_Hz = stream_bytes / length / seconds  # as if all bytes of the stream belonged to frames
     for order in ORDERS:
         for rows, check in rows_and_checks or [(rows, Check(0, order)) for rows in possible_rows]:
-            parts_at_each_byte = possible_parts(rows[:, : length - check.size], order, frame_rate_Hz)
+            rows_before_check = rows[:, : length - check.size]
+            parts_at_each_byte = possible_parts(rows_before_check, order, check.start, frame_rate_Hz)
             sync_lengths = range(1, count_leading(_may_be_sync(rows)) + 1) if has_sync else [0]
             score, sync_length, parts = split_frame(parts_at_each_byte, sync_lengths)
             has_channel = any(part.name == CHANNEL for part in parts)
             if has_channel:
                 sync = usual_bytes(rows)[0][:sync_length].tobytes()
+                layout = FrameLayout(
+                    framing=division.framing,
+                    sync_bytes=sync.hex(" ").upper() or None,
+                    length=length,
+                    byte_order=order,
+                    checksum=check.name,
+                    checksum_from=check.start,
+                    checksum_order=check.order if check.order != order and check.size > 1 else None,
+                    fields_and_padding=_fields(parts),
+                )
                 # Each byte outside of all frames contributes `Weights.noise` bits.
-                bits_per_byte = covered_share * score / length + (1.0 - covered_share) * Weights.noise
-                yield bits_per_byte, _frames_section(division, sync, check, order, parts)
+                yield covered_share * score / length + (1.0 - covered_share) * Weights.noise, layout
 
 
 def _may_be_sync(rows: Bytes) -> Booleans:
@@ -116,32 +127,6 @@ def _may_be_sync(rows: Bytes) -> Booleans:
     usual, is_constant = usual_bytes(rows)
     may_be_sync: Booleans = is_constant & (usual != 0)
     return may_be_sync
-
-
-def _frames_section(
-    division: FrameDivision, sync: bytes, check: Check, order: ByteOrder, parts: Sequence[Part]
-) -> dict[str, Any]:
-    """Convert a description of the frames to the section `[frames]` of a device file.
-
-    Args:
-        division: Division of the stream into frames, with the framing and the length of the frames.
-        sync: The sync pattern; empty if the frames have no sync pattern.
-        check: The checksum, whose size is 0 if the frames have no checksum.
-        order: Byte order of the numbers.
-        parts: Parts of a frame between the sync pattern and the checksum.
-    """
-    layout = FrameLayout(
-        framing=division.framing,
-        sync_bytes=sync.hex(" ").upper() or None,
-        length=division.length,
-        byte_order=order,
-        checksum=check.name,
-        checksum_from=check.start,
-        checksum_order=check.order if check.order != order and check.size > 1 else None,
-        fields_and_padding=_fields(parts),
-    )
-    section: dict[str, Any] = to_builtins(layout)
-    return section
 
 
 def _fields(parts: Sequence[Part]) -> tuple[Field, ...]:
