@@ -30,9 +30,6 @@ N_GOOD_PRESSES = 50_000
 HELD_PRESSES = "measured_presses"
 """Name of the error entry that contains the number of measured presses. Errors on simulated presses do not have it."""
 
-ONLY_SIMULATED = ("position_p99_mm", "force_p99_percent")
-"""Names of the errors that need more presses than a rig usually makes."""
-
 
 def evaluate(fitted: Fitted) -> dict[str, float]:
     """Measure the errors of a trained network on presses that were not used in its training.
@@ -56,8 +53,7 @@ def evaluate(fitted: Fitted) -> dict[str, float]:
 
     contact, std, misfit = fitted.cross_validated
     truth = fitted.test.contact
-    # Too few presses are measured for the 99th percentiles.
-    errors = {name: error for name, error in contact_errors(contact, std, truth).items() if name not in ONLY_SIMULATED}
+    errors = contact_errors(contact, std, truth)
     if "constant_force" in fitted.made_with:
         errors = {name: error for name, error in errors.items() if not name.startswith("force_")}
         errors |= _coverages(contact[:, :2], std[:, :2], truth[:, :2])

@@ -72,8 +72,14 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
     electrodes = metadata.electrodes
     sensor_name = metadata.sensor["name"]
     is_measured = "measured" in metadata.made_with
-    noise = zip(electrodes, *metadata.noise.for_each_electrode(len(electrodes)), strict=True)
-    noise_text = "; ".join(f"{name} {white:g} pC and {100 * gain:.3g} %" for name, white, gain in noise)
+    noise = zip(*metadata.noise.for_each_electrode(len(electrodes)), strict=True)
+    noise_texts = [f"{white:g} pC and {100 * gain:.3g} %" for white, gain in noise]
+    noise_text = noise_texts[0]
+    if len(set(noise_texts)) > 1:
+        noise_text = "; ".join(f"{name} {text}" for name, text in zip(electrodes, noise_texts, strict=True))
+    misfit_text = "It is large if the charges do not belong to one press."
+    if len(electrodes) == 3:
+        misfit_text = "Three charges nearly always fit some contact."
     error_rows = "\n".join(
         f"| {row.format(metadata.errors[name])} |" for name, row in LISTED_ERRORS.items() if name in metadata.errors
     )
@@ -101,8 +107,8 @@ The errors are those on {len(fitted.test)} {_presses_text(metadata)}.
 |---|---|
 {error_rows}
 
-The misfit is the distance of the charges from those of the nearest single contact, in units of the noise. Three charges
-nearly always fit some contact.
+The misfit is the distance of the charges from those of the nearest single contact, in units of the noise.
+{misfit_text}
 
 {unnoticed_text}## Limits
 
@@ -206,7 +212,8 @@ def release(
             "rotations or possible films differ by more than the noise: the flag `misfit` notices only larger faults",
             errors["misfit_p999"],
         )
-    package_versions = {name: installed_version(name) for name in ("isocharge", "numpy", "onnx", "onnxruntime")}
+    packages = ("isocharge", "numpy", "onnx", "onnxruntime", "torch")
+    package_versions = {name: installed_version(name) for name in packages}
     metadata_without_unnoticed = ModelMetadata(
         name=folder.resolve().name,
         version=version,

@@ -109,7 +109,13 @@ def fit_presses(
         TrainingError: If the loss is not finite.
     """
     settings = (config or FitConfig()).checked()
-    training = _with_defaults_for_measured(settings.training)
+    # Measured presses are few and noisy. Therefore, the misfit network is trained like that of many electrodes.
+    training = structs.replace(
+        settings.training,
+        steps=settings.training.steps or DEFAULT_STEPS,
+        misfit_steps=settings.training.misfit_steps or MANY_ELECTRODE_SIZES.misfit_steps,
+        misfit_charges=settings.training.misfit_charges or MANY_ELECTRODE_SIZES.misfit_charges,
+    )
     usable = usable_presses(presses)
     force_std = constant_force_std(usable)  # None if the forces vary
     labelled = LabelledPresses(usable.contact, usable.charge_pC)
@@ -156,7 +162,6 @@ def fit_presses(
     cross_validated = Answers(contact, std * [position_factor, position_factor, force_factor], misfit)
     made_with: dict[str, object] = {
         "config": settings.to_dict(),
-        "torch": torch.__version__,
         "measured": {
             "presses": len(labelled),
             "places": place_count(uncertain_places(usable)),
@@ -305,23 +310,6 @@ def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]
     position_factor = np.quantile(deviation[:, :2], one_std_coverage)
     force_factor = np.quantile(deviation[:, 2], one_std_coverage)
     return float(position_factor), float(force_factor)
-
-
-def _with_defaults_for_measured(config: TrainingConfig) -> TrainingConfig:
-    """Return a copy of the settings with default numbers of steps and charges for measured presses.
-
-    Numbers that are given in the settings are not replaced. Measured presses are few and noisy. Therefore, the default
-    numbers for the misfit network are larger than the defaults for simulated presses of a sensor with few electrodes.
-
-    Args:
-        config: Settings in which the numbers may be missing.
-    """
-    return structs.replace(
-        config,
-        steps=config.steps or DEFAULT_STEPS,
-        misfit_steps=config.misfit_steps or MANY_ELECTRODE_SIZES.misfit_steps,
-        misfit_charges=config.misfit_charges or MANY_ELECTRODE_SIZES.misfit_charges,
-    )
 
 
 def _cross_validated_answers(

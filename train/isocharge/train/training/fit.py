@@ -139,7 +139,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
         train_perceptron(stage, settings)
         misfit_training.result()
 
-    made_with: dict[str, object] = {"config": settings.to_dict(), "torch": torch.__version__}
+    made_with: dict[str, object] = {"config": settings.to_dict()}
     if split.cautions:
         made_with["cautions"] = list(split.cautions)
     files = {}
