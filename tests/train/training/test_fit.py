@@ -38,11 +38,6 @@ def stage_with_factor(factor):
     return TrainingStage("small", network, loss, 400, rate=1e-2, seed=0)
 
 
-def has_learned(stage):
-    """Return whether the loss of fresh inputs is small."""
-    return stage.loss(torch.Generator().manual_seed(1)).item() < 1e-3
-
-
 def test_a_training_reduces_the_loss_and_reports_it():
     stage = stage_with_factor(lambda _: 1.0)
     reports = []
@@ -51,20 +46,13 @@ def test_a_training_reduces_the_loss_and_reports_it():
     first, last = reports
     assert first[:3] == ("training the small network", 200, 400)
     assert last[1:3] == (400, 400)
-    assert has_learned(stage)
+    assert stage.loss(torch.Generator().manual_seed(1)).item() < 1e-3
 
 
 @pytest.mark.parametrize("bad_value", ["nan", "inf"])
-def test_a_training_continues_after_a_loss_that_is_not_finite(bad_value):
+def test_a_loss_that_is_not_finite_is_an_error(bad_value):
     stage = stage_with_factor(lambda call: float(bad_value) if call == 200 else 1.0)
-    stage.run()
-    assert has_learned(stage)
-
-
-@pytest.mark.parametrize("bad_value", ["nan", "inf"])
-def test_losses_that_are_never_finite_are_an_error(bad_value):
-    stage = stage_with_factor(lambda call: float(bad_value) if call >= 200 else 1.0)
-    with pytest.raises(TrainingError, match=rf"small network is {bad_value} at step 205 of 400, .* lower training\."):
+    with pytest.raises(TrainingError, match=rf"small network is {bad_value} at step 201 of 400; lower training\."):
         stage.run()
 
 
@@ -252,12 +240,12 @@ def test_keys_left_out_keep_their_defaults(tmp_path):
     assert load_config(CONFIGS / "quick.toml").network == NetworkConfig()
 
 
-def test_focused_distance_is_a_mean_with_smaller_weights_for_long_targets():
+def test_focused_distance_is_a_mean_with_smaller_weights_for_long_targets(monkeypatch):
+    monkeypatch.setattr("isocharge.train.training.misfit_training.FOCUS_LENGTH", 2.0)
     vector = torch.tensor([[1.0, 0.0], [0.0, 2.0]])
     target = torch.tensor([[0.0, 0.0], [3.0, 4.0]])
     # squared distances 1 and 13, weights 1 and 1 / (1 + 25 / 4)
-    expected = (1.0 + 13.0 / 7.25) / (1.0 + 1.0 / 7.25)
-    assert focused_squared_distance(vector, target, focus=2.0).item() == pytest.approx(expected, rel=1e-6)
+    assert focused_squared_distance(vector, target).item() == pytest.approx((1.0 + 13.0 / 7.25) / 2.0, rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -99,10 +99,8 @@ def contact_stage(
     """
     domain = network.domain
     charge = as_tensor(train.charge)
-    white, gain = (torch.as_tensor(values, dtype=torch.float32) for values in (noise.white, noise.gain))
-    noise_std = torch.hypot(white, gain * charge)
+    noise_std = as_tensor(noise.sigma(train.charge))
     unit_contact = as_tensor(domain.to_unit(train.contact))
-    batch = min(config.batch, len(charge))
 
     def loss(random: torch.Generator) -> Tensor:
         """Return the loss of a random batch with new noise.
@@ -110,10 +108,9 @@ def contact_stage(
         Args:
             random: Random number generator of the batch and of its noise.
         """
-        rows = torch.randint(len(charge), (batch,), generator=random)
-        added_noise = noise_std[rows] * torch.randn((batch, charge.shape[1]), generator=random)
+        rows = torch.randint(len(charge), (config.batch,), generator=random)
         target = unit_contact[rows]
-        posterior = network.posterior(charge[rows] + added_noise)
+        posterior = network.posterior(torch.normal(charge[rows], noise_std[rows], generator=random))
         # The two losses have separate gradients. The first loss does not change the outputs for the covariance, and the
         # second loss does not change the mean.
         return (mean_loss(posterior, target) + covariance_loss(posterior, target - posterior.mean)).mean()

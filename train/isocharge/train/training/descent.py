@@ -7,13 +7,12 @@ close to a second-order method (Vyas et al., 2024, arXiv 2409.11321, algorithm 3
 are updated every few steps by one orthogonal iteration.
 """
 
-import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from isocharge.common.errors import TrainingError
 from isocharge.common.progress import report
@@ -99,10 +98,7 @@ RATE_INCREASE_FRACTION = 0.1
 """Fraction of the steps during which the learning rate increases, dimensionless."""
 
 REPORT_EVERY = 200
-"""Number of steps between two progress reports. The weights are stored as often."""
-
-MAX_RETRIES = 4
-"""Largest number of times that a training continues from stored weights. After that, it is given up."""
+"""Number of steps between two progress reports."""
 
 
 @dataclass(frozen=True)
@@ -131,41 +127,24 @@ class TrainingStage:
         The learning rate increases to its largest value during the first tenth of the steps, and then decreases to zero
         along a cosine. Weights that require no gradient, such as rounded weights, are not trained.
 
-        If a loss or its gradient is not finite, the training continues from the latest stored weights with half of the
-        learning rate.
-
         Raises:
-            TrainingError: If this happens more than `MAX_RETRIES` times.
+            TrainingError: If a loss is not finite.
         """
         parameters = [parameter for parameter in self.network.parameters() if parameter.requires_grad]
         optimisers = [Soap(parameter) for parameter in parameters]
-        rate = self.rate
-        retry_count = 0
-        stored_weights = copy.deepcopy(self.network.state_dict())
         random = torch.Generator().manual_seed(self.seed)
         for step in range(self.steps):
             loss = self.loss(random)
-            self.network.zero_grad(set_to_none=False)
+            if not torch.isfinite(loss):
+                raise TrainingError(
+                    f"the loss of the {self.name} network is {loss.item():g} at step {step + 1} of {self.steps}; lower "
+                    "training.learning_rate, or check the presses"
+                )
+            self.network.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
-            gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
-            if not torch.isfinite(loss + nn.utils.get_total_norm(gradients)):
-                retry_count += 1
-                if retry_count > MAX_RETRIES:
-                    raise TrainingError(
-                        f"the loss of the {self.name} network is {loss.item():g} at step {step + 1} of {self.steps}, "
-                        f"also after {MAX_RETRIES} attempts with smaller learning rates; lower training.learning_rate, "
-                        "or check the presses"
-                    )
-                self.network.load_state_dict(stored_weights)
-                optimisers = [Soap(parameter) for parameter in parameters]
-                rate *= 0.5
-                continue
-            is_reported = (step + 1) % REPORT_EVERY == 0 or step + 1 == self.steps
-            if is_reported:
-                stored_weights = copy.deepcopy(self.network.state_dict())
             for optimiser in optimisers:
-                optimiser.step(rate * relative_rate(step / self.steps))
-            if is_reported:
+                optimiser.step(self.rate * relative_rate(step / self.steps))
+            if (step + 1) % REPORT_EVERY == 0 or step + 1 == self.steps:
                 report(f"training the {self.name} network", step + 1, self.steps, f"loss {loss.item():.3f}")
 
 

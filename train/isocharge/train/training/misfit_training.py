@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from isocharge.common.arrays import Array
-from isocharge.serve.model.contact import MISFIT_LIMIT
 from isocharge.simulate.identifiability.nearest_contact import search
 from isocharge.train.data.channel_noise import ChannelNoise, misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
@@ -55,8 +54,11 @@ If the dataset has no such presses, there are no such examples.
 """
 
 
-FOCUS_MISFIT = 2.0 * MISFIT_LIMIT
-"""Misfit at which the weight of an example is half of the largest weight, in standard deviations of the noise."""
+FOCUS_LENGTH = float(np.arcsinh(2.0))
+"""Compressed length of the misfit vector at which the weight of an example is half of the largest weight.
+
+The misfit is then twice the threshold of the flag `misfit`.
+"""
 
 
 def misfit_examples(
@@ -94,7 +96,7 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
     """Define the training of the misfit perceptron.
 
     The targets of the perceptron are the residuals, whose lengths are the misfits. The inverse hyperbolic sine
-    compresses the lengths. Examples with misfits far above `FOCUS_MISFIT` have smaller weights than other examples.
+    compresses the lengths. Examples with vectors far above `FOCUS_LENGTH` have smaller weights than other examples.
 
     Args:
         network: Network whose misfit perceptron is trained.
@@ -105,29 +107,26 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
     charges, residuals = examples
     inputs = network.inputs(as_tensor(charges))
     targets = compress_length(torch.tensor(residuals)).float()
-    focus = float(np.arcsinh(FOCUS_MISFIT / MISFIT_LIMIT))  # compressed length of a residual of length `FOCUS_MISFIT`
 
     def loss(random: torch.Generator) -> Tensor:
         """Return the weighted mean of the squared distances for a random batch of the examples."""
         rows = torch.randint(len(inputs), (config.batch,), generator=random)
-        return focused_squared_distance(network.misfit_vector(inputs[rows]), targets[rows], focus)
+        return focused_squared_distance(network.misfit_vector(inputs[rows]), targets[rows])
 
     steps = config.sizes(network.features.n_electrode).misfit_steps
     return TrainingStage("misfit", network.misfit_vector, loss, steps, config.learning_rate, config.seed)
 
 
-def focused_squared_distance(vector: Tensor, target: Tensor, focus: float) -> Tensor:
+def focused_squared_distance(vector: Tensor, target: Tensor) -> Tensor:
     """Compute a weighted mean of the squared distances between vectors, with small weights for long targets.
 
-    The weight is proportional to 1 / (1 + |target|^2 / focus^2). With these weights, the network becomes most accurate
-    for misfits up to the threshold of the flag `misfit`. The exact value of a misfit far above this threshold matters
+    The weight is 1 / (1 + |target|^2 / FOCUS_LENGTH^2). With these weights, the network becomes most accurate for
+    misfits up to the threshold of the flag `misfit`. The exact value of a misfit far above this threshold matters
     little.
 
     Args:
         vector: Estimated vectors, shape (n, n_electrode).
         target: True vectors, same shape.
-        focus: Length of a target at which its weight is half of the largest weight.
     """
-    squared_distance = torch.sum((vector - target) ** 2, dim=-1)
-    weight = 1.0 / (1.0 + torch.sum(target**2, dim=-1) / focus**2)
-    return (weight * squared_distance).sum() / weight.sum()
+    weight = 1.0 / (1.0 + torch.sum(target**2, dim=-1) / FOCUS_LENGTH**2)
+    return (weight * torch.sum((vector - target) ** 2, dim=-1)).mean()
