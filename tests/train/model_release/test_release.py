@@ -149,6 +149,8 @@ def test_the_folder_is_complete_and_its_card_and_metadata_agree(released, datase
     assert np.hypot(*edge_centres.T).min() == pytest.approx(RADIUS_mm, abs=1e-3)
     card = (released.folder / "card.md").read_text()
     assert f"{metadata.errors['position_median_mm']:g} mm" in card
+    assert "| noise `reference` | 1 pC and 0.2 % |" in card
+    assert "Three charges nearly always fit some contact." in card
     assert f"beyond {metadata.yield_force_N:g} N the film is stressed to more than 45 MPa" in card
     percentages = re.findall(r"\| (?:coverage|detected).* \| (\S+)% \|", card)
     names = ["coverage_68", "coverage_95", "found_gain_20_percent", "found_dead_electrode"]

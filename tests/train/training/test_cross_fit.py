@@ -156,6 +156,7 @@ def test_card_of_a_model_of_measured_presses_states_noise_and_coverage(fitted_pa
     # A few of the 1,200 random positions are closer to another one than the errors of the positions.
     assert re.search(r"1200 measured presses at 1[01][0-9]{2} places, which are in `presses\.csv`", card)
     assert "\n| probes | unknown |\n" in card
+    assert "It is large if the charges do not belong to one press." in card
     percentages = re.findall(r"pC and (\S+) %|intervals \| (\S+)%", card)
     expected = [*fitted_pad.noise.gain, metadata.errors["coverage_68"], metadata.errors["coverage_95"]]
     stated = np.array([float(gain or coverage) for gain, coverage in percentages])
