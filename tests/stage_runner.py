@@ -76,7 +76,7 @@ def track(tracker, contact, t_s, flags=(), charge_pC=None):
     frame = Frame(None, None, (), clock_s=t_s, flags=list(flags), charge_pC=charge_pC, contact=contact)
     frame.is_valid = INVALID not in flags
     tracker.step(frame)
-    return frame.tracking.tracked, frame.tracking.event
+    return frame.tracked, frame.event
 
 
 def recorded_lines(predictor, rows, table, requests=None):

@@ -16,7 +16,6 @@ from isocharge.common.arrays import Array
 from isocharge.serve import Contact, Predictor
 from isocharge.serve.benchmark import Contender, machine, take_turns
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.record.record import Tracking
 from isocharge.serve.tracking.tracker import Tracker
 from isocharge.simulate import ChargeSpline, Circle, ForwardMap, NoiseModel, Sweep
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
@@ -139,8 +138,8 @@ def whitened_errors(contact: Array, truth: Array, std: Array, correlation: Array
     return np.linalg.solve(np.linalg.cholesky(matrix), ((contact - truth) / std)[..., None])[..., 0]
 
 
-def track_contacts(tracker: Tracker, t_s: Array, contacts: Array, charge: Array) -> list[Tracking]:
-    """Follow the contacts of one path, from its first frame.
+def track_contacts(tracker: Tracker, t_s: Array, contacts: Array, charge: Array) -> list[Frame]:
+    """Follow the contacts of one path, from its first frame, and return the frames with the tracked contacts.
 
     Args:
         tracker: The tracker.
@@ -149,12 +148,12 @@ def track_contacts(tracker: Tracker, t_s: Array, contacts: Array, charge: Array)
         charge: Charges of each frame, shape (n, n_electrode), pC.
     """
     tracker.reset()
-    tracking = []
+    frames = []
     for time_s, contact, charge_pC in zip(t_s.tolist(), contacts.tolist(), charge, strict=True):
         frame = Frame(None, None, (), clock_s=time_s, charge_pC=charge_pC, contact=Contact(*contact))
         tracker.step(frame)
-        tracking.append(frame.tracking)
-    return tracking
+        frames.append(frame)
+    return frames
 
 
 def report_progress(title: str, result: dict[str, float]) -> None:

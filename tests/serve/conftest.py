@@ -26,7 +26,7 @@ from isocharge.serve.network.address import Address
 from isocharge.serve.network.http.server import HttpServer
 from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol.handler import Handler
-from isocharge.serve.record.record import selected_fields
+from isocharge.serve.record.record import record_fields
 
 NAMES = ("A", "B", "C", "D")
 """Names of the electrodes."""
@@ -265,7 +265,7 @@ def fill_disk(monkeypatch):
 @pytest.fixture
 def contract():
     """Names of the fields of a prediction record, in their order."""
-    return [field.name for field in selected_fields()]
+    return [field.name for field in record_fields()]
 
 
 @pytest.fixture

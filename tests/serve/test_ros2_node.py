@@ -146,7 +146,7 @@ def test_the_node_publishes_what_an_mcap_file_holds(run_node, record):
     }
     tracked = TrackedContact(1.0, -3.0, 0.5, 0.01, 0.02, 0.001, 0.0, 0.0, 0.1)
     records = [
-        record(**press, has_tracking=True, tracked=tracked),
+        record(**press, sections=("track",), tracked=tracked),
         record(**press, contact=False),
         record(contact=False),
     ]

@@ -213,8 +213,8 @@ def test_every_record_is_valid_under_its_schema(record):
 def test_wrench_and_pose_describe_the_tracked_contact(tmp_path, press):
     tracked = TrackedContact(1.0, -4.0, 0.25, 0.01, 0.02, 0.001, 5.0, 0.0, 0.9)
     records = [
-        press(0, has_tracking=True, tracked=tracked, event="slide", xy_correlation=0.5),
-        press(1, has_tracking=True, tracked=tracked, x_mm=None, force_N=None, flags=("invalid",)),
+        press(0, sections=("track",), tracked=tracked, event="slide", xy_correlation=0.5),
+        press(1, sections=("track",), tracked=tracked, x_mm=None, force_N=None, flags=("invalid",)),
     ]
     topics = read_with_rosbags(write(tmp_path / "a.mcap", records, is_ros2=True))
     check_messages(topics, [record.to_json() for record in records])

@@ -21,7 +21,7 @@ TRACKED = TrackedContact(1.0, 2.0, 0.5, 0.01, 0.02, 0.001, 3.0, 0.0, 0.25)
 def test_json_has_the_fields_of_tracking_and_film_after_the_others(contract, record):
     film = FollowedFilm(0.71234567, 0.05, 12)
     other = OtherContact(5.0, -1.0, 1.0, 0.25)
-    tracked_record = record(has_tracking=True, tracked=TRACKED, event="slide", other=other, film=film)
+    tracked_record = record(sections=("track", "follow"), tracked=TRACKED, event="slide", other=other, film=film)
     written = json.loads(tracked_record.to_json())
     assert [*written] == [*contract, "tracked", "event", "other", "film"]
     assert (written["tracked"], written["event"]) == (structs.asdict(TRACKED), "slide")

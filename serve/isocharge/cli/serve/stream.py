@@ -133,8 +133,7 @@ def command_outputs(targets: Sequence[str] | None, touch: TouchStream, *, is_liv
     """
     context = OutputContext(
         electrodes=touch.predictor.metadata.electrodes,
-        with_tracking=touch.has_tracking,
-        with_film=touch.has_film,
+        sections=touch.sections,
         is_live=is_live,
         write_stdout=write_stdout,
     )

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import GAP, REPEAT, RESTART
 from isocharge.serve.model.contact import Contact, Validity
-from isocharge.serve.record.record import FollowedFilm, Tracking
+from isocharge.serve.record.record import FollowedFilm, OtherContact, TrackedContact
 
 SMALLEST_RESTART = 128
 """Smallest increase of a frame counter across the end of its range that counts as a restart of the board, not as a gap.
@@ -92,7 +92,9 @@ class Frame:
         contact: The computed contact; None if nothing touches the film, or if the frame is invalid.
         contact_flags: Flags that are the reasons why the contact may be wrong.
         film: Estimated film; None if the film is not followed.
-        tracking: The tracked contact; None if contacts are not tracked.
+        tracked: The tracked contact; None if nothing touches the film, or if contacts are not tracked.
+        event: Event of the tracked contact that begins with the frame, or None.
+        other: Another contact with the same charges, or None.
         flags: Flags of `isocharge.serve.flags` that do not depend on the contact.
     """
 
@@ -121,7 +123,9 @@ class Frame:
     contact: Contact | None = None
     contact_flags: tuple[str, ...] = ()
     film: FollowedFilm | None = None
-    tracking: Tracking | None = None
+    tracked: TrackedContact | None = None
+    event: str | None = None
+    other: OtherContact | None = None
     flags: list[str] = field(default_factory=list)
 
     def set_contact(self, contact: Contact, validity: Validity) -> None:

@@ -18,10 +18,8 @@ from isocharge.serve.frames.frame import Frame, FrameCounts
 from isocharge.serve.live.device import ANY_BOARD, create_stages
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.file_source import Chunk
-from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, Charges, PredictionRecord, Tracking
+from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, Charges, PredictionRecord
 from isocharge.serve.signal_chain.stage import Device, Setup
-from isocharge.serve.tracking.film_follower import FollowRule
-from isocharge.serve.tracking.tracker import TrackRule
 
 RESTART_OUTAGE_s = 1e-6
 """Outage that a chunk states if a new recording begins after the first frames, s. Every outage of a port is longer."""
@@ -186,6 +184,7 @@ class TouchStream(ReadingStream):
     Attributes:
         predictor: The loaded model. If the film is followed, its contacts are then corrected.
         frame_id: Name of the film, which each record contains.
+        sections: Sections of the device file whose stages process contacts, which may add fields to the records.
     """
 
     def __init__(
@@ -232,6 +231,7 @@ class TouchStream(ReadingStream):
         for stage in contact_stages:
             stage.continue_touch(previous_stages.get(type(stage), stage))
         self._stages = charge_stages + contact_stages
+        self.sections = tuple(stage.section for stage in contact_stages)
         self.predictor = predictor
         self._label = predictor.metadata.label
         self.frame_id = self._given_name or predictor.metadata.frame_id
@@ -254,19 +254,6 @@ class TouchStream(ReadingStream):
                 f"{new.electrodes}; start another stream for it"
             )
         self._set_model(predictor)
-
-    @property
-    def has_tracking(self) -> bool:
-        """Whether contacts are tracked. If contacts are tracked, the records contain the fields of `Tracking`."""
-        return self._device.rule(TrackRule) is not None
-
-    @property
-    def has_film(self) -> bool:
-        """Whether the film is followed, that is, whether its pretension is estimated.
-
-        If the film is followed, the records contain the field `film`.
-        """
-        return self._device.rule(FollowRule) is not None
 
     def feed(self, chunk: Chunk) -> Iterator[PredictionRecord]:
         """Process a chunk, and yield the records of the frames whose last byte is in the chunk.
@@ -304,9 +291,11 @@ class TouchStream(ReadingStream):
             latency_us=(time.perf_counter_ns() - chunk.clock_ns) / 1e3,  # includes the time that the stages have taken
             model=self._label,
             frame_id=self.frame_id,
-            **(frame.tracking or Tracking())._asdict(),
+            tracked=frame.tracked,
+            event=frame.event,
+            other=frame.other,
             film=frame.film,
-            has_tracking=frame.tracking is not None,
+            sections=self.sections,
         )
 
     def _by_electrode(self, charge_pC: Array | None) -> Charges | None:

@@ -58,16 +58,14 @@ class OutputContext:
 
     Attributes:
         electrodes: Names of the electrodes, in the order of the charges.
-        with_tracking: Whether contacts are tracked, so that the records have the fields of a `Tracking`.
-        with_film: Whether the pretension of the film is estimated, so that the records have the field `film`.
+        sections: Sections of the device file whose stages process contacts, which may add fields to the records.
         is_live: True if the records come from a sensor, which does not wait for the outputs. False if they come from a
             recording.
         write_stdout: Function that writes a text to standard output.
     """
 
     electrodes: tuple[str, ...]
-    with_tracking: bool = False
-    with_film: bool = False
+    sections: tuple[str, ...] = ()
     is_live: bool = False
     write_stdout: Callable[[str], object] = sys.stdout.write
 

@@ -17,7 +17,7 @@ from isocharge.common.errors import InputError, shown
 from isocharge.common.files import as_output_errors
 from isocharge.serve.outputs.output import FileOutput, OutputContext, OutputKind, is_file_with
 from isocharge.serve.record.formats import csv_header, csv_row
-from isocharge.serve.record.record import PredictionRecord, selected_fields
+from isocharge.serve.record.record import PredictionRecord, record_fields
 
 
 class LineFormat(NamedTuple):
@@ -39,8 +39,7 @@ def json_lines(_: OutputContext) -> LineFormat:
 
 def csv_lines(context: OutputContext) -> LineFormat:
     """Return the format of records as CSV with the columns that the stream needs."""
-    fields = selected_fields(with_tracking=context.with_tracking, with_film=context.with_film)
-    header = csv_header(context.electrodes, fields)
+    header = csv_header(context.electrodes, record_fields(context.sections))
     return LineFormat(f"{header}\n", lambda record: csv_row(record, context.electrodes))
 
 

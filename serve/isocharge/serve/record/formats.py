@@ -119,7 +119,7 @@ def _object(electrodes: Sequence[str], *, allows_null: bool) -> dict[str, Any]:
         allows_null: Whether fields that may be unknown may be null.
     """
     properties = {field.name: _property(field, electrodes, allows_null=allows_null) for field in RECORD_FIELDS}
-    required = sorted(field.name for field in RECORD_FIELDS if not field.group)
+    required = sorted(field.name for field in RECORD_FIELDS if not field.section)
     return {"type": "object", "properties": properties, "required": required}
 
 

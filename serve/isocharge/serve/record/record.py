@@ -37,7 +37,7 @@ class Field(NamedTuple):
         meaning: Description of the value, a sentence.
         may_be_null: Whether the value may be null, because it is unknown.
         parts: Fields of a struct; empty for any other value, also for an object with a number for each electrode.
-        group: Group of optional fields to which the field belongs; empty for a field that every record has.
+        section: Section of the device file that adds the field to the records; empty for a field that every record has.
     """
 
     name: str
@@ -45,25 +45,25 @@ class Field(NamedTuple):
     meaning: str
     may_be_null: bool
     parts: tuple["Field", ...] = ()
-    group: str = ""
+    section: str = ""
 
 
 def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
     """Return the fields of a struct in the order of their declaration.
 
-    The annotation of each field contains a sentence that describes the value, and the group of an optional field. An
-    attribute without such an annotation is no field of the JSON object.
+    The annotation of each field contains a sentence that describes the value, and the section of the device file that
+    adds an optional field. An attribute without such an annotation is no field of the JSON object.
     """
     fields: list[Field] = []
     for name, annotation in get_type_hints(struct, include_extras=True).items():  # with the metadata of `Annotated`
         if get_origin(annotation) is not Annotated:
             continue
-        declared_type, meaning, *group = get_args(annotation)
+        declared_type, meaning, *section = get_args(annotation)
         may_be_null = isinstance(declared_type, UnionType)  # the other alternative is None
         value_type = get_args(declared_type)[0] if may_be_null else declared_type
         parts = () if value_type in JSON_TYPES else fields_of(value_type)
         json_type = JSON_TYPES.get(value_type, "object")
-        fields.append(Field(name, json_type, meaning, may_be_null, parts, "".join(group)))
+        fields.append(Field(name, json_type, meaning, may_be_null, parts, "".join(section)))
     return tuple(fields)
 
 
@@ -108,21 +108,14 @@ class FollowedFilm(Struct, frozen=True):
     touches: Annotated[int, "Number of touches from which the pretension was estimated."]
 
 
-class Tracking(NamedTuple):
-    """Values that the tracking of contacts adds to a record, which describes them."""
-
-    tracked: TrackedContact | None = None
-    event: str | None = None
-    other: OtherContact | None = None
-
-
 class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     """One reading of a sensor and the contact that a model computed from the reading.
 
     The annotations of the fields describe the values. The page `serve/docs/record.md` contains a table of all fields.
 
     Attributes:
-        has_tracking: Whether contacts are tracked. Otherwise, JSON and CSV do not contain the fields of the tracking.
+        sections: Sections of the device file whose stages process contacts. They decide which optional fields JSON and
+            CSV contain.
     """
 
     timestamp: Annotated[float | None, "Time of the reading, unix seconds."]
@@ -153,25 +146,25 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     tracked: Annotated[
         TrackedContact | None,
         "Contact that was estimated from all frames of the touch up to now; null out of contact.",
-        "tracking",
+        "track",
     ] = None
     event: Annotated[
         str | None,
         "Event that begins with this record: press, hold, slide, tap or release; null if none begins.",
-        "tracking",
+        "track",
     ] = None
     other: Annotated[
         OtherContact | None,
         "Second possible contact with the same charges, on a film with folds; null if there is none.",
-        "tracking",
+        "track",
     ] = None
-    film: Annotated[FollowedFilm | None, "Estimated film for which the model answered.", "film"] = None
-    has_tracking: bool = False
+    film: Annotated[FollowedFilm | None, "Estimated film for which the model answered.", "follow"] = None
+    sections: tuple[str, ...] = ()
 
     @property
     def fields(self) -> tuple[Field, ...]:
         """The fields that this record has, in their order."""
-        return selected_fields(with_tracking=self.has_tracking, with_film=self.film is not None)
+        return record_fields(self.sections)
 
     @property
     def json_values(self) -> dict[str, Any]:
@@ -213,19 +206,13 @@ NO_CONTACT: dict[str, Any] = UNKNOWN_CONTACT | {"force_N": 0.0}
 
 
 @cache
-def selected_fields(*, with_tracking: bool = False, with_film: bool = False) -> tuple[Field, ...]:
-    """Return the fields that every record has, and the fields of the selected optional groups.
-
-    There are two optional groups. The first group contains the fields that the tracking of contacts adds. The second
-    group contains the field of the film follower, which estimates the parameters of the film from the touches.
+def record_fields(sections: tuple[str, ...] = ()) -> tuple[Field, ...]:
+    """Return the fields that every record has, and the fields that sections of the device file add.
 
     Args:
-        with_tracking: Whether to include the fields of the tracking.
-        with_film: Whether to include the field of the film follower.
+        sections: Names of the sections. Sections that add no field are ignored.
     """
-    # The name of the group of fields that every record has is empty.
-    is_selected = {"": True, "tracking": with_tracking, "film": with_film}
-    return tuple(field for field in RECORD_FIELDS if is_selected[field.group])
+    return tuple(field for field in RECORD_FIELDS if field.section in ("", *sections))
 
 
 _UNCHANGED = frozenset({str, int, bool, tuple, type(None)})

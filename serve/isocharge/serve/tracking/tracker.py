@@ -12,7 +12,7 @@ from isocharge.serve.flags import SATURATED
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.charge_file import read_charge_map
 from isocharge.serve.model.contact import Contact, disk_corners
-from isocharge.serve.record.record import OtherContact, TrackedContact, Tracking
+from isocharge.serve.record.record import OtherContact, TrackedContact
 from isocharge.serve.signal_chain.stage import Rule, Setup, Share, Stage
 from isocharge.serve.tracking.contact_mixture import ContactHypothesis, ContactMixture
 from isocharge.serve.tracking.film_follower import FollowRule
@@ -164,15 +164,15 @@ class Tracker(Stage):
         """
         self._time_s += max(frame.clock_s - self._latest_clock_s, 0.0)
         self._latest_clock_s = frame.clock_s
-        event = None
         if frame.contact is not None:
-            event = self._follow(frame, frame.contact)
+            frame.event = self._follow(frame, frame.contact)
         elif frame.is_valid:  # an invalid frame does not show whether the touch has ended
             if self._events is not None:
-                event = self._events.end(self._time_s)
+                frame.event = self._events.end(self._time_s)
                 self._events = None
             self.reset()
-        frame.tracking = Tracking(self._tracked, event, self._other)
+        frame.tracked = self._tracked
+        frame.other = self._other
 
     def _follow(self, frame: Frame, contact: Contact) -> str | None:
         """Update the tracked contact with a frame in contact, and return the event that begins, or None.
