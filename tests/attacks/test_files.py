@@ -24,9 +24,10 @@ from isocharge.serve import (
     read_charges,
 )
 from isocharge.serve.live.device import create_stages
-from isocharge.serve.model.charge_file import FILE, charge_map_bytes, read_charge_map
+from isocharge.serve.model.charge_file import FILE, charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.model.metadata import ModelMetadata
+from isocharge.serve.model.model_folder import read_checked, read_golden
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.virtual_sensor.script import load_script
 from isocharge.simulate import Circle, Samples, load_amplifier, load_sensor, parse_probe, read_dataset, write_dataset
@@ -185,7 +186,7 @@ def test_tables_with_junk(attack, model):
     golden = json.loads((model / "golden.json").read_text())
     golden["inputs"]["charge_pC"] = golden["inputs"]["charge_pC"][:2]
 
-    def read_golden(value):
+    def check_vectors(value):
         (model / "golden.json").write_text(json.dumps(value))
         check_golden(load_model(model))
 
@@ -201,7 +202,7 @@ def test_tables_with_junk(attack, model):
     attack("sensor tables", lambda value: sensor_from_dict(value, "junk"), lambda rng: table(rng, sensor), 12_000)
     attack("device tables", read_device, lambda rng: table(rng, device), 12_000)
     attack("metadata", read_props, lambda rng: table(rng, props), 12_000)
-    attack("golden vectors", read_golden, lambda rng: with_junk(rng, golden), 2_000)
+    attack("golden vectors", check_vectors, lambda rng: with_junk(rng, golden), 2_000)
 
 
 @pytest.fixture
@@ -286,10 +287,10 @@ def test_charge_maps_with_faults(model, attack_file):
     )
     good = charge_map_bytes(series)
     put_charge_map(model, good)
+    golden = read_golden(model / "golden.json")
 
-    def read(path):
-        read_charge_map(model, series.electrodes)
-        assert path.read_bytes() == good
+    def read(_):
+        assert read_checked(model, FILE, golden) == good
 
     attack_file("charges.npz bytes", model / FILE, read, mutated, 3_000)
 

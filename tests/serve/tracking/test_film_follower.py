@@ -1,8 +1,6 @@
 """Following a film through touches, on a film whose charges are a closed formula and whose model searches exactly."""
 
-import shutil
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,18 +10,14 @@ from drawn_contacts import draw_contacts
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError
 from isocharge.serve import Contact, Frame
-from isocharge.serve.model.charge_file import charge_map_bytes
+from isocharge.serve.model.charge_file import FILE, charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.tracking.film_follower import FilmFollower, TouchPeak
 from isocharge.simulate import NoiseModel, noise_model
-from model_files import put_charge_map
 
 NOISE = noise_model("reference")
 ELECTRODES = ("A", "B", "C", "D")
-
-GOLDEN = Path(__file__).parents[3] / "models" / "four-25um-biaxial" / "1" / "golden.json"
-"""Golden vectors of a released model, to which the checksum of a charge map is added."""
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +53,7 @@ def model_in(folder, series, noise=NOISE):
         series: Charge map of the film.
         noise: Noise that a device file states.
     """
-    shutil.copy(GOLDEN, folder)
-    put_charge_map(folder, charge_map_bytes(series))
+    (folder / FILE).write_bytes(charge_map_bytes(series))
 
     def predict(charge_pC):
         contact = np.array([0.0, 0.0, np.log(0.5)])

@@ -250,9 +250,9 @@ def test_tare_that_is_too_long_for_c_is_refused():
 
 
 def test_stage_without_code_in_c_is_refused_by_its_name(monkeypatch):
-    monkeypatch.setattr(Hum, "c_prefix", "")
+    monkeypatch.setattr(Hum, "section", "notch")
     board = device_from_table({"hum": {}}, "board")
-    with pytest.raises(DeviceError, match="board: hum: this stage does not exist"):
+    with pytest.raises(DeviceError, match="board: notch: this stage does not exist"):
         device_header(board, ("A", "B", "C"))
 
 

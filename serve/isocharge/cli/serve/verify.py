@@ -18,7 +18,7 @@ def verify_command(model: ModelArgument, json: JsonOption = False, models: Model
     facts = {
         "model": checked.metadata.label,
         "folder": str(checked.folder),
-        "sha256": {"model.onnx": golden.sha256} | golden.files,
+        "sha256": golden.checksums,
         "golden_presses": len(golden.charge_pC),
         "dataset_sha256": checked.metadata.dataset_sha256,
         "made_with": checked.metadata.made_with,

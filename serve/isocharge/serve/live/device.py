@@ -75,7 +75,6 @@ class Prediction(Stage):
     section = "noise"
     rule_class = NoiseRule
     is_required = True
-    needs_model = True
     needs_contact = True
 
     def __init__(self, setup: Setup) -> None:

@@ -27,8 +27,8 @@ import numpy as np
 from isocharge.common.arrays import npz_arrays
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError, cut
+from isocharge.common.files import read_needed
 from isocharge.serve.model.charge_series import ChargeSeries
-from isocharge.serve.model.session import read_companion_file
 
 FILE = "charges.npz"
 """Name of the file in a version folder."""
@@ -71,20 +71,18 @@ def read_charge_map(version_folder: Path, electrodes: tuple[str, ...]) -> Charge
         electrodes: Names of the electrodes of the model.
 
     Raises:
-        ModelError: If the file is damaged, has another format, or belongs to another model. The checksum of the file in
-            `golden.json` shows damage.
+        ModelError: If the file cannot be read, or `charge_map_from_bytes` refuses its content.
     """
     path = version_folder / FILE
     if not path.exists():
         return None
-    return charge_map_from_bytes(read_companion_file(version_folder, FILE, ADVICE), electrodes, str(path))
+    return charge_map_from_bytes(read_needed(path, ModelError, ADVICE), electrodes, str(path))
 
 
 def charge_map_from_bytes(data: bytes, electrodes: tuple[str, ...], where: str = FILE) -> ChargeSeries:
     """Create the charge map from the content of a file `charges.npz`.
 
-    The numbers are not checked, because the checksum of the file is the checksum that `golden.json` contains, and a
-    model folder is trusted.
+    The numbers are not checked. When a model is loaded, the file is compared with its checksum in `golden.json`.
 
     Args:
         data: Content of the file.

@@ -33,6 +33,7 @@ from isocharge.common.files import new_folder, read_needed, refuse_existing, sha
 from isocharge.serve.model.contact import as_charges
 from isocharge.serve.model.metadata import NAME, VERSION, ModelMetadata
 from isocharge.serve.model.session import (
+    GRAPH_FILE,
     INPUT,
     OUTPUTS,
     Golden,
@@ -40,7 +41,6 @@ from isocharge.serve.model.session import (
     contact_floors,
     make_golden,
     open_session,
-    read_companion_file,
     read_golden,
     run,
 )
@@ -217,25 +217,44 @@ def load_model(folder: Path) -> Model:
     Raises:
         ModelError: If a file is missing or damaged, or has an unsupported format.
     """
-    path = folder / "model.onnx"
-    onnx_model = read_needed(path, ModelError, "copy or export the model again")
     golden = read_golden(folder / "golden.json")
-    actual_sha256 = sha256_of(onnx_model)
-    if actual_sha256 != golden.sha256:
-        raise ModelError(
-            f"{path}: expected sha256 {golden.sha256} (golden.json), got {actual_sha256} over {len(onnx_model)} bytes; "
-            "the file is damaged or changed: copy or export it again"
-        )
-    session = open_session(onnx_model, str(path))
-    metadata = ModelMetadata.from_props(session.get_modelmeta().custom_metadata_map, str(path))
+    where = str(folder / GRAPH_FILE)
+    session = open_session(read_checked(folder, GRAPH_FILE, golden), where)
+    metadata = ModelMetadata.from_props(session.get_modelmeta().custom_metadata_map, where)
     n_electrode = len(metadata.electrodes)
-    check_interface(session, n_electrode, str(path))
+    check_interface(session, n_electrode, where)
     if golden.charge_pC.shape[1] != n_electrode:
         raise ModelError(
             f"{folder / 'golden.json'}: expected charges of shape (n, {n_electrode}), got {golden.charge_pC.shape}; "
             "copy or export the model again"
         )
     return Model(folder, metadata, golden, session)
+
+
+def read_checked(folder: Path, name: str, golden: Golden) -> bytes:
+    """Read a file of a version, and compare it with its checksum in `golden.json`.
+
+    A companion file of another model, such as `charges.npz`, would have the right format but give wrong contacts.
+
+    Args:
+        folder: The version folder.
+        name: Name of the file.
+        golden: Golden vectors of the version, with the checksums.
+
+    Raises:
+        ModelError: If the file cannot be read, or `golden.json` contains no checksum or another checksum of the file.
+    """
+    content = read_needed(folder / name, ModelError, "copy or export the model again")
+    # If `golden.json` does not list the file, the comparison with this text fails, and the message contains the text.
+    expected_sha256 = golden.checksums.get(name, "no such file")
+    actual_sha256 = sha256_of(content)
+    if actual_sha256 != expected_sha256:
+        raise ModelError(
+            f"{folder / name}: expected sha256 {expected_sha256} (golden.json), got {actual_sha256} over "
+            f"{len(content)} bytes; the file is damaged or changed, or belongs to another model: copy the whole folder "
+            "of the model again, or make it again"
+        )
+    return content
 
 
 def check_golden(model: Model) -> None:
@@ -283,7 +302,7 @@ def load_checked_model(folder: Path) -> Model:
         )
     existing_names = {path.name for path in folder.glob("*.npz")}
     for name in sorted(existing_names | model.golden.files.keys()):
-        read_companion_file(folder, name, "make the model again")
+        read_checked(folder, name, model.golden)
     check_golden(model)
     return model
 

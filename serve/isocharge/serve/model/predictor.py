@@ -134,7 +134,16 @@ class Predictor:
 
         if not self._has_warned and BEYOND in self.flags(contact):
             self._has_warned = True
-            self._warn(charge_pC, contact)
+            log.warning(
+                "%s: the charges %s pC on %s are far from those of any press in the training, and %s cannot be a "
+                "measurement; check the unit, the gain and the tare, and with `isocharge serve doctor "
+                "--check-electrodes` whether wires are swapped. Further contacts of this kind are not logged; "
+                "Predictor.flags reports each of them",
+                self.metadata.label,
+                charge_pC,
+                " ".join(self.metadata.electrodes),
+                contact,
+            )
         return contact
 
     def _predict_one(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
@@ -252,27 +261,6 @@ class Predictor:
         return (
             f"Predictor({metadata.label}: sensor {metadata.frame_id}, charges {' '.join(metadata.electrodes)} (pC), "
             f"positions {self.validity.area_text}, forces {low_N:.3g} to {high_N:.3g} N)"
-        )
-
-    def _warn(self, charge_pC: object, contact: Contact) -> None:
-        """Log a warning for a contact that cannot be a measurement.
-
-        Args:
-            charge_pC: Charges of the press, as they were passed to `predict`.
-            contact: Contact that the model computed from the charges.
-        """
-        charges = np.ravel(np.asarray(charge_pC, float))
-        pairs = zip(self.metadata.electrodes, charges, strict=True)
-        log.warning(
-            "%s: the charges %s pC are far from those of any press in the training, and the contact (%.2f, %.2f) mm, "
-            "%.6g N cannot be a measurement; check the unit, the gain and the tare, and with `isocharge serve doctor "
-            "--check-electrodes` whether wires are swapped. Further contacts of this kind are not logged; "
-            "Predictor.flags reports each of them",
-            self.metadata.label,
-            ", ".join(f"{electrode} = {charge:.4g}" for electrode, charge in pairs),
-            contact.x_mm,
-            contact.y_mm,
-            contact.force_N,
         )
 
 

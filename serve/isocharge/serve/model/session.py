@@ -28,9 +28,12 @@ from msgspec import Meta, Struct, json
 
 from isocharge.common.arrays import Singles
 from isocharge.common.errors import ModelError, cut
-from isocharge.common.files import read_needed, sha256_of
+from isocharge.common.files import sha256_of
 from isocharge.common.structs import Finite, NotNegative, Text, read_json
 from isocharge.serve.model.metadata import ModelMetadata
+
+GRAPH_FILE = "model.onnx"
+"""Name of the file of a model in its version folder."""
 
 INPUT = "charge_pC"
 """Name of the input."""
@@ -272,6 +275,11 @@ class Golden(Struct, frozen=True):
     files: dict[Text, Text]
 
     @property
+    def checksums(self) -> dict[str, str]:
+        """Checksums of the model file and of the files beside it, by file name."""
+        return {GRAPH_FILE: self.sha256} | self.files
+
+    @property
     def charge_pC(self) -> Singles:
         """Input charges, shape (n, electrodes), pC. A charge beyond the range of float32 is infinite."""
         with np.errstate(over="ignore"):
@@ -341,35 +349,3 @@ def read_golden(path: Path) -> Golden:
         where = "" if isinstance(error, ModelError) else f"{path}: "
         raise ModelError(f"{where}{error}; the file is damaged: copy or export the model again") from error
     return golden
-
-
-def read_companion_file(version_folder: Path, name: str, advice: str) -> bytes:
-    """Read a companion file of a model, such as `charges.npz`, and compare it with its checksum in `golden.json`.
-
-    A companion file belongs to one `model.onnx`. A companion file of another model would have the right format but give
-    wrong contacts.
-
-    Args:
-        version_folder: Folder of the model, which contains `model.onnx`.
-        name: Name of the companion file.
-        advice: What the user can do if the file cannot be read, for the error message.
-
-    Returns:
-        The bytes of the file.
-
-    Raises:
-        ModelError: If the file cannot be read, if its checksum differs from the checksum in `golden.json`, or if
-            `golden.json` is missing or damaged, or does not list the file.
-    """
-    path = version_folder / name
-    data = read_needed(path, ModelError, advice)
-    checksums = read_golden(version_folder / "golden.json").files
-    # If `golden.json` does not list the file, the comparison with this text fails, and the message contains the text.
-    expected_sha256 = checksums.get(name, "no such file")
-    actual_sha256 = sha256_of(data)
-    if actual_sha256 != expected_sha256:
-        raise ModelError(
-            f"{path}: expected sha256 {expected_sha256:.12} (golden.json), got {actual_sha256:.12}; the file is "
-            f"damaged or belongs to another model: copy the whole folder of the model again, or {advice}"
-        )
-    return data

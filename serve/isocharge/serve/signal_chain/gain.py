@@ -58,7 +58,6 @@ class Gain(Stage):
     section = "gain"
     is_required = True
     rule_class = GainRule
-    c_prefix = "GAIN"
 
     def __init__(self, setup: Setup) -> None:
         """Set the conversion. Without settings, the values are charges in pC."""
@@ -114,7 +113,6 @@ class Saturation(Stage):
     section = "saturation"
     is_required = True
     rule_class = SaturationRule
-    c_prefix = "SATURATION"
 
     def __init__(self, setup: Setup) -> None:
         """Begin without a press."""

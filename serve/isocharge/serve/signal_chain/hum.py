@@ -57,7 +57,6 @@ class Hum(Stage):
 
     section = "hum"
     rule_class = HumRule
-    c_prefix = "HUM"
 
     def __init__(self, setup: Setup) -> None:
         """Begin with an estimate of zero hum."""

@@ -136,7 +136,6 @@ class Leak(Stage):
 
     section = "leak"
     rule_class = LeakRule
-    c_prefix = "LEAK"
 
     def __init__(self, setup: Setup) -> None:
         """Store the settings. The state begins at the first frame after the tare."""
@@ -269,7 +268,6 @@ class Integrator(Leak):
     """
 
     section = ""
-    c_prefix = ""
 
     @classmethod
     def is_used(cls, setup: Setup) -> bool:

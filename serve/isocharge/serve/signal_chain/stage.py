@@ -188,20 +188,16 @@ class Stage(ABC):
         section: Name of the section of the device file with the settings; empty if the stage has no settings.
         rule_class: Class of the settings.
         is_required: Whether each stream has the stage, even if the device file switches it off.
-        needs_model: Whether a stream has the stage only if it has a model.
         is_default: Whether the stage is switched on, with default settings, if the device file has no such section.
         needs_contact: Whether the stage processes the contact of a record. Such a stage skips frames without a record,
             and is not part of an export to C.
-        c_prefix: Prefix of the settings in the export to C; empty if the stage does not exist in C.
     """
 
     section: ClassVar[str] = ""
     rule_class: ClassVar[type[Rule]] = Rule
     is_required: ClassVar[bool] = False
-    needs_model: ClassVar[bool] = False
     is_default: ClassVar[bool] = False
     needs_contact: ClassVar[bool] = False
-    c_prefix: ClassVar[str] = ""
 
     def __init__(self, setup: Setup) -> None:  # noqa: B027  # some stages have no settings
         """Begin without any frame.
@@ -213,9 +209,7 @@ class Stage(ABC):
     @classmethod
     def is_used(cls, setup: Setup) -> bool:
         """Return whether a stream has this stage."""
-        is_switched_on = cls.is_required or cls.rule_class in setup.device.rules
-        has_model = setup.predictor is not None or not cls.needs_model
-        return is_switched_on and has_model
+        return cls.is_required or cls.rule_class in setup.device.rules
 
     @abstractmethod
     def step(self, frame: Frame) -> None:
@@ -237,6 +231,8 @@ class Stage(ABC):
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:
         """Return the settings of the stage for C by name, as numbers, truth values or arrays.
+
+        The C sources contain these settings in macros with the name of the section.
 
         Raises:
             DeviceError: If the stage does not exist in C with these settings.

@@ -86,7 +86,6 @@ class Tare(Stage):
     is_required = True
     rule_class = TareRule
     is_default = True
-    c_prefix = "TARE"
 
     def __init__(self, setup: Setup) -> None:
         """Begin without a tare."""

@@ -106,7 +106,6 @@ class Touch(Stage):
     is_required = True
     rule_class = TouchRule
     is_default = True
-    c_prefix = "TOUCH"
 
     def __init__(self, setup: Setup) -> None:
         """Begin without a touch."""

@@ -32,17 +32,11 @@ RATES = slice(3, 6)
 VELOCITY = slice(3, 5)
 """Slice of the velocities along x and y in a state."""
 
-IS_HELD = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
-"""Whether x, y and ln F are held (1) or change (0) in each of the four modes."""
-
-_IS_MOVING = np.tile(1.0 - IS_HELD, 2)[:, None]
-"""Whether each value and its rate change (1) or are held (0) in each mode, shape (4, 1, 6)."""
+IS_MOVING = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0], [1.0, 1.0, 1.0]])
+"""Whether x, y and ln F change (1) or are held (0) in each of the four modes."""
 
 _CHANGE_COUNT = np.array([[0, 1, 1, 2], [1, 0, 2, 1], [1, 2, 0, 1], [2, 1, 1, 0]])
 """Number of changes between two modes: the position starts or stops, and the force starts or stops to change."""
-
-_INTEGRATION = np.eye(6, k=3)
-"""Matrix that adds the rates to the values."""
 
 MEAN_MODE_TIME_s = 0.7
 """Mean time after which a position or a force that is held starts to change, or the reverse, s."""
@@ -50,11 +44,19 @@ MEAN_MODE_TIME_s = 0.7
 INITIAL_RATE_STD = np.array([60.0, 60.0, 10.0])
 """Standard deviations of the rates at the beginning of a movement, mm/s, mm/s and 1/s."""
 
-_HELD_RATE_COVARIANCE = np.eye(6) * np.concatenate([np.zeros((4, 3)), IS_HELD * INITIAL_RATE_STD**2], axis=1)[:, None]
+_HELD_RATE_COVARIANCE = (
+    np.eye(6) * np.concatenate([np.zeros((4, 3)), (1.0 - IS_MOVING) * INITIAL_RATE_STD**2], axis=1)[:, None]
+)
 """Variances of the rates of held values, shape (4, 6, 6). A held value may begin to change at any time."""
 
-_KEPT = np.eye(6) * np.concatenate([np.ones((4, 3)), 1.0 - IS_HELD], axis=1)[:, None]
+_HAS_EFFECT = np.concatenate([np.ones((4, 3)), IS_MOVING], axis=1)[:, None]
+"""Whether each value and rate has an effect on the next state (1), as all but the rates of held values; (4, 1, 6)."""
+
+_KEPT = np.eye(6) * _HAS_EFFECT
 """Matrices that keep the values, and the rates of values that change, shape (4, 6, 6)."""
+
+_INTEGRATION = np.eye(6, k=3) * _HAS_EFFECT
+"""Matrices that add the rates of values that change to the values, shape (4, 6, 6)."""
 
 HELD_DRIFT = 5e-4
 """Increase of the variance of a held value per second, mm^2/s or 1/s. A held finger drifts by 0.02 mm in a second."""
@@ -102,7 +104,7 @@ NOISE_INTERVAL_s = 0.0045
 """Time after which the noise of two frames is independent, s. Boards filter their charges over shorter times."""
 
 
-def process_noise(velocity_mm_per_s: Array, force_density: float, dt_s: float) -> Array:
+def process_noise(velocity_mm_per_s: Array, force_density: float, dt_s: float, is_moving: Array | float = 1.0) -> Array:
     """Return the covariance that a white acceleration adds to moving states (Bar-Shalom et al. 2001, 6.2.2).
 
     The spectral density of the acceleration of the position increases with the squared speed, because a fast contact
@@ -112,6 +114,7 @@ def process_noise(velocity_mm_per_s: Array, force_density: float, dt_s: float) -
         velocity_mm_per_s: Velocities along x and y, shape (n, 2), mm/s.
         force_density: Spectral density of the second derivative of ln F, 1/s^3.
         dt_s: Time over which the acceleration acts, s.
+        is_moving: Whether x, y and ln F change (1) or are held (0) in each state, shape (n, 3). By default, all change.
 
     Returns:
         Covariances of x, y, ln F and their rates, shape (n, 6, 6).
@@ -121,7 +124,7 @@ def process_noise(velocity_mm_per_s: Array, force_density: float, dt_s: float) -
     density[:, POSITION] = (ACCELERATION_DENSITY + SPEED_CHANGE_RATE * squared_speed)[:, None]
     # Covariance of a value and its rate for a unit density
     unit_covariance = np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
-    blocks = unit_covariance[:, None, :, None] * (density[:, :, None] * _IDENTITY)[:, None, :, None]
+    blocks = np.einsum("ab,nk,kl->nakbl", unit_covariance, is_moving * density, _IDENTITY)
     return np.asarray(blocks.reshape(-1, 6, 6))
 
 
@@ -208,7 +211,7 @@ class MotionFilter:
     @property
     def moving_probability(self) -> float:
         """Probability that the position moves."""
-        return float(self.probability @ (1.0 - IS_HELD[:, 0]))
+        return float(self.probability @ IS_MOVING[:, 0])
 
     def predict(self, dt_s: float) -> None:
         """Mix the modes, and predict the state of each mode at the next frame.
@@ -224,9 +227,9 @@ class MotionFilter:
         mean, covariance = mixture_moments(joint / self.probability[:, None], self.mean, self.covariance)
 
         # The rate of a held value is that of a movement that would begin now: zero on average.
-        noise = _IS_MOVING * process_noise(mean[:, VELOCITY], FORCE_ACCELERATION_DENSITY, dt_s)
+        noise = process_noise(mean[:, VELOCITY], FORCE_ACCELERATION_DENSITY, dt_s, IS_MOVING)
         noise += _HELD_RATE_COVARIANCE + dt_s * _HELD_DRIFT_DENSITY
-        transition = _KEPT + dt_s * _INTEGRATION * _IS_MOVING
+        transition = _KEPT + dt_s * _INTEGRATION
         self.mean = (transition @ mean[:, :, None])[:, :, 0]
         self.covariance = transition @ covariance @ transition.swapaxes(1, 2) + noise
 

@@ -25,8 +25,9 @@ log = logging.getLogger(__name__)
 def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: bool = False) -> str:
     """Return the text of `isocharge_device.h`.
 
-    Each stage of the signal chain states its settings for C. The macro `ISOCHARGE_<STAGE>_ON` is 1 if the stage is
-    switched on. The other macros have the names of the settings in capital letters.
+    Each stage of the signal chain whose section the C sources contain states its settings for C. The macro
+    `ISOCHARGE_<SECTION>_ON` is 1 if the stage is switched on. The other macros have the names of the settings in capital
+    letters.
 
     Args:
         device: The board.
@@ -41,13 +42,14 @@ def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: 
     if setup.device.has_currents:
         raise DeviceError(f"{device.where}: front_end: {NOT_IN_C}")
     lines = [f"#define ISOCHARGE_SUM_TOLERANCE_S {_c_literal(SUM_TOLERANCE_s)}"]
+    chain_source = source_text("isocharge_chain.c")
     sections_of_host = []
     for stage in STAGES:
         is_on = stage.rule_class in device.rules
-        if stage.c_prefix:
+        prefix = f"ISOCHARGE_{stage.section.upper()}_"
+        if prefix in chain_source:
             settings = {"on": is_on, **stage.c_settings(setup)}
-            for name, value in settings.items():
-                lines.append(f"#define ISOCHARGE_{stage.c_prefix}_{name.upper()} {_c_literal(value)}")
+            lines += [f"#define {prefix}{name.upper()} {_c_literal(value)}" for name, value in settings.items()]
         elif stage.section and is_on:
             if not stage.needs_contact:
                 raise DeviceError(f"{device.where}: {stage.section}: {NOT_IN_C}")

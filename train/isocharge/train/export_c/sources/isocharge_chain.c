@@ -56,7 +56,7 @@ static void forget_tare(isocharge_chain *chain)
         chain->direction[k] = ISOCHARGE_TOUCH_ANY_SIGN ? 0 : 1;
     }
 #endif
-#if ISOCHARGE_THERMAL_ON
+#if ISOCHARGE_COMMON_MODE_ON
     chain->drift_pC = chain->drift_pC2 = chain->waited_s = 0;
     chain->blind = 0;
 #endif
@@ -368,16 +368,16 @@ static void update_contact(isocharge_chain *chain, const real charge_pC[N], real
 #endif
 }
 
-#if ISOCHARGE_THERMAL_ON
+#if ISOCHARGE_COMMON_MODE_ON
 /* The common charge of a warming film, as far as this frame tells; returns its change. */
 static real track_thermal_drift(isocharge_chain *chain, const real charge_pC[N], real dt_s)
 {
     real slope = 0, curvature = 0, estimate_pC2 = 0, predicted_pC2, change_pC, gain;
 
     chain->waited_s += dt_s;
-    if (chain->waited_s < (real)(ISOCHARGE_THERMAL_EVERY_S - ISOCHARGE_SUM_TOLERANCE_S))
+    if (chain->waited_s < (real)(ISOCHARGE_COMMON_MODE_EVERY_S - ISOCHARGE_SUM_TOLERANCE_S))
         return 0;
-    predicted_pC2 = chain->drift_pC2 + (real)(ISOCHARGE_THERMAL_WANDER_PC * ISOCHARGE_THERMAL_WANDER_PC) * chain->waited_s;
+    predicted_pC2 = chain->drift_pC2 + (real)(ISOCHARGE_COMMON_MODE_WANDER_PC * ISOCHARGE_COMMON_MODE_WANDER_PC) * chain->waited_s;
     chain->waited_s = 0;
     for (int n = -2; n <= 2; ++n) { /* the parabola of the squared misfit by least squares */
         float tried_pC[N], contact[7];
@@ -391,8 +391,8 @@ static real track_thermal_drift(isocharge_chain *chain, const real charge_pC[N],
     }
     chain->blind = !(curvature > 0);
     if (!chain->blind) {
-        estimate_pC2 = (real)(ISOCHARGE_THERMAL_NOISE * ISOCHARGE_THERMAL_NOISE) / curvature;
-        chain->blind = estimate_pC2 > (real)(ISOCHARGE_THERMAL_BLIND_PC * ISOCHARGE_THERMAL_BLIND_PC);
+        estimate_pC2 = (real)(ISOCHARGE_COMMON_MODE_NOISE * ISOCHARGE_COMMON_MODE_NOISE) / curvature;
+        chain->blind = estimate_pC2 > (real)(ISOCHARGE_COMMON_MODE_BLIND_PC * ISOCHARGE_COMMON_MODE_BLIND_PC);
     }
     if (chain->blind) {
         chain->drift_pC2 = predicted_pC2;
@@ -434,7 +434,7 @@ static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real d
 #endif
     update_contact(chain, charge_pC, decay, TARE_FOLLOWS, dt_s);
     chain->saturated = limited || (chain->saturated && chain->contact);
-#if ISOCHARGE_THERMAL_ON
+#if ISOCHARGE_COMMON_MODE_ON
     if (!chain->contact) {
         chain->drift_pC = chain->drift_pC2 = chain->waited_s = 0;
         chain->blind = 0;
@@ -451,7 +451,7 @@ static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real d
 #endif
         }
     }
-    if (chain->contact && !chain->saturated && ABS(chain->drift_pC) >= (real)ISOCHARGE_THERMAL_TELL_PC)
+    if (chain->contact && !chain->saturated && ABS(chain->drift_pC) >= (real)ISOCHARGE_COMMON_MODE_TELL_PC)
         reading->flags |= ISOCHARGE_THERMAL;
     if (!chain->saturated && chain->blind)
         reading->flags |= ISOCHARGE_BLIND;

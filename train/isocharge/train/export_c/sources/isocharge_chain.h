@@ -67,7 +67,7 @@ typedef struct {
     isocharge_real last[ISOCHARGE_ELECTRODES], base[ISOCHARGE_ELECTRODES], mean[ISOCHARGE_ELECTRODES];
     isocharge_real direction[ISOCHARGE_ELECTRODES];
 #endif
-#if ISOCHARGE_THERMAL_ON
+#if ISOCHARGE_COMMON_MODE_ON
     isocharge_real drift_pC, drift_pC2, waited_s;
     int blind;
 #endif
