@@ -44,9 +44,7 @@ MEAN_MODE_TIME_s = 0.7
 INITIAL_RATE_STD = np.array([60.0, 60.0, 10.0])
 """Standard deviations of the rates at the beginning of a movement, mm/s, mm/s and 1/s."""
 
-_HELD_RATE_COVARIANCE = (
-    np.eye(6) * np.concatenate([np.zeros((4, 3)), (1.0 - IS_MOVING) * INITIAL_RATE_STD**2], axis=1)[:, None]
-)
+_HELD_RATE_COVARIANCE = np.eye(6) * np.pad((1.0 - IS_MOVING) * INITIAL_RATE_STD**2, ((0, 0), (3, 0)))[:, None]
 """Variances of the rates of held values, shape (4, 6, 6). A held value may begin to change at any time."""
 
 _HAS_EFFECT = np.concatenate([np.ones((4, 3)), IS_MOVING], axis=1)[:, None]
