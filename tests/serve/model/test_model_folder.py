@@ -71,7 +71,7 @@ def wrong_arguments(film):
         ("other metadata", ModelError, "disagree on 'probes'"),
         ("other output", ModelError, "expected the tensors .*misfit"),
         ("golden too narrow", ChargeError, "'A', 'B', 'C'"),
-        ("no answer", ModelError, "contact: expected finite outputs, got .*nan"),
+        ("no answer", ModelError, "golden.json: outputs.*: expected a finite number, got null"),
         ("no golden", ModelError, "expected a list of lists, 1 or more"),
     ],
 )
@@ -285,5 +285,5 @@ def test_noise_of_each_electrode_and_of_older_models_is_read(film, extra):
 
 @pytest.mark.parametrize("value", [{"median_mm": float("nan")}, {"median_mm": object()}], ids=["NaN", "object"])
 def test_metadata_that_are_not_json_are_refused(film, value):
-    with pytest.raises(ModelError, match="'errors': expected a JSON value"):
+    with pytest.raises((TypeError, ValueError), match="not JSON"):
         film.metadata(errors=value).to_props()

@@ -90,9 +90,13 @@ def test_predict_into_fills_an_array(film, predictor, plain_session, gap):
 @pytest.mark.parametrize(
     ("charge_pC", "out", "message"),
     [
-        (np.ones(3), np.zeros(10, np.float32), r"got float64 of shape \(3,\) and float32 of shape \(10,\)"),
-        (np.ones(4, np.float32), np.zeros(10, np.float32), r"\('A', 'B', 'C'\) .* got float32 of shape \(4,\)"),
-        (np.ones(3, np.float32), np.zeros(10), r"and float64 of shape \(10,\)"),
+        (np.ones(3), np.zeros(10, np.float32), r"got array\(\[1\., 1\., 1\.\]\) and array\(\[.*dtype=float32\)"),
+        (
+            np.ones(4, np.float32),
+            np.zeros(10, np.float32),
+            r"\('A', 'B', 'C'\) .* got array\(\[1\., 1\., 1\., 1\.\], ",
+        ),
+        (np.ones(3, np.float32), np.zeros(10), r"and array\(\[0\., .* 0\.\]\) "),
         (np.ones(3, np.float32), np.broadcast_to(np.float32(0.0), 10), "read-only"),
     ],
 )

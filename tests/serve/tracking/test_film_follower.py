@@ -231,7 +231,7 @@ def test_film_that_is_lost_again_keeps_the_state_of_the_latest_touches(series, m
 
 
 def test_models_that_cannot_be_followed_are_refused(series, tmp_path):
-    single = replace(series, coefficients=series.coefficients[:1], node_MPa=np.zeros(1), directions=None)
+    single = replace(series, coefficients=series.coefficients[:1], node_MPa=np.zeros(1))
     with pytest.raises(ModelError, match="calibrate"):
         new_follower(model_in(tmp_path, single))
     three = replace(

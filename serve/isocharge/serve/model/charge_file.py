@@ -6,8 +6,8 @@ The file is in the same folder as `model.onnx`. It contains these arrays, with t
     format           version of the format
     series           coefficients c, shape (n_node, degree + 1, degree + 1, force_degree + 1, n_electrode)
     node_MPa         values of t at the nodes, shape (n_node,), MPa
-    directions       coefficients of d, shape (degree + 1, degree + 1, force_degree + 1, K, n_electrode); missing if
-                     K = 0. The degrees may differ from those of `series`
+    directions       coefficients of d, shape (degree + 1, degree + 1, force_degree + 1, K, n_electrode); may be missing
+                     if K = 0. The degrees may differ from those of `series`
     log_size         Chebyshev coefficients of ln S as a function of l; missing if all charges are positive
     radius_mm        radius r of the domain, mm
     force_N          smallest and largest force of the domain, N
@@ -49,13 +49,12 @@ def charge_map_bytes(series: ChargeSeries) -> bytes:
         "format": FORMAT,
         "series": series.coefficients.astype(np.float32),
         "node_MPa": series.node_MPa,
+        "directions": series.directions.astype(np.float32),
         "radius_mm": series.domain.radius,
         "force_N": series.domain.force_range,
         "is_folded": int(series.is_folded),
     }
     arrays |= {name: getattr(series, name) for name in NUMBERS}
-    if series.directions is not None:
-        arrays["directions"] = series.directions.astype(np.float32)
     if series.log_size is not None:
         arrays["log_size"] = series.log_size
     file = io.BytesIO()
@@ -101,13 +100,12 @@ def charge_map_from_bytes(data: bytes, electrodes: tuple[str, ...], where: str =
         coefficients = arrays["series"]
         if coefficients.shape[-1] != len(electrodes):
             raise ValueError(f"series: expected charges of {electrodes}, got an array of shape {coefficients.shape}")
-        directions = arrays.get("directions")
         return ChargeSeries(
             domain=Domain(float(arrays["radius_mm"]), tuple(arrays["force_N"].tolist())),
             electrodes=electrodes,
             coefficients=coefficients.astype(float),
             node_MPa=arrays["node_MPa"],
-            directions=None if directions is None else directions.astype(float),
+            directions=arrays.get("directions", np.zeros((1, 1, 1, 0, 1))).astype(float),
             log_size=arrays.get("log_size"),
             is_folded=bool(arrays["is_folded"]),
             **{name: float(arrays[name]) for name in NUMBERS},

@@ -176,7 +176,7 @@ class ChargeSeries:
             n_electrode).
         node_MPa: Changes t of the mean pretension at the nodes, shape (n_node,), MPa, ascending and containing 0.
         directions: Coefficients of the changes of v by one unit of each direction, shape (degree + 1, degree + 1,
-            force_degree + 1, K, n_electrode); None if the map has no directions.
+            force_degree + 1, K, n_electrode). By default, the map has no directions.
         log_size: Chebyshev coefficients of ln S as a function of l; None if all charges are positive.
         is_folded: Whether different contacts of the domain have the same charges. A service then tracks contacts with a
             `ContactMixture`.
@@ -191,7 +191,7 @@ class ChargeSeries:
     electrodes: tuple[str, ...]
     coefficients: Array
     node_MPa: Array = field(default_factory=lambda: np.zeros(1))
-    directions: Array | None = None
+    directions: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 0, 1)))
     log_size: Array | None = None
     is_folded: bool = False
     charge_std: float = 0.0
@@ -202,7 +202,7 @@ class ChargeSeries:
     @property
     def direction_count(self) -> int:
         """Number K of directions."""
-        return 0 if self.directions is None else self.directions.shape[3]
+        return int(self.directions.shape[3])
 
     def charges(self, contact: Array) -> Array:
         """Compute the charges of contacts on the calibrated film.
@@ -254,11 +254,10 @@ class ChargeSeries:
         # of v with respect to the state
         value = np.einsum("nk,nske->nse", weights, node_values)  # shape (n, 4, n_electrode)
         value_by_state = np.einsum("nk,nke->ne", weight_slopes, node_values[:, 0])[:, :, None]
-        if self._direction_series is not None:
-            direction_values = self._direction_series.values_and_derivatives(nearest, excess)
-            direction_values = direction_values.reshape(n_contact, 4, -1, n_electrode)
-            value = value + np.einsum("nk,nske->nse", states[:, 1:], direction_values)
-            value_by_state = np.concatenate([value_by_state, direction_values[:, 0].swapaxes(1, 2)], axis=2)
+        direction_values = self._direction_series.values_and_derivatives(nearest, excess)
+        direction_values = direction_values.reshape(n_contact, 4, self.direction_count, n_electrode)
+        value = value + np.einsum("nk,nske->nse", states[:, 1:], direction_values)
+        value_by_state = np.concatenate([value_by_state, direction_values[:, 0].swapaxes(1, 2)], axis=2)
 
         charge_pC, charge_per_value, by_contact = self._charges(value, nearest, excess)
         return ModelValues(charge_pC + self.offset_pC, by_contact, charge_per_value[:, :, None] * value_by_state)
@@ -275,11 +274,8 @@ class ChargeSeries:
         return Series(by_term.reshape(*by_term.shape[:3], -1))
 
     @cached_property
-    def _direction_series(self) -> Series | None:
+    def _direction_series(self) -> Series:
         """Series of the changes of v by all directions. Directions and electrodes share the last axis."""
-        if self.direction_count == 0:
-            return None
-        assert self.directions is not None
         return Series(self.directions.reshape(*self.directions.shape[:3], -1))
 
     def _nearest_in_domain(self, contact: Array) -> tuple[Array, Array]:

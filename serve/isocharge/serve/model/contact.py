@@ -23,6 +23,12 @@ from isocharge.common.errors import ChargeError
 from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE, STRESS
 from isocharge.serve.model.metadata import ModelMetadata
 
+STD = slice(3, 6)
+"""Standard deviations among the ten numbers of a contact."""
+
+CORRELATION = slice(7, 10)
+"""Correlations among the ten numbers of a contact."""
+
 
 class Contact(NamedTuple):
     """Position and force of one press, with the uncertainties of the position and the force.
@@ -130,15 +136,14 @@ class Contacts(NamedTuple):
         Args:
             covariance: Covariance of the additional error of x, y and the force, shape (n, 3, 3), mm and N.
         """
-        std = np.stack([self.x_std_mm, self.y_std_mm, self.force_std_N], axis=1).astype(float)
-        correlation = np.stack([self.xy_correlation, self.xF_correlation, self.yF_correlation], axis=1)
+        values = np.asarray(self, float)
+        std = values[:, STD]
         total_std = np.sqrt(std**2 + np.diagonal(covariance, axis1=1, axis2=2))
         i, j = [0, 0, 1], [1, 2, 2]  # the pairs (x, y), (x, F) and (y, F)
-        total = correlation * std[:, i] * std[:, j] + covariance[:, i, j]
-        total_correlation = total / (total_std[:, i] * total_std[:, j])
-        stds = total_std.T.astype(np.float32)
-        correlations = total_correlation.T.astype(np.float32)
-        return Contacts(*[self.x_mm, self.y_mm, self.force_N, *stds, self.misfit, *correlations])
+        total = values[:, CORRELATION] * std[:, i] * std[:, j] + covariance[:, i, j]
+        values[:, CORRELATION] = total / (total_std[:, i] * total_std[:, j])
+        values[:, STD] = total_std
+        return Contacts(*values.astype(np.float32).T)
 
 
 def write_finite(write: Callable[..., object], values: Iterable[float]) -> bool:
@@ -339,19 +344,14 @@ class Validity:
         """Squared radius of a circle around the origin that lies inside the working area, mm^2.
 
         The radius is the distance from the origin to the nearest line through an edge of the working area. If the
-        origin is outside the working area, the radius is 0.
+        origin is not on the same side of all edges, the radius is 0.
         """
-        origin_coordinate_mm = np.zeros(1)  # x and also y; `inside_polygon` takes arrays of points, here of one point
-        is_origin_inside = inside_polygon(origin_coordinate_mm, origin_coordinate_mm, self.corners_mm)[0]
-        if not is_origin_inside:
-            return 0.0
-
-        # The line through an edge is at most as far away as the edge, so the radius is not too large.
         x_start, y_start = self.corners_mm.T
         x_end, y_end = np.roll(self.corners_mm, -1, axis=0).T  # the last edge ends at the first corner
         with np.errstate(invalid="ignore"):  # if the last corner repeats the first corner, an edge has the length 0
-            distance_mm = np.abs(x_start * y_end - x_end * y_start) / np.hypot(x_end - x_start, y_end - y_start)
-        return float(np.nanmin(distance_mm)) ** 2
+            signed_distance_mm = (x_start * y_end - x_end * y_start) / np.hypot(x_end - x_start, y_end - y_start)
+        # The distances are positive if the corners are in anticlockwise order, and negative if they are clockwise.
+        return float(max(np.nanmin(signed_distance_mm), -np.nanmax(signed_distance_mm), 0.0)) ** 2
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
         """Return the flags of one contact, which are the reasons why the contact may be wrong.

@@ -225,19 +225,13 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         Fields that are None are left out.
 
         Raises:
-            ModelError: If a value, such as NaN, cannot be expressed in JSON.
+            TypeError, ValueError: If a value, such as NaN, cannot be expressed in JSON.
         """
-        props = {}
-        for name, value in structs.asdict(self).items():
-            if value is None:
-                continue
-            try:
-                props[name] = json.dumps(value, allow_nan=False, default=to_builtins)
-            except (TypeError, ValueError) as error:
-                raise ModelError(
-                    f"model metadata {name!r}: expected a JSON value, got {shown(value)} ({error})"
-                ) from error
-        return props
+        return {
+            name: json.dumps(value, allow_nan=False, default=to_builtins)
+            for name, value in structs.asdict(self).items()
+            if value is not None
+        }
 
     @classmethod
     def from_props(cls, props: Mapping[str, str], where: str) -> "ModelMetadata":

@@ -20,7 +20,7 @@ from msgspec import structs
 from numpy.typing import ArrayLike
 
 from isocharge.common.arrays import Array, Singles
-from isocharge.common.errors import ChargeError
+from isocharge.common.errors import ChargeError, shown
 from isocharge.common.structs import WrongKey, convert
 from isocharge.serve.flags import BEYOND
 from isocharge.serve.model.contact import Contact, Contacts, Validity, as_charges, write_finite
@@ -204,7 +204,7 @@ class Predictor:
         except (AttributeError, NotImplementedError, TypeError, ValueError) as error:
             raise ChargeError(
                 f"expected charges {self.metadata.electrodes} and a writable `out` for the {len(Contact._fields)} "
-                f"numbers of a Contact, both float32 arrays, got {_describe(charge_pC)} and {_describe(out)} ({error})"
+                f"numbers of a Contact, both float32 arrays, got {shown(charge_pC)} and {shown(out)} ({error})"
             ) from error
 
     def predict_batch(self, charge_pC: ArrayLike) -> Contacts:
@@ -262,10 +262,3 @@ class Predictor:
             f"Predictor({metadata.label}: sensor {metadata.frame_id}, charges {' '.join(metadata.electrodes)} (pC), "
             f"positions {self.validity.area_text}, forces {low_N:.3g} to {high_N:.3g} N)"
         )
-
-
-def _describe(value: object) -> str:
-    """For an error message, describe an array by its number type and shape, and any other object by its type."""
-    if isinstance(value, np.ndarray):
-        return f"{value.dtype} of shape {value.shape}"
-    return type(value).__name__

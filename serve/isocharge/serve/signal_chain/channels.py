@@ -43,9 +43,8 @@ class Channels(Stage):
         self._channels = setup.device.channels
         self._setup = setup
         self._where = setup.device.where
-        # Names, number of values and channel indices of the previous frame. `step` uses the indices again.
-        self._previous_names: tuple[str, ...] | None = None  # None before the first frame
-        self._previous_n_values = -1
+        # Names and number of values of the previous frame, and its channel indices. `step` uses the indices again.
+        self._previous_layout: tuple[tuple[str, ...], int] | None = None  # None before the first frame
         self._channel_indices: tuple[int, ...] = ()
 
     def step(self, frame: Frame) -> None:
@@ -56,10 +55,10 @@ class Channels(Stage):
         Raises:
             ChargeError: If the frame has no value for an electrode.
         """
-        if frame.names != self._previous_names or len(frame.values) != self._previous_n_values:
+        layout = (frame.names, len(frame.values))
+        if layout != self._previous_layout:
             self._channel_indices = self.channel_indices(frame)
-            self._previous_names = frame.names
-            self._previous_n_values = len(frame.values)
+            self._previous_layout = layout
         # With several indices, `itemgetter` returns a tuple. With a single index, it returns a number, which `reshape`
         # converts to an array with one element.
         values = itemgetter(*self._channel_indices)(frame.values)

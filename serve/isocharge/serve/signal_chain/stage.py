@@ -9,7 +9,7 @@ export to C follow from the list.
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
 import numpy as np
 from msgspec import Meta, field, structs
@@ -117,8 +117,7 @@ class Device(Board, frozen=True):
 
     def rule(self, rule_class: type[R]) -> R | None:
         """Return the settings of a class, or None if their stage is switched off."""
-        rule = self.rules.get(rule_class)
-        return rule if isinstance(rule, rule_class) else None
+        return cast("R | None", self.rules.get(rule_class))
 
 
 NO_SETTINGS = Device()

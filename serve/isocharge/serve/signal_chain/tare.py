@@ -99,8 +99,8 @@ class Tare(Stage):
         self._noise_pC = np.zeros(len(setup.electrodes))  # standard deviation of the charge at rest
         self._previous: Frame | None = None  # previous frame
         self._latest_pC = np.empty((0, len(setup.electrodes)))  # charges from which the tare is measured
-        self._searched_frames = 0  # number of frames since the beginning of the search
-        self._is_search_limited = True  # whether the search ends with an error after too many frames
+        patience = 0 if self._rule is None else self._rule.patience
+        self._remaining_frames = patience or math.inf  # number of frames after which the search ends with an error
 
     def step(self, frame: Frame) -> None:
         """Subtract the tare from a frame. While there is no tare, search for it, and remove the charges from the frame.
@@ -137,8 +137,7 @@ class Tare(Stage):
         self._tare_pC = None
         self._previous = None
         self._latest_pC = self._latest_pC[:0]  # without any frame
-        self._searched_frames = 0
-        self._is_search_limited = False
+        self._remaining_frames = math.inf
 
     def _change_pC(self, frame: Frame) -> Array | float:
         """Return the change of the tare because of a frame, shape (n_electrode,) or one number, pC.
@@ -166,8 +165,7 @@ class Tare(Stage):
             return
         stored_pC = np.vstack([self._latest_pC, frame.charge_pC])
         self._latest_pC = stored_pC[-rule.frames :]  # at most as many frames as a tare needs
-        if self._is_search_limited:  # otherwise the count remains 0, and the search never ends with an error
-            self._searched_frames += 1
+        self._remaining_frames -= 1
         if len(self._latest_pC) < rule.frames:
             return
         mean_pC = self._latest_pC.mean(axis=0)
@@ -177,7 +175,7 @@ class Tare(Stage):
             self._tare_pC = mean_pC
             self._noise_pC = noise_pC
             self._latest_pC = self._latest_pC[:0]  # the frames are not needed any more
-        elif 0 < rule.patience <= self._searched_frames:
+        elif self._remaining_frames <= 0:
             raise self._search_error(reason, frame)
 
     def _search_error(self, reason: str, frame: Frame) -> TareError:

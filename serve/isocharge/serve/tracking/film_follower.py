@@ -224,9 +224,10 @@ class FilmFollower(Stage):
         std[self._gains] = GAIN_STD
         std[self._offset] = self._offset_std_pC
         self._initial_std = np.maximum(std, SMALLEST_STD)
-        self._highest = MAX_DEVIATION * self._initial_std
-        self._lowest = -self._highest
-        self._lowest[0], self._highest[0] = series.node_MPa[[0, -1]]
+        highest = MAX_DEVIATION * self._initial_std
+        lowest = -highest
+        lowest[0], highest[0] = series.node_MPa[[0, -1]]
+        self._state_bounds = (lowest, highest)
 
         # Smallest and largest x, y and ln F
         domain = series.domain
@@ -302,8 +303,9 @@ class FilmFollower(Stage):
         problem = RobustProblem(
             self._values, charge_pC[np.newaxis], covariance_pC2[np.newaxis], self._state, self._covariance
         )
-        state_bounds = (self._lowest, self._highest)
-        estimate = problem.estimate(self._state, start, contact_bounds=self._contact_bounds, state_bounds=state_bounds)
+        estimate = problem.estimate(
+            self._state, start, contact_bounds=self._contact_bounds, state_bounds=self._state_bounds
+        )
         self._state = estimate.state
         self._covariance = problem.state_covariance(estimate)
         self._touch_count += 1
@@ -312,7 +314,7 @@ class FilmFollower(Stage):
         # makes it relative to the unscaled errors.
         self._mean_square += (2.0 * scale * estimate.cost - self._mean_square) / MEMORY_TOUCHES
         is_changed = np.abs(estimate.state) > CLEAR_CHANGE * np.sqrt(self._covariance.diagonal())
-        at_end = is_changed & ((estimate.state <= self._lowest) | (estimate.state >= self._highest))
+        at_end = is_changed & np.any(estimate.state == self._state_bounds, axis=0)
         was_lost = self.is_lost
         self.is_lost = self._mean_square > MAX_MEAN_SQUARE or bool(at_end[0] or at_end[self._offset])
         if self.is_lost and not was_lost:

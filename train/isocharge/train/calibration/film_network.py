@@ -95,7 +95,7 @@ def compact_charges(
     unit_contact = domain.to_unit(contact)
     size = charge if series.log_size is None else series_size(series.log_size, unit_contact[:, 2])[0]
     values = changes / size[:, None]  # a direction changes the value v of the series
-    directions = None
+    directions = series.directions  # none
     if values.size > 0:
         coefficients = fit_series(unit_contact, values.reshape(len(contact), -1), *DIRECTION_DEGREES)
         directions = coefficients.reshape(*coefficients.shape[:3], *changes.shape[1:])
