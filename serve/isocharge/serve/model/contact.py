@@ -60,15 +60,6 @@ class Contact(NamedTuple):
     xF_correlation: float = math.nan
     yF_correlation: float = math.nan
 
-    def with_covariance(self, covariance: Array) -> "Contact":
-        """Return the contact with the covariance of an additional independent error.
-
-        Args:
-            covariance: Covariance of the additional error of x, y and the force, shape (3, 3), mm and N.
-        """
-        contacts = Contacts(*np.array([self], np.float32).T).with_covariance(covariance[np.newaxis])
-        return Contact(*np.asarray(contacts)[0].tolist())
-
     def __repr__(self) -> str:
         """Return a text with x, y, the force and their standard deviations, rounded to a few significant digits."""
         return (
@@ -128,22 +119,22 @@ class Contacts(NamedTuple):
         """
         return np.stack(tuple(self), axis=1).astype(dtype or np.float32, copy=False)
 
-    def with_covariance(self, covariance: Array) -> "Contacts":
-        """Return the contacts with the covariance of an additional independent error.
 
-        Correlations that are NaN remain NaN.
+def add_covariance(contacts: Singles, covariance: Array) -> Singles:
+    """Return contacts with the covariance of an additional independent error. Correlations that are NaN remain NaN.
 
-        Args:
-            covariance: Covariance of the additional error of x, y and the force, shape (n, 3, 3), mm and N.
-        """
-        values = np.asarray(self, float)
-        std = values[:, STD]
-        total_std = np.sqrt(std**2 + np.diagonal(covariance, axis1=1, axis2=2))
-        i, j = [0, 0, 1], [1, 2, 2]  # the pairs (x, y), (x, F) and (y, F)
-        total = values[:, CORRELATION] * std[:, i] * std[:, j] + covariance[:, i, j]
-        values[:, CORRELATION] = total / (total_std[:, i] * total_std[:, j])
-        values[:, STD] = total_std
-        return Contacts(*values.astype(np.float32).T)
+    Args:
+        contacts: The ten numbers of n contacts, shape (n, 10).
+        covariance: Covariance of the additional error of x, y and the force, shape (n, 3, 3), mm and N.
+    """
+    total = contacts.astype(float)
+    std = total[:, STD]
+    total_std = np.sqrt(std**2 + np.diagonal(covariance, axis1=1, axis2=2))
+    i, j = [0, 0, 1], [1, 2, 2]  # the pairs (x, y), (x, F) and (y, F)
+    total_covariance = total[:, CORRELATION] * std[:, i] * std[:, j] + covariance[:, i, j]
+    total[:, CORRELATION] = total_covariance / (total_std[:, i] * total_std[:, j])
+    total[:, STD] = total_std
+    return total.astype(np.float32)
 
 
 def write_finite(write: Callable[..., object], values: Iterable[float]) -> bool:
@@ -377,10 +368,7 @@ class Validity:
         )
         if is_valid:
             return ()
-        is_in_area = is_in_circle
-        if not is_in_circle:
-            x_mm, y_mm = np.array([contact[:2]]).T
-            is_in_area = inside_polygon(x_mm, y_mm, self.corners_mm)[0]
+        is_in_area = is_in_circle or inside_polygon(*np.array([contact[:2]]).T, self.corners_mm)[0]
         return tuple(word for word, is_flagged in self._conditions(contact, is_in_area).items() if is_flagged)
 
     def batch_flags(self, contacts: Contacts) -> list[tuple[str, ...]]:

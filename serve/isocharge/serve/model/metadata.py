@@ -103,14 +103,6 @@ class UnnoticedPresses(Struct, frozen=True, kw_only=True):
     force_N: tuple[Positive, Positive]
     share: Annotated[tuple[tuple[Share, ...], ...], Meta(min_length=1)]
 
-    def __post_init__(self) -> None:
-        if self.from_mm >= self.to_mm:
-            raise WrongKey("to_mm", f"a number above from_mm ({self.from_mm:g})", self.to_mm)
-        sector_counts = [len(ring) for ring in self.share]
-        has_different_counts = len(set(sector_counts)) > 1
-        if has_different_counts or sector_counts[0] == 0:
-            raise WrongKey("share", "as many sectors in every ring", sector_counts)
-
     @property
     def total_share(self) -> float:
         """Share of unnoticed presses between the two circles, from 0 to 1. The rings are weighted by their areas."""

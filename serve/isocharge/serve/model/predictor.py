@@ -23,7 +23,7 @@ from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ChargeError, shown
 from isocharge.common.structs import WrongKey, convert
 from isocharge.serve.flags import BEYOND
-from isocharge.serve.model.contact import Contact, Contacts, Validity, as_charges, write_finite
+from isocharge.serve.model.contact import Contact, Contacts, Validity, add_covariance, as_charges, write_finite
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.model.model_folder import find_model, load_checked_model
 from isocharge.serve.model.session import COLUMNS, BoundPress, run
@@ -243,7 +243,7 @@ class Predictor:
         relative_extra = extra_variance / np.maximum(model_variance, np.finfo(float).tiny)  # a model may have no noise
         noise_ratio = np.sqrt(1.0 + relative_extra.mean(axis=1))
         misfit = (contacts.misfit / noise_ratio).astype(np.float32)
-        return contacts.with_covariance(covariance)._replace(misfit=misfit)
+        return Contacts(*add_covariance(np.asarray(contacts), covariance).T)._replace(misfit=misfit)
 
     def _predict(self, charges: Singles) -> Contacts:
         """Compute the contacts of n presses, with the standard deviations for the noise of the training.

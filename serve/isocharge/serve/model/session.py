@@ -72,8 +72,10 @@ def open_session(onnx_model: bytes, where: str) -> ort.InferenceSession:
             "file, which no checksum covers; save the model again with onnx.save(model, path, "
             "save_as_external_data=False)"
         )
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = 1  # starts no other threads
     try:
-        session = ort.InferenceSession(onnx_model, _single_thread_options(), providers=["CPUExecutionProvider"])
+        session = ort.InferenceSession(onnx_model, options, providers=["CPUExecutionProvider"])
         # onnxruntime raises an exception when a text that is not valid UTF-8 is read.
         _ = session.get_modelmeta().custom_metadata_map
         _ = [tensor.name for tensor in (*session.get_inputs(), *session.get_outputs())]
@@ -83,18 +85,6 @@ def open_session(onnx_model: bytes, where: str) -> ort.InferenceSession:
             f"{where}: onnxruntime {ort.__version__} cannot read these {len(onnx_model)} bytes as a model "
             f"({cut(str(error))}); copy or export it again"
         ) from error
-
-
-def _single_thread_options() -> ort.SessionOptions:
-    """Return the options of a session that computes in the calling thread and starts no other threads."""
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
-    options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
-    # A spinning thread would keep a processor core busy while it waits for work.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.add_session_config_entry("session.inter_op.allow_spinning", "0")
-    return options
 
 
 def run(session: ort.InferenceSession, charge_pC: Singles) -> dict[str, Singles]:
@@ -113,17 +103,14 @@ def run(session: ort.InferenceSession, charge_pC: Singles) -> dict[str, Singles]
     """
     try:
         outputs = dict(zip(OUTPUTS, session.run(tuple(OUTPUTS), {INPUT: charge_pC}), strict=True))
+        for name, width in OUTPUTS.items():
+            if outputs[name].shape != (len(charge_pC), width):
+                raise ValueError(f"{name} has the shape {outputs[name].shape}")
     except Exception as error:  # onnxruntime's exceptions have no common base class of their own
-        raise run_error(error) from error
-    for name, width in OUTPUTS.items():
-        if outputs[name].shape != (len(charge_pC), width):
-            raise run_error(ValueError(f"{name} has the shape {outputs[name].shape}"))
+        raise ModelError(
+            f"the model's graph fails when it is run ({cut(str(error))}); copy or export it again"
+        ) from error
     return outputs
-
-
-def run_error(error: Exception) -> ModelError:
-    """Return the error for a graph that onnxruntime can read but cannot run."""
-    return ModelError(f"the model's graph fails when it is run ({cut(str(error))}); copy or export it again")
 
 
 def check_interface(session: ort.InferenceSession, n_electrode: int, where: str) -> None:

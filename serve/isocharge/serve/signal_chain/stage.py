@@ -66,22 +66,19 @@ NOT_IN_C = (
 """Part of the message about a stage that cannot be exported to C."""
 
 
-FrontEnd = Literal["charge", "current"]
-"""What the values of a board are: charges, or currents. A current is the charge of one sampling interval."""
-
-
 class Board(Settings, frozen=True):
     """The part of a device file that does not belong to a stage.
 
     Attributes:
         name: Name of the board.
-        front_end: Whether the values of the board are charges or currents.
+        front_end: Whether the values of the board are charges or currents. A current is the charge of one sampling
+            interval.
         frames: Format of the frames.
         channels: Name or number of the channel of each electrode; empty without the section `[channels]`.
     """
 
     name: str = "unnamed board"
-    front_end: FrontEnd = "charge"
+    front_end: Literal["charge", "current"] = "charge"
     frames: Frames = AutoFrames()
     channels: dict[str, str] = field(default_factory=dict)
 

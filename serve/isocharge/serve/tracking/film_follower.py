@@ -38,7 +38,7 @@ from isocharge.common.errors import ModelError
 from isocharge.serve.flags import BEYOND, FILM, GAP, MISFIT, OUTSIDE, REPEAT, STRESS
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.charge_file import FILE, read_charge_map
-from isocharge.serve.model.contact import Contact, is_close
+from isocharge.serve.model.contact import Contact, add_covariance, is_close
 from isocharge.serve.model.robust_estimate import ModelValues, RobustProblem
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.stage import Rule, Setting, Setup, Stage
@@ -396,7 +396,9 @@ class FilmFollower(Stage):
             corrected = self.predictor.predict(charge_pC + rough_conversion.shift_pC)
             conversion = self._conversion_at(corrected, state)._replace(contact=contact)
             self._conversion = conversion
-        return self.predictor.predict(charge_pC + conversion.shift_pC).with_covariance(conversion.covariance)
+        followed = self.predictor.predict(charge_pC + conversion.shift_pC)
+        (values,) = add_covariance(np.array([followed], np.float32), conversion.covariance[np.newaxis])
+        return Contact(*values.tolist())
 
     def _conversion_at(self, contact: Contact, state: Array) -> _Conversion:
         """Return the conversion of charges of the changed film, near a contact, into charges of the calibrated film.
