@@ -23,11 +23,11 @@ from isocharge.common.errors import ChargeError
 from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE, STRESS
 from isocharge.serve.model.metadata import ModelMetadata
 
-STD = slice(3, 6)
+STD_COLUMNS = slice(3, 6)
 """Standard deviations among the ten numbers of a contact."""
 
-CORRELATION = slice(7, 10)
-"""Correlations among the ten numbers of a contact."""
+CORRELATION_COLUMNS = slice(7, 10)
+"""Correlations among the ten numbers of a contact, which come last."""
 
 
 class Contact(NamedTuple):
@@ -128,12 +128,12 @@ def add_covariance(contacts: Singles, covariance: Array) -> Singles:
         covariance: Covariance of the additional error of x, y and the force, shape (n, 3, 3), mm and N.
     """
     total = contacts.astype(float)
-    std = total[:, STD]
+    std = total[:, STD_COLUMNS]
     total_std = np.sqrt(std**2 + np.diagonal(covariance, axis1=1, axis2=2))
     i, j = [0, 0, 1], [1, 2, 2]  # the pairs (x, y), (x, F) and (y, F)
-    total_covariance = total[:, CORRELATION] * std[:, i] * std[:, j] + covariance[:, i, j]
-    total[:, CORRELATION] = total_covariance / (total_std[:, i] * total_std[:, j])
-    total[:, STD] = total_std
+    total_covariance = total[:, CORRELATION_COLUMNS] * std[:, i] * std[:, j] + covariance[:, i, j]
+    total[:, CORRELATION_COLUMNS] = total_covariance / (total_std[:, i] * total_std[:, j])
+    total[:, STD_COLUMNS] = total_std
     return total.astype(np.float32)
 
 
@@ -282,11 +282,6 @@ class Validity:
         )
 
     @cached_property
-    def radius_mm(self) -> float:
-        """Largest distance of a corner of the working area from the origin, mm."""
-        return float(np.linalg.norm(self.corners_mm, axis=1).max())
-
-    @cached_property
     def centre_mm(self) -> tuple[float, float]:
         """Centre (x, y) of the bounding box of the working area, mm."""
         x_mm, y_mm = box_middle(self.corners_mm).tolist()
@@ -322,9 +317,10 @@ class Validity:
 
         The text states the radius of the area if its centre is close to the origin, and its bounding box otherwise.
         """
-        is_centred = math.hypot(*self.centre_mm) < MAX_CENTRE_OFFSET * self.radius_mm
+        radius_mm = np.linalg.norm(self.corners_mm, axis=1).max()
+        is_centred = math.hypot(*self.centre_mm) < MAX_CENTRE_OFFSET * radius_mm
         if is_centred:
-            return f"up to {self.radius_mm:.3g} mm from the centre"
+            return f"up to {radius_mm:.3g} mm from the centre"
         # The limits are the corners of the bounding box of the working area.
         left_mm, bottom_mm = self.corners_mm.min(axis=0)
         right_mm, top_mm = self.corners_mm.max(axis=0)

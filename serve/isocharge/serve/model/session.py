@@ -30,6 +30,7 @@ from isocharge.common.arrays import Singles
 from isocharge.common.errors import ModelError, cut
 from isocharge.common.files import sha256_of
 from isocharge.common.structs import Finite, NotNegative, Text, read_json
+from isocharge.serve.model.contact import CORRELATION_COLUMNS, STD_COLUMNS
 from isocharge.serve.model.metadata import ModelMetadata
 
 GRAPH_FILE = "model.onnx"
@@ -44,11 +45,13 @@ CORRELATION = "contact_correlation"
 OUTPUTS = {"contact": 3, "contact_std": 3, CORRELATION: 3, "misfit": 1}
 """Names of the outputs and their numbers of columns. `isocharge.serve.model.contact.Contact` describes the columns."""
 
-COLUMNS = {"contact": slice(0, 3), "contact_std": slice(3, 6), "misfit": slice(6, 7), CORRELATION: slice(7, 10)}
+COLUMNS = {
+    "contact": slice(0, 3),
+    "contact_std": STD_COLUMNS,
+    "misfit": slice(6, 7),
+    CORRELATION: CORRELATION_COLUMNS,
+}
 """Columns of each output among the ten values of a `Contact`."""
-
-N_WITHOUT_CORRELATION = COLUMNS[CORRELATION].start
-"""Number of values of a `Contact` before its correlations."""
 
 EXTERNAL_DATA = b"\x0a\x08location"
 """Encoded key of the entry of an ONNX tensor that names the file with the numbers of the tensor."""

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.serve.model.contact import MISFIT_LIMIT, Contacts, Validity, inside_polygon
+from isocharge.serve.model.contact import CORRELATION_COLUMNS, MISFIT_LIMIT, Contacts, Validity, inside_polygon
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.predictor import Predictor
-from isocharge.serve.model.session import COLUMNS, N_WITHOUT_CORRELATION
+from isocharge.serve.model.session import COLUMNS
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 
 CHARGE_UNKNOWN = "a charge is unknown"
@@ -81,7 +81,7 @@ class PressErrors:
         The correlations of the contact are not included.
         """
         x_error_mm, y_error_mm, force_error = self.error.T  # the force is relative to the measured force
-        contact_names = Contacts._fields[:N_WITHOUT_CORRELATION]
+        contact_names = Contacts._fields[: CORRELATION_COLUMNS.start]
         columns: dict[str, Any] = {
             "line": self.presses.lines,
             **dict(zip(contact_names, self.predicted.T, strict=False)),  # the last columns are the correlations

@@ -16,9 +16,8 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import ChargeError
-from isocharge.serve.model.contact import Contact
+from isocharge.serve.model.contact import CORRELATION_COLUMNS, Contact
 from isocharge.serve.model.predictor import Predictor
-from isocharge.serve.model.session import N_WITHOUT_CORRELATION
 from isocharge.serve.presses.number_columns import CHARGE_RULE
 from isocharge.serve.presses.table_file import open_table
 from isocharge.serve.record.formats import cell_text
@@ -64,7 +63,7 @@ def write_contacts(charge_pC: Array, predictor: Predictor, out: TextIO) -> None:
     Raises:
         ChargeError: If the charges do not fit the model.
     """
-    names = (*Contact._fields[:N_WITHOUT_CORRELATION], "flags")
+    names = (*Contact._fields[: CORRELATION_COLUMNS.start], "flags")
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(names)
     for record in table_records(charge_pC, predictor):
