@@ -112,20 +112,18 @@ class UnnoticedPresses(Struct, frozen=True, kw_only=True):
 
     @property
     def summary(self) -> str:
-        """Sentence that states the share of unnoticed presses between the two circles."""
+        """Sentence that states the share of unnoticed presses between the two circles.
+
+        The share is in percent. Only values below 9.5 % have a decimal.
+        """
         min_force_N, max_force_N = self.force_N
+        percent = 100.0 * self.total_share
+        decimals = 1 if percent < 9.5 else 0
         return (
-            f"{percent_text(self.total_share)} of the presses outside the working area, from {self.from_mm:.3g} to "
+            f"{percent:.{decimals}f} % of the presses outside the working area, from {self.from_mm:.3g} to "
             f"{self.to_mm:.3g} mm from the centre and with {min_force_N:g} to {max_force_N:g} N, are answered wrongly "
             "without a flag"
         )
-
-
-def percent_text(share: float) -> str:
-    """Format a share of presses, from 0 to 1, in percent. Only values below 9.5 % have a decimal."""
-    percent = 100.0 * share
-    decimals = 1 if percent < 9.5 else 0
-    return f"{percent:.{decimals}f} %"
 
 
 class ModelMetadata(Settings, frozen=True, kw_only=True):

@@ -34,7 +34,6 @@ MAX_ROWS = 1_000_000
 """Largest number of presses in a file."""
 
 CONTACT = ("x_mm", "y_mm", "force_N")
-UNCERTAINTY = ("position_std_mm", "force_std")
 
 TEMPERATURE = "temperature_C"
 """Name of a column that is neither used nor taken for an electrode."""
@@ -170,7 +169,7 @@ class MeasuredPresses:
         """
         # The columns have the same rules as the columns of a file, except that all standard deviations must be known.
         rules = PRESS_RULES | dict.fromkeys(self.electrodes, CHARGE_RULE)
-        for name in UNCERTAINTY:
+        for name in ("position_std_mm", "force_std"):
             rules[name] = replace(rules[name], may_be_empty=False)
         columns = NumberColumns(self.columns, self.lines)
         columns.check(rules, where="", error_class=PressError)  # the caller knows the file, if there is one
