@@ -285,5 +285,5 @@ def test_noise_of_each_electrode_and_of_older_models_is_read(film, extra):
 
 @pytest.mark.parametrize("value", [{"median_mm": float("nan")}, {"median_mm": object()}], ids=["NaN", "object"])
 def test_metadata_that_are_not_json_are_refused(film, value):
-    with pytest.raises((TypeError, ValueError), match="not JSON|unsupported"):
+    with pytest.raises((TypeError, ValueError), match=r"not JSON|unsupported"):
         film.metadata(errors=value).to_props()
