@@ -364,7 +364,8 @@ class Validity:
         )
         if is_valid:
             return ()
-        is_in_area = is_in_circle or inside_polygon(*np.array([contact[:2]]).T, self.corners_mm)[0]
+        x_mm, y_mm = np.array([contact[:2]]).T
+        is_in_area = is_in_circle or inside_polygon(x_mm, y_mm, self.corners_mm)[0]
         return tuple(word for word, is_flagged in self._conditions(contact, is_in_area).items() if is_flagged)
 
     def batch_flags(self, contacts: Contacts) -> list[tuple[str, ...]]:
