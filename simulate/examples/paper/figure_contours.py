@@ -14,6 +14,7 @@ from triangulation_errors import BEYOND, Accuracy
 
 from isocharge.common.arrays import Array
 from isocharge.simulate import ChargeMap, ChargeSpline, Sensor
+from isocharge.simulate.forward.charge_map import within
 from isocharge.simulate.numerics.disk import INNER_RADIUS
 from isocharge.simulate.plots.figure import COLOURS, FELT, INK
 from isocharge.simulate.plots.film import draw_electrodes, draw_working_area, frame_film
@@ -33,7 +34,7 @@ def fig_9(solves: Solves, accuracy: Accuracy) -> Entry:
     at = solves.choices.shown
     reach = BEYOND * solves.choices.radius
     charges = solves.charges("triangle", sensor, np.array([at]))[0]
-    spline = ChargeSpline.of(solves.forward_map("triangle", sensor), reach, solves.choices.spacing)
+    spline = within(ChargeSpline.of(solves.forward_map("triangle", sensor), solves.choices.spacing), reach)
     x, y, field = charge_field(spline)
     figure, axes = new_axes(6.6, 7.0)
     for name, charge, values, colour in zip(sensor.electrode_names, charges, field, COLOURS, strict=False):
@@ -169,7 +170,7 @@ def _distributions(axes: Any, accuracy: Accuracy, degree: int) -> None:
 def fig_11(solves: Solves) -> Entry:
     """Return the entry of Fig. 11: contours of all four electrodes under a circle."""
     sensor = solves.choices.sensor("four")
-    spline = ChargeSpline.of(solves.forward_map("circle", sensor), AREA, solves.choices.spacing)
+    spline = within(ChargeSpline.of(solves.forward_map("circle", sensor), solves.choices.spacing), AREA)
     x, y, field = charge_field(spline)
     reached_pC = {
         name: [float(values.min()), float(values.max())]

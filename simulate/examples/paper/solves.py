@@ -28,6 +28,7 @@ from isocharge.simulate import (
     touch_charge,
 )
 from isocharge.simulate.execution import in_order
+from isocharge.simulate.forward.charge_map import within
 from isocharge.simulate.numerics.disk import sunflower
 
 FORCE = 1.0
@@ -254,7 +255,7 @@ def find_eq_4(forward_map: ForwardMap, choices: Choices) -> tuple[tuple[float, f
     Returns:
         Position (x, y), mm, and the mean ratio of our charges at this position to those of the paper.
     """
-    spline = ChargeSpline.of(forward_map, 1.2 * choices.radius, choices.spacing)
+    spline = within(ChargeSpline.of(forward_map, choices.spacing), 1.2 * choices.radius)
     paper_charge = np.array([sum(cubic) for cubic in CUBICS])  # the cubics at 1 N
 
     def charge_at(position: Array) -> Array:

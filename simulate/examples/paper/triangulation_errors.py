@@ -12,6 +12,7 @@ from solves import Solves, run_all, sample
 
 from isocharge.common.arrays import Array
 from isocharge.simulate import ChargeSpline, Triangulation, noise_model
+from isocharge.simulate.forward.charge_map import within
 from isocharge.simulate.identifiability.triangulation import Fix
 
 LAYOUTS = ("three", "four")
@@ -110,7 +111,9 @@ class Accuracy:
         drawn = [Errors(fix, places) for fix in run_all(jobs, "triangulating", executor)]
         fields = {
             layout: Triangulation(
-                ChargeSpline.of(solves.forward_map("triangle", sensor), BEYOND * choices.radius, choices.spacing)
+                within(
+                    ChargeSpline.of(solves.forward_map("triangle", sensor), choices.spacing), BEYOND * choices.radius
+                )
             )
             for layout, sensor in sensors.items()
         }

@@ -5,10 +5,7 @@ The unit of the drawing is the millimetre. There is one layer for each kind of o
 
 import io
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from isocharge.common.errors import require
 from isocharge.common.files import new_folder, write_whole
@@ -28,6 +25,9 @@ with require("design"):
     from ezdxf.addons.drawing.properties import RenderContext
     from ezdxf.addons.drawing.svg import SVGBackend
     from ezdxf.document import Drawing
+
+# ezdxf then writes the same dates and identifiers into every file, so that equal drawings result in equal files.
+ezdxf.options.write_fixed_meta_data_for_testing = True
 
 LAYERS = {"FILM": 7, "ELECTRODES": 1, "NAMES": 8, "BACK": 5}
 """Names of the layers of a drawing, and their colours in the AutoCAD colour index."""
@@ -49,8 +49,7 @@ def draw_layout(sensor: Sensor) -> Drawing:
         The drawing as a DXF document.
     """
     # Create an empty drawing in mm with one layer for each kind of object.
-    with _fixed_metadata():
-        document = ezdxf.new("R2010")
+    document = ezdxf.new("R2010")
     document.units = units.MM
     for name, colour in LAYERS.items():
         document.layers.add(name, color=colour)
@@ -82,8 +81,7 @@ def draw_layout(sensor: Sensor) -> Drawing:
 def to_dxf(document: Drawing) -> str:
     """Convert a drawing into the text of a DXF file. Equal drawings result in equal texts."""
     stream = io.StringIO()
-    with _fixed_metadata():
-        document.write(stream)
+    document.write(stream)
     return stream.getvalue()
 
 
@@ -98,21 +96,6 @@ def to_svg(document: Drawing) -> str:
     page = Page(0.0, 0.0, Units.mm, margins=Margins.all(MARGIN))
     text: str = backend.get_string(page, settings=Settings(fit_page=False))
     return text
-
-
-@contextmanager
-def _fixed_metadata() -> Iterator[None]:
-    """Return a context manager within which ezdxf writes the same dates and identifiers into every file.
-
-    Equal drawings therefore result in equal files. The setting of ezdxf is restored afterwards.
-    """
-    options: Any = ezdxf.options
-    previous_setting = options.write_fixed_meta_data_for_testing
-    options.write_fixed_meta_data_for_testing = True
-    try:
-        yield
-    finally:
-        options.write_fixed_meta_data_for_testing = previous_setting
 
 
 def write_design(design: Design, folder: Path) -> None:

@@ -3,9 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
-from isocharge.common.errors import SceneError
 from isocharge.simulate import ChargeSpline
 from isocharge.simulate.numerics.disk import sunflower
 from kept import kept
@@ -43,9 +41,3 @@ def test_spline_includes_the_charge_of_contact_pressure(near_map):
     assert relative_error(difference, extra) <= 0.015
     # The power of the force differs from that of the stress, so more forces are needed.
     assert without.force.size == near_map.family.force.size < with_d33.force.size
-
-
-@pytest.mark.parametrize("radius", [0.0, 5.1, np.nan])
-def test_invalid_radius_raises_error(near_map, radius):
-    with pytest.raises(SceneError, match=r"radius: expected up to the forward map's 5 mm"):
-        ChargeSpline.of(near_map, radius)

@@ -100,7 +100,7 @@ def test_find_folds_finds_a_fold_smaller_than_the_rings():
 
 def test_error_does_not_exceed_its_limit_on_finer_rings_within_the_working_area(film):
     """Beside an electrode within the area, the error may be larger between two rings than on both rings."""
-    charges = ChargeSpline.of(squares(film), 9.0, 0.3)
+    charges = within(ChargeSpline.of(squares(film), 0.3), 9.0)
     working = working_area(charges, REFERENCE, search_pairs=False, error=0.3)
     assert limits_at(charges, Rings.spread(working.radius).contacts(0.05), REFERENCE).position.max() <= 0.3
     assert working.radius == pytest.approx(working.error_radius, abs=0.101)
@@ -127,7 +127,7 @@ def test_find_folds_finds_nothing_in_a_sharply_bent_map():
 
 def test_find_folds_finds_nothing_beside_an_electrode(film):
     """The orientation seems reversed between rings with a spacing of 0.3 mm, but not between ten times as many."""
-    charges = ChargeSpline.of(squares(film), 4.0)
+    charges = within(ChargeSpline.of(squares(film)), 4.0)
     assert len(find_folds(charges, Rings.spread(4.0, 13, 60), 0.05, REFERENCE)) == 0
 
 

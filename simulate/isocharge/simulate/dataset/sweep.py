@@ -14,6 +14,7 @@ same for every executor. The dataset is written completely or not at all.
 """
 
 import logging
+import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -50,9 +51,6 @@ from isocharge.simulate.solver.stress_limit import yield_force
 
 MAX_SAMPLES = 10_000_000
 """Largest number of presses of a sweep. The files of a dataset with so many presses occupy about 600 MB."""
-
-FULL_TURN = 2.0 * np.pi
-"""Angle of a full turn, rad."""
 
 SAMPLING = "scrambled Sobol, uniform over the disk, log-uniform in force"
 """Description of the sampling in the manifest of a dataset."""
@@ -157,7 +155,7 @@ class Sweep:
             own = np.flatnonzero(probe == index)
             contact[own], turn_fraction = self._draw(own.size, (index,), 0.0, self.radius)
             if self.orientation == "random":
-                rotation[own] = FULL_TURN * turn_fraction
+                rotation[own] = math.tau * turn_fraction
         return SweepPresses(probe, contact, rotation)
 
     def _draw(
@@ -187,7 +185,7 @@ class Sweep:
 
         # The area within a distance is proportional to the square of the distance.
         distance = np.sqrt(inner_radius**2 + (outer_radius**2 - inner_radius**2) * distance_fraction)
-        position = distance * np.exp(1j * FULL_TURN * angle_fraction)
+        position = distance * np.exp(1j * math.tau * angle_fraction)
         force = log_spaced_forces(force_fraction, self.force_range)
         return np.column_stack([position.real, position.imag, force]), turn_fraction
 

@@ -18,8 +18,7 @@ from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 from scipy.sparse.linalg import splu
 
 from isocharge.common.arrays import Array
-from isocharge.common.contact_domain import LIMIT_TOLERANCE, Domain
-from isocharge.common.errors import SceneError
+from isocharge.common.contact_domain import Domain
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.forward.readout import contact_charges
 from isocharge.simulate.mechanics.theory import amplitude_squared
@@ -82,27 +81,16 @@ class ChargeSpline:
     table: "scipy.interpolate.NdBSpline"
 
     @classmethod
-    def of(cls, forward_map: ForwardMap, radius: float | None = None, spacing: float | None = None) -> "ChargeSpline":
+    def of(cls, forward_map: ForwardMap, spacing: float | None = None) -> "ChargeSpline":
         """Fit splines to the charges that a forward map computes. The fit takes a few seconds.
 
         Args:
             forward_map: Forward map to which the splines are fitted. The probe keeps the orientation with which the map
                 was built.
-            radius: Largest distance of a press from the centre of the film, mm; None for the largest distance of the
-                forward map.
             spacing: Largest distance between the knots, mm. If None, it is a quarter of the reach of the probe, but at
                 most `MAX_KNOT_SPACING`. The reach is the radius of a circular probe. There are at most `MAX_CELLS`
                 cells between the knots.
-
-        Raises:
-            SceneError: If the radius is not positive or is larger than the radius of the forward map.
         """
-        map_domain = forward_map.domain
-        domain = map_domain if radius is None else map_domain.within(radius)
-        if not 0.0 < domain.radius <= map_domain.radius * LIMIT_TOLERANCE:
-            raise SceneError(
-                f"radius: expected up to the forward map's {map_domain.radius:g} mm, got {domain.radius:g} mm"
-            )
         spacing = spacing or min(MAX_KNOT_SPACING, RELATIVE_KNOT_SPACING * forward_map.probe.reach)
 
         sensor = forward_map.sensor
@@ -110,9 +98,9 @@ class ChargeSpline:
         return cls(
             electrodes=forward_map.electrodes,
             film=sensor.film,
-            domain=domain,
+            domain=forward_map.domain,
             force=force,
-            table=_fit_disk(forward_map, force, domain.radius, spacing),
+            table=_fit_disk(forward_map, force, spacing),
         )
 
     def charges(self, contact: Array) -> Array:
@@ -233,7 +221,7 @@ def _scaled_charges(forward_map: ForwardMap, force: Array, position: Array) -> A
     return sensor.calibration.read(scaled_charge)
 
 
-def _fit_disk(forward_map: ForwardMap, force: Array, radius: float, spacing: float) -> "scipy.interpolate.NdBSpline":
+def _fit_disk(forward_map: ForwardMap, force: Array, spacing: float) -> "scipy.interpolate.NdBSpline":
     """Fit a cubic spline to the scaled charges of all electrodes over the disk.
 
     The fit is by least squares with a penalty on the third differences of the coefficients.
@@ -241,7 +229,6 @@ def _fit_disk(forward_map: ForwardMap, force: Array, radius: float, spacing: flo
     Args:
         forward_map: Forward map that computes the charges.
         force: Forces at which the splines are fitted, shape (n_force,), N.
-        radius: Radius of the disk, mm.
         spacing: Largest distance between the knots, mm.
 
     Returns:
@@ -249,6 +236,7 @@ def _fit_disk(forward_map: ForwardMap, force: Array, radius: float, spacing: flo
     """
     # The ends of the interval occur four times among the knots, so that the spline is defined on the whole interval. A
     # cubic spline has 4 coefficients fewer than knots along each axis.
+    radius = forward_map.domain.radius
     cells = int(np.clip(np.ceil(2.0 * radius / spacing), 8, MAX_CELLS))
     line_knots = np.concatenate([[-radius] * 3, np.linspace(-radius, radius, cells + 1), [radius] * 3])
     knots = (line_knots, line_knots)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.common.errors import ChargeError, SceneError
+from isocharge.common.errors import ChargeError
 from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count
 from isocharge.simulate.identifiability.nearest_contact import explain, starting_contacts
 
@@ -21,6 +21,9 @@ ROUNDS = 3
 
 STARTS = 4
 """Number of searches for each press, which start at different contacts."""
+
+TOLERANCE = 1.0
+"""Largest spread at which contours meet, and largest distance between contacts that count as one contact, mm."""
 
 MIN_RELATIVE_SLOPE = 0.02
 """Lower bound of the gradient of a charge, relative to the largest gradient of the charges of a press."""
@@ -59,20 +62,15 @@ class Triangulation:
     Attributes:
         charge_map: Map that computes the charges of contacts. A `ChargeSpline` is much faster than a forward map. If
             the force of the presses is known, the map has this single force.
-        tolerance: Largest spread at which contours meet, mm. Contours that meet at two positions that are not farther
-            apart than the tolerance meet at one position.
 
     Raises:
-        SceneError: If there are fewer than three electrodes, or if the tolerance is not positive.
+        SceneError: If there are fewer than three electrodes.
     """
 
     charge_map: ChargeMap
-    tolerance: float = 1.0
 
     def __post_init__(self) -> None:
         check_electrode_count(len(self.charge_map.electrodes))
-        if not 0.0 < self.tolerance < np.inf:
-            raise SceneError(f"tolerance: expected a positive length, got {self.tolerance} mm")
 
     def locate(self, charge: Array) -> Fix:
         """Estimate the contacts of presses.
@@ -104,10 +102,10 @@ class Triangulation:
         best = spreads.argmin(axis=1)
         contact = contacts[row, best]
         spread = spreads[row, best]
-        is_elsewhere = np.linalg.norm((contacts - contact[:, None])[..., :2], axis=2) > self.tolerance
+        is_elsewhere = np.linalg.norm((contacts - contact[:, None])[..., :2], axis=2) > TOLERANCE
         other_spread = spreads.min(axis=1, where=is_elsewhere, initial=np.inf)
         is_ambiguous = other_spread <= np.maximum(AMBIGUOUS_RATIO * spread, AMBIGUOUS_SPREAD)
-        contact[(spread > self.tolerance) | is_ambiguous] = np.nan
+        contact[(spread > TOLERANCE) | is_ambiguous] = np.nan
         return Fix(contact, spread)
 
     def _descend(self, charge: Array, contact: Array) -> tuple[Array, Array]:
