@@ -39,10 +39,9 @@ from isocharge.simulate.forward.readout import (
     STRESS_WEIGHTS,
     ElectrodePieces,
     PressedFilm,
-    PressMeshes,
     contact_charges,
 )
-from isocharge.simulate.mechanics.theory import Theory, amplitude_squared
+from isocharge.simulate.mechanics.theory import Theory, amplitude_squared, rotate_stress
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.oval import film_oval
 from isocharge.simulate.mesh.placement import Placement
@@ -401,11 +400,22 @@ class ForwardMap:
         template = template_for(self.resolution, self.probe.topology, not film.is_axisymmetric)
         oval = film_oval(film, direction)
         placement = Placement.of(template, self.probe, np.abs(position), film.radius, self.layer, rotation, oval)
-        meshes = PressMeshes(template, placement, direction, film.radius)
 
         # Interpolate the stress in the precision of the table, and multiply by the unit of the scaled stress.
         stress_unit = film.young * amplitude_squared(film, force)
         weights = self.family.weights(position, force, rotation) * stress_unit[:, None]
         fields = weights.astype(self.table.dtype) @ self.table
+        stress = fields.reshape(position.size, -1, is_odd.size, 3).swapaxes(1, 2)  # shape (n, n_field, n_node, 3)
+
+        # Compute the charge per area and stress in the frame of the press. At reflected points, s12 of an even field
+        # changes its sign, and s11 and s22 of an odd field change theirs.
         frame_angle = direction + rotation + self.probe.angle
-        return PressedFilm.of(position, self.probe, meshes, fields, frame_angle, is_odd, charge_per_stress)
+        frame_coefficients = rotate_stress(np.eye(3), frame_angle[:, None]) @ charge_per_stress.T
+        reflected_sign = np.where(is_odd[:, None], [-1.0, -1.0, 1.0], [1.0, 1.0, -1.0])
+        sign = np.stack([np.ones_like(reflected_sign), reflected_sign])  # shape (2, n_field, 3)
+        # The indices are the press (n), field (f), stress component (c), reflection (m) and kind of piece (k).
+        coefficients = np.einsum("mfc,nck->nfcmk", sign, frame_coefficients).astype(fields.dtype)
+        density = stress @ coefficients.reshape(*stress.shape[:2], 3, -1)  # shape (n, n_field, n_node, 2 * n_kind)
+        shape = (2, len(charge_per_stress), position.size, template.n_element, -1, is_odd.size)
+        node_density = density.transpose(3, 0, 2, 1).reshape(shape)
+        return PressedFilm(position, self.probe, film.radius, template, placement, node_density)

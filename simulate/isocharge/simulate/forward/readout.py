@@ -18,9 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans, Complexes, Integers
+from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.common.errors import SensorError
-from isocharge.simulate.mechanics.theory import rotate_stress
 from isocharge.simulate.mechanics.warming import tension_change
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template, locate_points
@@ -312,50 +311,15 @@ def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[tuple[Array, 
 
 
 @dataclass(frozen=True)
-class PressMeshes:
-    """Meshes under several presses.
-
-    Attributes:
-        template: Template of the meshes.
-        placement: Position of the template under each press, after the press has been rotated onto the x axis.
-        direction: Direction from the centre of the film to each press, shape (n,), rad.
-        film_radius: Radius of the film, mm.
-    """
-
-    template: Template
-    placement: Placement
-    direction: Array
-    film_radius: float
-
-    def locate(self, press_index: Integers, points: Complexes) -> tuple[Integers, Array, Booleans]:
-        """Find the elements that contain integration points, and evaluate the basis functions at the points.
-
-        If only half of the film is meshed, points in the other half are reflected into the meshed half.
-
-        Args:
-            press_index: For each pair of a press and a group of points, the index of the press, shape (n_pair,).
-            points: Integration points x + iy of each pair, shape (n_pair, n_point), mm.
-
-        Returns:
-            Index of the element, shape (n_pair, n_point). Values of the basis functions, shape (n_pair, n_point,
-            n_local). Whether each point was reflected, shape (n_pair, n_point).
-        """
-        mesh = self.template
-        # After the rotation, the press is on the x axis. The unit is the radius of the film.
-        rotated_points = points / self.film_radius * np.exp(-1j * self.direction[press_index])[:, None]
-        element, xi, eta, is_mirrored = locate_points(self.placement[press_index], mesh, rotated_points)
-        basis_values = tensor_values(mesh.resolution.order, xi.ravel(), eta.ravel())
-        return element, basis_values.reshape(*points.shape, mesh.xi.size), is_mirrored
-
-
-@dataclass(frozen=True)
 class PressedFilm:
     """Charge per area that several presses cause, at the nodes of the mesh under each press.
 
     Attributes:
         position: Positions x + iy of the presses, shape (n,), mm.
         probe: Probe of the presses.
-        meshes: Meshes under the presses.
+        film_radius: Radius of the film, mm.
+        template: Template of the meshes.
+        placement: Position of the template under each press, after the press has been rotated onto the x axis.
         density: Charge per area that each stress field causes, for points of the meshed part of the film and for points
             that are reflected into it, shape (2, n_kind, n, n_element, n_local, n_field), pC/mm^2. The second axis is
             the kind of a piece; see `STRESS_WEIGHTS`.
@@ -363,48 +327,15 @@ class PressedFilm:
 
     position: Complexes
     probe: Probe
-    meshes: PressMeshes
+    film_radius: float
+    template: Template
+    placement: Placement
     density: np.ndarray
-
-    @classmethod
-    def of(
-        cls,
-        position: Complexes,
-        probe: Probe,
-        meshes: PressMeshes,
-        fields: np.ndarray,
-        frame_angle: Array,
-        is_odd: Booleans,
-        charge_per_stress: Array,
-    ) -> "PressedFilm":
-        """Convert the stress fields under several presses into charge per area.
-
-        Args:
-            position: Positions x + iy of the presses, shape (n,), mm.
-            probe: Probe of the presses.
-            meshes: Meshes under the presses.
-            fields: Stresses of all fields at the nodes of every element for each press, shape (n, n_element * n_local
-                * n_field * 3), MPa. The values of all fields at one node are adjacent.
-            frame_angle: Angle of axis 1 of the stress fields from the x axis, shape (n,), rad.
-            is_odd: Whether each field is odd, shape (n_field,). A reflection in the direction of the press leaves an
-                even field unchanged, and changes the sign of an odd field.
-            charge_per_stress: Charge per area and stress (s11, s22, s12) of each kind of piece, shape (n_kind, 3),
-                pC/N.
-        """
-        # At reflected points, s12 of an even field changes its sign, and s11 and s22 of an odd field change theirs.
-        reflected_sign = np.where(is_odd[:, None], [-1.0, -1.0, 1.0], [1.0, 1.0, -1.0])
-        sign = np.stack([np.ones_like(reflected_sign), reflected_sign])  # shape (2, n_field, 3)
-        frame_coefficients = rotate_stress(np.eye(3), frame_angle[:, None]) @ charge_per_stress.T
-        # The indices are the press (n), field (f), stress component (c), reflection (m) and kind of piece (k).
-        coefficients = np.einsum("mfc,nck->nfcmk", sign, frame_coefficients).astype(fields.dtype)
-        n, n_field, _, _, n_kind = coefficients.shape
-        stress = fields.reshape(n, -1, n_field, 3).swapaxes(1, 2)  # shape (n, n_field, n_node, 3)
-        density = stress @ coefficients.reshape(n, n_field, 3, -1)  # shape (n, n_field, n_node, 2 * n_kind)
-        shape = (2, n_kind, n, meshes.template.n_element, -1, n_field)
-        return cls(position, probe, meshes, density.transpose(3, 0, 2, 1).reshape(shape))
 
     def charges(self, pieces: ElectrodePieces) -> Array:
         """Integrate the charge per area over electrodes.
+
+        If only half of the film is meshed, points in the other half are reflected into the meshed half.
 
         Args:
             pieces: Pieces of the electrodes.
@@ -414,11 +345,17 @@ class PressedFilm:
         """
         n_field = self.density.shape[-1]
         charge = np.zeros((self.position.size, pieces.electrode.max() + 1, n_field))
+        # After the rotation, the press is on the x axis. The unit is the radius of the film.
+        rotation_and_scale = np.exp(-1j * np.angle(self.position)) / self.film_radius
         for rule in pieces.rules(self.probe, self.position):
-            element, basis_values, is_mirrored = self.meshes.locate(rule.press, rule.points)
+            points = rule.points * rotation_and_scale[rule.press, None]
+            element, xi, eta, is_mirrored = locate_points(self.placement[rule.press], self.template, points)
+            basis_values = tensor_values(self.template.resolution.order, xi.ravel(), eta.ravel())
             kind = pieces.kind[rule.piece, None]
             density = self.density[is_mirrored.astype(np.intp), kind, rule.press[:, None], element]
-            node_weights = (rule.area[..., None] * basis_values).reshape(len(kind), 1, -1)
+
+            # Sum over the points of each pair and over the nodes of their elements.
+            node_weights = (rule.area.reshape(-1, 1) * basis_values).reshape(len(kind), 1, -1)
             pair_charge = node_weights.astype(density.dtype) @ density.reshape(len(kind), -1, n_field)
             np.add.at(charge, (rule.press, pieces.electrode[rule.piece]), pair_charge[:, 0])
         return charge

@@ -115,7 +115,7 @@ def electrode_rows(pressed: PressedFilm, electrodes: Sequence[Electrode]) -> Arr
     # Rotate the derivatives along and across the direction of each press into derivatives with respect to x and y.
     x_column = COLUMNS.index("x")
     y_column = COLUMNS.index("y")
-    derivative = (rows[..., x_column] + 1j * rows[..., y_column]) * np.exp(1j * pressed.meshes.direction)[:, None]
+    derivative = (rows[..., x_column] + 1j * rows[..., y_column]) * np.exp(1j * np.angle(pressed.position))[:, None]
     rows[..., x_column] = derivative.real
     rows[..., y_column] = derivative.imag
     return rows
