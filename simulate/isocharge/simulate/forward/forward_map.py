@@ -133,17 +133,13 @@ class ForwardMap:
             SceneError: If some presses of the domain cannot exist.
             SolveError: If a press has no equilibrium, or the interpolation error exceeds `INTERPOLATION_ERROR`.
         """
-        film = sensor.film
         domain = Domain(radius, force_range)
-        check_family(film, probe, domain)
-
         # Increase the number of nodes until the interpolated charges are sufficiently accurate. They are compared at
         # the check presses, which are solved directly in the first pass of the loop. If the error is very large, the
         # next number of nodes would not suffice either and is skipped.
-        contact, rotation = spread_check_presses(domain, CHECK_COUNT)
         check_charges: list[Array] = []
         error = np.inf
-        remaining_counts = list(node_counts(film))
+        remaining_counts = list(node_counts(sensor.film))
         while remaining_counts:
             count = remaining_counts.pop(0)
             forward_map = cls.build_unchecked(
@@ -151,6 +147,7 @@ class ForwardMap:
             )
             settings = replace(forward_map.settings, layer=forward_map.layer)  # the next map has the same mesh
             if not check_charges:
+                contact, rotation = spread_check_presses(domain, CHECK_COUNT)
                 if forward_map.family.is_oriented:
                     rotation = np.zeros(CHECK_COUNT)
                 checks = np.column_stack([contact, rotation]).tolist()

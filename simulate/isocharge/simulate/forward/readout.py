@@ -207,9 +207,8 @@ def stress_charge(sensor: Sensor, equilibrium: Equilibrium, counts: tuple[int, i
         # `touch_stress` expects one list of points.
         stress_of_points = touch_stress(equilibrium, to_corners(rule.points.ravel()), sensor.surface)
         stress = stress_of_points.reshape(*rule.points.shape, 3)
-        # Sum over the points (index p) and then over the stress components (c) of each pair of press and piece (k).
-        integral = np.einsum("kpc,kp->kc", stress, rule.area)
-        pair_charge = np.einsum("kc,kc->k", integral, charge_per_stress[pieces.kind[rule.piece]])
+        # Sum over the points (index p) and the stress components (c) of each pair of press and piece (k).
+        pair_charge = np.einsum("kpc,kp,kc->k", stress, rule.area, charge_per_stress[pieces.kind[rule.piece]])
         np.add.at(charge, pieces.electrode[rule.piece], pair_charge)
     return sensor.gains * charge
 

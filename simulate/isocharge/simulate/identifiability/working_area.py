@@ -146,11 +146,6 @@ class AmbiguousPairs:
     second: Array
     distance: Array
 
-    @classmethod
-    def none(cls) -> "AmbiguousPairs":
-        """Return a result without any pair."""
-        return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
-
     def __len__(self) -> int:
         return len(self.first)
 
@@ -183,6 +178,10 @@ class AmbiguousPairs:
             f"of {other_force:.3g} N at ({other_x:.1f}, {other_y:.1f}) mm differ by {self.distance[0]:.1f} standard "
             "deviations."
         )
+
+
+NO_PAIRS = AmbiguousPairs(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+"""Result without any pair."""
 
 
 def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float, places: int = 1000) -> AmbiguousPairs:
@@ -342,7 +341,7 @@ def working_area(
     error_radius = search_radius
     if not is_within_limit.all():
         error_radius = float(np.append(0.0, rings.distance)[is_within_limit.argmin()])
-    pairs = find_ambiguous_pairs(charge_map, noise, min_force) if search_pairs else AmbiguousPairs.none()
+    pairs = find_ambiguous_pairs(charge_map, noise, min_force) if search_pairs else NO_PAIRS
 
     # The smallest of the following radii bounds the working area. If the error never exceeds its limit, `error_radius`
     # is the radius of the search, and the error is not a bound.

@@ -292,8 +292,6 @@ class Design:
     Attributes:
         case: Requirements of the layout.
         sensor: Sensor with the new layout.
-        minimised_error: Value of the minimised quantity for the new layout, mm. It is the largest error or the root
-            mean square of the errors.
         summary: Sentence about folds and ambiguous pairs of the new layout over the default range of forces.
         n_rejected: Number of layouts with a smaller error that were rejected because their charges are ambiguous.
         errors_before: Errors of the initial sensor; None if it has fewer than three electrodes.
@@ -302,7 +300,6 @@ class Design:
 
     case: DesignCase
     sensor: Sensor
-    minimised_error: float
     summary: str
     n_rejected: int
     errors_before: ErrorMap | None
@@ -378,8 +375,7 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     chosen = summaries.index(UNAMBIGUOUS) if UNAMBIGUOUS in summaries else 0
     errors_before = search.error_map(case.sensor) if len(case.sensor.electrodes) >= 3 else None
     errors_after = search.error_map(sensors[chosen])
-    error = refined_layouts[chosen].error
-    return Design(case, sensors[chosen], error, summaries[chosen], chosen, errors_before, errors_after)
+    return Design(case, sensors[chosen], summaries[chosen], chosen, errors_before, errors_after)
 
 
 def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMap | None:
