@@ -184,6 +184,7 @@ class RequestLog(logging.Handler):
     def __init__(self, write: Callable[[str], object]) -> None:
         super().__init__()
         self._write = write
+        self.setFormatter(logging.Formatter())  # otherwise, `basicConfig` sets a format that repeats level and logger
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a line with a message of the module `logging`. The message contains its traceback if it has one."""
