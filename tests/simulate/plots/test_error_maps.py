@@ -21,7 +21,7 @@ PRESSES = 4.0 * np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [0.5, 1.0], [0
 def test_error_maps_picture_marks_the_position_of_the_largest_error(nuisances, before, known):
     errors = ErrorMap(PRESSES, np.ones(5), np.array([0.1, 0.2, 0.1, 3.0, 0.3]))
     case = DesignCase(SENSOR, 3, 4.0, nuisances=nuisances)
-    figure = error_maps_picture(Design(case, SENSOR, 1.0, "", 0, errors if before else None, errors))
+    figure = error_maps_picture(Design(case, SENSOR, "", 0, errors if before else None, errors))
     maps = figure.axes[:-1]
     assert figure.get_size_inches().tolist() == [13.8 if before else 7.4, 6.0]
     assert (len(maps), known in figure.get_suptitle()) == (1 + before, True)
