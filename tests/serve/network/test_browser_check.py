@@ -56,13 +56,14 @@ REFUSED = {
 
 @pytest.mark.parametrize("headers", SERVED.values(), ids=SERVED)
 def test_clients_and_own_pages_are_served(headers):
-    AccessCheck().check(headers_of(**headers))
+    AccessCheck().check("POST", headers_of(**headers))
 
 
 @pytest.mark.parametrize(("headers", "header"), REFUSED.values(), ids=REFUSED)
 def test_pages_of_other_sites_are_refused(headers, header):
-    with pytest.raises(OriginError, match=f"^{header}: expected"):
-        AccessCheck().check(headers_of(**headers))
+    for method in ("GET", "POST"):
+        with pytest.raises(OriginError, match=f"^{header}: expected"):
+            AccessCheck().check(method, headers_of(**headers))
 
 
 def test_repeated_host_is_refused_and_other_repeated_headers_are_joined(handler):
@@ -72,6 +73,16 @@ def test_repeated_host_is_refused_and_other_repeated_headers_are_joined(handler)
     for headers, status in [([own], 200), ([own, other], 400), ([own, own], 400), ([own, *origins], 403)]:
         for order in (headers, headers[::-1]):
             assert handler.answer("GET", "/v2", order, b"").status == status
+
+
+def test_link_on_another_site_is_accepted():
+    link = headers_of(
+        host="127.0.0.1:8000", sec_fetch_site="cross-site", sec_fetch_mode="navigate", sec_fetch_dest="document"
+    )
+    AccessCheck().check("GET", link)
+    for method, changes in (("POST", {}), ("GET", {b"sec-fetch-dest": b"iframe"})):
+        with pytest.raises(OriginError, match="Sec-Fetch-Site"):
+            AccessCheck().check(method, link | changes)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +102,7 @@ def test_allow_host_accepts_pages_behind_a_proxy_and_none_of_another_port(host, 
     expected = pytest.raises(OriginError, match=message) if message else nullcontext()
     for allowed_hosts in (["Robot.Example"], "Robot.Example"):
         with expected:
-            AccessCheck("0.0.0.0", allowed_hosts).check(headers_of(host=host, origin=origin))
+            AccessCheck("0.0.0.0", allowed_hosts).check("POST", headers_of(host=host, origin=origin))
 
 
 @pytest.mark.parametrize(
@@ -106,7 +117,7 @@ def test_allow_host_expects_a_plain_name(name):
 def test_no_name_but_localhost_is_served(name):
     if name.partition(":")[0] != "localhost":
         with pytest.raises(OriginError, match="Host"):
-            AccessCheck().check({b"host": name.encode()})
+            AccessCheck().check("GET", {b"host": name.encode()})
 
 
 def test_with_a_token_any_host_name_is_served(store):

@@ -67,9 +67,13 @@ def recording_picture(samples: Samples, title: str) -> Figure:
     """
     start_s = samples["timestamp"][0]
     time_s = samples["timestamp"] - start_s
+    is_flagged = {flag: samples["flags"].astype(int) & bit > 0 for flag, bit in FLAG_BITS.items()}
+    flags = {flag: time_s[is_set] for flag, is_set in is_flagged.items() if is_set.any()}
+    flag_height = 0.1 * (1 + len(flags))  # grows with the number of rows of flags
     figure = new_figure(12.0, 8.6)
     figure.suptitle(f"{title}: {len(time_s)} records; faint points: ± 2 standard deviations", parse_math=False)
-    charge_axes, position_axes, force_axes, flag_axes = figure.subplots(4, 1, sharex=True)
+    heights = (1.0, 1.0, 0.8, flag_height)
+    charge_axes, position_axes, force_axes, flag_axes = figure.subplots(4, 1, sharex=True, height_ratios=heights)
 
     for name in samples.dtype.names or ():
         if name.startswith("charge_pC."):
@@ -80,16 +84,13 @@ def recording_picture(samples: Samples, title: str) -> Figure:
         (points,) = axes.plot(time_s, values, ".", ms=2.0, label=quantity)
         for limit in (values - two_std, values + two_std):
             axes.plot(time_s, limit, ".", ms=1.0, alpha=0.3, color=points.get_color())
-    # Each flag has a row, because matplotlib assigns the position of a text on an axis at its first use.
-    for flag, bit in FLAG_BITS.items():
-        flag_time_s = time_s[samples["flags"].astype(int) & bit > 0]
-        if flag_time_s.size:
-            flag_axes.plot(flag_time_s, [flag] * flag_time_s.size, "|", color=INK)
+    for row, flag_time_s in enumerate(flags.values()):
+        flag_axes.plot(flag_time_s, np.full(len(flag_time_s), row), "|", color=INK)
 
     charge_axes.set_ylabel("touch charge, pC")
     position_axes.set_ylabel("position, mm")
     force_axes.set_ylabel("force, N")
-    flag_axes.set_ylabel("flags")
+    flag_axes.set(yticks=range(len(flags)), yticklabels=flags, ylim=(-0.7, max(len(flags), 1) - 0.3))
     flag_axes.set_xlabel(f"time since {datetime.fromtimestamp(start_s, UTC):%Y-%m-%d %H:%M:%S} UTC, s")
     for axes in (charge_axes, position_axes, force_axes):
         axes.grid(alpha=0.3)

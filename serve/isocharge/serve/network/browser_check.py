@@ -73,13 +73,14 @@ class AccessCheck:
                 "token: expected printable ASCII characters without blanks at the ends, and no %, which has another "
                 "meaning in the address of a page; choose another one"
             )
-        self._token = token
+        self._token = None if token is None else token.encode()
         self._any_host = any_host or token is not None
 
-    def check(self, headers: Mapping[bytes, bytes], *, needs_token: bool = True) -> None:
+    def check(self, method: str, headers: Mapping[bytes, bytes], *, needs_token: bool = True) -> None:
         """Check the headers of a request, and raise an error if the request is refused.
 
         Args:
+            method: Method in capitals.
             headers: Value of each header by the name of the header in lower case.
             needs_token: Whether the request must contain the token, if the server has one.
 
@@ -87,28 +88,7 @@ class AccessCheck:
             OriginError: If a page of another site has sent the request, or if `Host` is not a name of this server.
             TokenError: If the token is missing or wrong.
         """
-        host = headers.get(b"host", b"")
-        name = _name_in(host.decode("latin-1"))
-        # HTTP/1.0 does not require the header, but browsers always send it.
-        is_served = not host or ip_address(name) is not None or name in self._host_names
-        if not (self._any_host or is_served):
-            raise OriginError(
-                f"Host: expected an IP address or one of {', '.join(sorted(self._host_names))}, got {_quoted(host)}; "
-                "use the server's address, or name the host by --allow-host"
-            )
-        origin = headers.get(b"origin")
-        fetch_site = headers.get(b"sec-fetch-site", b"none")  # programs other than browsers do not send the header
-        if origin is not None:
-            if not self._is_own_page(origin, host):
-                raise OriginError(
-                    f"Origin: expected a page of this server, got a page of {_quoted(origin)}; open {_quoted(host)} "
-                    "itself, or name the page's host by --allow-host"
-                )
-        elif fetch_site.lower() not in TRUSTED_FETCH_SITES:
-            raise OriginError(
-                f"Sec-Fetch-Site: expected a request by a page of this server, got {_quoted(fetch_site)}; open the "
-                f"page of {_quoted(host)}"
-            )
+        self._check_site(method, headers)
         if needs_token:
             self.check_token(headers.get(b"authorization", b""))
 
@@ -127,13 +107,50 @@ class AccessCheck:
         scheme, _, token = authorization.partition(b" ")
         # The duration of this comparison does not depend on the number of correct characters. A client therefore cannot
         # use it to guess the token character by character.
-        is_correct = hmac.compare_digest(token.lstrip(b" "), self._token.encode())
+        is_correct = hmac.compare_digest(token.lstrip(b" "), self._token)
         if scheme.lower() != b"bearer" or not is_correct:
             received = "a wrong one" if authorization else "none"
             raise TokenError(
                 "expected `Authorization: Bearer TOKEN` with this server's token, in a header or in the metadata of "
                 f"gRPC, got {received}"
             )
+
+    def _check_site(self, method: str, headers: Mapping[bytes, bytes]) -> None:
+        """Raise an error if a page of another site has sent a request."""
+        host = headers.get(b"host", b"")
+        if not (self._any_host or self._is_served(host)):
+            raise OriginError(
+                f"Host: expected an IP address or one of {', '.join(sorted(self._host_names))}, got {_quoted(host)}; "
+                "use the server's address, or name the host by --allow-host"
+            )
+        origin = headers.get(b"origin")
+        if origin is not None:
+            if not self._is_own_page(origin, host):
+                raise OriginError(
+                    f"Origin: expected a page of this server, got a page of {_quoted(origin)}; open {_quoted(host)} "
+                    "itself, or name the page's host by --allow-host"
+                )
+            return
+        # Programs other than browsers do not send the header Sec-Fetch-Site. A link on another site may open a page of
+        # this server, because the other site cannot read the response.
+        fetch_site = headers.get(b"sec-fetch-site", b"none")
+        is_navigation = headers.get(b"sec-fetch-mode") == b"navigate" and headers.get(b"sec-fetch-dest") == b"document"
+        is_link = is_navigation and method in ("GET", "HEAD")
+        if fetch_site.lower() not in TRUSTED_FETCH_SITES and not is_link:
+            raise OriginError(
+                f"Sec-Fetch-Site: expected a request by a page of this server, got {_quoted(fetch_site)}; open the "
+                f"page of {_quoted(host)}"
+            )
+
+    def _is_served(self, host: bytes) -> bool:
+        """Return whether the header `Host` contains an IP address or a name of this server.
+
+        A missing header is accepted.
+        """
+        if not host:  # HTTP/1.0 does not require the header, but browsers always send it
+            return True
+        name = _name_in(host.decode("latin-1"))
+        return ip_address(name) is not None or name in self._host_names
 
     def _is_own_page(self, origin: bytes, host: bytes) -> bool:
         """Return whether the page that has sent a request belongs to this server.

@@ -193,7 +193,7 @@ class Handler(Application):
         route, model = match_path(path)
         # The token is checked before unknown paths are refused. A client without the token therefore cannot find out
         # which paths exist.
-        self.access.check(headers, needs_token=route.needs_token)
+        self.access.check(method, headers, needs_token=route.needs_token)
         if route is UNKNOWN:
             raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
         # A HEAD request is answered like a GET request. The server then sends the response without its body.
