@@ -90,6 +90,11 @@ def test_charges_as_fp32_contents(serve, film, predictor, datatype):
             "INVALID_ARGUMENT",
             r"got \[1.0, 1.0, 1.0\] and 12 bytes",
         ),
+        (
+            {"inputs": [tensor([[1.0] * 3], contents={})], "raw_input_contents": [bytes(4), bytes(8)]},
+            "INVALID_ARGUMENT",
+            "one input tensor, got 2",
+        ),
         ({"inputs": [tensor([[1.0] * 3], shape=[5000, 3])]}, "RESOURCE_EXHAUSTED", "at most 4096 presses"),
         ({"model_name": "cubic"}, "NOT_FOUND", "'cubic' is not found; serving: linear/1, linear/2"),
     ],

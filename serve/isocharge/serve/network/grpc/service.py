@@ -65,7 +65,9 @@ def read_request(message: Any) -> tuple[InferBody, bytes]:
     Raises:
         RequestError: If the message is not a request for an inference.
     """
-    raw_contents = b"".join(message.raw_input_contents)
+    raw_contents = message.raw_input_contents
+    if len(raw_contents) > 1:
+        raise RequestError(f"raw_input_contents: expected the bytes of one input tensor, got {len(raw_contents)}")
     content = {
         "id": message.id,
         "inputs": [
@@ -79,9 +81,9 @@ def read_request(message: Any) -> tuple[InferBody, bytes]:
             for tensor in message.inputs
         ],
         "outputs": [{"name": output.name, "parameters": _unsupported_parameters(output)} for output in message.outputs],
-        "parameters": {"binary_data_output": raw_contents != b""},
+        "parameters": {"binary_data_output": len(raw_contents) > 0},
     }
-    return convert(content, InferBody, "", RequestError), raw_contents
+    return convert(content, InferBody, "", RequestError), b"".join(raw_contents)
 
 
 def _numbers(tensor: Any) -> list[Any] | None:

@@ -45,9 +45,8 @@ class Connection(HttpToolsProtocol):
             uvicorn_arguments: Arguments that uvicorn passes to its protocols.
         """
         super().__init__(**uvicorn_arguments)
-        self._allow(limits.header_seconds)
-        # Time by which the client must have read its responses, s
-        self._write_deadline = self.loop.time() + limits.body_seconds
+        self.deadline = math.inf
+        self._write_deadline = math.inf  # time by which the client must have read its responses, s
         self._limits = limits
         self._traffic = traffic
         self._is_reading = False  # whether a request has begun and is not complete
@@ -65,6 +64,8 @@ class Connection(HttpToolsProtocol):
         is refused.
         """
         super().connection_made(transport)
+        self._allow(self._limits.header_seconds)  # the TLS handshake, which is over, has a limit of its own
+        self._write_deadline = self.loop.time() + self._limits.body_seconds
         if len(self.connections) <= self._limits.connections:
             return
         others: Any = self.connections - {self}  # all connections are of this class
