@@ -192,20 +192,26 @@ class RecordedTape(Tape):
     def __init__(self, dtype: "np.dtype[Any]") -> None:
         """Create the temporary file, which is removed when the tape is no longer used.
 
-        The file has room for the samples of 18 hours at 1 kHz. It occupies the disk only as far as samples are stored.
-
         Args:
             dtype: NumPy type of a sample.
         """
         super().__init__(dtype)
-        with tempfile.TemporaryFile() as file:  # the mapping keeps the closed file
-            self._ring = np.memmap(file, dtype, "r+", shape=(1 << 26,))
+        self._map_file(LIVE_SAMPLES)
 
     def append(self, values: tuple[float | None, ...]) -> None:
-        """Append a sample."""
+        """Append a sample. If the file is full, a file of twice its size replaces it."""
+        if self.total == len(self._ring):
+            self._map_file(2 * self.total)
         time_s, *others = values
         _, latest_time_s = self.span()
         super().append((max(latest_time_s, time_s or 0.0), *others))
+
+    def _map_file(self, capacity: int) -> None:
+        """Copy the stored samples to a file with room for `capacity` samples, and map the file to memory."""
+        with tempfile.TemporaryFile() as file:  # the mapping keeps the closed file
+            ring = np.memmap(file, self._ring.dtype, "r+", shape=(capacity,))
+        ring[: self.total] = self._ring[: self.total]
+        self._ring = ring
 
     def overview(self) -> list[float]:
         """Return the largest force in each of `MAX_DRAWN_SAMPLES` pieces of the recording, N."""
