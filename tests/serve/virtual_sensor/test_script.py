@@ -1,11 +1,13 @@
 """Scripts stay in their area and their range of forces, and are smooth."""
 
+import re
+
 import numpy as np
 import pytest
 
 from isocharge.common.errors import SceneError
 from isocharge.serve import Faults, wander
-from isocharge.serve.virtual_sensor.script import load_script
+from isocharge.serve.virtual_sensor.script import Script, load_script
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +30,17 @@ def test_wander_stays_inside_radius_and_forces(script):
 def test_impossible_script_is_refused(wrong):
     with pytest.raises(SceneError, match="wander: expected 0 < smallest"):
         wander(seed=0, **wrong)
+
+
+@pytest.mark.parametrize(
+    ("contact", "rate_Hz"),
+    [(np.zeros(3), 200.0), (np.zeros((2, 4)), 200.0), (np.zeros((0, 3)), 200.0), (np.zeros((2, 3)), 0.0)],
+)
+def test_contacts_of_another_shape_or_without_a_rate_are_refused(contact, rate_Hz):
+    with pytest.raises(
+        SceneError, match=f"script: expected contacts.*{re.escape(str(contact.shape))} and {rate_Hz} Hz"
+    ):
+        Script(contact, rate_Hz)
 
 
 PRESSES = "presses = [[3, 1, 2, 0], [4, 1, 2, 0], [4.1, 1, 2, 0.5], [5.1, 3, 2, 0.5], [5.2, 3, 2, 0]]\n"

@@ -46,6 +46,18 @@ class Script:
     contact: Array
     rate_Hz: float
 
+    def __post_init__(self) -> None:
+        """Check the shape of the contacts and the frame rate.
+
+        Raises:
+            SceneError: If the contacts have another shape than (n, 3), if n is 0, or if the frame rate is not positive.
+        """
+        if self.contact.ndim != 2 or self.contact.shape[1] != 3 or not len(self.contact) or not self.rate_Hz > 0.0:
+            raise SceneError(
+                "script: expected contacts (x, y, F) of shape (n, 3) with n above 0 and a positive rate, got the shape "
+                f"{self.contact.shape} and {self.rate_Hz} Hz"
+            )
+
     @property
     def touching(self) -> Booleans:
         """Whether something touches the film in each frame, shape (n,)."""

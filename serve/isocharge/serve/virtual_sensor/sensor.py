@@ -308,7 +308,7 @@ def _clean_charges(forward: Charges, script: Script) -> Array:
     if touch_pC.ndim != 2 or len(touch_pC) != touch_count or not np.isfinite(touch_pC).all():
         raise SceneError(
             f"forward map: expected finite charges of shape ({touch_count}, electrodes), got shape {touch_pC.shape} "
-            f"with the sum {touch_pC.sum()}"
+            f"with {np.count_nonzero(~np.isfinite(touch_pC))} not finite"
         )
     charge_pC = np.zeros((len(script.contact), touch_pC.shape[1]))
     charge_pC[is_touch] = touch_pC
