@@ -127,7 +127,7 @@ def _traffic(log_format: str) -> Iterator[Traffic]:
         return
     with closing(WriterQueue(write_stderr)) as line_queue:
         request_log = RequestLog(line_queue.put)
-        logging.basicConfig(level=logging.WARNING, handlers=[request_log], force=True, format="%(message)s")
+        logging.basicConfig(level=logging.WARNING, handlers=[request_log], force=True)
         logging.getLogger("isocharge").handlers.clear()  # its messages also reach `request_log`
         logging.captureWarnings(True)
         traffic = Traffic(request_log)

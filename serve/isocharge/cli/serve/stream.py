@@ -302,6 +302,9 @@ def replay_command(
     output: OutputOption = None,
     live: LiveOption = None,
     token: TokenOption = None,
+    allow_host: AllowHostOption = None,
+    tls_cert: TlsCertOption = None,
+    tls_key: TlsKeyOption = None,
 ) -> None:
     """Play a recording of raw bytes again: the same model and device give the same records, bit for bit.
 
@@ -331,6 +334,9 @@ def replay_command(
             predictor.metadata,
             is_recording=True,
             token=token,
+            tls_cert=tls_cert,
+            tls_key=tls_key,
+            allow_host=allow_host,
         ) as page,
         outputs,
     ):
