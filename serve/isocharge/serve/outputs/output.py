@@ -43,7 +43,10 @@ class Output(Protocol):
         """
 
     def close(self) -> None:
-        """Write all records that are still in memory, and close the files and sockets of the output."""
+        """Write all records that are still in memory, and close the files and sockets of the output.
+
+        The command waits until this method returns.
+        """
 
 
 def discard(output: Output) -> None:

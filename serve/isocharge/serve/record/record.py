@@ -114,8 +114,8 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     The annotations of the fields describe the values. The page `serve/docs/record.md` contains a table of all fields.
 
     Attributes:
-        sections: Sections of the device file whose stages process contacts. They decide which optional fields JSON and
-            CSV contain.
+        sections: Sections of the device file whose stages process contacts. JSON and CSV contain `tracked`, `event` and
+            `other` only if "track" is among these sections, and `film` only if "follow" is among them.
     """
 
     timestamp: Annotated[float | None, "Time of the reading, unix seconds."]
