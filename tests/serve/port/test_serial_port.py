@@ -70,13 +70,14 @@ def test_port_that_cannot_be_opened_is_refused(url, message):
         pass
 
 
-def test_port_in_a_folder_that_may_not_be_read_is_refused(monkeypatch):
+@pytest.mark.parametrize("make", [Port, open_source])
+def test_port_in_a_folder_that_may_not_be_read_is_refused(monkeypatch, make):
     def stat(_path, **_options):
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr(Path, "stat", stat)
     with pytest.raises(PortError, match=r"^/closed/film: its folder cannot be read \(Permission denied\)"):
-        open_source("/closed/film")
+        make("/closed/film").__enter__()
 
 
 @pytest.mark.parametrize("make", [Port, open_source])

@@ -139,9 +139,12 @@ class Port:
             InputError: If the port is a file.
         """
         is_path = "://" not in self.url
-        if is_path and not Path(self.url).exists():
+        with _permission_errors_converted(self.url):
+            exists = not is_path or Path(self.url).exists()
+            is_file = is_path and Path(self.url).is_file()
+        if not exists:
             raise PortError(f"{self.url}: there is no such port: plug the board in, check the name, or wait for it")
-        if is_path and Path(self.url).is_file():
+        if is_file:
             with open_file(Path(self.url)):  # raises another error for a file that does not come from a board
                 raise InputError(
                     f"{self.url}: expected a port, got a file; only `isocharge serve stream` reads the bytes of a "
@@ -275,6 +278,15 @@ class Port:
         return data
 
 
+@contextlib.contextmanager
+def _permission_errors_converted(url: str) -> Iterator[None]:
+    """If the folder of a path cannot be read in the `with` block, raise a `PortError`."""
+    try:
+        yield
+    except PermissionError as error:
+        raise PortError(f"{url}: its folder cannot be read ({error.strerror}); ask for the right to read it") from error
+
+
 def has_speed(url: str) -> bool:
     """Return whether a port has a baud rate. Sockets and pseudo-terminals have no baud rate."""
     return "://" not in url and not os.path.realpath(url).startswith("/dev/pts/")
@@ -385,12 +397,10 @@ def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> context
     is_path = "://" not in url
     path = Path(url)
     deadline_s = time.monotonic() + wait
-    try:
+    with _permission_errors_converted(url):
         while is_path and not path.exists() and time.monotonic() < deadline_s:
             time.sleep(RETRY_PAUSE_s)
         is_file = is_path and (path.is_file() or path.is_fifo())  # false for a device, and if the path does not exist
-    except PermissionError as error:
-        raise PortError(f"{url}: its folder cannot be read ({error.strerror}); ask for the right to read it") from error
     if is_file:
         return open_file(path)
     remaining_s = max(0.0, deadline_s - time.monotonic())
