@@ -3,13 +3,17 @@
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from isocharge.cli.shared.options import ForceStdOption, JsonOption, ModelArgument, ModelsOption, PositionStdOption
-from isocharge.cli.shared.terminal import show_result
+from isocharge.cli.shared.terminal import say, show_result
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.prediction.press_check import check_presses
 from isocharge.serve.presses.measured_presses import read_presses
+
+MAX_ROWS = 40
+"""Largest number of presses in the table. If there are more, the presses with the largest errors are listed."""
 
 SHOWN = ("line", "x_mm", "y_mm", "force_N", "position_error_mm", "force_error_percent", "flags", "left_out")
 """Values of a press in the table."""
@@ -45,7 +49,13 @@ def check_command(
         each_press = result.pop("each")
         summaries = {name: result.pop(name) for name in ("position_mm", "force_percent")}
         errors = {name: summary for name, summary in summaries.items() if summary is not None}
-        rows = [{name: press[name] for name in SHOWN} for press in each_press]
+        # The table contains the presses with the largest errors, in the order of the file. The squared errors of x, y
+        # and F are divided by their variances. An unknown error is NaN and does not count.
+        chi_squared = np.nansum(check.errors.squared_ratio, axis=1)  # shape (n,)
+        worst_indices = np.argsort(-chi_squared, kind="stable")[:MAX_ROWS]
+        if check.presses > MAX_ROWS:
+            say(f"the table has the {MAX_ROWS} worst of {check.presses} presses; --json has all")
+        rows = [{name: each_press[index][name] for name in SHOWN} for index in sorted(worst_indices)]
         result = {"each": rows, "errors": errors} | result
         if check.std_factor is not None:
             result["std_factor"] = f"{check.std_factor.statement}, if they were not used for the model"

@@ -1,6 +1,5 @@
 """`isocharge serve doctor`: examine what a port sends, and write the device file of the board."""
 
-import tomllib
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -93,13 +92,15 @@ def doctor_command(
     if write is not None:
         refuse_existing(write)
     electrodes = Predictor(model, models=models).metadata.electrodes if model else ()  # empty for any model
-    gain = None if pC_per_unit is None else _parse_gain(pC_per_unit)
+    gain = None if pC_per_unit is None else {"pC_per_unit": _parse_gain(pC_per_unit)}
     for option, value, section in (("--pc-per-unit", gain, "gain"), ("--request", request, "frames")):
         if value is not None and device is not None:
             raise InputError(
                 f"{option}: expected none beside --device, because the device file states it; leave the option out, "
                 f"or write it into the section [{section}] of {device}"
             )
+    if gain is not None:
+        device_from_table({"gain": gain}, "--pc-per-unit")  # raises an error for 0 or a number that is not finite
     request_table = device_from_table({"frames": {"request": request}}, "--request")
     say(f"listening for {seconds:g} s; leave the film alone")
     examination = examine(
@@ -178,19 +179,20 @@ def port_lines() -> Iterator[str]:
         yield f"{port.device} ({port.description}): {received}"
 
 
-def _parse_gain(text: str) -> dict[str, Any]:
-    """Return the value of `--pc-per-unit` as the content of the section `[gain]`.
-
-    The value has the notation of TOML, except that a table such as `A=0.1,B=-0.1` has no braces.
+def _parse_gain(text: str) -> Any:
+    """Parse `--pc-per-unit`, and return one number or a number for each electrode.
 
     Args:
-        text: Value of the option.
+        text: Value of the option, such as `0.1` or `A=0.1,B=-0.1`.
 
     Raises:
         InputError: If the text has neither of these forms.
     """
     try:
-        return tomllib.loads(f"pC_per_unit = {{{text}}}" if "=" in text else f"pC_per_unit = {text}")
+        if "=" not in text:
+            return float(text)
+        pairs = (part.partition("=") for part in text.split(","))
+        return {electrode.strip(): float(number) for electrode, _equals_sign, number in pairs}
     except ValueError as error:
         raise InputError(
             f"--pc-per-unit: expected a number like 0.0457, or A=0.0457,B=-0.0457, got {text!r}"
