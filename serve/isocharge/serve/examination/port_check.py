@@ -5,12 +5,13 @@ the settings that are still missing.
 """
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from isocharge.common.errors import printable
+from isocharge.common.errors import ChargeError, printable
 from isocharge.serve.examination.board_health import (
     ChannelHealth,
     channel_count_sentences,
@@ -25,7 +26,7 @@ from isocharge.serve.examination.proposal import propose, recognised_frames, uni
 from isocharge.serve.live.device import ANY_BOARD, device_from_table
 from isocharge.serve.port.serial_line import Request
 from isocharge.serve.recognition.framing import INTACT_SHARE
-from isocharge.serve.signal_chain.channels import channel_index
+from isocharge.serve.signal_chain.channels import Channels, channel_index
 from isocharge.serve.signal_chain.gain import Gain, GainRule
 from isocharge.serve.signal_chain.stage import Device, Setup
 
@@ -182,7 +183,7 @@ def examine_received(
         electrodes = electrodes or tuple(table.get("channels", {}))
         device = device_from_table({key: value for key, value in table.items() if gain or key != "gain"}, "board")
         Gain(Setup(electrodes, device))  # raises an error for the numbers of other electrodes
-    electrode_at_position = electrodes_by_position(capture, device)
+    electrode_at_position = electrodes_by_position(capture, device, electrodes)
     unit = unit_of(capture)
     charges = values[is_rest][:, list(electrode_at_position)]  # shape (n, n_electrode)
     gain_rule = device.rule(GainRule)
@@ -236,21 +237,33 @@ def examine_received(
     )
 
 
-def electrodes_by_position(capture: Capture, device: Device) -> dict[int, str]:
+def electrodes_by_position(capture: Capture, device: Device, electrodes: tuple[str, ...]) -> dict[int, str]:
     """Return the name of each electrode, by the position of its channel in the frame.
 
-    If the device file has no section `[channels]`, every channel is an electrode with the name of the channel.
-    Electrodes whose channel is missing in the frames are left out.
+    If the device file has no section `[channels]`, the channels are assigned to the electrodes as in a stream. If the
+    electrodes are not known, or the channels cannot be assigned, every channel is an electrode with the name of the
+    channel. Electrodes whose channel is missing in the frames are left out.
 
     Args:
         capture: The frames, at least one.
         device: Settings of the board. `channels` contains the name of the channel of each electrode.
+        electrodes: Electrodes of the model. Without a model, the electrodes are those for which `[gain]` states
+            numbers.
     """
-    if not device.channels:
-        return dict(enumerate(capture.names))
     last_frame = capture.frames[-1]
-    return {
-        position: electrode
-        for electrode, channel in device.channels.items()
-        if (position := channel_index(channel, last_frame)) is not None
-    }
+    if device.channels:
+        return {
+            position: electrode
+            for electrode, channel in device.channels.items()
+            if (position := channel_index(channel, last_frame)) is not None
+        }
+    rule = device.rule(GainRule)
+    for numbers in () if rule is None else (rule.offset, rule.pC_per_unit):
+        if isinstance(numbers, dict):
+            electrodes = electrodes or tuple(numbers)
+    positions = None
+    with suppress(ChargeError):  # is reported later
+        positions = Channels(Setup(electrodes), any_unit=True).indices_by_name_or_order(last_frame)
+    if not electrodes or positions is None:
+        return dict(enumerate(capture.names))
+    return dict(zip(positions, electrodes, strict=True))
