@@ -316,8 +316,9 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
     Lines are equal if their skeletons are equal. The length of the cycle is the distance from the last line to the
     latest earlier line that is equal.
 
-    If every value has a name, a frame consists of all lines of a cycle. Otherwise, a frame is a single line, and the
-    other lines of the cycle never change.
+    If lines occur several times in a cycle, the most frequent line is a frame. Otherwise, if every value has a name, a
+    frame consists of all lines of a cycle. Otherwise, a frame is a single line, and the other lines of the cycle never
+    change.
 
     Args:
         lines: The lines since the beginning.
@@ -333,6 +334,8 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
 
     lines = lines[-repeats * cycle_length :]
     cycle = lines[:cycle_length]
+    if len(set(skeletons[-cycle_length:])) < cycle_length:  # several frames, then another line such as a temperature
+        return [max(cycle, key=lambda line: skeletons.count(line.skeleton))]  # the most frequent line
     if cycle_length == 1:
         return cycle
     if all(all(line.names) for line in cycle):

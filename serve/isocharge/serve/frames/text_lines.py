@@ -79,8 +79,8 @@ _NAMES_OF_TIMES = {"time": "t_s", "uptime": "t_ms"}
 
 _CHARGE_UNITS = {unit for unit in OTHER_CHARGE_UNITS if unit != "C"}  # C may be the name of an electrode
 
-_SIGNED_NUMBERS = r"(?:[-+][0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?){2,}"
-"""Regular expression of a line of numbers with nothing but their signs between them, such as `+003.5-003.4+005.8`."""
+_SIGNED_NUMBERS = r"[^\w.]?(?:[-+][0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?){2,}[^\w.]?"
+"""Regular expression of numbers with nothing but their signs between them, such as `<+003.5-003.4+005.8>`."""
 
 _NAMED_NUMBER = r"([A-Za-z]+)([-+]?[0-9]*\.[0-9]+(?:[eE][-+]?[0-9]+(?![.0-9]))?|[-+][0-9]+)[\s,;|]*"
 """Regular expression of a number directly after its name, as in `A+3.5B-3.4`. The number has a sign or a fraction."""
@@ -95,7 +95,7 @@ def _token_pattern(number: str) -> re.Pattern[str]:
     Args:
         number: Regular expression of a decimal number.
     """
-    key = r"""(?:[0-9]+(?=[^\W\d_]))?(?![0-9()\[\]+.*$|-])(?>(?:[^\s:=,;{}"'<>()]|\([^\s()]*\))+)"""
+    key = r"""(?:[0-9]+(?=[^\W\d_]))?(?![0-9()\[\]+.*$|&/-]|#[0-9])(?>(?:[^\s:=,;{}"'<>()]|\([^\s()]*\))+)"""
     return re.compile(
         rf"(?P<time>(?<![\w.:]){_TIME}(?![\w:]))"
         r"|(?P<uptime>(?<=\b[EWIDV]\s\()[0-9]+(?=\)))"
@@ -188,6 +188,7 @@ def clean_text(text: str) -> str:
         return _teleplot_content(text)
     if text[:1] == "$" and "*" in text:
         return _sentence_content(text)
+    text = re.sub(r"\*[0-9A-Fa-f]{2}$", "", text)  # a checksum like that of a sentence, whose rule is not known
     return "" if text[:1] == "#" else text
 
 
@@ -237,8 +238,10 @@ def parse_line(text: str, *, has_header: bool = False, counters: Collection[str]
         raise ValueError(f"expected printable characters, got {text[:100]!r}")
     number_kind = "number with a decimal comma" if _has_decimal_commas(text) else "number"
     tokens = _tokens(text.rstrip(",; \t"), number_kind)
-    if not has_header:
-        tokens = _with_alternating_names(tokens)
+    # Whether the line is a name and a value, as in `A,3.5` and `12:34:56,A,3.5`
+    is_pair = re.fullmatch("[,;]?w[,;|]0w?", _shape(tokens)) is not None
+    if is_pair or not has_header:
+        tokens = _with_alternating_names(tokens, fewest=1 if is_pair else 2)
     names, names_with_units = _names(tokens, counters)
 
     units = {"pC", *_CHARGE_UNITS}
@@ -314,7 +317,7 @@ def _index_positions(tokens: list[_Token]) -> list[int]:
     Args:
         tokens: Parts of the line.
     """
-    shape = "".join(_SHAPES.get(token.kind, token.content) for token in tokens)
+    shape = _shape(tokens)
     numbers = [position for position, token in enumerate(tokens) if _SHAPES.get(token.kind) == "0"]
     before_colons = re.search(r"(?:[^0]*+0[)\]]?[:=]0)+[^0]*+$", shape)
     if before_colons is not None and (before_colons.start() == 0 or before_colons[0].count("0") > 2):
@@ -327,6 +330,11 @@ def _index_positions(tokens: list[_Token]) -> list[int]:
     are_counts = len(indices) > 1 and indices in (counts[:-1], counts[1:])
     is_prefix_equal = len({tokens[position - 1].content for position in positions}) == 1
     return positions if are_counts and is_prefix_equal else []
+
+
+def _shape(tokens: list[_Token]) -> str:
+    """Return one character for each part of a line."""
+    return "".join(_SHAPES.get(token.kind, token.content) for token in tokens)
 
 
 def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], list[str]]:
@@ -387,7 +395,7 @@ def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], 
     return names, names_with_units
 
 
-def _with_alternating_names(tokens: list[_Token]) -> list[_Token]:
+def _with_alternating_names(tokens: list[_Token], fewest: int) -> list[_Token]:
     """Mark the names in a line in which names and numbers alternate, and return the parts of the line.
 
     The name of a number is the word that is next to the number, either before each number, as in `C,7,A,3` and
@@ -396,13 +404,14 @@ def _with_alternating_names(tokens: list[_Token]) -> list[_Token]:
 
     Args:
         tokens: Parts of the line.
+        fewest: Smallest number of names. A single word before a number may also be a state of the board.
     """
     without_times = [token for token in tokens if token.kind not in _NAMES_OF_TIMES]
     for ordered_tokens in (without_times, without_times[::-1]):
         paths = _paths(ordered_tokens)
         named = [path[-1] for path in paths if path]
         names = {token.name for token in named}
-        if len(names) == len(paths) > 1 and _CHARGE_UNITS.isdisjoint(names):
+        if len(names) == len(paths) >= fewest and _CHARGE_UNITS.isdisjoint(names):
             return [token._replace(kind="name") if token in named else token for token in tokens]
     return tokens
 
