@@ -79,6 +79,8 @@ _NAMES_OF_TIMES = {"time": "t_s", "uptime": "t_ms"}
 
 _CHARGE_UNITS = {unit for unit in OTHER_CHARGE_UNITS if unit != "C"}  # C may be the name of an electrode
 
+_ALL_CHARGE_UNITS = {"pC", *_CHARGE_UNITS}
+
 _SIGNED_NUMBERS = r"[^\w.]?(?:[-+][0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?){2,}[^\w.]?"
 """Regular expression of numbers with nothing but their signs between them, such as `<+003.5-003.4+005.8>`."""
 
@@ -242,30 +244,45 @@ def parse_line(text: str, *, has_header: bool = False, counters: Collection[str]
     is_pair = re.fullmatch("[,;]?w[,;|]0w?", _shape(tokens)) is not None
     if is_pair or not has_header:
         tokens = _with_alternating_names(tokens, fewest=1 if is_pair else 2)
-    names, names_with_units = _names(tokens, counters)
+    names = _names(tokens, counters)
+    starts = tuple(token.start for token in tokens if token.kind in _NUMBER_KINDS)
+    words = tuple(token.name for token in tokens if token.kind not in ("mark", *_NUMBER_KINDS))
+    skeleton = _skeleton(tokens, names, number_kind)
+    return Line(text, skeleton, tuple(_with_units(names, tokens)), starts, _is_prose(tokens), words)
 
-    units = {"pC", *_CHARGE_UNITS}
+
+def _skeleton(tokens: list[_Token], names: list[str], number_kind: str) -> str:
+    """Return the skeleton of a line; see `Line`.
+
+    Args:
+        tokens: Parts of the line.
+        names: Names of the numbers.
+        number_kind: Kind of the numbers in the line, a key of `_TOKENS`.
+    """
+    fixed_words = {*names, *_ALL_CHARGE_UNITS}  # a line with another unit has another layout
     skeleton = ""
-    word_count = 0
     for previous, token in pairwise([_EDGE, *tokens]):
-        is_beside_mark = "mark" in (previous.kind, token.kind)
-        is_unit = token.content in units
-        if token.kind in ("word", "name") and not is_unit and not is_beside_mark:
-            word_count += 1
-        if is_beside_mark:
+        if "mark" in (previous.kind, token.kind):
             skeleton += _CODES["optional blanks"]
         elif token.is_after_blank:
             skeleton += _CODES["blanks"]
-        is_fixed_word = token.kind == "word" and (is_unit or token.content in names)
-        if token.kind in ("key", "name", "mark") or is_fixed_word:  # a line with another unit has another layout
+        if token.kind in ("key", "name", "mark") or (token.kind == "word" and token.content in fixed_words):
             skeleton += token.content
         else:
             skeleton += _CODES[number_kind if token.kind == "number" else token.kind]
-    starts = tuple(token.start for token in tokens if token.kind in _NUMBER_KINDS)
-    begins_with_address = re.search("hexadecimal.* number", " ".join(token.kind for token in tokens)) is not None
-    is_prose = begins_with_address or word_count >= len(starts)
-    words = tuple(token.name for token in tokens if token.kind not in ("mark", *_NUMBER_KINDS))
-    return Line(text, skeleton, tuple(names_with_units), starts, is_prose, words)
+    return skeleton
+
+
+def _is_prose(tokens: list[_Token]) -> bool:
+    """Return whether a line resembles a message; see `Line`."""
+    kinds = [token.kind for token in tokens]
+    has_address = re.search("hexadecimal.* number", " ".join(kinds)) is not None
+    words = [
+        token
+        for previous, token in pairwise([_EDGE, *tokens])
+        if token.kind in ("word", "name") and previous.kind != "mark" and token.content not in _ALL_CHARGE_UNITS
+    ]
+    return has_address or len(words) >= sum(kind in _NUMBER_KINDS for kind in kinds)
 
 
 def _has_decimal_commas(text: str) -> bool:
@@ -337,11 +354,12 @@ def _shape(tokens: list[_Token]) -> str:
     return "".join(_SHAPES.get(token.kind, token.content) for token in tokens)
 
 
-def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], list[str]]:
-    """Return the names of the numbers, and the names with their units. A number without a name has an empty text.
+def _names(tokens: list[_Token], counters: Collection[str]) -> list[str]:
+    """Return the names of the numbers. A number without a name has an empty text.
 
-    The name of a number is the last word or key between this number and the previous number or separator, as in
-    `A: 3.5`, `A -> 3.5` and `<A>3.5</A>`. These rules apply in this order:
+    If `_with_alternating_names` has marked names, these are the names. Otherwise, the name of a number is the last word
+    or key between this number and the previous number or separator, as in `A: 3.5`, `A -> 3.5` and `<A>3.5</A>`. These
+    rules apply in this order:
 
     - If several numbers have the same name, the word or key before it is the name, as in `{"A": {"pC": 3.5}}`. A name
       that still occurs several times is removed.
@@ -349,50 +367,61 @@ def _names(tokens: list[_Token], counters: Collection[str]) -> tuple[list[str], 
     - If only one of several numbers has a name, the name is a label of the line and is removed. This applies if the
       name is a word or belongs to the first number. Names of counters and clocks are kept.
 
-    A unit of charge or voltage other than pC directly behind a number, or between the name of a number and the number,
-    is added to its name, as in `A_nC`.
-
     Args:
         tokens: Parts of the line.
         counters: Names of counters and clocks.
     """
+    kinds = [token.kind for token in tokens if token.kind in _NUMBER_KINDS]
+    marked_names = [token.name for token in tokens if token.kind == "name"]
+    if marked_names:
+        next_names = iter(marked_names)
+        return [_NAMES_OF_TIMES.get(kind) or next(next_names) for kind in kinds]
+
+    # The last two words before each number, which are empty if there are fewer
     paths = [
         ["", "", *(token.name for token in path if token.kind != "quoted")] for path in _paths(tokens, _SEPARATORS)
     ]
-    kinds = [token.kind for token in tokens if token.kind in _NUMBER_KINDS]
     inner_names = [_NAMES_OF_TIMES.get(kind, path[-1]) for kind, path in zip(kinds, paths, strict=True)]
     outer_names = [path[-2] for path in paths]
-    words = {token.name for token in tokens if token.kind == "word"}
-    parts = [token for token in tokens if token.content not in ":="]
-    following_units = [
-        following.content for token, following in pairwise([*parts, _EDGE]) if token.kind in _NUMBER_KINDS
-    ]
-    # The word `C` may be the name of an electrode, but a word behind several numbers is not a name.
-    known_units = OTHER_CHARGE_UNITS if following_units.count("C") > 1 else _CHARGE_UNITS
-    units = []
-    for following_unit, path in zip(following_units, _paths(tokens), strict=True):
-        # The first word after the previous number is a name, or the unit of the previous number.
-        possible_units = (following_unit, *(token.name.strip("[]") for token in path[1:]))
-        unit = next((unit for unit in possible_units if unit in known_units), "")
-        units.append("coulomb" if unit == "C" else unit)  # `A_C` would be an electrode with the name C
-
     names = [name or outer_name for name, outer_name in zip(_unique(inner_names), _unique(outer_names), strict=True)]
+
+    # Remove the units and the label of the line.
+    words = {token.name for token in tokens if token.kind == "word"}
     channels = [index for index, name in enumerate(names) if name not in TIMES_US]
     contents = [token for token in tokens if token.kind != "mark"]
-    are_units = bool(channels) and not names[channels[0]] and contents[-1].kind == "word"
-    names = ["" if are_units and name in words else name for name in names]
+    if channels and not names[channels[0]] and contents[-1].kind == "word":
+        names = ["" if name in words else name for name in names]
     named = [index for index in channels if names[index]]
     is_single = len(channels) > 1 and len(named) == 1 and names[named[0]] not in counters
     if is_single and (named[0] == channels[0] or names[named[0]] in words):
         names[named[0]] = ""
-    alternating_names = [token.name for token in tokens if token.kind == "name"]
-    if alternating_names:
-        names = [_NAMES_OF_TIMES.get(kind) or alternating_names.pop(0) for kind in kinds]
-    names_with_units = [
-        f"{name or f'ch{number}'}_{unit}" if unit and unit not in names else name
-        for number, (name, unit) in enumerate(zip(names, units, strict=True), start=1)
+    return names
+
+
+def _with_units(names: list[str], tokens: list[_Token]) -> list[str]:
+    """Return the names of the numbers with their units of charge or voltage, as `A_nC`.
+
+    The unit is directly behind the number, or between the name of the number and the number. The unit pC is not added.
+
+    Args:
+        names: Name of each number; empty for a number without a name.
+        tokens: Parts of the line.
+    """
+    parts = [token for token in tokens if token.content not in ":="]
+    following_words = [
+        following.content for token, following in pairwise([*parts, _EDGE]) if token.kind in _NUMBER_KINDS
     ]
-    return names, names_with_units
+    # The word `C` may be the name of an electrode, but a word behind several numbers is not a name.
+    known_units = OTHER_CHARGE_UNITS if following_words.count("C") > 1 else _CHARGE_UNITS
+    names_with_units = []
+    for number, (name, following_word, path) in enumerate(zip(names, following_words, _paths(tokens), strict=True), 1):
+        # The first word after the previous number is a name, or the unit of the previous number.
+        possible_units = (following_word, *(token.name.strip("[]") for token in path[1:]))
+        unit = next((unit for unit in possible_units if unit in known_units), "")
+        ending = "coulomb" if unit == "C" else unit  # `A_C` would be an electrode with the name C
+        is_added = unit and ending not in names
+        names_with_units.append(f"{name or f'ch{number}'}_{ending}" if is_added else name)
+    return names_with_units
 
 
 def _with_alternating_names(tokens: list[_Token], fewest: int) -> list[_Token]:
