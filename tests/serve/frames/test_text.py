@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from isocharge.serve import AutoParser
 from isocharge.serve.frames.device_clock import DeviceClock
+from isocharge.serve.frames.line_notation import clean_text
 from isocharge.serve.frames.text import TextParser
-from isocharge.serve.frames.text_lines import clean_text, line_values, parse_line, skeleton_pattern
+from isocharge.serve.frames.text_lines import line_values, parse_line, skeleton_pattern
 from isocharge.serve.port.file_source import Chunk
 
 README_OF_TELEPLOT = [

@@ -3,7 +3,7 @@
 A device file selects the format with the key `format` of its section `[frames]`:
 
 - `binary`: the binary frames of isocharge (module `binary`),
-- `text`: lines of text (modules `text` and `text_lines`),
+- `text`: lines of text (modules `text`, `line_notation` and `text_lines`),
 - `described`: frames of fixed length whose layout the device file describes (module `frame_layout`),
 - `auto`: `binary` or `text`, depending on the bytes (module `formats`).
 

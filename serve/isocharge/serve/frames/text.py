@@ -41,7 +41,8 @@ from isocharge.serve.frames.frame import (
     DelimitedParser,
     Frame,
 )
-from isocharge.serve.frames.text_lines import Line, clean_text, header_names, line_values, parse_line, skeleton_pattern
+from isocharge.serve.frames.line_notation import clean_text
+from isocharge.serve.frames.text_lines import Line, header_names, line_values, parse_line, skeleton_pattern
 
 MAX_LINE_LENGTH = 4096
 """Length of the longest line that is parsed, bytes."""

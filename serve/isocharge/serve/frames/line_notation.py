@@ -1,0 +1,88 @@
+"""Removal of notations without a meaning from the lines of text that boards send, before their numbers are read.
+
+These are colours, quotes around numbers, blanks behind signs, checksums, and the marks of Teleplot.
+"""
+
+import re
+from functools import reduce
+from operator import xor
+
+_QUOTED_NUMBER = r"""(?<!\w)(["'])([-+]?\.?[0-9][0-9.,]*(?:[eE][-+]?[0-9]+)?)\1(?!\s*[:=])"""
+
+_COMMANDS = r"(?:\x1b\[[0-9;?]*[A-Za-z])+"
+
+_COLOURS = rf"\x1b\[[0-9;]*m|^{_COMMANDS}|{_COMMANDS}$"
+"""Regular expression of the colours that loggers use, and of commands to a terminal at the ends of a line."""
+
+_SIGNED_NUMBERS = r"[^\w.]?(?:[-+][0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?){2,}[^\w.]?"
+"""Regular expression of numbers with nothing but their signs between them, such as `<+003.5-003.4+005.8>`."""
+
+_NAMED_NUMBER = r"([A-Za-z]+)([-+]?[0-9]*\.[0-9]+(?:[eE][-+]?[0-9]+(?![.0-9]))?|[-+][0-9]+)[\s,;|]*"
+"""Regular expression of a number directly after its name, as in `A+3.5B-3.4`. The number has a sign or a fraction."""
+
+_TELEPLOT = r">([^\s:>][^:]*):(?:[^|]*;)?(?:([0-9.]+):)?([^:;|]*);?(?:\|.*)?"
+"""Regular expression of a line of Teleplot. The groups are the name, the latest time and the latest value."""
+
+
+def clean_text(text: str) -> str:
+    """Return the part of a line that may contain numbers; empty for a blank line, a comment or a text of Teleplot.
+
+    Colours, quotes around numbers and other notations without a meaning are removed.
+
+    Args:
+        text: The line.
+
+    Raises:
+        ValueError: If the checksum of a sentence is wrong.
+    """
+    if "\x1b" in text:
+        text = re.sub(_COLOURS, "", text)
+    if not text.isascii():
+        text = re.sub(r"[^\S\t]", " ", text)  # some programs write blanks of fixed width
+    text = text.strip().replace("\N{MINUS SIGN}", "-")  # programs with some locales, such as Swedish, write this sign
+    text = re.sub(r"(^|[:=,;(\[] *)([-+]) +(?=[.0-9])", r"\1\2", text)  # a sign apart from its number, as in `A: - 3.5`
+    if re.fullmatch(_SIGNED_NUMBERS, text):
+        text = re.sub(r"(?<=[0-9])(?=[-+])", " ", text)
+    if re.fullmatch(f"(?:{_NAMED_NUMBER}){{2,}}", text):
+        named_numbers = re.findall(_NAMED_NUMBER, text)
+        if len(dict(named_numbers)) == len(named_numbers):  # not a header such as `ch-1, ch-2`
+            text = " ".join(f"{name}={number}" for name, number in named_numbers)
+    if '"' in text or "'" in text:
+        text = re.sub(_QUOTED_NUMBER, r"\2", text)
+    if text[:1] == ">":
+        return _teleplot_content(text)
+    if text[:1] == "$" and "*" in text:
+        return _sentence_content(text)
+    text = re.sub(r"\*[0-9A-Fa-f]{2}$", "", text)  # a checksum like that of a sentence, whose rule is not known
+    return "" if text[:1] == "#" else text
+
+
+def _teleplot_content(text: str) -> str:
+    """Return the latest value of a line of Teleplot; empty for a text or a point in a plane.
+
+    A Teleplot line has the form `>name:time:value;time:value§unit|flags`. The result has the form
+    `t_ms:1000;"name":801.2§unit`. A line that only begins like one of Teleplot is returned as it is.
+    """
+    flags = text.rpartition("|")[2].split(",")
+    if "t" in flags or "xy" in flags:
+        return ""
+    teleplot = re.fullmatch(_TELEPLOT, text)
+    if teleplot is None:
+        return text
+    name, time, value = teleplot.groups()
+    named_time = f"t_ms:{time};" if time else ""
+    return f'{named_time}"{name}":{value}'
+
+
+def _sentence_content(text: str) -> str:
+    """Return a sentence in the style of NMEA 0183, such as `$NAME,1.5,2.5*3A`, without its checksum.
+
+    The checksum is the exclusive or of all bytes between `$` and `*`, as two hexadecimal digits.
+
+    Raises:
+        ValueError: If the checksum is wrong.
+    """
+    content, _, checksum = text.partition("*")
+    if len(checksum) != 2 or int(checksum, 16) != reduce(xor, content[1:].encode(), 0):
+        raise ValueError(f"expected the checksum of the sentence, got {text[-100:]!r}")
+    return content
