@@ -81,6 +81,7 @@ class Script:
 STEADY = WatchResult(Phase.taken, press=SteadyPress(np.full(4, 500.0), 0.7))
 TARED = WatchResult(Phase.waiting)
 HELD = WatchResult(Phase.settling)
+INVERTED = WatchResult(Phase.taken, press=SteadyPress(np.full(4, -500.0), 0.7, ("negative", "gap")))
 
 
 def refused(reason):
@@ -124,6 +125,7 @@ FIRST = (0.0, 0.0, 1.0)
         ([STEADY, "u", STEADY, "", "u", "q"], [], "press 1 is removed"),
         (["what?", STEADY, "1 2", "1 2 3", "q"], [(1.0, 2.0, 3.0)], "got '1 2'"),
         (["", STEADY, "q"], [], "press first"),
+        ([INVERTED, "q"], [], "D -500.0 pC [negative, gap]"),
     ],
 )
 def test_what_is_typed_is_done(events, taken, message, capsys):

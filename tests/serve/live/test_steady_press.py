@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from isocharge.serve import Frame
-from isocharge.serve.flags import RECONNECTED, RESTART, SATURATED, TARE
+from isocharge.serve.flags import NEGATIVE, RECONNECTED, RESTART, SATURATED, TARE
 from isocharge.serve.live.steady_press import Phase, PressWatch
 
 RATE_HZ = 200.0
@@ -78,12 +78,13 @@ def phases_of(results):
 
 
 def test_press_is_taken_once_and_the_next_press_after_a_lift():
-    results = watch_presses(rest(1), held(2), rest(1), held(2, press=PRESS / 2), rest(1))
+    results = watch_presses(rest(1), held(2), rest(1), held(2, press=PRESS / 2), rest(1), flags={250: (NEGATIVE,)})
     assert phases_of(results) == "waiting settling taken lift waiting settling taken lift waiting"
     for press, clean_pC in zip(taken_presses(results), (PRESS, PRESS / 2), strict=True):
         standard_error_pC = noise_std(clean_pC) * math.sqrt(1 / 100 + 1 / 50)  # of 100 frames, and of 50 frames at rest
         assert (np.abs(press.charge_pC - clean_pC) < 4 * standard_error_pC).all()
         assert press.held_s < 0.8
+    assert [press.flags for press in taken_presses(results)] == [(NEGATIVE,), ()]
 
 
 def test_drift_before_the_touch_is_subtracted():

@@ -11,7 +11,7 @@ import pytest
 from tests.train.calibration.conftest import FEW_VALUES, rig
 from tests.train.short_training import short_training
 
-from isocharge.common.errors import ModelError, PressError
+from isocharge.common.errors import ModelError, OutputError, PressError
 from isocharge.serve import Predictor, read_presses
 from isocharge.simulate import NoiseModel, load_sensor
 from isocharge.train import CalibrationProblem, calibrate
@@ -118,6 +118,8 @@ def test_unsuitable_folders_are_refused_and_left_as_they_are(written, problem, t
     other = CalibrationProblem(load_sensor("three-25um-biaxial"), problem.probe)
     with pytest.raises(ModelError):
         check_calibration_folder(written.path, other.electrodes)
+    with pytest.raises(OutputError, match=r"notes\.txt is not a writable folder"):
+        check_calibration_folder(tmp_path / "mine" / "notes.txt" / "film", problem.electrodes)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]
     with pytest.raises(PressError, match=r"calibration\.json"):
         read_earlier(tmp_path / "mine", problem)

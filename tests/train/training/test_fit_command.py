@@ -1,10 +1,14 @@
-"""The command `train fit` with a dataset: what it imports, and how it warns of presses without forces."""
+"""The command `train fit`: what it imports, how it warns of presses without forces, and how no trained model is lost."""
 
+import re
 import sys
+import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from isocharge.cli.train import fit as fit_command
 from isocharge.serve import load_model
 from processes import finished
 
@@ -52,3 +56,33 @@ def test_each_caution_about_a_file_of_presses_is_printed_once(tmp_path, command)
     assert code == 0, err
     assert "no press has a known force" in err
     assert err.count("caution: ") == 1
+
+
+OBSTACLES = {"m": "a file", "m/config.pbtxt": "a model of another sensor", "m/1": "the same version"}
+
+
+@pytest.mark.parametrize("obstacle", OBSTACLES, ids=OBSTACLES.values())
+def test_a_training_whose_release_is_refused_costs_no_model(
+    obstacle, dataset_folder, fitted, tmp_path, command, monkeypatch
+):
+    def train_slowly(*_):
+        path = tmp_path / obstacle
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("written by another process")
+        return fitted
+
+    monkeypatch.setattr(fit_command, "fit", train_slowly)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    code, _, err = command("train", "fit", dataset_folder, "-o", tmp_path / "m")
+    assert code != 0
+    kept_folder = Path(re.search(r"The trained model is kept in (\S+)", err)[1])
+    assert kept_folder.parts[-2:] == ("m", "1")
+    assert load_model(kept_folder).metadata.name == "m"
+    assert (tmp_path / obstacle).read_text() == "written by another process"
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_the_training(dataset_folder, tmp_path, refused, monkeypatch):
+    monkeypatch.setattr(fit_command, "fit", pytest.fail)
+    (tmp_path / "models").write_text("a file")
+    output = tmp_path / "models" / "m"
+    refused("train", "fit", dataset_folder, "-o", output, message="models is not a writable folder", code=1)

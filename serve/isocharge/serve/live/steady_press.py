@@ -54,10 +54,12 @@ class SteadyPress(NamedTuple):
     Attributes:
         charge_pC: Mean touch charges over the window, shape (n_electrode,), pC.
         held_s: Time from the touch to the end of the window, s.
+        flags: Flags of `isocharge.serve.flags` that at least one frame in the window has.
     """
 
     charge_pC: Array
     held_s: float
+    flags: tuple[str, ...] = ()
 
 
 class WatchResult(NamedTuple):
@@ -246,7 +248,8 @@ class PressWatch:
 
         reason = self._unsteady(mean_pC, scatter_pC, slope_pC_per_s, float(times_s[-1] - times_s[0]), noise_pC)
         if not reason:
-            return SteadyPress(mean_pC, self._end_s - self._begin_s)
+            flags = dict.fromkeys(flag for frame in self._frames for flag in frame.flags)  # each flag once
+            return SteadyPress(mean_pC, self._end_s - self._begin_s, tuple(flags))
         if scatter_pC.max() <= self._min_scatter_pC:
             self._min_scatter_pC = float(scatter_pC.max())
             self._reason = reason

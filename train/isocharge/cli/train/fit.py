@@ -4,6 +4,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Annotated
 
 import typer
@@ -19,12 +20,13 @@ from isocharge.cli.shared.forward_maps import (
 from isocharge.cli.shared.options import ForceStdOption, JsonOption, PositionStdOption, RadiusOption
 from isocharge.cli.shared.terminal import say, show_result, shown_progress, this_command
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.common.errors import InputError
+from isocharge.common.errors import InputError, ModelError, OutputError, OutputExists
 from isocharge.serve import read_presses
 from isocharge.serve.model.model_folder import check_target
 from isocharge.simulate import Sensor, load_sensor, parse_probe, read_dataset
 from isocharge.train import FitConfig, Fitted, TrainingConfig, TrainingData, fit, fit_presses, load_config, release
 from isocharge.train.data.channel_noise import misfit_noise
+from isocharge.train.model_release.release import Release
 
 
 def fit_command(
@@ -124,7 +126,7 @@ def fit_command(
     check_target(output, version, electrodes)
     with shown_progress():
         fitted = train(fit_config)
-        released = release(fitted, output, version=version, command=this_command())
+        released = _release(fitted, output, version)
     show_result({"folder": str(released.folder), "errors": dict(released.metadata.errors)}, json=json)
 
 
@@ -162,6 +164,28 @@ def _refuse_settings(path: Path | None, config: FitConfig) -> None:
                 f"{path}: training.{setting} has no effect on measured presses, whose noise is estimated, and whose "
                 "errors are measured by cross-validation; leave it out"
             )
+
+
+def _release(fitted: Fitted, model_folder: Path, version: int) -> Release:
+    """Write a trained network as a version of a model.
+
+    If the folder of the model refuses the version, for example because the disk is full or because another process has
+    written this version during the training, the version is written to a new temporary folder.
+
+    Args:
+        fitted: The network.
+        model_folder: Folder of the model.
+        version: Number of the version.
+
+    Raises:
+        IsochargeError: If the folder refuses the version. The message names the temporary folder.
+    """
+    write = partial(release, fitted, version=version, command=this_command())
+    try:
+        return write(model_folder)
+    except (OutputExists, OutputError, ModelError) as error:
+        kept = write(Path(mkdtemp(prefix="isocharge-"), model_folder.resolve().name))
+        raise type(error)(f"{error}. The trained model is kept in {kept.folder}") from error
 
 
 def _fit_simulated_presses(sensor: Sensor, notations: Sequence[str], radius: str, config: FitConfig) -> Fitted:

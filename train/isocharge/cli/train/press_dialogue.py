@@ -159,7 +159,8 @@ class Dialogue:
         """Print the charges of a steady press."""
         electrodes = self._session.presses.electrodes
         charges = ", ".join(f"{name} {charge:.1f}" for name, charge in zip(electrodes, press.charge_pC, strict=True))
-        say(f"   steady after {press.held_s:.1f} s: {charges} pC")
+        flags = f" [{', '.join(press.flags)}]" if press.flags else ""
+        say(f"   steady after {press.held_s:.1f} s: {charges} pC{flags}")
 
     def guide_person(self) -> None:
         """Propose and record presses until the film is known accurately enough, or the person quits."""

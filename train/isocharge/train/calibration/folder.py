@@ -211,7 +211,7 @@ CARD = "card.md"
 
 
 def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
-    """Raise ModelError if the name or the content of a folder makes it unsuitable for a calibration.
+    """Check that a calibration can be written to a folder.
 
     A calibration can be written to a new folder, to an empty folder, or to a folder of earlier calibrations. Hidden
     files in the folder are ignored.
@@ -219,6 +219,11 @@ def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
     Args:
         folder: The folder, which need not exist.
         electrodes: Names of the electrodes of the calibrated sensor.
+
+    Raises:
+        ModelError: If the name or the content of the folder makes it unsuitable for a calibration.
+        OutputExists: If a file has the folder's name.
+        OutputError: If the folder cannot be written.
     """
     versions = version_folders(folder)
     next_version = max(versions, default=0) + 1
