@@ -253,6 +253,7 @@ def test_focused_distance_is_a_mean_with_smaller_weights_for_long_targets(monkey
     [
         ("[trainig]\nsteps = 1\n", "unknown key 'trainig'"),
         ("[training]\nsteps = 0\n", "training.steps: expected a whole number from 1 to 10000000, got 0"),
+        ("[training]\nhold_out = 1e-9\n", "training.hold_out: expected a number from 0.01 to 0.6, got 1e-09"),
         ("[training]\nlearning_rate = 2\n", "training.learning_rate: expected a number between 0 and 1, got 2"),
         ("[network]\nhidden = []\n", "network.hidden: expected widths"),
         ("[network]\nhidden = [64]\nmisfit_hidden = [64, 64]\n", "as many layers as network.hidden"),

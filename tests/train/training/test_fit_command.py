@@ -1,4 +1,4 @@
-"""The command `train fit`: what it imports, how it warns of presses without forces, and how no trained model is lost."""
+"""The command `train fit`: imports, a warning of presses without forces, and a release that is refused."""
 
 import re
 import sys

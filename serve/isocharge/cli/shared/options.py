@@ -112,7 +112,9 @@ MapRadiusOption = Annotated[
 PositionStdOption = Annotated[
     float,
     typer.Option(
-        "--position-std", metavar="MM", help="Standard deviation of known x and y, mm, where the file has none."
+        "--position-std",
+        metavar="MM",
+        help="Standard deviation of known x and y, mm, of presses for which the file states no position_std_mm.",
     ),
 ]
 
@@ -120,7 +122,8 @@ ForceStdOption = Annotated[
     float,
     typer.Option(
         metavar="SHARE",
-        help="Standard deviation of known forces, a share of the force in N, where the file has none.",
+        help="Standard deviation of known forces, a share of the force, of presses for which the file states no "
+        "force_std.",
     ),
 ]
 

@@ -123,7 +123,7 @@ class TrainingConfig(Settings, frozen=True):
     misfit_charges: Annotated[int, Meta(ge=1_000, le=10_000_000)] | None = None
     batch: Annotated[int, Meta(ge=1, le=1_000_000)] = 512
     learning_rate: Annotated[float, Meta(gt=0.0, lt=1.0, description="a number between 0 and 1")] = 2e-2
-    hold_out: Annotated[float, Meta(gt=0.0, lt=0.6, description="a number between 0 and 0.6")] = 0.1
+    hold_out: Annotated[float, Meta(ge=0.01, lt=0.6, description="a number from 0.01 to 0.6")] = 0.1
     noise: Annotated[str | NoiseModel, Meta(description="a text")] = "reference"
     seed: Annotated[int, Meta(ge=0, lt=2**31)] = 0
     threads: Annotated[int, Meta(ge=1, le=64)] = 1

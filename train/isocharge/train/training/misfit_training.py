@@ -109,7 +109,7 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
     targets = compress_length(torch.tensor(residuals)).float()
 
     def loss(random: torch.Generator) -> Tensor:
-        """Return the weighted mean of the squared distances for a random batch of the examples."""
+        """Return the mean of the weighted squared distances for a random batch of the examples."""
         rows = torch.randint(len(inputs), (config.batch,), generator=random)
         return focused_squared_distance(network.misfit_vector(inputs[rows]), targets[rows])
 
@@ -118,7 +118,7 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
 
 
 def focused_squared_distance(vector: Tensor, target: Tensor) -> Tensor:
-    """Compute a weighted mean of the squared distances between vectors, with small weights for long targets.
+    """Compute the mean of the weighted squared distances between vectors, with small weights for long targets.
 
     The weight is 1 / (1 + |target|^2 / FOCUS_LENGTH^2). With these weights, the network becomes most accurate for
     misfits up to the threshold of the flag `misfit`. The exact value of a misfit far above this threshold matters
