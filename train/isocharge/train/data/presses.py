@@ -239,16 +239,16 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
             charge of an electrode never varies.
     """
     presses = LabelledPresses.of(dataset.samples)
-    row = presses.contact[:, 2].argmin()
-    if presses.contact[row, 2] <= 0.0:
-        raise DatasetError(f"sample {row}: expected a positive force, got {presses.contact[row, 2]:g} N")
-
     n_position = place_count(presses.contact)
     if len(presses) < fewest or n_position < FEWEST_PLACES:
         raise DatasetError(
             f"expected at least {fewest} presses at {FEWEST_PLACES} positions, got {len(presses)} at "
             f"{n_position}; sweep or measure more (of a described film, `isocharge train calibrate` needs only a few)"
         )
+
+    row = presses.contact[:, 2].argmin()
+    if presses.contact[row, 2] <= 0.0:
+        raise DatasetError(f"sample {row}: expected a positive force, got {presses.contact[row, 2]:g} N")
 
     n_electrode = presses.charge.shape[1]
     if n_electrode < 3:
