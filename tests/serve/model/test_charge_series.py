@@ -63,8 +63,8 @@ def test_charges_at_any_state_are_those_of_numpy_polynomials(is_signed):
     if is_signed:
         expected = value * np.exp(np.polynomial.chebyshev.chebval(unit_log_force, series.log_size))[:, None]
     expected += OFFSET_pC
-    np.testing.assert_allclose(series.changes(CONTACTS, state).charge_pC, expected, rtol=1e-10)
-    calibrated_pC = series.changes(CONTACTS, np.zeros(3)).charge_pC
+    np.testing.assert_allclose(series.in_state(CONTACTS, state).charge_pC, expected, rtol=1e-10)
+    calibrated_pC = series.in_state(CONTACTS, np.zeros(3)).charge_pC
     np.testing.assert_allclose(series.charges(CONTACTS), calibrated_pC, rtol=1e-12)
 
 
@@ -74,12 +74,12 @@ def test_derivatives_are_finite_differences_also_outside_the_range_of_forces(is_
     contact = CONTACTS.copy()
     contact[:3, 2] = [1e-3, 0.02, 7.0]
     state = np.array([-0.2, 0.5, 1.0])
-    changes = series.changes(contact, state)
+    changes = series.in_state(contact, state)
     step = 1e-6
     for number, change in enumerate(step * np.eye(3)):
-        up, down = (series.changes(contact, state + sign * change).charge_pC for sign in (1.0, -1.0))
+        up, down = (series.in_state(contact, state + sign * change).charge_pC for sign in (1.0, -1.0))
         np.testing.assert_allclose(changes.by_state[:, :, number], (up - down) / (2.0 * step), rtol=1e-6, atol=1e-6)
-    expected = differences(lambda stepped: series.changes(stepped, state).charge_pC, contact, (step, step, step))
+    expected = differences(lambda stepped: series.in_state(stepped, state).charge_pC, contact, (step, step, step))
     np.testing.assert_allclose(changes.by_contact[:, :, 2], expected[:, :, 2], rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(changes.by_contact[3:], expected[3:], rtol=1e-5, atol=1e-5)
 
@@ -100,7 +100,7 @@ def test_file_is_read_as_it_was_written(is_signed):
     written = random_series(is_signed=is_signed)
     read = charge_map_from_bytes(charge_map_bytes(written), ELECTRODES)
     state = np.array([0.1, 1.0, -1.0])
-    np.testing.assert_array_equal(read.changes(CONTACTS, state).charge_pC, written.changes(CONTACTS, state).charge_pC)
+    np.testing.assert_array_equal(read.in_state(CONTACTS, state).charge_pC, written.in_state(CONTACTS, state).charge_pC)
     for name in ("domain", "electrodes", "is_folded", "charge_std", "offset_pC", "pretension_MPa", "tension_std_MPa"):
         assert getattr(read, name) == getattr(written, name)
 

@@ -86,7 +86,7 @@ def model(tmp_path, series):
 def touches(series, state, rng, count):
     """Contacts and charges of a changed film."""
     contact = draw_contacts(rng, count, 6.5, (0.1, 1.5))
-    return contact, series.changes(contact, np.array(state)).charge_pC
+    return contact, series.in_state(contact, np.array(state)).charge_pC
 
 
 def new_follower(model):

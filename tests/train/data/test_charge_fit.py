@@ -208,6 +208,6 @@ def test_series_of_a_film_at_several_pretensions_agrees_with_its_closed_form():
 
     node_charge = np.stack([charges(tension_MPa) for tension_MPa in node_MPa], axis=1)
     series = fit_film_series(DOMAIN, ("A", "B", "C"), contact, node_charge, node_MPa)
-    np.testing.assert_allclose(series.changes(contact, np.array([0.1])).charge_pC, charges(0.1), rtol=1e-4)
+    np.testing.assert_allclose(series.in_state(contact, np.array([0.1])).charge_pC, charges(0.1), rtol=1e-4)
     np.testing.assert_allclose(series.charges(contact), charges(0.0), rtol=1e-4)
     assert series.charge_std < 1e-4

@@ -89,7 +89,7 @@ def virtual_command(
         played_sensor, footprint = virtual_film(played_sensor, footprint, film)
     if scripted_presses is not None and scripted_presses.touching.any():  # the map must contain the presses
         x_mm, y_mm, force_N = scripted_presses.contact.T
-        radius = max(DEFAULT_RADIUS, ROUNDING_MARGIN * float(np.nanmax(np.hypot(x_mm, y_mm))))
+        radius = max(radius, ROUNDING_MARGIN * float(np.nanmax(np.hypot(x_mm, y_mm))))
         force_max = max(force_max, ROUNDING_MARGIN * float(force_N.max()))
     with shown_progress(), solving_executor(played_sensor.film) as executor:
         forward_map = ForwardMap.build(

@@ -34,8 +34,8 @@ class AutoParser(Parser):
 
         Until the format is recognised, the data are passed to the parsers of all formats. The first parser that finds a
         frame receives all further data, and the other parsers are dropped. The description of the format and the moduli
-        of the counter and the clock are copied from the parser in each call, because the parser may determine them only
-        after many frames.
+        of the counter and the clock are copied from the parser together with each frame, because the parser may
+        determine them only after many frames.
         """
         for parser in self.candidates:
             frames = parser.feed(data)

@@ -231,7 +231,7 @@ class ChargeSeries:
         charge_pC, _, by_contact = self._charges(values, nearest, excess)
         return charge_pC + self.offset_pC, by_contact
 
-    def changes(self, contact: Array, state: Array) -> ModelValues:
+    def in_state(self, contact: Array, state: Array) -> ModelValues:
         """Compute the charges of contacts for any state of the film, and the derivatives of the charges.
 
         Args:
@@ -245,19 +245,21 @@ class ChargeSeries:
         n_contact = len(contact)
         n_electrode = len(self.electrodes)
         nearest, excess = self._nearest_in_domain(contact)
-        node_values = self._node_series.values_and_derivatives(nearest, excess)
-        node_values = node_values.reshape(n_contact, 4, -1, n_electrode)
         states = np.broadcast_to(state, (n_contact, 1 + self.direction_count))
-        weights, weight_slopes = interpolation_weights(self.node_MPa, states[:, 0])  # shape (n, n_node)
+        pretension, directions = states[:, 0], states[:, 1:]
 
-        # The value v that the series represent, with its derivatives with respect to the contact; then the derivatives
-        # of v with respect to the state
-        value = np.einsum("nk,nske->nse", weights, node_values)  # shape (n, 4, n_electrode)
-        value_by_state = np.einsum("nk,nke->ne", weight_slopes, node_values[:, 0])[:, :, None]
-        direction_values = self._direction_series.values_and_derivatives(nearest, excess)
-        direction_values = direction_values.reshape(n_contact, 4, self.direction_count, n_electrode)
-        value = value + np.einsum("nk,nske->nse", states[:, 1:], direction_values)
-        value_by_state = np.concatenate([value_by_state, direction_values[:, 0].swapaxes(1, 2)], axis=2)
+        # Evaluate v at the nodes, and the change of v by each direction. An axis of length 4 contains the value and its
+        # derivatives with respect to the three coordinates of the contact.
+        at_nodes = self._node_series.values_and_derivatives(nearest, excess).reshape(n_contact, 4, -1, n_electrode)
+        by_directions = self._direction_series.values_and_derivatives(nearest, excess)
+        by_directions = by_directions.reshape(n_contact, 4, self.direction_count, n_electrode)
+
+        # Interpolate between the nodes (index k), and add the changes by the directions (index d). The other indices
+        # are the press (n), the value or one of its derivatives (s) and the electrode (e).
+        weights, weight_slopes = interpolation_weights(self.node_MPa, pretension)  # shape (n, n_node)
+        value = np.einsum("nk,nske->nse", weights, at_nodes) + np.einsum("nd,nsde->nse", directions, by_directions)
+        by_pretension = np.einsum("nk,nke->ne", weight_slopes, at_nodes[:, 0])
+        value_by_state = np.stack([by_pretension, *by_directions[:, 0].swapaxes(0, 1)], axis=2)
 
         charge_pC, charge_per_value, by_contact = self._charges(value, nearest, excess)
         return ModelValues(charge_pC + self.offset_pC, by_contact, charge_per_value[:, :, None] * value_by_state)

@@ -202,10 +202,11 @@ class Outputs:
         self._stack.close()
 
     def _close_or_discard(self, target: str, output: Output, queue: WriterQueue[PredictionRecord] | None) -> None:
-        """Close an output, or discard it if a replay was stopped or the output has failed, because it is incomplete.
+        """Close an output, or discard it.
 
-        An error while an output is discarded is written to the log, because the error that has ended the command is
-        more important.
+        An incomplete output is discarded: a replay was stopped, another output could not be opened, or this output has
+        failed. An error while an output is discarded is written to the log, because the error that has ended the
+        command is more important.
 
         Raises:
             Exception: The error of the output, if it cannot be closed.
@@ -215,7 +216,8 @@ class Outputs:
                 self._close_queue(target, queue)
                 if queue.is_stuck:  # the thread is still in `write` of the output, which therefore cannot be closed
                     return
-            if self._is_discarded or target not in self._writers:
+            has_failed = target not in self._writers
+            if self._is_discarded or has_failed:
                 discard(output)
                 if self._is_discarded and self._context.is_live and isinstance(output, FileOutput):
                     output.path.unlink()  # another output could not be opened, so the file has no records

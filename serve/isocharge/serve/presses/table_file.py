@@ -194,10 +194,7 @@ class CsvTable:
                         f"{shown(cell)}{advice}"
                     )
                 numbers.append(number)
-            if self._mark and not self._is_mark_certain:  # a fraction in another column, such as 0.5, is no date
-                texts = [cell.strip() for cell in cells]
-                fractions = [text for text in texts if text.startswith(f"0{self._mark}")]
-                self._is_mark_certain = any(map(_NUMBER.fullmatch, fractions))
+            self._is_mark_certain = self._is_mark_certain or self._has_fraction(cells)
         if self._mark and not self._is_mark_certain:
             raise self.error(
                 f": every number with the mark {self._mark!r} may have a decimal mark or a separator of thousands; "
@@ -206,6 +203,11 @@ class CsvTable:
         rows = np.asarray(numbers, dtype=np.float64).reshape(len(line_numbers), len(column_indices))
         values = dict(zip(column_indices, rows.T, strict=True))
         return NumberColumns(values, line_numbers)
+
+    def _has_fraction(self, cells: list[str]) -> bool:
+        """Return whether a cell of any column has a fraction such as 0.5, whose mark does not separate thousands."""
+        texts = [cell.strip().lstrip("+-") for cell in cells]
+        return any(text.startswith(f"0{self._mark}") and _NUMBER.fullmatch(text) for text in texts if self._mark)
 
     def _number(self, text: str) -> float | None:
         """Return the number in a cell: NaN for an empty cell, and None for a cell without a finite number.
@@ -369,7 +371,11 @@ def _find_header(lines: list[str], names: Collection[str]) -> tuple[int, str]:
 
 
 def _spellings(name: str) -> set[str]:
-    """Return the letters and digits of a name in lower case, and the same with the quantity instead of a unit."""
+    """Return spellings of the name of a column, two of which are equal if the names are similar.
+
+    They are the letters and digits of the name in lower case, and the same with a quantity instead of a unit. For
+    example, `x_mm` gives `xmm` and `xlength`, and `X (cm)` gives `xcm` and `xlength`.
+    """
     with_quantity = name.casefold()
     for quantity, unit in _UNITS_AT_END.items():
         with_quantity = re.sub(rf"[\W_]{unit}[\W_]*$", quantity, with_quantity)

@@ -360,7 +360,7 @@ class FilmFollower(Stage):
             contacts: Contacts (x, y, ln F), shape (n, 3), mm and the logarithm of N.
             state: State, shape (n_state,).
         """
-        film = self._series.changes(contacts_of(contacts), state[self._film])
+        film = self._series.in_state(contacts_of(contacts), state[self._film])
         gains = np.exp(state[self._gains])
         film_charge_pC = film.charge_pC * gains
         by_state = np.zeros((*film_charge_pC.shape, state.size))

@@ -118,7 +118,7 @@ def solve_newton(
         if relative_residual <= tolerance:
             return iterate.result(iteration, "converged", f"converged in {iteration} steps")
         if iteration == MAX_ITERATIONS:
-            return iterate.result(iteration, "failed", f"no progress any more after {iteration} steps")
+            return iterate.result(iteration, "failed", f"not converged after {iteration} steps")
 
         # Compute the Newton step.
         stabilising_tension = _stabilising_tension(elastic, relative_residual)

@@ -142,6 +142,8 @@ def press_command(
     options = ["--sensor", sensor, "--probe", probe, "--radius", f"{radius:g}"]
     if earlier is not None:
         options += ["--from", str(earlier)]
+    if stress_limit != DEFAULT_STRESS_LIMIT:
+        options += ["--stress-limit", f"{stress_limit:g}"]
     say(f"To make a model: isocharge train calibrate {shlex.join([str(output), *options])} -o my-film")
 
 

@@ -233,7 +233,7 @@ def _drawn_charges(series: ChargeSeries, rng: np.random.Generator, contact: Arra
     for chunk in np.array_split(contact, len(contact) // CHUNK_SIZE + 1):
         state = rng.standard_normal((len(chunk), 1 + series.direction_count))
         state[:, 0] = 0.0  # the pretension does not change
-        drawn.append(series.changes(chunk, state).charge_pC)
+        drawn.append(series.in_state(chunk, state).charge_pC)
     return np.concatenate(drawn)
 
 
