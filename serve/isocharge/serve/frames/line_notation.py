@@ -7,7 +7,8 @@ import re
 from functools import reduce
 from operator import xor
 
-_QUOTED_NUMBER = r"""(?<!\w)(["'])([-+]?\.?[0-9][0-9.,]*(?:[eE][-+]?[0-9]+)?)\1(?!\s*[:=])"""
+_QUOTED_NUMBER = r"""(?<!\w)(["'])([-+]?\.?[0-9][0-9.,]*(?:[eE][-+]?[0-9]+)?(?:\s?[pnuµm]?[CV])?)\1(?!\s*[:=])"""
+"""Regular expression of a number in quotes, with or without its unit."""
 
 _COMMANDS = r"(?:\x1b\[[0-9;?]*[A-Za-z])+"
 
