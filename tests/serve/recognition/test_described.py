@@ -161,15 +161,19 @@ def test_checksum_covers_at_least_two_bytes():
     assert next(find_checks(np.array(rows, np.uint8))).name == "sum-16"
 
 
+PATTERN = np.random.default_rng(0).bytes(98)
+
+
 @pytest.mark.parametrize(
     "data",
     [
         b"",
         b"\xaa" * 1000,
         b"\xaa\x55\x01\x02\x03\x04" * 100,
+        (PATTERN + PATTERN[::-1] + PATTERN[:54]) * 260,
         *(np.random.default_rng(seed).bytes(20_000) for seed in (0, 1)),
     ],
-    ids=["nothing", "a byte", "constant frames", "noise", "other noise"],
+    ids=["nothing", "a byte", "constant frames", "constant frames with many repeated pairs", "noise", "other noise"],
 )
 def test_noise_and_constant_bytes_are_not_recognised(data):
     assert described_frames_section([data], 2.0) is None

@@ -166,15 +166,16 @@ def _most_common_length(frames: Sequence[bytes]) -> tuple[int, int]:
     return Counter(map(len, frames)).most_common(1)[0]
 
 
-def _synchronised_frames(data: bytes) -> Iterator[FrameDivision]:
+def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDivision]:
     """Yield divisions of a stream into frames that begin at a repeated byte or a repeated pair of bytes.
 
     If a byte or a pair of bytes is the same in every frame, it repeats at a distance of one frame length. Frames are
     therefore assumed to begin at every repetition of a byte or pair. For each frame length, the byte or pair whose
-    frames would cover the largest share of the stream is chosen.
+    frames would cover the largest share of the stream is chosen. The lengths that cover the largest shares are yielded.
 
     Args:
         data: Bytes of the stream.
+        max_lengths: Largest number of divisions.
     """
     # Positions of each byte and each pair of bytes after which it occurs again, by the distance to the next occurrence
     starts_by_distance: defaultdict[tuple[int, bytes, int], list[int]] = defaultdict(list)
@@ -195,8 +196,10 @@ def _synchronised_frames(data: bytes) -> Iterator[FrameDivision]:
         if is_frequent and is_best:
             best_starts[length] = starts
 
-    for length, starts in best_starts.items():
-        yield FrameDivision(SYNC, np.frombuffer(data, np.uint8), np.array(starts), length)
+    # The shares are rounded to 0.1, so that of two lengths with about equal shares the shorter length comes first.
+    shares = {length: round(len(starts) * length / len(data), 1) for length, starts in best_starts.items()}
+    for length in sorted(shares, key=lambda length: (-shares[length], length))[:max_lengths]:
+        yield FrameDivision(SYNC, np.frombuffer(data, np.uint8), np.array(best_starts[length]), length)
 
 
 ORDERS: tuple[ByteOrder, ...] = ("little", "big")
