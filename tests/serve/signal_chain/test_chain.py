@@ -48,11 +48,13 @@ def test_tare_gives_up_with_the_reason(charges_pC, message):
         run(charges_pC, tare={"patience": 250})
 
 
-def test_second_tare_never_gives_up():
+@pytest.mark.parametrize("patience", [50, 0])
+def test_second_tare_and_search_without_limit_never_give_up(patience):
     """A finger that rests on the film does not stop a live stream."""
-    chain = StageRunner(tare={"frames": 20, "patience": 50})
-    chain.run(rest(60), RATE_HZ)
-    chain.reset_tare()
+    chain = StageRunner(tare={"frames": 20, "patience": patience})
+    if patience > 0:
+        chain.run(rest(60), RATE_HZ)
+        chain.reset_tare()
     readings = chain.run(np.concatenate([rest(200, std_pC=100.0), rest(30)]), RATE_HZ)
     assert [reading.tare_pC is not None for reading in readings].index(True) == 220
 

@@ -230,6 +230,19 @@ def test_film_that_is_lost_again_keeps_the_state_of_the_latest_touches(series, m
     assert follower.film.pretension_MPa == pytest.approx(1.4, abs=0.1)
 
 
+def test_film_whose_pretension_is_at_the_end_of_the_charge_map_is_lost(series, tmp_path):
+    """The largest change of the map explains the touches well enough, but the real change may be larger."""
+    rng = np.random.default_rng(5)
+    middle, highest = series.coefficients[1:]
+    nodes = np.array([-0.3, 0.0, 0.3])
+    narrow = replace(
+        series, node_MPa=nodes, coefficients=np.stack([middle + node / 0.7 * (highest - middle) for node in nodes])
+    )
+    _, charge = touches(series, [0.32, 0.0, 0.0], rng, 40)
+    _, was_lost = followed(model_in(tmp_path, narrow), charge, rng)
+    assert any(was_lost)
+
+
 def test_models_that_cannot_be_followed_are_refused(series, tmp_path):
     single = replace(series, coefficients=series.coefficients[:1], node_MPa=np.zeros(1))
     with pytest.raises(ModelError, match="calibrate"):
