@@ -150,6 +150,14 @@ def test_channel_of_a_device_file_that_the_board_does_not_send_is_reported():
     assert report.missing[0].startswith('board.toml: [channels] B = "4": no channel is called that; the frames have 1,')
 
 
+@pytest.mark.parametrize("electrodes", [(), FOUR[:3], FOUR[:2]])
+def test_channels_of_a_board_that_sends_the_same_values_all_the_time_are_proposed_in_their_order(electrodes):
+    gain = {"pC_per_unit": dict.fromkeys(electrodes or FOUR[:3], 0.5)}
+    report = examined(lambda _: b"100,200,300\n", electrodes=electrodes, gain=gain)
+    assert report.device["channels"] == dict(zip(electrodes or FOUR[:3], "123", strict=False))
+    assert "channel 1 is dead" in missing(report)
+
+
 def test_gain_of_some_electrodes_is_refused():
     with pytest.raises(DeviceError, match=r"gain\.pC_per_unit: expected a number, or one for each"):
         examined(row, electrodes=FOUR, gain={"pC_per_unit": {"A": 0.5}})

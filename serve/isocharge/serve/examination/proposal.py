@@ -113,11 +113,12 @@ def _choose_channels(
     Returns:
         Position of the channel in the frame by the name of the electrode; empty if there are too few channels.
     """
-    # A channel is left out if its values do not vary, vary much less than the others, or are mostly not finite.
+    # A channel is left out if its values vary much less than the others, or are mostly not finite. If no channel varies,
+    # all channels are candidates.
     noise = estimate_noise(values)
     noise[2 * np.isfinite(values).sum(axis=0) <= len(values)] = 0.0
     usual_noise = np.median(noise[noise > 0.0]) if noise.any() else 0.0
-    candidates = np.flatnonzero(noise > min_noise_share * usual_noise).tolist()
+    candidates = np.flatnonzero(noise >= min_noise_share * usual_noise).tolist()
     if not electrodes:
         electrodes = tuple(ELECTRODES[: len(candidates)])  # A, B, C, ...
     try:
@@ -130,7 +131,8 @@ def _choose_channels(
     if len(candidates) < len(electrodes):
         return {}
     # Compare the groups of adjacent channels by their largest noise over the smallest one, in powers of ten.
-    groups = np.lib.stride_tricks.sliding_window_view(np.log10(noise[candidates]), len(electrodes))
+    log_noise = np.log10(np.maximum(noise[candidates], np.finfo(float).tiny))
+    groups = np.lib.stride_tricks.sliding_window_view(log_noise, len(electrodes))
     first = int(np.argmin(np.round(np.ptp(groups, axis=1))))
     return dict(zip(electrodes, candidates[first:], strict=False))
 
