@@ -148,6 +148,13 @@ def test_datagrams_contain_whole_frames():
     assert (parser.counts.malformed, parser.counts.bytes_dropped) == (2, 9)
 
 
+@pytest.mark.parametrize("framing", [{"sync": "A5", "length": 5}, {"framing": "cobs"}, {"framing": "datagram"}])
+def test_counter_and_clock_wrap_at_the_ends_of_their_fields(framing):
+    fields = [{"name": "seq", "type": "u8"}, {"name": "t_ms", "type": "u16"}, {"name": "A", "type": "i8"}]
+    parser = layout({"length": 4, "fields": fields} | framing).parser()
+    assert (parser.seq_modulus, parser.t_us_modulus) == (256, 65_536_000)
+
+
 def test_constant_bytes_are_checked():
     """The byte after the counter is the length of the frame. Frames of another kind differ in this byte."""
     text = """

@@ -197,6 +197,14 @@ def test_number_before_the_channels_is_a_counter_or_a_clock_with_a_usual_rate(nu
     assert recognised_fields(f"<{number_format}4h", numbers, VALUES, rate_Hz)[0] == pytest.approx(field)
 
 
+def test_binary_frames_are_recognised_after_lines_of_text():
+    """A board may print its settings when it starts."""
+    board = RandomBoard(5003)
+    table = recognise([b"gain 1.0, rate 200.0\n" * 12 + board.data], FRAMES / RATE_HZ)
+    assert table["format"] == "described"
+    assert board.is_read_by(table)
+
+
 @pytest.mark.parametrize(("size", "start", "step"), [(1, 0, 1), (2, 0x9000, 1), (4, 0x03F0_0000, 5000)])
 def test_constant_bytes_before_a_counter_or_clock_do_not_belong_to_it(size, start, step):
     """The number wraps or changes its high byte only after the doctor has listened."""
