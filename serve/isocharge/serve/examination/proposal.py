@@ -113,8 +113,8 @@ def _choose_channels(
     Returns:
         Position of the channel in the frame by the name of the electrode; empty if there are too few channels.
     """
-    # A channel is left out if its values vary much less than the others, or are mostly not finite. If no channel varies,
-    # all channels are candidates.
+    # A channel is left out if its values vary much less than the others, or are mostly not finite. If no channel
+    # varies, all channels are candidates.
     noise = estimate_noise(values)
     noise[2 * np.isfinite(values).sum(axis=0) <= len(values)] = 0.0
     usual_noise = np.median(noise[noise > 0.0]) if noise.any() else 0.0
