@@ -248,4 +248,5 @@ def test_warming_needs_four_electrodes(device):
     assert board.rule(ThermalRule).every_s == 0.1
     with pytest.raises(DeviceError, match=r"device\.toml: common_mode: expected four electrodes or more"):
         StageRunner(3, lambda _: None, device=board)
+    ReadingStream(ELECTRODES, board)  # estimates no warming, because it has no model
     assert device("[common_mode]\non = false\n").rule(ThermalRule) is None
