@@ -132,6 +132,18 @@ def test_silent_port_is_opened_again_after_growing_pauses(board, monkeypatch):
     assert pauses_s == [0.01, 0.02, 0.04, 0.05, 0.05, 0.05]
 
 
+def test_port_that_is_opened_again_waits_until_the_board_has_started_again(board, monkeypatch):
+    monkeypatch.setattr("isocharge.serve.port.source.START_UP_s", 0.05)
+    port = Port(board.url, silence_s=0.01)
+    with port:
+        board.write_whole(b"started")
+        next(iter(port))
+        with pytest.raises(PortLost, match=r"no data for 0\.01 s"):
+            next(iter(port))
+    with port, pytest.raises(PortLost, match=r"no data for 0\.05 s"):
+        next(iter(port))
+
+
 def test_closing_a_port_leaves_dtr_set(board):
     """With HUPCL, the system would clear DTR at the end, and the next opening would restart an Arduino."""
     with Port(board.url):
