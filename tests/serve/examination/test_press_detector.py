@@ -53,6 +53,13 @@ def test_noise_drift_and_warming_are_not_taken_for_a_touch(level, seconds):
         assert find_touch(np.round(20.0 * charges), times_s, unit_is_pC=False) is None
 
 
+def test_step_of_one_count_is_not_taken_for_a_touch():
+    """A converter with a coarse step shows no noise, but a slow drift changes its whole numbers."""
+    times_s = np.arange(1000) / RATE_HZ
+    counts = np.column_stack([300.0 + np.floor(times_s), np.full(1000, 7.0), 40.0 - np.floor(times_s)])
+    assert find_touch(counts, times_s, unit_is_pC=False) is None
+
+
 @pytest.mark.parametrize("level", ["reference", "bench"])
 @pytest.mark.parametrize("press", PRESSES)
 def test_press_of_0_05_N_is_found(level, press):
