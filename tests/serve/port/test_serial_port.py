@@ -146,9 +146,12 @@ def test_port_that_is_opened_again_waits_until_the_board_has_started_again(board
 
 def test_closing_a_port_leaves_dtr_set(board):
     """With HUPCL, the system would clear DTR at the end, and the next opening would restart an Arduino."""
+    reader = os.open(board.url, os.O_RDWR | os.O_NOCTTY)
+    attributes = termios.tcgetattr(reader)
+    attributes[2] |= termios.HUPCL
+    termios.tcsetattr(reader, termios.TCSANOW, attributes)
     with Port(board.url):
         pass
-    reader = os.open(board.url, os.O_RDWR | os.O_NOCTTY)
     control_modes = termios.tcgetattr(reader)[2]
     os.close(reader)
     assert not control_modes & termios.HUPCL
