@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import socket
+import threading
 import time
 from contextlib import closing
 
@@ -65,6 +66,26 @@ def test_close_waits_for_a_slow_consumer():
         for line in "abcd":
             queue.put(line)
     assert ("".join(written), queue.lost) == ("abcd", 0)
+
+
+def test_closed_queue_writes_no_further_item_when_the_consumer_continues(monkeypatch):
+    """All three items count as lost, because it is not known whether the consumer takes the first."""
+    monkeypatch.setattr("isocharge.serve.outputs.output.CLOSE_TIMEOUT_s", 0.05)
+    written = []
+    continues = threading.Event()
+
+    def write(line):
+        continues.wait(20)
+        written.append(line)
+
+    queue = WriterQueue(write)
+    for line in "abc":
+        queue.put(line)
+    queue.close()
+    assert (queue.is_stuck, queue.lost) == (True, 3)
+    continues.set()
+    queue._thread.join(20)
+    assert written == ["a"]
 
 
 def test_datagrams_without_a_receiver_are_dropped(record):
