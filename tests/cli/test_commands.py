@@ -22,6 +22,7 @@ from isocharge.cli.demo import live_film
 from isocharge.cli.demo.command import demo_command
 from isocharge.cli.demo.full_demo import run_demo
 from isocharge.cli.shared import terminal
+from isocharge.common.errors import InputError
 from isocharge.common.progress import report, track
 from isocharge.common.toml_text import to_toml
 from isocharge.serve import find_model, load_model
@@ -300,5 +301,7 @@ def test_live_demo_streams_a_virtual_sensor_to_its_model(monkeypatch):
     monkeypatch.setattr(live_film, "ForwardMap", SimpleNamespace(build=lambda sensor, *_, **__: sensor.name))
     monkeypatch.setattr(live_film, "virtual_sensor", lambda played: nullcontext(calls.append(played) or board))
     monkeypatch.setattr(live_film, "stream_command", lambda *words, **options: calls.append((words, options["live"])))
+    with pytest.raises(InputError, match="--live: expected PORT"):
+        demo_command(live="here")
     demo_command(live="8081")
     assert calls == [SENSOR, ((SENSOR, board.url), "8081")]

@@ -98,7 +98,7 @@ def check_commands(example, folder, printed):
         outputs = json.loads(printed[printed.index("{") :])["outputs"]
         assert outputs[0]["data"] == pytest.approx([3.0, -2.0, 1.0], abs=0.02)
     if "/session.json | head" in example:
-        assert '"sensor":"three-25um-biaxial"' in printed
+        assert '"model":"three-25um-biaxial/1"' in printed
     if "serve check" in example:
         assert f"```text\n{printed}```" in PAGES["measured_presses.md"]
     if "doctor" in example:

@@ -83,12 +83,12 @@ def read_needed(path: Path, error_class: type[IsochargeError], advice: str, max_
 
 
 def refuse_existing(path: Path) -> None:
-    """Check that neither a file nor a folder exists at the path of an output.
+    """Check that neither a file nor a folder nor a symbolic link exists at the path of an output.
 
     Raises:
-        OutputExists: If a file or a folder exists at the path.
+        OutputExists: If the path exists, also as a link to a path that does not exist.
     """
-    if path.exists():
+    if os.path.lexists(path):
         raise OutputExists(f"{path} is already there and is not overwritten; choose another output or remove it")
 
 

@@ -1,6 +1,7 @@
 """Demo of the live page with a virtual sensor and a released model."""
 
 from isocharge.cli.serve.stream import stream_command
+from isocharge.cli.shared.live_page import page_address
 from isocharge.cli.shared.terminal import say, shown_progress, until_stopped
 from isocharge.cli.shared.virtual_sensor import virtual_sensor
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE
@@ -19,6 +20,7 @@ def show_live_film(live: str) -> None:
     Raises:
         InputError: If the address has another form than PORT or HOST:PORT.
     """
+    page_address(live)  # a wrong address is refused before the film is solved
     with until_stopped():
         with shown_progress():
             forward_map = ForwardMap.build(

@@ -212,9 +212,9 @@ def stream_command(
 
     The tare (the charges at rest) is measured from the first 100 frames, which take 0.5 s at 200 Hz. Do not touch the
     film meanwhile. The signal SIGUSR1 starts a new tare. The signal SIGHUP loads the latest version of MODEL without
-    losing a frame. Ctrl-C stops the command. If the reader
-    of stdout is too slow for a sensor, the oldest lines are dropped, and the summary states their number. A recording
-    (--record) is complete even if lines are dropped. The exit code is 1 if no frames are recognised within --seconds.
+    losing a frame. Ctrl-C stops the command. If the reader of stdout is too slow for a sensor, the oldest lines are
+    dropped, and the summary states their number. A recording (--record) is complete even if lines are dropped. The exit
+    code is 1 if no frames are recognised within --seconds.
 
     Example: isocharge serve stream three-25um-biaxial --port /dev/ttyACM0 --seconds 10
     """

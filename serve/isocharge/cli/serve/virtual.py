@@ -83,6 +83,7 @@ def virtual_command(
     scripted_presses = settings.script(rate)
     played_sensor = load_sensor(sensor)
     footprint = parse_probe(probe)
+    amplifier = load_amplifier(noise)
     if film is not None:
         if not isinstance(footprint, Circle):
             raise InputError(f"--film: expected a --probe like circle:1.0, whose radius is drawn, too, got {probe!r}")
@@ -102,7 +103,7 @@ def virtual_command(
     player = VirtualSensor(
         film_charges(forward_map),
         scripted_presses or random_script(forward_map, rate, force_max, rest),
-        noise=measure_function(load_amplifier(noise), len(forward_map.electrodes), rate),
+        noise=measure_function(amplifier, len(forward_map.electrodes), rate),
         encode=encode_frame if frames == "binary" else partial(encode_text, notation=frames),
         faults=settings.faults,
         link=link,
