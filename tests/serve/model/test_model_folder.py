@@ -71,7 +71,7 @@ def wrong_arguments(film):
         ("other metadata", ModelError, "disagree on 'probes'"),
         ("other output", ModelError, "expected the tensors .*misfit"),
         ("golden too narrow", ChargeError, "'A', 'B', 'C'"),
-        ("no answer", ModelError, "golden.json: outputs.*: expected a finite number, got None"),
+        ("no answer", ModelError, "contact: expected finite outputs, got .*nan"),
         ("no golden", ModelError, "expected a list of lists, 1 or more"),
     ],
 )

@@ -300,6 +300,13 @@ def make_golden(
         ModelError: If an output is not finite.
     """
     outputs = run(session, charge_pC)
+    for name, rows in outputs.items():
+        is_bad = ~np.isfinite(rows).all(axis=1)
+        if is_bad.any():
+            raise ModelError(
+                f"the new model: {name}: expected finite outputs, got {rows[is_bad][0]} for the charges "
+                f"{charge_pC[is_bad][0]} pC"
+            )
     return Golden(
         sha256=sha256_of(onnx_model),
         tolerance=Tolerance(RELATIVE_TOLERANCE, FLOORS | {"contact": contact_floor, "contact_std": contact_floor}),
