@@ -296,8 +296,10 @@ class ForwardMap:
     def charges_by_force(self, position: Array, is_odd: Booleans = EVEN_FIELD) -> Array:
         """Compute the charges of each stress field in the table at given positions, for all forces of the family.
 
-        Each force has a map of its own, for the footprint that the probe has under this force. The result includes
-        neither the crosstalk nor the charges that the contact pressure causes. The probe keeps its own orientation.
+        If the footprint of the probe grows, each force has a map of its own with its own mesh. Otherwise, one map
+        contains the fields of all forces, so that the integration points are located only once. Its table has single
+        precision. The result includes neither the crosstalk nor the charges that the contact pressure causes. The probe
+        keeps its own orientation.
 
         Args:
             position: Positions (x, y) in the domain, shape (n, 2), mm.
@@ -306,18 +308,28 @@ class ForwardMap:
         Returns:
             Charges, shape (n_force, n, n_electrode, n_field), pC.
         """
-        n_column = self.table.shape[1]
-        table = self.table.reshape(self.family.distance.size, self.family.force.size, -1, n_column)
+        family = self.family
+        n_map = family.force.size if self.probe.grows else 1
+        precision = np.float64 if self.probe.grows else np.float32
+        shape = (family.distance.size, family.force.size, family.turns.rotation.size, -1, is_odd.size * 3)
         charges = []
-        for index, force in enumerate(self.family.force.tolist()):
-            map_of_force = replace(
+        for table, force in zip(
+            np.split(self.table.reshape(shape), n_map, axis=1), np.split(family.force, n_map), strict=True
+        ):
+            # The fields of all forces at one node become adjacent. The map of the first force returns charges in the
+            # unit of this force, which is proportional to the squared amplitude.
+            fields = np.moveaxis(table, 1, 3)
+            one_map = replace(
                 self,
-                probe=self.probe.under(force),
-                family=replace(self.family, force=np.array([force])),
-                table=table[:, index].reshape(-1, n_column),
+                probe=self.probe.under(force[0]),
+                family=replace(family, force=force[:1]),
+                table=fields.reshape(-1, fields[0, 0].size).astype(precision),
             )
-            charges.append(map_of_force.field_charges(contacts_at(position, force), is_odd))
-        return np.stack(charges)
+            charge = one_map.field_charges(contacts_at(position, force[0]), np.tile(is_odd, force.size))
+            unit_ratio = amplitude_squared(self.sensor.film, force) / amplitude_squared(self.sensor.film, force[0])
+            by_force = charge.reshape(*charge.shape[:2], force.size, is_odd.size) * unit_ratio[:, None]
+            charges.append(np.moveaxis(by_force, 2, 0))
+        return np.concatenate(charges)
 
     def _unchecked_charges(self, contact: Array, orientation: Array | float = 0.0) -> Array:
         """Compute the charges of presses that lie in the domain or slightly outside the domain.
@@ -368,8 +380,9 @@ class ForwardMap:
         pieces = ElectrodePieces.of(self.sensor)
         charge_per_stress = STRESS_WEIGHTS[self.sensor.readout] * self.sensor.piezo.charge_per_stress
         with single_threaded_blas():  # faster for the many small matrices of a chunk
-            for start in range(0, len(contact), CHUNK_SIZE):
-                chunk = slice(start, start + CHUNK_SIZE)
+            chunk_size = max(1, CHUNK_SIZE // is_odd.size)
+            for start in range(0, len(contact), chunk_size):
+                chunk = slice(start, start + chunk_size)
                 pressed = self.pressed(
                     position[chunk], contact[chunk, 2], orientation[chunk], is_odd, charge_per_stress
                 )
@@ -404,15 +417,17 @@ class ForwardMap:
         fields = weights.astype(self.table.dtype) @ self.table
         stress = fields.reshape(position.size, -1, is_odd.size, 3).swapaxes(1, 2)  # shape (n, n_field, n_node, 3)
 
-        # Compute the charge per area and stress in the frame of the press. At reflected points, s12 of an even field
-        # changes its sign, and s11 and s22 of an odd field change theirs.
+        # Compute the charge per area and stress in the frame of the press.
         frame_angle = direction + rotation + self.probe.angle
         frame_coefficients = rotate_stress(np.eye(3), frame_angle[:, None]) @ charge_per_stress.T
-        reflected_sign = np.where(is_odd[:, None], [-1.0, -1.0, 1.0], [1.0, 1.0, -1.0])
-        sign = np.stack([np.ones_like(reflected_sign), reflected_sign])  # shape (2, n_field, 3)
+        sign = np.ones((1, is_odd.size, 3))
+        if template.half:
+            # At reflected points, s12 of an even field changes its sign, and s11 and s22 of an odd field change theirs.
+            reflected_sign = np.where(is_odd[:, None], [-1.0, -1.0, 1.0], [1.0, 1.0, -1.0])
+            sign = np.stack([sign[0], reflected_sign])
         # The indices are the press (n), field (f), stress component (c), reflection (m) and kind of piece (k).
         coefficients = np.einsum("mfc,nck->nfcmk", sign, frame_coefficients).astype(fields.dtype)
-        density = stress @ coefficients.reshape(*stress.shape[:2], 3, -1)  # shape (n, n_field, n_node, 2 * n_kind)
-        shape = (2, len(charge_per_stress), position.size, template.n_element, -1, is_odd.size)
+        density = stress @ coefficients.reshape(*stress.shape[:2], 3, -1)  # shape (n, n_field, n_node, n_sign * n_kind)
+        shape = (len(sign), len(charge_per_stress), position.size, template.n_element, -1, is_odd.size)
         node_density = density.transpose(3, 0, 2, 1).reshape(shape)
         return PressedFilm(position, self.probe, film.radius, template, placement, node_density)

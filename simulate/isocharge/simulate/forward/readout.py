@@ -319,9 +319,10 @@ class PressedFilm:
         film_radius: Radius of the film, mm.
         template: Template of the meshes.
         placement: Position of the template under each press, after the press has been rotated onto the x axis.
-        density: Charge per area that each stress field causes, for points of the meshed part of the film and for points
-            that are reflected into it, shape (2, n_kind, n, n_element, n_local, n_field), pC/mm^2. The second axis is
-            the kind of a piece; see `STRESS_WEIGHTS`.
+        density: Charge per area that each stress field causes, shape (n_sign, n_kind, n, n_element, n_local, n_field),
+            pC/mm^2. The first axis has one entry for points of the meshed part of the film and, if only half of the
+            film is meshed, a second entry for points that are reflected into it. The second axis is the kind of a
+            piece; see `STRESS_WEIGHTS`.
     """
 
     position: Complexes
