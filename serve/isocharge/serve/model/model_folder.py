@@ -331,6 +331,7 @@ def write_model(
 
     Raises:
         OutputExists: If this version exists already, or a file has the folder's name.
+        OutputError: If the folder cannot be written.
         ChargeError: If the golden charges do not fit the electrodes.
         ModelError: If a reader would refuse the model, or its metadata differ from `metadata`. After any error no file
             of the version remains.
