@@ -55,7 +55,10 @@ from isocharge.simulate.solver.assembly import single_threaded_blas
 from isocharge.simulate.solver.load_case import SolveSettings
 
 CHUNK_SIZE = 256
-"""Number of presses that are evaluated at once, which limits the size of the working arrays to about 100 MB."""
+"""Number of presses that are evaluated at once, multiplied by the number of stress fields.
+
+The number limits the size of the working arrays to about 100 MB.
+"""
 
 INTERPOLATION_ERROR = 5e-4
 """Largest relative error of a charge, with respect to direct solves, that a forward map may have, dimensionless."""
