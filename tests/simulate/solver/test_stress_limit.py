@@ -24,7 +24,7 @@ def test_probe_of_1_mm_exceeds_the_yield_stress_of_pvdf(force, stress):
     largest = largest_stress(FILM, TIP, force)
     assert largest == pytest.approx(stress, rel=3e-3)
     assert f"{force:g} N under circle:1.0 stress the film to {largest:.3g} MPa" in stress_caution(FILM, TIP, force)
-    assert not stress_caution(FILM, TIP, force, 80.0)
+    assert not stress_caution(FILM, TIP, 0.4 * force)
 
 
 def test_repr_of_an_equilibrium_contains_the_largest_stress():

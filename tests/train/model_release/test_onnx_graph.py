@@ -66,9 +66,10 @@ def test_folded_network_gives_the_answers_of_pytorch(split):
     std = np.exp(posterior.log_std.numpy()) * domain.scale
     std[:, 2] *= contact[:, 2]
     misfit = MISFIT_LIMIT * np.sinh(np.linalg.norm(misfit_vector, axis=1, keepdims=True))
-    folded_contact, folded_std, _, folded_misfit = folded.outputs(charge)
-    for given, expected in ((folded_contact, contact), (folded_std, std), (folded_misfit, misfit)):
-        np.testing.assert_allclose(given, expected, rtol=1e-6)
+    a, b, c = posterior.turn.numpy().T + 0.5 * np.pi  # angles of the rows of a Cholesky factor
+    correlation = np.transpose([np.cos(a), np.cos(b), np.cos(a) * np.cos(b) + np.sin(a) * np.sin(b) * np.cos(c)])
+    for given, expected in zip(folded.outputs(charge), (contact, std, correlation, misfit), strict=True):
+        np.testing.assert_allclose(given, expected, rtol=1e-6, atol=1e-9)
 
 
 def test_the_file_is_plain_onnx_with_its_metadata(graph):

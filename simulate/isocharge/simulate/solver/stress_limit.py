@@ -42,25 +42,24 @@ def largest_stress(film: Film, probe: Probe, force: float) -> float:
     return largest
 
 
-def stress_caution(film: Film, probe: Probe, force: float, limit: float = DEFAULT_STRESS_LIMIT) -> str:
-    """Return a warning if the stress under a press exceeds a limit, and an empty string otherwise.
+def stress_caution(film: Film, probe: Probe, force: float) -> str:
+    """Return a warning if the stress under a press exceeds the default limit, and an empty string otherwise.
 
     Args:
         film: The film.
         probe: The probe.
         force: Force, N.
-        limit: Largest allowed stress, MPa.
 
     Raises:
         SceneError: If the press cannot exist.
         SolveError: If no equilibrium is reached.
     """
     stress = largest_stress(film, probe, force)
-    if stress <= limit:
+    if stress <= DEFAULT_STRESS_LIMIT:
         return ""
     return (
-        f"{force:.3g} N under {probe.notation} stress the film to {stress:.3g} MPa, the limit is {limit:.3g} MPa; PVDF "
-        "yields at 45 to 55 MPa, and a dent stays"
+        f"{force:.3g} N under {probe.notation} stress the film to {stress:.3g} MPa, the limit is "
+        f"{DEFAULT_STRESS_LIMIT:.3g} MPa; PVDF yields at 45 to 55 MPa, and a dent stays"
     )
 
 
