@@ -1,22 +1,21 @@
 """`isocharge serve doctor`: examine what a port sends, and write the device file of the board."""
 
-from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from shlex import join
 from typing import Annotated, Any
 
 import typer
-from serial.tools import list_ports
 
 from isocharge.cli.shared.options import DeviceOption, JsonOption, ModelsOption, WaitOption
 from isocharge.cli.shared.terminal import say, show, show_json, show_result
-from isocharge.common.errors import InputError, IsochargeError, printable
+from isocharge.common.errors import InputError, printable
 from isocharge.common.files import as_output_errors, refuse_existing, write_whole
 from isocharge.common.toml_text import to_toml
 from isocharge.serve import Examination, Port, Predictor, device_from_table, examine, load_device
 from isocharge.serve.examination.electrode_check import ElectrodeCheck, check_electrodes, corrected_table
 from isocharge.serve.examination.listening import BAUDS
+from isocharge.serve.examination.port_check import port_lines
 
 HEAD = "Written by `isocharge serve doctor` from what came through a port; the keys are in serve/docs/device_file.md."
 """First line of a device file."""
@@ -160,23 +159,6 @@ def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> Elec
     with Port(examination.url, baud=examination.baud, request=device.request) as port:
         rest_span = max(channel.span_pC or 0.0 for channel in examination.channels)
         return check_electrodes(port, device, channel_of_electrode, say, examination.unit, rest_span)
-
-
-def port_lines() -> Iterator[str]:
-    """Listen on each serial port of this machine for one second, and yield a line for each port.
-
-    The line contains the name of the port and describes the frames that arrived. If no intact frames arrived, the line
-    names the first missing setting. If the port cannot be read, the line contains the error message.
-    """
-    for port in sorted(list_ports.comports()):
-        try:
-            examination = examine(port.device, seconds=1.0)
-            received = f"{examination.format}, {examination.rate_Hz:.0f} frames/s at {examination.baud} baud"
-            if not examination.good:
-                received = examination.missing[0]
-        except IsochargeError as error:
-            received = str(error)
-        yield f"{port.device} ({port.description}): {received}"
 
 
 def _parse_gain(text: str) -> Any:

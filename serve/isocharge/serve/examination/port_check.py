@@ -4,14 +4,14 @@ The result contains the format and the rate of the frames, the health of the cha
 the settings that are still missing.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from isocharge.common.errors import ChargeError, printable
+from isocharge.common.errors import ChargeError, IsochargeError, printable
 from isocharge.serve.examination.board_health import (
     ChannelHealth,
     channel_count_sentences,
@@ -267,3 +267,22 @@ def electrodes_by_position(capture: Capture, device: Device, electrodes: tuple[s
     if not electrodes or positions is None:
         return dict(enumerate(capture.names))
     return dict(zip(positions, electrodes, strict=True))
+
+
+def port_lines() -> Iterator[str]:
+    """Listen on each serial port of this machine for one second, and yield a line for each port.
+
+    The line contains the name of the port and describes the frames that arrived. If no intact frames arrived, the line
+    names the first missing setting. If the port cannot be read, the line contains the error message.
+    """
+    from serial.tools import list_ports  # imported here, because programs that open no port need not wait for it
+
+    for port in sorted(list_ports.comports()):
+        try:
+            examination = examine(port.device, seconds=1.0)
+            received = f"{examination.format}, {examination.rate_Hz:.0f} frames/s at {examination.baud} baud"
+            if not examination.good:
+                received = examination.missing[0]
+        except IsochargeError as error:
+            received = str(error)
+        yield f"{port.device} ({port.description}): {received}"
