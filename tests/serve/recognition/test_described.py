@@ -180,6 +180,20 @@ def test_noise_and_constant_bytes_are_not_recognised(data):
     assert recognise([data], 2.0) is None
 
 
+DAMAGED_FRAMES = """
+44deab000202031027010104802e44cc9500020303983a010104c06144b3cb00
+020403204e010106206144e8e900020503a86101010440614425910001010101
+01010106206144deab000202031027010104206144cc9500020303983a010104
+c04844e8e900020503a861010104206144
+"""
+
+
+def test_first_byte_that_is_constant_in_too_few_rows_belongs_to_the_pattern():
+    """A byte is constant in most frames. Behind the first frame, it is constant in too few of them."""
+    section = described_frames_section([bytes.fromhex(DAMAGED_FRAMES)], 1.0)
+    assert (section["sync"], section["length"]) == ("44", 14)
+
+
 NUMBERS = np.arange(FRAMES)
 
 
