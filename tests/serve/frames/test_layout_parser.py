@@ -14,7 +14,7 @@ from crcmod.predefined import mkPredefinedCrcFun
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from frame_formats import FORMATS
+from frame_formats import FORMATS, STUFFINGS
 from isocharge.common.errors import DeviceError
 from isocharge.serve import Frame, device_from_table
 from isocharge.serve.frames.frame_layout import SyncParser
@@ -132,6 +132,16 @@ def test_damaged_frame_in_a_datagram_makes_no_other_frame():
         datagram[15] ^= 0x55
         assert [frame.seq for frame in parser.feed(bytes(datagram))] == [0, 1, 3]
     assert (parser.counts.crc_errors, parser.counts.bytes_dropped) == (200, 1200)
+
+
+@pytest.mark.parametrize(("framing", "byte"), [("slip", 0xC0), ("slip", 0xDB), ("hdlc", 0x7E), ("hdlc", 0x7D)])
+def test_frame_in_which_every_byte_is_stuffed_is_not_too_long(framing, byte):
+    fields = [{"name": name, "type": "u8"} for name in "ABC"]
+    delimiter, stuff = STUFFINGS[framing]
+    layout = {"format": "described", "framing": framing, "length": 3, "fields": fields}
+    parser = device_from_table({"frames": layout}, "board").frames.parser()
+    frames = parser.feed(2 * (delimiter + stuff(bytes([byte] * 3))) + delimiter)
+    assert [frame.values for frame in frames] == 2 * [(byte, byte, byte)]
 
 
 def test_datagrams_contain_whole_frames():

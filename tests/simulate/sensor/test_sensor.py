@@ -148,3 +148,9 @@ def test_area_of_a_union_counts_overlaps_once_and_only_metal_with_a_back():
     assert twice.centre == (0.0, 0.0)
     quarter = ((0.0, 0.0), (20.0, 0.0), (20.0, 20.0), (0.0, 20.0))  # metal on the back of a quarter of the plane
     assert replace(TRACED, back=(quarter,)).area == pytest.approx(2.25 + 0.25 * 7.75 + 0.5 * 4.75, rel=1e-12)
+
+
+def test_calibrated_position_is_rotated_anticlockwise_and_then_shifted():
+    calibration = Calibration(shift=(0.5, -0.25), rotation=np.pi / 2.0)
+    placed = calibration.place(np.array([[1.0, 0.0], [0.0, 2.0]]))
+    np.testing.assert_allclose(placed, [[0.5, 0.75], [-1.5, -0.25]], atol=1e-15)
