@@ -240,15 +240,14 @@ def examine_received(
 def electrodes_by_position(capture: Capture, device: Device, electrodes: tuple[str, ...]) -> dict[int, str]:
     """Return the name of each electrode, by the position of its channel in the frame.
 
-    If the device file has no section `[channels]`, the channels are assigned to the electrodes as in a stream. If the
-    electrodes are not known, or the channels cannot be assigned, every channel is an electrode with the name of the
-    channel. Electrodes whose channel is missing in the frames are left out.
+    The section `[channels]` of the device file states the channel of each electrode. Electrodes whose channel is
+    missing in the frames are left out. Without this section, the channels are assigned by name or by order, as in a
+    stream. If this is not possible, each channel counts as an electrode with the name of the channel.
 
     Args:
         capture: The frames, at least one.
         device: Settings of the board. `channels` contains the name of the channel of each electrode.
-        electrodes: Electrodes of the model. Without a model, the electrodes are those for which `[gain]` states
-            numbers.
+        electrodes: Electrodes of the model. If it is empty, the electrodes are those for which `[gain]` states numbers.
     """
     last_frame = capture.frames[-1]
     if device.channels:
@@ -258,15 +257,15 @@ def electrodes_by_position(capture: Capture, device: Device, electrodes: tuple[s
             if (position := channel_index(channel, last_frame)) is not None
         }
     rule = device.rule(GainRule)
-    for numbers in () if rule is None else (rule.offset, rule.pC_per_unit):
-        if isinstance(numbers, dict):
-            electrodes = electrodes or tuple(numbers)
+    gain_numbers = [] if rule is None else [rule.offset, rule.pC_per_unit]
+    numbers_by_electrode = [numbers for numbers in gain_numbers if isinstance(numbers, dict)]
+    names = electrodes or tuple(next(iter(numbers_by_electrode), ()))
     positions = None
-    with suppress(ChargeError):  # is reported later
-        positions = Channels(Setup(electrodes), any_unit=True).indices_by_name_or_order(last_frame)
-    if not electrodes or positions is None:
+    with suppress(ChargeError):  # a stream reports this error when it begins
+        positions = Channels(Setup(names), any_unit=True).indices_by_name_or_order(last_frame)
+    if not names or positions is None:
         return dict(enumerate(capture.names))
-    return dict(zip(positions, electrodes, strict=True))
+    return dict(zip(positions, names, strict=True))
 
 
 def port_lines() -> Iterator[str]:

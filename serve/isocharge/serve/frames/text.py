@@ -314,8 +314,8 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
     """Return the lines of one frame; empty if the lines do not repeat, or if it is not clear which lines are frames.
 
     A cycle is a sequence of lines that repeats. It is recognised if the last lines consist of several equal cycles.
-    Lines are equal if their skeletons are equal. The length of the cycle is the distance from the last line to the
-    latest earlier line that is equal.
+    Lines are equal if their skeletons are equal. The length of a cycle is the number of lines from the last line back
+    to the nearest earlier line that is equal to it.
 
     If lines occur several times in a cycle, the most frequent line is a frame. Otherwise, if every value has a name, a
     frame consists of all lines of a cycle. Otherwise, a frame is a single line, and the other lines of the cycle never
@@ -335,8 +335,10 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
 
     lines = lines[-repeats * cycle_length :]
     cycle = lines[:cycle_length]
-    if len(set(skeletons[-cycle_length:])) < cycle_length:  # several frames, then another line such as a temperature
-        return [max(cycle, key=lambda line: skeletons.count(line.skeleton))]  # the most frequent line
+    has_equal_lines = len(set(skeletons[-cycle_length:])) < cycle_length
+    if has_equal_lines:  # for example, three frames and then a temperature
+        most_frequent_line = max(cycle, key=lambda line: skeletons.count(line.skeleton))
+        return [most_frequent_line]
     if cycle_length == 1:
         return cycle
     if all(all(line.names) for line in cycle):

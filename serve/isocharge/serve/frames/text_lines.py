@@ -20,7 +20,7 @@ line, except units of charge and voltage. Quotes around a number have no meaning
 import math
 import re
 from collections.abc import Collection
-from itertools import pairwise
+from itertools import dropwhile, pairwise
 from typing import NamedTuple
 
 from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, SEQ, TIMES_US
@@ -129,9 +129,7 @@ class Line(NamedTuple):
             number, each other part that may change, and optional blanks.
         names: Name of each number; empty for a number without a name.
         starts: Position in the line at which each number begins.
-        is_prose: Whether the line resembles a message. Either it has at least as many words as numbers, as in `Channel
-            3 is ready`; keys, and words after a comma or another mark, do not count. Or it has a decimal number after a
-            hexadecimal number, such as the size after the address of a part of a program.
+        is_prose: Whether the line resembles a message; see `_is_prose`.
         words: The keys, words and texts in quotes.
     """
 
@@ -158,10 +156,7 @@ def parse_line(text: str, *, has_header: bool = False, counters: Collection[str]
         raise ValueError(f"expected printable characters, got {text[:100]!r}")
     number_kind = "number with a decimal comma" if _has_decimal_commas(text) else "number"
     tokens = _tokens(text.rstrip(",; \t"), number_kind)
-    # Whether the line is a name and a value, as in `A,3.5` and `12:34:56,A,3.5`
-    is_pair = re.fullmatch("[,;]?w[,;|]0w?", _shape(tokens)) is not None
-    if is_pair or not has_header:
-        tokens = _with_alternating_names(tokens, fewest=1 if is_pair else 2)
+    tokens = _with_alternating_names(tokens, has_header=has_header)
     names = _names(tokens, counters)
     starts = tuple(token.start for token in tokens if token.kind in _NUMBER_KINDS)
     words = tuple(token.name for token in tokens if token.kind not in ("mark", *_NUMBER_KINDS))
@@ -192,15 +187,23 @@ def _skeleton(tokens: list[_Token], names: list[str], number_kind: str) -> str:
 
 
 def _is_prose(tokens: list[_Token]) -> bool:
-    """Return whether a line resembles a message; see `Line`."""
-    kinds = [token.kind for token in tokens]
-    has_address = re.search("hexadecimal.* number", " ".join(kinds)) is not None
+    """Return whether a line resembles a message of a board instead of a frame.
+
+    A message has at least as many words as numbers, as in `Channel 3 is ready`. Keys, units of charge, and words after
+    a comma or another mark do not count. A line with a decimal number after a hexadecimal number is a message, too. For
+    example, boards print the address of a part of their program and then its size.
+
+    Args:
+        tokens: Parts of the line.
+    """
+    number_kinds = [token.kind for token in tokens if token.kind in _NUMBER_KINDS]
     words = [
         token
         for previous, token in pairwise([_EDGE, *tokens])
         if token.kind in ("word", "name") and previous.kind != "mark" and token.content not in _ALL_CHARGE_UNITS
     ]
-    return has_address or len(words) >= sum(kind in _NUMBER_KINDS for kind in kinds)
+    has_address_and_size = "number" in dropwhile(lambda kind: kind != "hexadecimal", number_kinds)
+    return has_address_and_size or len(words) >= len(number_kinds)
 
 
 def _has_decimal_commas(text: str) -> bool:
@@ -342,17 +345,24 @@ def _with_units(names: list[str], tokens: list[_Token]) -> list[str]:
     return names_with_units
 
 
-def _with_alternating_names(tokens: list[_Token], fewest: int) -> list[_Token]:
+def _with_alternating_names(tokens: list[_Token], *, has_header: bool) -> list[_Token]:
     """Mark the names in a line in which names and numbers alternate, and return the parts of the line.
 
     The name of a number is the word that is next to the number, either before each number, as in `C,7,A,3` and
     `C[7] A[3]`, or behind each number, as in `7 C, 3 A`. All names are different, because words that repeat are units
     or states. Times have no names. Words of another meaning that alternate with the numbers are taken for names, too.
 
+    A single word and a single number are a name and its value only if a mark separates them and nothing else follows,
+    as in `A,3.5`. Then the word is a name even if the board has sent a header, such as `channel,charge_pC`.
+
     Args:
         tokens: Parts of the line.
-        fewest: Smallest number of names. A single word before a number may also be a state of the board.
+        has_header: Whether a header names the numbers.
     """
+    is_pair = re.fullmatch("[,;]?w[,;|]0w?", _shape(tokens)) is not None  # may begin with a time or end with a unit
+    if has_header and not is_pair:
+        return tokens
+    fewest = 1 if is_pair else 2
     without_times = [token for token in tokens if token.kind not in _NAMES_OF_TIMES]
     for ordered_tokens in (without_times, without_times[::-1]):
         paths = _paths(ordered_tokens)

@@ -301,11 +301,11 @@ def make_golden(
     """
     outputs = run(session, charge_pC)
     for name, rows in outputs.items():
-        is_bad = ~np.isfinite(rows).all(axis=1)
-        if is_bad.any():
+        is_finite = np.isfinite(rows).all(axis=1)  # shape (n,)
+        if not is_finite.all():
             raise ModelError(
-                f"the new model: {name}: expected finite outputs, got {rows[is_bad][0]} for the charges "
-                f"{charge_pC[is_bad][0]} pC"
+                f"the new model: {name}: expected finite outputs, got {rows[~is_finite][0]} for the charges "
+                f"{charge_pC[~is_finite][0]} pC"
             )
     return Golden(
         sha256=sha256_of(onnx_model),

@@ -171,7 +171,8 @@ def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDiv
 
     If a byte or a pair of bytes is the same in every frame, it repeats at a distance of one frame length. Frames are
     therefore assumed to begin at every repetition of a byte or pair. For each frame length, the byte or pair whose
-    frames would cover the largest share of the stream is chosen. The lengths that cover the largest shares are yielded.
+    frames would cover the largest share of the stream is chosen. Only the lengths with the largest shares are yielded,
+    because the examination of a division takes long.
 
     Args:
         data: Bytes of the stream.

@@ -100,7 +100,8 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
         for rows, check in rows_and_checks or [(rows, Check(0, order)) for rows in possible_rows]:
             rows_before_check = rows[:, : length - check.size]
             parts_at_each_byte = possible_parts(rows_before_check, order, check.start, frame_rate_Hz)
-            # The first byte may belong to the pattern, even if it does not in the rows, which end earlier or later.
+            # The first byte belongs to the pattern: it is constant in the unshifted rows. In the shifted rows, of which
+            # there may be one less, a damaged frame may hide this.
             sync_lengths = range(1, max(1, count_leading(_may_be_sync(rows))) + 1) if has_sync else [0]
             score, sync_length, parts = split_frame(parts_at_each_byte, sync_lengths)
             has_channel = any(part.name == CHANNEL for part in parts)

@@ -354,7 +354,10 @@ class FilmFollower(Stage):
         self._applied_covariance[self._offset, self._offset] += self._error_scale * self._offset_std_pC**2
 
     def _values(self, contacts: Array, state: Array) -> ModelValues:
-        """Compute the charges of touches and their derivatives.
+        """Compute the measured charges of touches and their derivatives.
+
+        The measured charge of an electrode is the charge of the film, multiplied by the gain of the electrode, plus the
+        common offset, multiplied by the offset ratio of the electrode. The state contains the logarithms of the gains.
 
         Args:
             contacts: Contacts (x, y, ln F), shape (n, 3), mm and the logarithm of N.
@@ -362,12 +365,14 @@ class FilmFollower(Stage):
         """
         film = self._series.in_state(contacts_of(contacts), state[self._film])
         gains = np.exp(state[self._gains])
-        film_charge_pC = film.charge_pC * gains
-        by_state = np.zeros((*film_charge_pC.shape, state.size))
+        amplified_pC = film.charge_pC * gains  # shape (n, n_electrode)
+        charge_pC = amplified_pC + state[self._offset] * self._offset_ratio
+
+        # A gain only changes the charge of its own electrode, in proportion to this charge.
+        by_state = np.zeros((*charge_pC.shape, state.size))
         by_state[:, :, self._film] = film.by_state * gains[:, None]
-        by_state[:, :, self._gains] = film_charge_pC[:, :, None] * np.eye(gains.size)
+        by_state[:, :, self._gains] = amplified_pC[:, :, None] * np.eye(gains.size)
         by_state[:, :, self._offset] = self._offset_ratio
-        charge_pC = film_charge_pC + state[self._offset] * self._offset_ratio
         return ModelValues(charge_pC, film.by_contact * gains[:, None], by_state)
 
     def _log_contact(self, contact: Contact) -> Array:

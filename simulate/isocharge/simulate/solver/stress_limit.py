@@ -43,7 +43,7 @@ def largest_stress(film: Film, probe: Probe, force: float) -> float:
 
 
 def stress_caution(film: Film, probe: Probe, force: float) -> str:
-    """Return a warning if the stress under a press exceeds the default limit, and an empty string otherwise.
+    """Return a warning if the stress under a press exceeds `DEFAULT_STRESS_LIMIT`; empty otherwise.
 
     Args:
         film: The film.

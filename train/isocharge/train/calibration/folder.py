@@ -213,15 +213,16 @@ CARD = "card.md"
 def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
     """Check that a calibration can be written to a folder.
 
-    A calibration can be written to a new folder, to an empty folder, or to a folder of earlier calibrations. Hidden
-    files in the folder are ignored.
+    A calibration can be written to a new folder, to an empty folder, or to a folder of earlier calibrations. A folder
+    that contains only hidden files, such as those of file managers, counts as empty.
 
     Args:
         folder: The folder, which need not exist.
         electrodes: Names of the electrodes of the calibrated sensor.
 
     Raises:
-        ModelError: If the name or the content of the folder makes it unsuitable for a calibration.
+        ModelError: If the folder contains other files or a model with another number of electrodes, or if the name of
+            the folder is not a valid name of a model.
         OutputExists: If a file has the folder's name.
         OutputError: If the folder cannot be written.
     """
@@ -229,10 +230,8 @@ def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
     next_version = max(versions, default=0) + 1
     check_target(folder, next_version, electrodes)
     has_calibration = any((version / RESULT).is_file() for version in versions.values())
-    if not folder.exists() or has_calibration:
-        return
-    has_other_files = any(not path.name.startswith(".") for path in folder.iterdir())
-    if has_other_files:
+    is_empty = not folder.exists() or all(path.name.startswith(".") for path in folder.iterdir())
+    if not (has_calibration or is_empty):
         raise ModelError(f"{folder}: expected a new folder or one of an earlier calibration; choose another --output")
 
 
