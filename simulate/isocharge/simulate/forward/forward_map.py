@@ -420,17 +420,28 @@ class ForwardMap:
         fields = weights.astype(self.table.dtype) @ self.table
         stress = fields.reshape(position.size, -1, is_odd.size, 3).swapaxes(1, 2)  # shape (n, n_field, n_node, 3)
 
-        # Compute the charge per area and stress in the frame of the press.
+        # Convert the stress into charge per area, for each reflection of the mesh and each kind of piece.
+        signs = _reflection_signs(is_odd) if template.half else np.ones((1, is_odd.size, 3))
         frame_angle = direction + rotation + self.probe.angle
-        frame_coefficients = rotate_stress(np.eye(3), frame_angle[:, None]) @ charge_per_stress.T
-        sign = np.ones((1, is_odd.size, 3))
-        if template.half:
-            # At reflected points, s12 of an even field changes its sign, and s11 and s22 of an odd field change theirs.
-            reflected_sign = np.where(is_odd[:, None], [-1.0, -1.0, 1.0], [1.0, 1.0, -1.0])
-            sign = np.stack([sign[0], reflected_sign])
+        charge_per_frame_stress = rotate_stress(np.eye(3), frame_angle[:, None]) @ charge_per_stress.T
         # The indices are the press (n), field (f), stress component (c), reflection (m) and kind of piece (k).
-        coefficients = np.einsum("mfc,nck->nfcmk", sign, frame_coefficients).astype(fields.dtype)
+        coefficients = np.einsum("mfc,nck->nfcmk", signs, charge_per_frame_stress).astype(fields.dtype)
         density = stress @ coefficients.reshape(*stress.shape[:2], 3, -1)  # shape (n, n_field, n_node, n_sign * n_kind)
-        shape = (len(sign), len(charge_per_stress), position.size, template.n_element, -1, is_odd.size)
+        shape = (len(signs), len(charge_per_stress), position.size, template.n_element, -1, is_odd.size)
         node_density = density.transpose(3, 0, 2, 1).reshape(shape)
         return PressedFilm(position, self.probe, film.radius, template, placement, node_density)
+
+
+def _reflection_signs(is_odd: Booleans) -> Array:
+    """Return the signs of the stress at a point of the half mesh and at its reflection.
+
+    At the reflection, s12 of an even field changes its sign, and s11 and s22 of an odd field change theirs.
+
+    Args:
+        is_odd: Whether each field is odd with respect to the reflection, shape (n_field,).
+
+    Returns:
+        Signs 1 and -1, shape (2, n_field, 3). The first index is 0 for the point and 1 for its reflection.
+    """
+    reflected_signs = np.where(is_odd[:, None], [-1.0, -1.0, 1.0], [1.0, 1.0, -1.0])
+    return np.stack([np.ones_like(reflected_signs), reflected_signs])

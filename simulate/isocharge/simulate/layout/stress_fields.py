@@ -134,47 +134,72 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
         Stress (s11, s22, s12) and its derivatives in the order of `COLUMNS`, divided by the unit of the scaled stress,
         shape (n_element, n_local, 6, 3).
     """
-    mesh = solved.mesh
-    film = solved.film
+    stress = _stress_in_film_axes(solved, surface)
     radius = solved.probe.reach
-    settings = SolveSettings(theory=solved.theory, resolution=mesh.resolution, layer=mesh.layer)
-    distance, _ = solved.at
-
-    def stress_of(equilibrium: Equilibrium) -> tuple[Array, Complexes]:
-        """Return the stress at the nodes in the frame of the given press, MPa, and the nodes, in film radii."""
-        stress_unit = film.young * equilibrium.groups.squared_amplitude
-        stress = stress_unit * rotate_stress(nodal_stress(equilibrium, surface), equilibrium.direction)
-        return stress, equilibrium.mesh.points * np.exp(1j * equilibrium.direction)
-
-    def changed(changes: Array) -> Equilibrium:
-        """Return the equilibrium after changes of x, y, ln F, the probe radius and the pretension, shape (5,)."""
-        x, y, log_force, probe_radius, pretension = changes.tolist()
-        return press(
-            replace(film, pretension=film.pretension + pretension),
-            Circle(radius + probe_radius),
-            (distance + x, y),
-            solved.force * math.exp(log_force),
-            settings,
-            start=solved,
-        )
-
-    stress, _ = stress_of(solved)
-    points = film.radius * (1.0 - 1e-12) * mesh.points.ravel()  # on the film despite rounding errors
-    nodes = to_corners(points)
-    columns = [stress]
     steps = np.multiply(STEPS, [radius, radius, 1.0, radius, 1.0])
+    columns = [stress]
     for column, step, changes in zip(COLUMNS[1:], steps, np.diag(steps), strict=True):
-        last = changed(changes)
-        last_stress, last_points = stress_of(last)
+        later = _changed_press(solved, changes)
         if column == "pretension":  # the pretension may be zero and must not become negative
-            columns.append((last_stress - stress) / step)
+            columns.append((_stress_in_film_axes(later, surface) - stress) / step)
             continue
-        first = changed(-changes)
-        first_stress, first_points = stress_of(first)
-        # The nodes move with the press. Subtract the change of the stress that their movement causes.
-        change = last_stress - first_stress - change_by_node_shift(mesh, stress, last_points - first_points)
-        if column == "y" and distance < 10.0 * step:  # the mesh turns by a large angle, so read fixed points
-            difference = touch_stress(last, nodes, surface) - touch_stress(first, nodes, surface)
-            change = difference.reshape(stress.shape)
+        earlier = _changed_press(solved, -changes)
+        distance, _ = solved.at
+        if column == "y" and distance < 10.0 * step:  # the direction of the press changes by a large angle
+            change = _change_at_fixed_points(solved, earlier, later, surface)
+        else:
+            # The nodes move with the press. Subtract the change of the stress that their movement causes.
+            node_shift = _nodes_in_film_axes(later) - _nodes_in_film_axes(earlier)
+            change_at_nodes = _stress_in_film_axes(later, surface) - _stress_in_film_axes(earlier, surface)
+            change = change_at_nodes - change_by_node_shift(solved.mesh, stress, node_shift)
         columns.append(change / (2.0 * step))
-    return np.stack(columns, axis=2) / (film.young * solved.groups.squared_amplitude)
+    return np.stack(columns, axis=2) / (solved.film.young * solved.groups.squared_amplitude)
+
+
+def _changed_press(solved: Equilibrium, changes: Array) -> Equilibrium:
+    """Solve a press that differs from a solved press.
+
+    Args:
+        solved: Equilibrium of the film under a press on the positive x axis, from which the solver starts.
+        changes: Changes of x and y (mm), ln F, the probe radius (mm) and the pretension (MPa), shape (5,).
+    """
+    x, y, log_force, probe_radius, pretension = changes.tolist()
+    film = solved.film
+    distance, _ = solved.at
+    return press(
+        replace(film, pretension=film.pretension + pretension),
+        Circle(solved.probe.reach + probe_radius),
+        (distance + x, y),
+        solved.force * math.exp(log_force),
+        SolveSettings(theory=solved.theory, resolution=solved.mesh.resolution, layer=solved.mesh.layer),
+        start=solved,
+    )
+
+
+def _stress_in_film_axes(solved: Equilibrium, surface: Surface) -> Array:
+    """Return the stress at the nodes in the axes of the film, shape (n_element, n_local, 3), MPa."""
+    stress_unit = solved.film.young * solved.groups.squared_amplitude
+    return stress_unit * rotate_stress(nodal_stress(solved, surface), solved.direction)
+
+
+def _nodes_in_film_axes(solved: Equilibrium) -> Complexes:
+    """Return the positions x + iy of the nodes in the axes of the film, shape (n_element, n_local), film radii."""
+    return np.asarray(solved.mesh.points * np.exp(1j * solved.direction))
+
+
+def _change_at_fixed_points(solved: Equilibrium, earlier: Equilibrium, later: Equilibrium, surface: Surface) -> Array:
+    """Return the difference of the stresses of two presses at the nodes of a third press.
+
+    Args:
+        solved: Press whose nodes are the points at which both stresses are read.
+        earlier: Press whose stress is subtracted.
+        later: Press from whose stress it is subtracted.
+        surface: Surface at which the stress is read.
+
+    Returns:
+        Difference of the stress (s11, s22, s12), shape (n_element, n_local, 3), MPa.
+    """
+    points = solved.film.radius * (1.0 - 1e-12) * solved.mesh.points  # on the film despite rounding errors
+    corners = to_corners(points.ravel())
+    difference = touch_stress(later, corners, surface) - touch_stress(earlier, corners, surface)
+    return difference.reshape(*points.shape, 3)

@@ -76,29 +76,12 @@ def compact_charges(
     names = charges.prior.sensor.electrode_names
     node_MPa = _nodes(film) if len(names) > len(CONTACT) else np.zeros(1)  # three charges only determine the contact
     factors = _tension_factors(charges, film, contact, node_MPa, executor)
-    while True:
-        series = fit_film_series(domain, names, contact, charge[:, None] * factors, node_MPa)
-        if series.charge_std <= MAX_SERIES_ERROR or node_MPa.size == 1:
-            break
-        # At a distant node, the imperfections may nearly cancel a charge. Their first-order effect is then not enough.
-        is_near = np.abs(node_MPa) < np.abs(node_MPa).max()
-        node_MPa, factors = node_MPa[is_near], factors[:, is_near]
-        log.warning(
-            "the charges of this film are not known after large changes of its pretension; changes from %+.2g to "
-            "%+.2g MPa can be followed",
-            node_MPa[0],
-            node_MPa[-1],
-        )
-
-    contact, charge = contact[:DIRECTION_CONTACTS], charge[:DIRECTION_CONTACTS]
-    changes = _directions(charges, film, contact, charge)  # shape (n, n_direction, n_electrode), pC
-    unit_contact = domain.to_unit(contact)
-    size = charge if series.log_size is None else series_size(series.log_size, unit_contact[:, 2])[0]
-    values = changes / size[:, None]  # a direction changes the value v of the series
+    series = _fit_followable_nodes(domain, names, contact, charge[:, None] * factors, node_MPa)
+    few_contacts = slice(DIRECTION_CONTACTS)
+    changes = _directions(charges, film, contact[few_contacts], charge[few_contacts])
     directions = series.directions  # none
-    if values.size > 0:
-        coefficients = fit_series(unit_contact, values.reshape(len(contact), -1), *DIRECTION_DEGREES)
-        directions = coefficients.reshape(*coefficients.shape[:3], *changes.shape[1:])
+    if changes.size > 0:
+        directions = _fit_directions(series, contact[few_contacts], charge[few_contacts], changes)
     return replace(
         series,
         directions=directions,
@@ -108,6 +91,54 @@ def compact_charges(
         pretension_MPa=film.value(PRETENSION.name),
         tension_std_MPa=PRETENSION.drift,
     )
+
+
+def _fit_followable_nodes(
+    domain: Domain, electrodes: tuple[str, ...], contact: Array, charge: Array, node_MPa: Array
+) -> ChargeSeries:
+    """Fit the charges at the nodes, and leave out outermost nodes until the relative error is small enough.
+
+    At a distant node, the imperfections may nearly cancel a charge. Their first-order effect is then not accurate. A
+    warning is logged for each change of the nodes.
+
+    Args:
+        domain: Contacts for which the series is needed.
+        electrodes: Names of the electrodes.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        charge: Their charges at the nodes, shape (n, n_node, n_electrode), pC.
+        node_MPa: Changes of the pretension at the nodes, shape (n_node,), MPa.
+    """
+    series = fit_film_series(domain, electrodes, contact, charge, node_MPa)
+    if series.charge_std <= MAX_SERIES_ERROR or node_MPa.size == 1:
+        return series
+    is_nearer = np.abs(node_MPa) < np.abs(node_MPa).max()
+    remaining_MPa = node_MPa[is_nearer]
+    log.warning(
+        "the charges of this film are not known after large changes of its pretension; changes from %+.2g to "
+        "%+.2g MPa can be followed",
+        remaining_MPa[0],
+        remaining_MPa[-1],
+    )
+    return _fit_followable_nodes(domain, electrodes, contact, charge[:, is_nearer], remaining_MPa)
+
+
+def _fit_directions(series: ChargeSeries, contact: Array, charge: Array, changes: Array) -> Array:
+    """Fit the coefficients of the directions of a series.
+
+    Args:
+        series: Series of the charges, whose values are the charges divided by the size of a contact.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        charge: Their charges, shape (n, n_electrode), pC.
+        changes: Changes of the charges by each direction, shape (n, n_direction, n_electrode), pC.
+
+    Returns:
+        Coefficients, as in `ChargeSeries.directions`.
+    """
+    unit_contact = series.domain.to_unit(contact)
+    size = charge if series.log_size is None else series_size(series.log_size, unit_contact[:, 2])[0]
+    values = changes / size[:, None]
+    coefficients = fit_series(unit_contact, values.reshape(len(contact), -1), *DIRECTION_DEGREES)
+    return coefficients.reshape(*coefficients.shape[:3], *changes.shape[1:])
 
 
 def _nodes(film: FilmEstimate) -> Array:

@@ -127,17 +127,13 @@ def fit_presses(
     level = noise.level(labelled.charge)  # charges on a scale on which the noise has the standard deviation 1
     with threads_and_seed(training.threads, training.seed):
         features = signed_features(labelled.charge, noise.transition_charge(labelled.charge))
-        # The first network will be returned. The other networks each belong to one fold of the cross-validation.
+        # The first network learns from the others, and is returned. The others are those of the cross-validation.
         network, *fold_networks = (
             InverseNetwork(domain, features, labelled.charge, settings.network, force_std)
             for _ in range(1 + HELD_PARTS)
         )
-        # For the cross-validation, train a network for each fold on the presses of all other folds.
         fold_of_press = (HELD_PARTS * position_ranks(uncertain_places(usable))).astype(int)
-        for fold_index, network_of_fold in enumerate(fold_networks):
-            fold_config = structs.replace(training, seed=training.seed + fold_index)
-            train_presses = labelled[fold_of_press != fold_index]
-            contact_stage(network_of_fold, train_presses, noise.scaled(TRAINING_NOISE_FACTOR), fold_config).run()
+        _train_fold_networks(fold_networks, labelled, fold_of_press, noise, training)
         contact, std, misfit = _cross_validated_answers(
             fold_networks, labelled.charge, unit_contact, level, fold_of_press
         )
@@ -148,11 +144,7 @@ def fit_presses(
         # Train the returned network: its contacts on the mean outputs of the other networks, then its misfits.
         distillation = _distillation_stage(network, fold_networks, labelled, noise, training)
         train_perceptron(distillation, settings)
-        # The charges of contacts are known only at the presses. Near each press, planes approximate their levels.
-        planes = LocalPlanes.fit(unit_contact, level)
-        count = training.sizes(len(usable.electrodes)).misfit_charges
-        drawn_charge = draw_charges(np.random.default_rng(training.seed), labelled.charge, noise, count)
-        examples = np.stack([drawn_charge, planes.residuals(noise.level(drawn_charge))])
+        examples = _misfit_examples(labelled.charge, unit_contact, noise, training)
         train_perceptron(misfit_stage(network, examples, training), settings)
 
     folded_network = fold_network(network.eval())
@@ -310,6 +302,49 @@ def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]
     position_factor = np.quantile(deviation[:, :2], one_std_coverage)
     force_factor = np.quantile(deviation[:, 2], one_std_coverage)
     return float(position_factor), float(force_factor)
+
+
+def _train_fold_networks(
+    fold_networks: list[InverseNetwork],
+    presses: LabelledPresses,
+    fold_of_press: Integers,
+    noise: ChannelNoise,
+    config: TrainingConfig,
+) -> None:
+    """Train the contact perceptron of one network for each fold on the presses of all other folds.
+
+    Args:
+        fold_networks: Networks, one for each fold.
+        presses: All presses.
+        fold_of_press: Index of the fold of each press, shape (n,).
+        noise: Noise of the charges.
+        config: Settings, whose seed is that of the first fold.
+    """
+    added_noise = noise.scaled(TRAINING_NOISE_FACTOR)
+    for fold_index, network in enumerate(fold_networks):
+        fold_config = structs.replace(config, seed=config.seed + fold_index)
+        contact_stage(network, presses[fold_of_press != fold_index], added_noise, fold_config).run()
+
+
+def _misfit_examples(charge: Array, unit_contact: Array, noise: ChannelNoise, config: TrainingConfig) -> Array:
+    """Draw charges, and compute the differences between their levels and those of the most similar contacts.
+
+    The charges of contacts are known only at the presses. Near each press, planes approximate the levels of contacts.
+
+    Args:
+        charge: Charges of the presses, shape (n, n_electrode), pC.
+        unit_contact: Contacts of the presses in unit coordinates, shape (n, 3).
+        noise: Noise of the charges.
+        config: Number of examples and seed.
+
+    Returns:
+        Charges and differences, shape (2, n_example, n_electrode).
+    """
+    planes = LocalPlanes.fit(unit_contact, noise.level(charge))
+    _, n_electrode = charge.shape
+    count = config.sizes(n_electrode).misfit_charges
+    drawn_charge = draw_charges(np.random.default_rng(config.seed), charge, noise, count)
+    return np.stack([drawn_charge, planes.residuals(noise.level(drawn_charge))])
 
 
 def _cross_validated_answers(
