@@ -1,4 +1,4 @@
-"""The exceptions of isocharge, the printable text of their messages, and imports that fail with advice.
+"""The exceptions of isocharge, the printable text of their messages, and imports whose failure gives advice.
 
 Each exception also inherits from the built-in exception with the most similar meaning. A message states what was
 expected, what was given, where the error is, and what the user can do. `isocharge.cli.main` maps the exceptions to exit

@@ -116,7 +116,7 @@ CLEAN_SHARE = 0.99
 
 
 def transmission_sentences(capture: Capture) -> Iterator[str]:
-    """Yield one sentence if no frames were received, or for each fault of the transmission.
+    """Yield a sentence for each fault of the transmission, or only one sentence if no frames were received.
 
     Args:
         capture: The frames, with their bytes, the share of intact bytes and the gaps in the frame numbers.

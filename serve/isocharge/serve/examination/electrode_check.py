@@ -178,8 +178,9 @@ def _charge_frames(
         port: The open port.
         device: Settings of the board, of which the frames, the kind of the front end and the gain are used.
         channels: Channel of each electrode, by the name of the electrode.
-        unit: Unit of the charges. A touch changes counts and charges in pC by more than the default threshold.
-        rest_span: Largest minus smallest charge of a channel at rest, which the noise of a tare does not exceed.
+        unit: Unit of the charges. The default threshold of a touch is for pC and counts. In another unit, the threshold
+            depends only on the noise.
+        rest_span: Largest minus smallest charge of a channel at rest, which limits the noise that a tare accepts.
     """
     rules: dict[type[Rule], Rule] = {
         TareRule: TareRule(noise_limit_pC=rest_span, offset_limit_pC=math.inf, patience=0),

@@ -1,4 +1,4 @@
-"""Removal of notations without a meaning from the lines of text that boards send, before their numbers are read.
+"""Removal of marks that carry no information from the lines of text that boards send, before their numbers are read.
 
 These are colours, quotes around numbers, blanks behind signs, checksums, and the marks of Teleplot.
 """

@@ -108,7 +108,7 @@ class ReadingStream:
         return self._before_restart + self.parser.counts
 
     def frames(self, chunk: Chunk) -> Iterator[Frame]:
-        """Process a chunk, and yield each frame whose last byte is in the chunk, after all stages of the stream.
+        """Process a chunk, pass each frame whose last byte it contains through all stages, and yield the frame.
 
         If the chunk follows an outage of the port, the state before the outage is discarded first.
 

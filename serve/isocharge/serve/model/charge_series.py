@@ -297,6 +297,9 @@ class ChargeSeries:
     def _charges(self, value: Array, nearest: Array, excess: Array) -> tuple[Array, Array, Array]:
         """Convert values v of the series into charges without the offset.
 
+        If all charges are positive, v is the logarithm of the charge. Otherwise, v is the charge divided by the typical
+        size S of charges at the force, whose scaled logarithm is l.
+
         Args:
             value: v and its derivatives with respect to the unit coordinates, shape (n, 4, n_electrode).
             nearest: Nearest contacts in the domain, as `_nearest_in_domain` returns them.

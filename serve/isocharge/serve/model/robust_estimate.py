@@ -177,7 +177,15 @@ class RobustProblem:
         return np.asarray(np.linalg.inv(normal_matrix))
 
     def evaluate(self, state: Array, contacts: Array) -> RobustPoint:
-        """Evaluate the model, the residuals and the cost at a state and contacts."""
+        """Evaluate the model, the residuals and the cost at a state and contacts.
+
+        The residuals of a press have a Student t distribution, so that a press with large residuals has little weight.
+        The weights of the presses turn each step into a weighted least squares problem.
+
+        Args:
+            state: State, shape (p,).
+            contacts: Contacts, shape (n, 3).
+        """
         values = self._model(contacts, state)
         residual = (self._whitening @ (self._charge_pC - values.charge_pC)[:, :, None])[:, :, 0]
         contact_residual = (self._measured - contacts) * self._contact_weight
@@ -201,28 +209,30 @@ class RobustProblem:
         """Compute the normal equations of a step of the state, from which the contacts are eliminated.
 
         The whitened derivatives of press i are C_i with respect to its contact and S_i with respect to the state. For a
-        step ds of the state, the contact moves by du_i = a_i - B_i ds, with a_i = (C_i' C_i + D_i)^-1 (C_i' r_i + ...)
-        and B_i = (C_i' C_i + D_i)^-1 C_i' S_i. D_i contains the damping and the weights of measured coordinates.
+        step ds of the state, the contact moves by du_i = a_i - B_i ds, with a_i = M_i^-1 (C_i' r_i + W m_i) and
+        B_i = M_i^-1 C_i' S_i. The residuals of the charges are r_i, and those of the measured coordinates are m_i, in
+        standard deviations. W is the diagonal matrix of the inverse standard deviations of the coordinates, and M_i is
+        C_i' C_i + W^2 with a damped diagonal. The weights of the robust loss multiply the equations of the state.
 
         Args:
             point: State and contacts.
             damping: Damping of the contacts, relative to the diagonal of their normal matrices.
 
         Returns:
-            Normal matrix, shape (p, p), and right side, shape (p,). The shifts a_i, shape (n, 3), and the matrices B_i,
-            shape (n, 3, p).
+            Normal matrix, shape (p, p), and right side, shape (p,), of the state. The shifts a_i, shape (n, 3), and the
+            matrices B_i, shape (n, 3, p).
         """
         transposed = point.by_contact.swapaxes(1, 2)
-        contact_matrix = transposed @ point.by_contact
+        contact_matrix = transposed @ point.by_contact  # becomes M_i
         diagonal = np.einsum("nkk->nk", contact_matrix)  # a view, through which the matrices are changed
         diagonal += self._contact_weight**2
         diagonal *= 1.0 + damping
         # The smallest number is for contacts that change no charge.
         diagonal += RELATIVE_RIDGE * diagonal.sum(axis=1, keepdims=True) + np.finfo(float).tiny
         charge_part = (transposed @ point.residual[:, :, None])[:, :, 0]
-        right_side = charge_part + self._contact_weight * point.contact_residual
+        contact_side = charge_part + self._contact_weight * point.contact_residual
         mixed = transposed @ point.by_state  # shape (n, 3, p)
-        solution = np.linalg.solve(contact_matrix, np.concatenate([right_side[:, :, None], mixed], axis=2))
+        solution = np.linalg.solve(contact_matrix, np.concatenate([contact_side[:, :, None], mixed], axis=2))
         contact_shift = solution[:, :, 0]
         contact_by_state = solution[:, :, 1:]
 
@@ -232,13 +242,13 @@ class RobustProblem:
         remaining_residual = point.residual - (point.by_contact @ contact_shift[:, :, None])[:, :, 0]
         weighted = (point.weights[:, None, None] * point.by_state).reshape(-1, n_state)
         normal_matrix = self._precision + weighted.T @ remaining_slopes
-        gradient = self._precision @ (self._prior_mean - point.state) + weighted.T @ remaining_residual.ravel()
-        symmetric = 0.5 * (normal_matrix + normal_matrix.T)
-        return symmetric, gradient, contact_shift, contact_by_state
+        right_side = self._precision @ (self._prior_mean - point.state) + weighted.T @ remaining_residual.ravel()
+        symmetric_matrix = 0.5 * (normal_matrix + normal_matrix.T)  # despite rounding errors
+        return symmetric_matrix, right_side, contact_shift, contact_by_state
 
     def step(self, point: RobustPoint, damping: float) -> tuple[Array, Array]:
         """Compute a damped Gauss-Newton step of the state, shape (p,), and of the contacts, shape (n, 3)."""
-        normal_matrix, gradient, contact_shift, contact_by_state = self.normal_equations(point, damping)
+        normal_matrix, right_side, contact_shift, contact_by_state = self.normal_equations(point, damping)
         damped = normal_matrix + damping * np.diag(np.diag(normal_matrix))
-        state_step = np.linalg.solve(damped, gradient)
+        state_step = np.linalg.solve(damped, right_side)
         return np.asarray(state_step), contact_shift - contact_by_state @ state_step

@@ -347,8 +347,8 @@ class UdpSocket:
     def _with_line_feed(self, data: bytes) -> bytes:
         """Return a datagram of text with a line feed at its end.
 
-        If this datagram or one of the latest datagrams of the board ends with a line feed, the datagram is returned
-        unchanged. A datagram that is no text is also returned unchanged.
+        If this datagram or one of the latest datagrams of the board ends with a line feed, the board itself ends its
+        lines, and the datagram is returned unchanged. A datagram that is no text is also returned unchanged.
 
         Args:
             data: The datagram.

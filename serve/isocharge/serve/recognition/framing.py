@@ -93,7 +93,7 @@ def count_leading(are_true: NDArray[np.bool_]) -> int:
 
 
 def possible_divisions(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Iterable[FrameDivision]]:
-    """Yield all possible divisions of a stream into frames with each kind of framing.
+    """For each kind of framing, yield all possible divisions of a stream into frames.
 
     The kinds of framing are yielded from the most certain to the least certain kind. Datagrams of whole frames are the
     most certain kind, followed by frames with byte stuffing. Frames that begin at a repeated byte or pair of bytes are

@@ -81,7 +81,7 @@ class Inflow:
         """
         self._rule = rule
         self.pC_per_s = np.zeros(n_electrode)
-        self.learned_s = 1.0
+        self.learned_s = 1.0  # as if the inflow had been zero for one second
         self.hold_s = 0.0
         self._trusted_pC_per_s = self.pC_per_s  # inflow at least `look_back_s` ago
         self._candidate_pC_per_s = self.pC_per_s  # becomes the trusted inflow when its age is `look_back_s`
@@ -98,12 +98,12 @@ class Inflow:
         """Use a frame out of contact to update the inflow.
 
         The surplus is the part of the new charge that the estimated inflow does not explain. The surplus is divided by
-        an averaging time and added to the inflow, so that the inflow follows its mean over this time. Large surpluses
-        are clipped, because touches cause large surpluses.
+        an averaging time and added to the inflow, so that the estimate becomes the mean current over this time. Large
+        surpluses are clipped, because touches cause large surpluses.
 
-        The beginning of an undetected touch may have changed the latest inflow. During a touch, the older trusted
-        inflow is therefore used. After each time interval `look_back_s`, the inflow is stored as the candidate, and the
-        previous candidate becomes the trusted inflow.
+        A touch is detected some time after it has begun, and until then it has falsified the inflow. During a touch, an
+        older inflow is therefore used, which is the trusted inflow. After each time interval `look_back_s`, the
+        candidate becomes the trusted inflow, and the present inflow becomes the candidate.
 
         Args:
             surplus_pC: New charge minus the contribution of the inflow, shape (n_electrode,), pC.
@@ -176,10 +176,10 @@ class Leak(Stage):
     def _advance(self, frame: Frame, previous: Frame, output_pC: Array) -> None:
         """Add the charge that is new since the previous frame to the touch charge.
 
-        The new charge is the part of the output that does not follow from the previous output by the leak, without the
-        inflow, which is the constant current at the inputs of the amplifiers. Out of contact, the touch charge should
-        be zero. Therefore, it is made to decay to zero, and the inflow is learned from the new charge. If frames are
-        missing, the touch may have ended meanwhile, or its charge may have become wrong.
+        The new charge is the output, minus the part of the previous output that the leak has left, minus the inflow
+        (pC/s) times the time since the previous frame. Out of contact, the touch charge should be zero. Therefore, it
+        is made to decay to zero, and the inflow is learned from the new charge, except during a pause after a release.
+        If frames are missing, the touch may have ended meanwhile, or its charge may have become wrong.
 
         Args:
             frame: The frame.
@@ -187,7 +187,7 @@ class Leak(Stage):
             output_pC: Output of the amplifiers above the tare, shape (n_electrode,), pC.
         """
         dt_s = frame.dt_s
-        self._charge_pC = self._charge_pC - previous.warming_pC
+        self._charge_pC = self._charge_pC - previous.warming_pC  # the part that warming, and not a touch, has caused
         innovation_pC = self._innovation_pC(output_pC, np.exp(-dt_s / self._tau_s))
         surplus_pC = innovation_pC - self._inflow.pC_per_s * dt_s  # new touch charge and noise
         if previous.is_contact:

@@ -119,12 +119,14 @@ class Warming(Stage):
             frame.flags.append(BLIND)
 
     def _estimate(self, charge_pC: Array, dt_s: float) -> float:
-        """Update the estimate of the warming p, and return its change, pC.
+        """Update the estimate of the charge that the warming has caused, and return its change, pC.
 
-        If the parabola is too flat, p is not changed, its predicted variance is kept, and the state is blind.
+        The squared misfit of the charges is computed for several trial values of the change, and a parabola is fitted
+        to it. If the parabola is too flat, the warming cannot be distinguished from the force (`blind`). The estimate
+        is then not changed.
 
         Args:
-            charge_pC: Touch charges from which the present p has been subtracted, shape (n_electrode,), pC.
+            charge_pC: Touch charges from which the present estimate has been subtracted, shape (n_electrode,), pC.
             dt_s: Time since the previous frame, s.
         """
         rule = self._rule
@@ -139,19 +141,18 @@ class Warming(Stage):
         squared_misfits = np.square(self._setup.model.predict_batch(trial_charges_pC).misfit, dtype=float)
         _constant, slope, curvature = (_PARABOLA_FIT @ squared_misfits).tolist()
 
-        # The variance of the estimate is the inverse of the curvature, because the misfit is in standard deviations.
-        # Errors of the model increase it by `noise` squared. If the parabola is flat, warming cannot be distinguished
-        # from force.
+        # The variance of the minimum is the inverse of the curvature, because the misfit is in standard deviations.
+        # Errors of the model multiply it by `noise` squared.
         estimate_variance_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
         self._is_blind = estimate_variance_pC2 > rule.blind_pC**2
         if self._is_blind:
             return 0.0
 
-        # The estimate is the minimum of the parabola, limited to the range of the trial values.
+        # The measured change is the minimum of the parabola, limited to the range of the trial values.
         minimum_pC = -slope / (2.0 * curvature)
         change_pC = min(max(minimum_pC, float(TRIED_PC[0])), float(TRIED_PC[-1]))
 
-        # Kalman update of p and of its variance
+        # Kalman update of the estimate and of its variance
         gain = self._variance_pC2 / (self._variance_pC2 + estimate_variance_pC2)
         self._charge_pC += gain * change_pC
         self._variance_pC2 *= 1.0 - gain

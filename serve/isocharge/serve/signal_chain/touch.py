@@ -176,7 +176,10 @@ class Touch(Stage):
             self._touch_direction = direction + charge / size
 
     def _await(self, frame: Frame, charge: Array, direction: Array) -> None:
-        """Update the base with the charges of a frame without a touch, or begin a touch.
+        """Update the base, which are the charges that belong to no touch, or begin a touch.
+
+        A touch begins if the charges above the base exceed the threshold in the expected direction. The base decays to
+        zero, and takes over charges that change against this direction.
 
         Args:
             frame: The frame.
@@ -185,8 +188,8 @@ class Touch(Stage):
                 latest touch while the charges of that touch may remain, and later the direction that all touches share.
                 It is zero if a touch may have any direction.
         """
-        # While a finger leaves the film, a remaining base must not decay, because this charge still belongs to the
-        # finger.
+        # After a touch, the base is the charge that remains of it. While the finger leaves the film, the charge at rest
+        # is held, and the base must not decay, because the finger still causes this charge.
         is_remainder = float(self._base @ direction) > 0.0
         if not (frame.is_base_held and is_remainder):
             self._base = self._base * math.exp(-frame.dt_s / frame.base_relax_s)
@@ -194,7 +197,7 @@ class Touch(Stage):
         change = charge - self._base
         change_size = _norm(change)
         if float(change @ direction) < OPPOSING_COSINE * change_size * _norm(direction):
-            self._base = charge  # a release or a drift, which changes the charges against the direction of a touch
+            self._base = charge  # a release or a drift
         elif change_size > 1.0:  # a touch begins
             self._is_contact = True
             self._peak = min(size, _norm(self._previous))
@@ -202,7 +205,7 @@ class Touch(Stage):
             self._has_drifted = _norm(self._mean - self._base) > 0.5
             return
         elif is_remainder and size < _norm(self._base):
-            self._base = charge  # the remaining charge of the latest touch becomes smaller
+            self._base = charge  # the charge that remains of the latest touch becomes smaller
 
         self._mean = charge + math.exp(-frame.dt_s / RISE_S) * (self._mean - charge)
         if size > 1.0 and float(charge @ direction) < 0.0:

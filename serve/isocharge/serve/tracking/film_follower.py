@@ -310,13 +310,14 @@ class FilmFollower(Stage):
         self._covariance = problem.state_covariance(estimate)
         self._touch_count += 1
 
-        # Twice the cost is the sum of the squared residuals, in which large residuals have little weight. The scale
-        # makes it relative to the unscaled errors.
+        # Twice the cost is the sum of the squared residuals, in which large residuals have little weight. The residuals
+        # are divided by the scaled errors. Multiply by the scale, so that the sum refers to the unscaled errors.
         self._mean_square += (2.0 * scale * estimate.cost - self._mean_square) / MEMORY_TOUCHES
         is_changed = np.abs(estimate.state) > CLEAR_CHANGE * np.sqrt(self._covariance.diagonal())
-        at_end = is_changed & np.any(estimate.state == self._state_bounds, axis=0)
+        is_at_bound = is_changed & np.any(estimate.state == self._state_bounds, axis=0)
+        has_implausible_state = bool(is_at_bound[0] or is_at_bound[self._offset])  # the pretension or the offset
         was_lost = self.is_lost
-        self.is_lost = self._mean_square > MAX_MEAN_SQUARE or bool(at_end[0] or at_end[self._offset])
+        self.is_lost = self._mean_square > MAX_MEAN_SQUARE or has_implausible_state
         if self.is_lost and not was_lost:
             self._start_estimate()  # the film may have changed suddenly, so earlier touches do not help
         elif not self.is_lost:
@@ -340,7 +341,7 @@ class FilmFollower(Stage):
         (Savage-Dickey ratio, Dickey 1971).
 
         The covariance remains that of a film which has changed, because hardly any film keeps its pretension exactly.
-        The square of the shift to the estimate without a change is added to it, times the probability of this estimate.
+        Added to it is the outer product of the shift between the two cases, times the probability of no change.
         """
         change_MPa = self._state[0]
         variance = self._covariance[0, 0]
@@ -396,7 +397,8 @@ class FilmFollower(Stage):
             return contact
         conversion = self._conversion
         if conversion is None or not is_close(contact, conversion.contact):
-            # The conversion is computed at a roughly corrected contact, and stored for contacts near the given one.
+            # The conversion is computed at a roughly corrected contact. It is used again while the given contact hardly
+            # changes.
             rough_conversion = self._conversion_at(contact, state)
             corrected = self.predictor.predict(charge_pC + rough_conversion.shift_pC)
             conversion = self._conversion_at(corrected, state)._replace(contact=contact)

@@ -291,7 +291,7 @@ class ContactFilter:
 
         The standard deviations of the smoothed contact include the constant errors.
 
-        A frame that does not belong to the contact is ignored once. A second such frame in succession begins a new
+        A single frame that does not belong to the contact is ignored. A second such frame in succession begins a new
         contact. A new contact also begins if the time since the latest frame is longer than `MAX_GAP_s`. Frames may
         have the same time, for example because they were received together.
 

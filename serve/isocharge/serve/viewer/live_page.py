@@ -200,7 +200,7 @@ class LivePage(Application):
         first = tape.first_number_after(shown_until_s - HISTORY_S) if request.first is None else request.first
         samples = coalesce(tape.samples(first, stop), request.most)
         content: dict[str, Any] = {
-            "first": stop,
+            "first": stop,  # number of the first sample of the next request
             "missed": max(tape.oldest - first, 0),
             "sent_s": time.time(),
             "samples": samples.tolist(),

@@ -232,7 +232,7 @@ class Family:
         read: Reading,
         chain: tuple[float, tuple[float, float]],
     ) -> Array:
-        """Solve the presses with all forces at one position and rotation, one after the other; see `solve`.
+        """Solve one press for each force, all at one position and rotation, one after the other; see `solve`.
 
         Args:
             sensor: Sensor with the film, and with the surface at which the stress is read.
@@ -244,7 +244,8 @@ class Family:
         Returns:
             Values that `read` computes, shape (n_force, n_value).
         """
-        # Instead of the press, the film is rotated, so that every press lies on the positive x axis.
+        # The press is moved onto the positive x axis: the film is rotated by the opposite angle. The turn states the
+        # direction plus the rotation of the probe, so that the angle is the difference.
         distance, (direction, rotation) = chain
         film = sensor.film.rotated(rotation - direction)
         rotated_probe = probe.rotated(rotation)

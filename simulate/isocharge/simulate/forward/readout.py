@@ -276,7 +276,8 @@ def _area_pieces(electrode: Electrode) -> Iterator[tuple[Array, float, int]]:
         electrode: Electrode over whose area the stress is averaged.
 
     Yields:
-        Nominal corners (x, y), shape (4, 2), mm. The area of the line, which is zero. The kind of the piece.
+        Nominal corners (x, y), shape (4, 2), mm. The area of the line, which is zero. The kind of the piece, which is
+        its index in `STRESS_WEIGHTS`.
     """
     for polygon in electrode.collecting_polygons:
         # The quadrilaterals share the first corner. If a corner is missing, the last one is repeated.
@@ -296,7 +297,8 @@ def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[tuple[Array, 
         rotation: Angle by which the electrode is turned, rad.
 
     Yields:
-        The same as `_area_pieces`, with the area that the line represents.
+        The same as `_area_pieces`, with the area that the line represents. A line is a quadrilateral whose corners
+        coincide in pairs.
     """
     # Each edge leads from a corner to the next one. Each mean is over two edges, so each half of an edge represents a
     # quarter of the area.

@@ -89,7 +89,7 @@ class Triangulation:
                 f"{np.count_nonzero(~np.isfinite(charge))} charges that are not finite"
             )
 
-        # Search from several starting points for each press, which do not lie close together.
+        # For each press, search from several starting points that do not lie close together.
         largest_charge = np.abs(charge).max(axis=1, keepdims=True, initial=1.0)
         equal_sigma = np.broadcast_to(largest_charge, charge.shape)
         starts = starting_contacts(self.charge_map, charge, equal_sigma, starts=STARTS)

@@ -271,8 +271,9 @@ class DimensionlessGroups:
 
     @property
     def height(self) -> float:
-        """Approximate deflection of the centre of the film under the force of the probe, in units of a A.
+        """Approximate scaled deflection of the centre of the film under the force of the probe, dimensionless.
 
+        The unit is the product of the radius a of the film and the amplitude A.
         The value is 1 if the back of the film is vented and the theory includes bending.
         """
         film_stiffness = MEMBRANE_STIFFNESS * max(self.tension, 0.0) + PLATE_STIFFNESS * self.bending
@@ -281,11 +282,11 @@ class DimensionlessGroups:
 
     @property
     def static_height(self) -> float:
-        """Approximate deflection of the centre of the film under the static pressure, in units of a A.
+        """Approximate scaled deflection of the centre of the film under the static pressure, dimensionless.
 
-        The deflection H is the solution of a cubic equation that is correct in three limiting cases. For a scaled
-        pressure p, the limits are H^3 = 0.662^3 p for a membrane without pretension (Hencky 1915), H = p / (4 tension)
-        for a membrane with a large pretension, and H = p / (64 bending) for a plate.
+        The unit is that of `height`. The deflection H solves a cubic equation that is correct in three limits. For a
+        scaled pressure p, the limits are H^3 = 0.662^3 p for a membrane without pretension (Hencky 1915),
+        H = p / (4 tension) for a membrane with a large pretension, and H = p / (64 bending) for a plate.
         """
         # The cubic equation is cubic_factor H^3 + linear_factor H = p. The trapped air also resists the deflection. The
         # displaced volume is about pi H / 2, the volume of a paraboloid with the height H and the radius 1.

@@ -46,7 +46,7 @@ def tension_change(film: Film, film_warming_K: float, ring_warming_K: float) -> 
 
 
 def warmed(sensor: Sensor, film_warming_K: float, ring_warming_K: float = 0.0) -> Sensor:
-    """Return a copy of a sensor whose pretension is the pretension at other temperatures of the film and its ring.
+    """Return a copy of a sensor, with its pretension at other temperatures of the film and its ring.
 
     Args:
         sensor: The sensor at the temperatures for which it is described.

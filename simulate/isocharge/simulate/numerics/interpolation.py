@@ -258,8 +258,9 @@ class Turns:
             largest_harmonics: Largest |k| of the terms of the series for |m| = 0, 1, 2, and so on; see the docstring of
                 the class. Without directions, only m = 0 is used. For an axisymmetric probe, only k = 0 is used.
             period: Smallest rotation that maps the probe onto itself, rad; 0 if the probe is axisymmetric.
-            has_directions: Whether the angle d varies. On an axisymmetric film, it has no effect. If the probe keeps
-                its orientation on the film, it is zero.
+            has_directions: Whether the angle d varies; see the docstring of the class. It does not vary if the film is
+                axisymmetric, so that d has no effect, or if the probe keeps its orientation on the film, so that d is
+                zero.
         """
         largest_m = len(largest_harmonics) - 1 if has_directions else 0
         pairs: list[tuple[int, int]] = []  # (m, k) of each term
@@ -271,9 +272,10 @@ class Turns:
         n_turn, step = _lattice(harmonics, symmetry_order)
         turn = np.arange(n_turn)
         return cls(
+            # Only even harmonics of d occur, so half a turn is the period of d.
             direction=np.pi * step * turn / n_turn if has_directions else np.zeros(n_turn),
             rotation=2.0 * np.pi * turn / n_turn if period else np.zeros(n_turn),
-            harmonics=harmonics * np.array([2, 1]),
+            harmonics=harmonics * np.array([2, 1]),  # (2 m, k)
             symmetry_order=symmetry_order,
         )
 

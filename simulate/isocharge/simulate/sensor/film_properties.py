@@ -115,7 +115,7 @@ FILM_PROPERTIES = (
 
 
 def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> tuple[Sensor, Probe]:
-    """Change a sensor and a probe by values of film properties.
+    """Return a sensor and a probe that have the given values of film properties.
 
     Args:
         sensor: Sensor that is changed.
@@ -219,7 +219,7 @@ class FilmPrior:
     def properties(self) -> tuple[FilmProperty, ...]:
         """Declarations of all properties, in the order of the vector of their values."""
         # The shift may use half of the gap between the electrodes and the rim, and an oval clamp the other half. Each
-        # of them has two components.
+        # of them has two components of up to this size, whose vector sum is larger by a factor of sqrt(2).
         largest_shift = 0.5 * self._rim_gap / math.sqrt(2.0)
         largest_oval = largest_shift / self.sensor.film.radius
         largest_of = {

@@ -46,7 +46,7 @@ class PressEvents:
             keyboard: File descriptor of the keyboard; None for no keyboard.
         """
         self._watch = watch
-        self._queue: Queue[Frame | str | Exception | None] = Queue()  # None is a call of `arm`
+        self._queue: Queue[Frame | str | Exception | None] = Queue()  # None stands for a call of the method `arm`
         self._waiting_arms = 0  # number of calls of `arm` that are still in the queue
         self._stop = threading.Event()
         self._port_thread = self._start_reading(_frames(chunks, stream))
@@ -215,7 +215,7 @@ class Dialogue:
     def _wait_for(self, *phases: Phase) -> WatchResult:
         """Wait for the next reading in one of the given phases.
 
-        Readings in other phases are only displayed. A machine types nothing.
+        Readings in other phases are only displayed. Typed lines are ignored, because a machine makes the presses.
 
         Raises:
             SessionEnd: If the port or the input has ended.
@@ -263,8 +263,8 @@ class Dialogue:
     def _handle_line(self, line: str, press: SteadyPress | None, proposed: Array) -> bool:
         """Carry out the command that a person typed, or print why it cannot be carried out.
 
-        A press can only be recorded while a question about it is open. While a question is open, the command to remove
-        the last press discards the steady press. Otherwise, this command removes a recorded press.
+        A press can only be recorded while a question about it is open. The remaining command removes the last press:
+        the steady press if a question about it is open, or otherwise the press that was recorded last.
 
         Args:
             line: The typed line.
@@ -293,7 +293,7 @@ class Dialogue:
             self._say_summary()
         except PressError as error:
             say(f"   {error}")
-        return False  # an open question remains open; without one, the caller compares the proposal with the new one
+        return False  # an open question remains open; the caller notices whether the proposal has changed
 
     def _take(self, press: SteadyPress, contact: Array) -> bool:
         """Record a press in the session, and return whether the session accepts it.

@@ -140,14 +140,14 @@ def solve_even(
     Args:
         problem: The calibration problem.
         executor: Executor that runs the solves; None for this process.
-        values: Properties of the film, shape (n_property,), of which the imperfections are ignored; None for those with
-            which a calibration begins.
+        values: Properties of the film, shape (n_property,); None for the properties with which a calibration begins.
+            Imperfections are ignored.
     """
     layout = problem.prior.layout
     prior = layout.prior
     even_values = prior.even(problem.prior.mean[layout.film] if values is None else values)
     film = solve_even_map(prior, even_values, problem.solved_domain, executor)
-    larger_probe = None
+    larger_probe = None  # map of a larger probe, for the derivatives with respect to the radius of the probe
     is_radius = np.array(prior.names) == PROBE_RADIUS
     if is_radius.any():
         larger_values = even_values + STEP * prior.std * is_radius
@@ -193,17 +193,20 @@ def _solved_distance(estimation: Estimation) -> float:
 
 
 def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
-    """Return whether the solved film hardly differs from a film with given properties and with the real probe.
+    """Return whether the charges of the solved film hardly differ from those of the film with the given properties.
+
+    The solved film may lack imperfections, and its probe may be round although the real probe is not. The lack of
+    imperfections may be neglected if their effects on the charges are small.
 
     Args:
         charges: The solved film, with its charges and their derivatives.
-        values: Properties of the other film, shape (n_property,).
-        contact: Contacts at which the effect of the missing imperfections is computed, shape (n, 3).
+        values: The given properties, shape (n_property,).
+        contact: Contacts at which the effects are computed, shape (n, 3).
     """
-    solved, described = charges.film, charges.prior
-    if solved.probe.is_axisymmetric != described.probe.is_axisymmetric:
+    solved, wanted = charges.film, charges.prior
+    if solved.probe.is_axisymmetric != wanted.probe.is_axisymmetric:
         return False
-    if solved.sensor.film.shear != described.sensor.film.shear:
+    if solved.sensor.film.shear != wanted.sensor.film.shear:
         return False
     charge, jacobian = charges.linearised(values, contact)
     # The effects of the imperfections that do not change the stress are exact.

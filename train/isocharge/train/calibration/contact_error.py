@@ -21,7 +21,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import with_log_force
-from isocharge.serve.presses.measured_presses import FORCE_STD, POSITION_STD_MM
+from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM
 from isocharge.simulate import Domain, Sweep
 from isocharge.simulate.identifiability.cramer_rao import CramerRao
 from isocharge.simulate.numerics.disk import log_spaced_forces, sunflower
@@ -68,7 +68,8 @@ class ContactSensitivity:
     """Effects of noise and of errors of a film on estimated contacts.
 
     Attributes:
-        film_gain: Matrix G, shape (n, 3, n_unknown).
+        film_gain: Derivatives of the errors of the contacts (x, y, ln F) with respect to errors of the unknowns, shape
+            (n, 3, n_unknown).
         noise_covariance: Covariance of the errors that noise alone causes, shape (n, 3, 3).
     """
 
@@ -85,10 +86,15 @@ class ContactSensitivity:
             domain: The working area.
         """
         linearised = _linearise_at(film, charges, spread_contacts(domain))
-        slopes = linearised.contact_jacobian[:, :-3]
-        domain_precision = np.diag(3.0 / domain.scale**2)  # the variance of a uniform distribution from -1 to 1 is 1/3
+        charge_rows = slice(-len(CONTACT))  # the last rows are those of measured coordinates
+        slopes = linearised.contact_jacobian[:, charge_rows]
+        film_slopes = linearised.jacobian[:, charge_rows]
+        # The error of a contact is (S' S + P)^-1 S' (noise + R e), where e is the error of the unknowns, and P is the
+        # precision of the prior. S and R are the derivatives of the charges with respect to the contact and to the
+        # unknowns. A uniform distribution from -1 to 1 has the variance 1/3.
+        domain_precision = np.diag(3.0 / domain.scale**2)
         noise_covariance = np.linalg.inv(slopes.swapaxes(1, 2) @ slopes + domain_precision)
-        film_gain = noise_covariance @ slopes.swapaxes(1, 2) @ linearised.jacobian[:, :-3]
+        film_gain = noise_covariance @ slopes.swapaxes(1, 2) @ film_slopes
         return cls(film_gain, np.asarray(noise_covariance))
 
     @property
@@ -156,17 +162,17 @@ def next_presses(
     covariance = film.covariance
     candidates = _candidates(problem)
     contact_std = (position_std_mm, position_std_mm, force_std)
-    _, information_root = _linearise_at(film, charges, candidates, contact_std).eliminated()
+    _, candidate_rows = _linearise_at(film, charges, candidates, contact_std).eliminated()
     sensitivity = ContactSensitivity.of(film, charges, problem.domain)
 
-    # The errors of position and force count relative to those of the noise.
+    # Divide the errors of x, y and ln F by those that the noise causes, so that they can be added.
     scale = np.sqrt(np.diagonal(sensitivity.noise_covariance, axis1=1, axis2=2).mean(axis=0))  # shape (3,)
     gain = (sensitivity.film_gain / scale[:, None]).reshape(-1, len(covariance))
     proposed = []
     for _ in range(count):
-        # A press with the rows H reduces the covariance C by C H' (1 + H C H')^-1 H C.
-        spread_rows = information_root @ covariance  # H C, shape (n, n_row, n_unknown)
-        innovation = np.eye(information_root.shape[1]) + spread_rows @ information_root.swapaxes(1, 2)
+        # A candidate with the rows H reduces the covariance C by C H' (1 + H C H')^-1 H C.
+        spread_rows = candidate_rows @ covariance  # H C, shape (n, n_row, n_unknown)
+        innovation = np.eye(candidate_rows.shape[1]) + spread_rows @ candidate_rows.swapaxes(1, 2)  # 1 + H C H'
         effect = spread_rows @ gain.T  # shape (n, n_row, n_error)
         reduction = (effect * np.linalg.solve(innovation, effect)).sum(axis=(1, 2))
         best = int(reduction.argmax())

@@ -154,7 +154,7 @@ class Prior:
 
     @cached_property
     def parts(self) -> Array:
-        """Parts of the covariance of the unknowns, shape (4 + n_session, n_unknown, n_unknown).
+        """Terms whose sum is the covariance of the unknowns, shape (4 + n_session, n_unknown, n_unknown).
 
         The first part is the covariance that is the same under all hypotheses. The other parts are the covariances of
         the uneven tension, of the other imperfections, of the discrepancy, and of each unknown of the session. A
@@ -409,6 +409,10 @@ class _Evidence:
     @classmethod
     def of(cls, model: ModelValues, data: PressData, contact: Array, unknowns: Array, prior: Prior) -> "_Evidence":
         """Linearise the residuals, and eliminate the contacts from them, so that they only depend on the unknowns.
+
+        The hypotheses differ only in the prior of the unknowns. Therefore, the residuals are projected onto the column
+        space of their Jacobian (QR factorisation), which has fewer dimensions. The squares of the other components,
+        and the logarithms of the volumes and densities, are the same for all hypotheses.
 
         Args:
             model: Charges at the unknowns, as `model_values` returns them.

@@ -1,4 +1,4 @@
-"""Estimate of a film: a Gaussian distribution of its properties, of its discrepancy, and of what a session adds.
+"""Estimate of a film: a Gaussian distribution of its properties, its discrepancy, and the unknowns of the session.
 
 The discrepancy contains smooth differences between the real charges and those of the film with its best properties. A
 real film has features that no property describes. For each electrode, a Gaussian process of finite rank models their
@@ -34,7 +34,9 @@ FADING = 0.5
 
 
 def terms(contact: Array, domain: Domain) -> Array:
-    """Compute the terms of the discrepancy, each multiplied by FADING^(i + j + m).
+    """Compute the terms of the discrepancy, which are products of Chebyshev polynomials.
+
+    The polynomials in x, y and ln F have the degrees i, j and m. Each term is multiplied by FADING^(i + j + m).
 
     Args:
         contact: Contacts (x, y, F) within the domain, shape (n, 3), mm and N.
@@ -47,7 +49,7 @@ def terms(contact: Array, domain: Domain) -> Array:
     largest_degrees = (DEGREE, DEGREE, FORCE_DEGREE)
     x, y, log_force = domain.to_unit(contact).T
     products = chebyshev.chebvander3d(x, y, log_force, largest_degrees)
-    columns = np.ravel_multi_index(degrees.T, np.add(largest_degrees, 1))
+    columns = np.ravel_multi_index(degrees.T, np.add(largest_degrees, 1))  # columns of `products` with these degrees
     return np.asarray(FADING ** degrees.sum(axis=1) * products[:, columns])
 
 
@@ -203,10 +205,10 @@ class FilmEstimate:
     def drifted(self) -> "FilmEstimate":
         """Return the estimate with which a later session begins.
 
-        The possible drift of the film since then is added to the covariance. A drift of the pretension comes from a
-        change of the temperature, which adds the same tension in all directions. The uneven parts of the tension remain
-        the same, so their shares of the mean tension change, which are unknowns of the estimate. The offset and the
-        other unknowns of the earlier session are removed.
+        The covariance is increased, because the film may have drifted since this session. A drift of the pretension
+        comes from a change of the temperature, which adds the same tension in all directions. The estimate contains the
+        uneven parts of the tension as shares of the mean tension. The uneven parts do not drift, so the drift of the
+        mean tension changes their shares. The offset and the other unknowns of this session are removed.
         """
         layout = self.layout
         drift_std = np.zeros(len(self.values))

@@ -177,14 +177,14 @@ def _tension_factors(
         """Solve the film after an equal change of its tension in all directions, and return its charges."""
         values = film.film_values.copy()
         values[mean_tension] += change_MPa
-        # The uneven parts of the tension do not change in MPa, so their shares of the mean change.
+        # The values contain the uneven parts of the tension as shares of the mean tension. In MPa, they do not change.
         values[uneven_tensions] *= film.values[mean_tension] / values[mean_tension]
         even_map = solve_even_map(prior, values, charges.domain, executor)
         is_even = charges.film.sensor.film.is_axisymmetric
         if is_even:
             return even_map.charges(contact)
         slopes = FilmSlopes.build(even_map, executor=executor)
-        # The radius of the probe is the same.
+        # The values contain the same radius of the probe, so that its derivatives are not needed.
         similar_films = FilmCharges(prior, prior.even(values), even_map, slopes, larger_probe=None)
         return similar_films.charges(values, contact)
 
@@ -241,9 +241,10 @@ def training_data(
     domain = series.domain
     contact = draw_contacts(rng, domain, PRESSES)
     charge = _drawn_charges(series, rng, contact)
-    # The gain changes linearly during the session, so that its values have the standard deviation drift / sqrt(12).
-    drift = np.hypot(film.value("drift"), film.std("drift")) / np.sqrt(12.0)
-    charge = charge * (1.0 + drift * rng.standard_normal((PRESSES, 1)))
+    # The gain changed linearly by the drift during the session. A uniform distribution of this width has the standard
+    # deviation drift / sqrt(12). The mean square of the drift is that of its estimate plus its variance.
+    drift_std = np.hypot(film.value("drift"), film.std("drift")) / np.sqrt(12.0)
+    charge = charge * (1.0 + drift_std * rng.standard_normal((PRESSES, 1)))
     charge = charge + film.std("offset") * rng.standard_normal((PRESSES, 1))
     sensor, probe = charges.prior.film(film.film_values)
     return TrainingData(

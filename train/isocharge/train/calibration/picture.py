@@ -39,7 +39,7 @@ def calibration_picture(result: CalibrationResult) -> Figure:
         map_axes.plot(x[is_bad], y[is_bad], "X", color=FELT, mec=INK, ms=9, label="left out")
     map_axes.legend(loc="upper right", fontsize=8)
 
-    # The residual of each press, relative to the expected size. Without redundant measurements, there is none.
+    # The residual of each press, relative to the expected size. A press without redundant measurements has no residual.
     relative_residual = np.sqrt(np.nan_to_num(result.estimation.press_chi2))
     largest_shown = max(3.0, 1.1 * relative_residual[~is_bad].max(initial=0.0))
     residual_axes.bar(result.presses.lines, relative_residual, color=np.where(is_bad, FELT, FITTED))

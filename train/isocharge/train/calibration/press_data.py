@@ -143,7 +143,7 @@ class Linearised:
         return (transposed @ self.residual[:, :, None])[:, :, 0], transposed @ self.jacobian
 
     def contact_change(self, change: Array) -> Array:
-        """Return the best changes of the contacts (x, y, ln F), shape (n, 3), after a change of the unknowns."""
+        """Return the changes of the contacts (x, y, ln F), shape (n, 3), that fit best after the unknowns have changed."""
         residual = self.residual + self.jacobian @ change
         return -(np.linalg.pinv(self.contact_jacobian) @ residual[:, :, None])[:, :, 0]
 

@@ -81,7 +81,7 @@ class CalibrationResult:
 
     @cached_property
     def film_error_before(self) -> ContactError:
-        """Errors of contacts that the uncertainty of the film caused before the presses."""
+        """Errors of contacts that the uncertainty of the film would cause without the presses."""
         return self.sensitivity.film_error(self.problem.film_before.covariance)
 
     @cached_property

@@ -141,7 +141,7 @@ class PressSession:
 
     @cached_property
     def _charges(self) -> FilmCharges:
-        """Charges of the film that was solved last. The next fit begins with them; the first one with an even film."""
+        """Charges of the film that was solved last, where the next fit begins. The first fit begins with an even film."""
         return solve_even(self.problem, self._executor)
 
     @property

@@ -154,7 +154,7 @@ class FitConfig(Settings, frozen=True):
     training: TrainingConfig = TrainingConfig()
 
     def for_electrodes(self, n_electrode: int) -> "FitConfig":
-        """Return a copy of the settings, with each missing size replaced by its default for a number of electrodes."""
+        """Return a copy of the settings, in which missing sizes are the defaults for the given number of electrodes."""
         hidden, misfit_hidden = self.network.widths(n_electrode)
         network = replace(self.network, hidden=hidden, misfit_hidden=misfit_hidden)
         sizes = self.training.sizes(n_electrode)

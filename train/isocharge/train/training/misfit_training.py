@@ -25,11 +25,11 @@ LOG_DISTANCES = (-1.0, 3.0)
 
 
 def draw_charges(rng: np.random.Generator, charge: Array, noise: ChannelNoise, count: int) -> Array:
-    """Draw charges at all distances from the charges of presses.
+    """Draw charges whose distances from the charges of presses vary from less than the noise to very large values.
 
-    All electrodes have the noise of the press. For each press, some electrodes are chosen at random, and their charges
-    are moved by normally distributed distances. The standard deviation of these distances is log-uniform within
-    `LOG_DISTANCES`. The distances are added to the levels of the charges, whose noise has the standard deviation 1.
+    Presses are chosen at random, and normally distributed errors are added to the levels of their charges. The level of
+    a charge is its value on a scale on which the noise has the standard deviation 1. In each press, a random share of
+    the electrodes has errors whose standard deviation is log-uniform within `LOG_DISTANCES`. The others have noise.
 
     Args:
         rng: Random number generator.
@@ -41,7 +41,7 @@ def draw_charges(rng: np.random.Generator, charge: Array, noise: ChannelNoise, c
         Charges, shape (count, n_electrode), pC.
     """
     level = noise.level(charge[rng.integers(len(charge), size=count)])
-    is_moved = rng.random(level.shape) < rng.random((count, 1))
+    is_moved = rng.random(level.shape) < rng.random((count, 1))  # each press has its own share of such electrodes
     distance = 10.0 ** rng.uniform(*LOG_DISTANCES, (count, 1))
     std = np.where(is_moved, distance, 1.0)
     return noise.charge(level + std * rng.standard_normal(level.shape))

@@ -63,8 +63,8 @@ def logarithmic_features(charge: Array, white_noise_pC: float = LOWEST_CHARGE) -
 def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
     """Return features for charges of both signs: asinh(charge / typical charge) minus its mean over the given charges.
 
-    Before the conversion, each charge is limited to three times the range of the given charges: the inverse hyperbolic
-    sines may exceed their range by its width on both sides.
+    Before the conversion, each charge is limited, so that the inverse hyperbolic sines may lie outside the range of
+    those of the given charges by at most the width of this range.
 
     Args:
         charge: Charges of presses, shape (n, n_electrode), pC.
@@ -270,7 +270,7 @@ def feature_values(features: ChargeFeatures, charge: Tensor) -> Tensor:
         return torch.tensor(values, dtype=charge.dtype)
 
     ratio = charge.clamp(constant(features.low_pC), constant(features.high_pC)) / constant(features.typical_pC)
-    # Without a mean, all charges of the presses are positive.
+    # Logarithmic features, which have no mean, are for presses whose charges are all positive.
     return torch.log(ratio) if features.mean is None else torch.asinh(ratio) - constant(features.mean)
 
 
@@ -297,7 +297,7 @@ def as_tensor(values: Reals) -> Tensor:
 def fold_network(network: InverseNetwork) -> FoldedNetwork:
     """Fold the whitening and the units of the answers into the perceptrons of a trained network.
 
-    A constant force is part of the last layer of the contact perceptron.
+    If all presses have the same force, the last layer of the contact perceptron always gives this force.
     """
     mean = _to_numpy(network.features_mean)
     matrix = _to_numpy(network.whitening)

@@ -288,7 +288,7 @@ class HttpServer(uvicorn.Server):
         return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to close the context beside the server, and finish the open requests. Then refuse the others."""
+        """Begin to close the context beside the server, and wait for open requests. Then refuse those that remain."""
         closing = asyncio.create_task(self._beside.aclose())
         await super().shutdown(sockets)
         connections: Any = list(self.server_state.connections)
