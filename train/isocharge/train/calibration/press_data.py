@@ -143,7 +143,14 @@ class Linearised:
         return (transposed @ self.residual[:, :, None])[:, :, 0], transposed @ self.jacobian
 
     def contact_change(self, change: Array) -> Array:
-        """Return the changes of the contacts (x, y, ln F), shape (n, 3), that fit best after the unknowns have changed."""
+        """Return the changes of the contacts that fit best after a change of the unknowns.
+
+        Args:
+            change: Change of the unknowns, shape (n_unknown,).
+
+        Returns:
+            Changes of x, y and ln F, shape (n, 3).
+        """
         residual = self.residual + self.jacobian @ change
         return -(np.linalg.pinv(self.contact_jacobian) @ residual[:, :, None])[:, :, 0]
 

@@ -141,7 +141,7 @@ class PressSession:
 
     @cached_property
     def _charges(self) -> FilmCharges:
-        """Charges of the film that was solved last, where the next fit begins. The first fit begins with an even film."""
+        """Charges of the film that was solved last, with which the next fit begins. At first, it is an even film."""
         return solve_even(self.problem, self._executor)
 
     @property
