@@ -41,8 +41,8 @@ CHANGE_BLOCKS = 5
 def touched_blocks(values: Array, times_s: Array, min_noise: float = 0.0) -> tuple[Reals, Array, Booleans]:
     """Return the time of each block, the median of each channel in it, and whether something touches the film in it.
 
-    The stage `Touch` of a stream detects the touches. While nothing touches the film, the charges at rest are the
-    levels half a second ago. A slow change is therefore no touch.
+    The stage `Touch` of a stream detects the touches. Its charges are the differences from the levels `CHANGE_BLOCKS`
+    earlier, so that a slow change is no touch. During a touch, the earlier levels are those before its beginning.
 
     Args:
         values: Values of the channels, shape (n, channels), in any unit.

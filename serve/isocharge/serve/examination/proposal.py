@@ -122,19 +122,20 @@ def _choose_channels(
     if not electrodes:
         electrodes = tuple(ELECTRODES[: len(candidates)])  # A, B, C, ...
     try:
-        # A unit in the names does not matter, because the gain is requested if it is missing.
+        # Units in the names are ignored here. If a unit requires a gain that is missing, the gain is requested later.
         positions = Channels(Setup(electrodes), any_unit=True).indices_by_name_or_order(capture.frames[-1])
     except ChargeError:  # the names are nearly those of electrodes, which is reported later
         return {}
-    if positions is not None:  # perhaps with a channel that never changes, which is reported later
+    if positions is not None:  # one of these channels may never change, which is reported later
         return dict(zip(electrodes, positions, strict=True))
     if len(candidates) < len(electrodes):
         return {}
     # Compare the groups of adjacent channels by their largest noise over the smallest one, in powers of ten.
     log_noise = np.log10(np.maximum(noise[candidates], np.finfo(float).tiny))
     groups = np.lib.stride_tricks.sliding_window_view(log_noise, len(electrodes))
-    first = int(np.argmin(np.round(np.ptp(groups, axis=1))))
-    return dict(zip(electrodes, candidates[first:], strict=False))
+    log_ratios = np.round(np.ptp(groups, axis=1))
+    first_of_group = int(np.argmin(log_ratios))
+    return dict(zip(electrodes, candidates[first_of_group:], strict=False))
 
 
 def _rest_level(values: Array) -> float:

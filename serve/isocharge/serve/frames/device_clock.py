@@ -172,7 +172,8 @@ class DeviceClock:
         """
         previous_arrival_s = self._chunk_arrival_s
         self._chunk_arrival_s = arrival_s
-        is_new_arrival = previous_arrival_s not in (None, arrival_s)  # the first arrival may be that of a file
+        # All chunks of a file arrive at the same time. After the first arrival, it is not known whether this is a file.
+        is_new_arrival = previous_arrival_s not in (None, arrival_s)
         if self._fitted_us is None or not is_new_arrival:
             return  # the provisional fit of `stamp` remains
 
@@ -180,7 +181,7 @@ class DeviceClock:
         was_clock_set = abs(delay_s) > MAX_DELAY_s
         if was_clock_set and not self._is_fit_provisional:
             self._latest_host_s = -math.inf  # allows the host time of the next reading to be earlier
-        # Readings that a board has stored before the connection may have moved a provisional fit far ahead.
+        # If a board has stored readings before the connection, a provisional fit may have moved far ahead.
         self._latest_host_s = min(self._latest_host_s, arrival_s + MAX_LEAD_s)
         # A provisional fit relies on the arrival of only one chunk. A fit that begins at this arrival replaces it.
         if was_clock_set or self._is_fit_provisional:

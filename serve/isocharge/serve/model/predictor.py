@@ -222,10 +222,12 @@ class Predictor:
         return self._predict(charges)
 
     def _predict_with_noise(self, charge_pC: Singles) -> Contacts:
-        """Compute the contacts of n presses, with the covariance for the noise of `with_noise`.
+        """Compute the contacts of n presses whose charges have more noise than those of the training.
 
         Each charge is raised and lowered by the standard deviation of its additional noise. Half of the difference
-        between the two contacts is the effect of the additional noise of this charge (central difference).
+        between the two contacts is the effect of the additional noise of this charge (central difference). The effects
+        of all charges are added to the covariance. The misfit is divided by the mean factor by which the noise is
+        larger.
 
         Args:
             charge_pC: Touch charges, shape (n, electrodes), pC.

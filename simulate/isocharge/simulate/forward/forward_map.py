@@ -129,7 +129,7 @@ class ForwardMap:
                 smallest and the largest force.
             orientation: Whether the probe keeps its own orientation ("fixed") or may be rotated ("random"). It only
                 matters if neither the film nor the probe is axisymmetric. A fixed orientation then needs fewer solves:
-                a quarter for a rectangle, and two thirds for an equilateral triangle.
+                a quarter of them for a rectangle, and two thirds for an equilateral triangle.
             executor: Executor that runs the solves; None for this process. The result does not depend on it.
 
         Raises:
@@ -137,10 +137,10 @@ class ForwardMap:
             SolveError: If a press has no equilibrium, or the interpolation error exceeds `INTERPOLATION_ERROR`.
         """
         domain = Domain(radius, force_range)
-        # Increase the number of nodes until the interpolated charges are sufficiently accurate. They are compared at
-        # the check presses, which are solved directly in the first pass of the loop. If the error is very large, the
-        # next number of nodes would not suffice either and is skipped.
-        check_charges: list[Array] = []
+        # Increase the number of nodes until the interpolated charges are sufficiently accurate. They are compared with
+        # the charges of the check presses, which are solved directly. If the error is very large, the next number of
+        # nodes would not suffice either and is skipped.
+        check_charges: list[Array] = []  # solved in the first pass of the loop
         error = np.inf
         remaining_counts = list(node_counts(sensor.film))
         while remaining_counts:
@@ -148,7 +148,8 @@ class ForwardMap:
             forward_map = cls.build_unchecked(
                 sensor, probe, domain, count, settings, orientation=orientation, executor=executor
             )
-            settings = replace(forward_map.settings, layer=forward_map.layer)  # the next map has the same mesh
+            # With the mesh of this map, the charges of the next map can be compared with the same check presses.
+            settings = replace(forward_map.settings, layer=forward_map.layer)
             if not check_charges:
                 contact, rotation = spread_check_presses(domain, CHECK_COUNT)
                 if forward_map.family.is_oriented:
@@ -185,7 +186,7 @@ class ForwardMap:
             sensor: Sensor whose charges the map computes.
             probe: Probe that presses the film.
             domain: Presses for which the map will be used.
-            count: Numbers of distances and forces, and harmonics of the angles, for which presses are solved.
+            count: Numbers of distances and forces at which presses are solved, and of harmonics of the angles.
             settings: Accuracy, theory and mesh; see `build`.
             orientation: Whether the probe keeps its own orientation; see `build`.
             read: Function that computes the stress fields of the table from each solved press, shape (n_element,
@@ -202,7 +203,7 @@ class ForwardMap:
         family = Family.spread(domain, sensor.film, probe, count, orientation)
         template = template_for(resolution, probe.topology, not sensor.film.is_axisymmetric)
         table = family.unfold(family.solve(sensor, probe, same_mesh, executor, read), template)
-        return cls(sensor, probe, family, settings.theory, resolution, layer, table, np.inf)
+        return cls(sensor, probe, family, settings.theory, resolution, layer, table, error=np.inf)
 
     @property
     def domain(self) -> Domain:

@@ -78,6 +78,9 @@ class Triangulation:
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
 
+        Returns:
+            The contacts. A contact is NaN if no position, or more than one, agrees with the charges; see `Fix`.
+
         Raises:
             ChargeError: If there is not one finite charge for each electrode.
         """
@@ -90,8 +93,8 @@ class Triangulation:
             )
 
         # For each press, search from several starting points that do not lie close together.
-        largest_charge = np.abs(charge).max(axis=1, keepdims=True, initial=1.0)
-        equal_sigma = np.broadcast_to(largest_charge, charge.shape)
+        largest_charge = np.abs(charge).max(axis=1, keepdims=True, initial=1.0)  # at least 1 pC
+        equal_sigma = np.broadcast_to(largest_charge, charge.shape)  # all charges of a press have the same weight
         starts = starting_contacts(self.charge_map, charge, equal_sigma, starts=STARTS)
         contacts, spreads = self._descend(np.repeat(charge, STARTS, axis=0), starts.reshape(-1, 3))
         contacts = contacts.reshape(starts.shape)

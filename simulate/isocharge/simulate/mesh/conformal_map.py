@@ -217,8 +217,8 @@ def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array, ma
 
     # Rotate the direction of each inner point towards the even angle. The rotation is small if the circle is close to
     # the inner points. The function `tanh` limits the rotation to `max_turn`.
-    evenness = 0.5 * np.minimum((radius_ratio - 1.0) / CLEARANCE, 1.0)[..., None]  # from 0 to 0.5
-    rotation = max_turn * np.tanh(evenness * (even_angle - inner_angle) / max_turn)
+    share = 0.5 * np.minimum((radius_ratio - 1.0) / CLEARANCE, 1.0)[..., None]  # of the difference, from 0 to 0.5
+    rotation = max_turn * np.tanh(share * (even_angle - inner_angle) / max_turn)
     mixed_angle = inner_angle + rotation
 
     # Add the rays between the rays of the inner points.

@@ -363,7 +363,7 @@ def _thin_ring_count(placement: Placement, total_width: float) -> int:
     smallest_width = min(min(total_width, 0.2) / stretch / log_range, 1.0 / 8.0)
 
     # The logarithm to the base 3 is the number of rings between both widths. Two rings are needed even if the widths
-    # are equal. With one ring, the charge of an electrode that ends 1 mm from the rim of a film of 25 um is wrong by up
-    # to 0.4 %. If the strip is 0.12 to 0.7 film radii wide, all charges are wrong by 0.02 to 0.24 %. With two rings,
-    # these errors are 0.003 and 0.002 %.
+    # are equal. With only one ring, the charge of an electrode that ends 1 mm from the rim of a film of 25 um is wrong
+    # by up to 0.4 %, and all charges are wrong by 0.02 to 0.24 % if the strip is 0.12 to 0.7 film radii wide. With two
+    # rings, these errors are 0.003 and 0.002 %.
     return max(2, 1 + math.floor(THIN_RINGS_PER_FACTOR * math.log(largest_width / smallest_width, 3.0)))

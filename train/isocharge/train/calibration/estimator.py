@@ -137,7 +137,7 @@ class Prior:
 
     @property
     def mean(self) -> Array:
-        """Means, shape (n_unknown,)."""
+        """Means of the unknowns, shape (n_unknown,)."""
         if self.earlier is not None:
             return self.earlier.values
         mean = np.zeros(self.layout.coefficients.stop)

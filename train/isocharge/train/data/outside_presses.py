@@ -52,13 +52,13 @@ class OutsidePresses:
 
         Args:
             domain: Working area and range of forces of the network.
-            presses: Presses of the area for which a network was requested. If the working area is smaller, because the
-                map from contacts to charges folds, the presses beyond the working area are outside.
+            presses: Presses of the area for which a network was requested. The working area may be smaller, because the
+                map from contacts to charges folds beyond it. The presses beyond it are then used.
             outside: Presses farther from the centre than all of `presses`; None if there are none.
             seed: Seed of the random choice of the presses for training and of the presses for measuring.
 
         Returns:
-            The presses; None if they are too few.
+            The presses; None if fewer than `N_NEIGHBOURS` presses for measuring have a large enough force.
         """
         pool = presses[presses.distance > domain.radius]
         if outside is not None:

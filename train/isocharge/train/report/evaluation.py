@@ -355,9 +355,9 @@ def _calibration_charges(model_folder: Path, model: ModelMetadata) -> Array:
 def check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
     """Raise an error if a model was not trained for the sensor of a dataset.
 
-    For measured presses, the names of the electrodes must be equal, because a calibrated model has another film. A
-    model of presses alone may have learned from the presses on which it would be tested. For simulated presses, all
-    values of the two sensors must be equal, except the names of the sensors.
+    For measured presses, only the names of the electrodes are compared, because a calibration changes the film. A model
+    of presses alone is refused, because it may have learned from the presses on which it would be tested. For simulated
+    presses, all values of the two sensors must be equal, except the names of the sensors.
 
     Args:
         model: Metadata of the model.
