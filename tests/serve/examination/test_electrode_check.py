@@ -106,6 +106,7 @@ def test_channels_are_assigned_for_any_order_and_gain(order):
     gains = np.random.default_rng(0).uniform(0.2, 5.0, (2, 4))
     changes = (0.6 + np.eye(4))[:, list(order)] * np.outer(*gains)
     assert [order[column] for column in assign_channels(changes, "ABCD")] == [0, 1, 2, 3]
+    assert assign_channels(np.array([[1.0, 2.0], [2.0, 1.0]]), "AB") == [1, 0]
 
 
 def test_presses_that_do_not_distinguish_the_channels_raise_an_error():

@@ -8,6 +8,9 @@ import pytest
 from isocharge.serve import examine
 from isocharge.serve.examination import listening
 from isocharge.serve.port.file_source import Chunk
+from isocharge.serve.port.serial_line import Request
+
+REQUEST = Request(b"?", 200.0)
 
 
 @pytest.mark.parametrize(
@@ -27,6 +30,7 @@ def test_baud_rate_is_found(monkeypatch, silence_s, bauds, tried, good):
 
     @contextmanager
     def open_port(url, *, baud, request, wait):  # noqa: ARG001
+        assert request is REQUEST
         opened_bauds.append(baud)
         first_s = clock.now_s + silence_s
 
@@ -41,7 +45,7 @@ def test_baud_rate_is_found(monkeypatch, silence_s, bauds, tried, good):
 
     monkeypatch.setattr(listening, "Port", open_port)
     monkeypatch.setattr(listening.time, "monotonic", lambda: clock.now_s)
-    report = examine("/dev/ttyUSB9", bauds=bauds, seconds=2.0)
+    report = examine("/dev/ttyUSB9", bauds=bauds, seconds=2.0, request=REQUEST)
     assert report.baud == tried[-1]
     assert report.good == pytest.approx(good, abs=5)
     assert report.seconds == pytest.approx(2.0)

@@ -59,6 +59,7 @@ def test_of_a_touched_film_only_the_touch_is_reported():
 
 
 def test_check_of_a_healthy_board():
+    assert "gain" not in examined(charges()).device
     report = examined(charges(), device=AT_REST, electrodes=FOUR[:3])
     assert (report.baud, report.format) == (115200, "binary frames of isocharge")
     assert (report.missing, report.missing_for_held_presses) == ((), ())

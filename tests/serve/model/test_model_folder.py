@@ -14,7 +14,7 @@ import pytest
 
 from isocharge.common.errors import ChargeError, ModelError, OutputExists
 from isocharge.serve import ModelMetadata, find_labelled_model, find_model, load_model, write_model
-from isocharge.serve.model.session import make_golden
+from isocharge.serve.model.session import contact_floors, make_golden
 from model_files import put_graph
 
 
@@ -93,6 +93,13 @@ def test_golden_vectors_are_checked_before_a_version_appears(film, tmp_path, mon
     with pytest.raises(ModelError, match=r"contact\[0, .\]: expected"):
         write(film, tmp_path / "linear")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_tolerance_near_zero_is_that_of_a_twentieth_of_the_range(film):
+    """It is at least that of 1 mm and 0.1 N."""
+    assert contact_floors(film.metadata()) == (1.0, 1.0, 0.1)
+    large = film.metadata(working_area_mm=((36.0, 0.0), (0.0, 36.0), (-9.0, 0.0)), force_range_N=(0.05, 3.0))
+    assert contact_floors(large) == pytest.approx((1.8, 1.8, 0.15))
 
 
 def test_model_in_a_folder_with_another_name_is_refused(film, tmp_path):

@@ -43,6 +43,7 @@ def test_intervals_for_a_stated_noise_hold_as_often_as_they_state(released, pres
     assert 0.65 < np.mean(error < 1.0) < 0.71
     assert 0.93 < np.mean(error < 1.96) < 0.97
     assert np.mean(contacts[:, 6] > 5.0) < 0.01  # few misfits
+    assert np.median(contacts[:, 6]) == pytest.approx(0.674, rel=0.2)  # that of the magnitude of a normal variable
 
 
 def covariance(values):

@@ -237,6 +237,15 @@ def test_constant_bytes_before_a_counter_or_clock_do_not_belong_to_it(size, star
         assert set(np.diff([frame.t_us for frame in parsed]) % parser.t_us_modulus) == {step}
 
 
+def test_number_does_not_begin_before_the_bytes_that_a_checksum_covers():
+    """The third byte is constant and could be the high byte of the counter."""
+    bodies = [struct.pack(">B4h", number, *row) for number, row in enumerate(VALUES[:200].astype(int).tolist())]
+    data = b"".join(b"\xaa\x55\x03" + body + bytes([sum(body) % 256]) for body in bodies)
+    section = recognise([data], len(bodies) / RATE_HZ)
+    assert (section["checksum"], section["checksum_from"]) == ("sum-8", 3)
+    assert section["fields"][0] == {"name": "seq", "type": "u8"}
+
+
 @pytest.mark.parametrize(
     ("header", "notation", "rate_Hz", "expected"),
     [

@@ -150,6 +150,16 @@ def test_film_is_followed_with_the_noise_that_the_device_file_states(series, tmp
     assert follower.film.pretension_std_MPa < 0.2
 
 
+def test_errors_of_the_charge_map_are_not_taken_for_changes_of_the_film(series, tmp_path):
+    """Each charge of a touch differs from that of the map by 3 %. The map states this error."""
+    rng = np.random.default_rng(4)
+    model = model_in(tmp_path, replace(series, charge_std=0.03))
+    _, charge = touches(series, [0.3, 0.7, -0.8], rng, 60)
+    follower, was_lost = followed(model, charge * (1.0 + 0.03 * rng.standard_normal(charge.shape)), rng, 1)
+    assert not any(was_lost)
+    assert abs(follower.film.pretension_MPa - 1.3) < 2.0 * follower.film.pretension_std_MPa
+
+
 @pytest.mark.parametrize("change_MPa", [0.3, -0.3])
 def test_a_sudden_change_is_followed_after_twenty_touches(series, model, change_MPa):
     """The forty touches before the change must not determine the pretension too well."""

@@ -10,7 +10,6 @@ from isocharge.simulate import (
     Circle,
     Electrode,
     Film,
-    Finger,
     Polygon,
     SolveSettings,
     load_sensor,
@@ -53,7 +52,7 @@ ON_TOP = replace(
 """Electrodes that read the top surface, below the probe and at the edge of its footprint, where the bending stress
 changes its sign."""
 
-CLOSED = with_film(FOUR, pretension=0.0, back_volume=95_000.0)
+CLOSED = with_film(FOUR, pretension=0.0, back_volume=127_000.0)
 """The trapped air lifts the slack film beside the probe, so that narrow strips of the film are bent."""
 
 UNEVEN = with_film(FOUR, pretension=2.4, deviator=(1.2, 0.0))
@@ -69,7 +68,7 @@ CHOSEN = {
     "thick film": (square_pair(30.0, 0.05, 0.0), PROBE, (6.0, 1.5), 0.05, BENT_MESH, 1e-4),
     "surface under the probe": (ON_TOP, PROBE, (8.0, 3.0), 0.05, Resolution(7, 16, 8, 2), 2e-4),
     "electrode at the rim": (AT_THE_RIM, PROBE, (0.0, 8.0), 0.5, Resolution(8, 16, 8, 3), 1e-4),
-    "slack film with a closed back": (CLOSED, Finger(5.0), (22.0, 5.0), 0.05, Resolution(7, 8, 12, 4), 1e-3),
+    "slack film with a closed back": (CLOSED, PROBE, (20.0, 5.0), 0.05, Resolution(7, 8, 14, 4), 1e-4),
 }
 """Sensor, probe, position, force, a mesh that is finer than the chosen one, and the largest error of a charge."""
 

@@ -10,7 +10,7 @@ from tests.train.calibration.conftest import rig_presses
 
 from isocharge.common.errors import PressError
 from isocharge.train import calibrate
-from isocharge.train.calibration.diagnosis import check_places, find_mistakes
+from isocharge.train.calibration.diagnosis import check_places, expected_charges, find_mistakes
 
 pytestmark = pytest.mark.usefixtures("never_solved")
 
@@ -59,6 +59,14 @@ def test_mistake_in_the_presses_is_found(problem, synthetic, name):
     assert find_mistakes(with_mistake(problem, synthetic, lambda *presses: presses), synthetic) == []
     mistakes = find_mistakes(with_mistake(problem, synthetic, make_mistake), synthetic)
     assert re.search(message, "; ".join(mistakes))
+
+
+def test_mistake_that_explains_the_presses_exactly_is_the_only_one_that_is_named(problem, synthetic):
+    """Forces in pounds would explain the presses better than forces in newtons, but not as well as kilograms."""
+    contact = rig_presses(problem, synthetic, 12, seed=7).contact
+    _, charge, _ = expected_charges(synthetic, contact)
+    in_kg = measured_presses(problem, contact / [1.0, 1.0, 9.80665], charge)
+    assert find_mistakes(in_kg, synthetic) == ["the forces are in kg, not N"]
 
 
 def test_places_near_the_rim_of_an_oval_film(problem, synthetic):

@@ -1,11 +1,15 @@
 """Presses between the working area and the clamp, and the shares that are measured on them."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from isocharge.simulate import Domain
+from isocharge.serve import Predictor
+from isocharge.simulate import Domain, noise_model
 from isocharge.train.data.outside_presses import N_SECTORS, OutsidePresses
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
+from isocharge.train.model_release.evaluate import unnoticed_presses
 
 FORCES_N = (0.05, 2.0)
 
@@ -51,3 +55,15 @@ def test_few_presses_leave_no_presses_outside():
     assert OutsidePresses.of(Domain(10.0, FORCES_N), INSIDE) is None
     for count in (1, 10):
         assert OutsidePresses.of(Domain(10.0, FORCES_N), INSIDE, OUTSIDE[:count]) is None
+
+
+def test_answers_wrong_by_more_than_four_standard_deviations_without_a_flag_are_unnoticed():
+    """The answers for y > 0 are wrong, and those for x > 0 have the flag `misfit`."""
+    outside = OutsidePresses.of(Domain(10.0, FORCES_N), INSIDE, OUTSIDE)
+    x, y, _ = outside.test.contact.T
+    contact = outside.test.contact * [0.1, 0.1, 0.9]
+    std = np.abs(contact - outside.test.contact) / np.where(y > 0.0, 4.1, 3.9)[:, None]
+    misfit = np.where(x > 0.0, 100.0, 0.0)[:, None]
+    fitted = SimpleNamespace(outside=outside, noise=noise_model("reference"), predict=lambda _: (contact, std, misfit))
+    unnoticed = unnoticed_presses(fitted, Predictor("three-25um-biaxial").metadata)
+    assert unnoticed == outside.unnoticed_shares((y > 0.0) & (x <= 0.0))

@@ -218,13 +218,12 @@ def _check_independence(channels: Mapping[str, Array]) -> None:
     largest, *_, smallest = singular_values
     if smallest > LEAST_INDEPENDENCE * largest:
         return
-    # The last singular vector contains the coefficients of a combination of the channels that is nearly zero.
-    coefficients = np.abs(directions[-1])
-    smallest_coefficient = LEAST_INDEPENDENCE * coefficients.max()
+    # The last singular vector, a unit vector, contains the coefficients of a combination of the channels that is nearly
+    # zero.
     dependent_names = [
         shown(name)
-        for name, coefficient in zip(channels, coefficients, strict=True)
-        if coefficient > smallest_coefficient
+        for name, coefficient in zip(channels, directions[-1], strict=True)
+        if abs(coefficient) > LEAST_INDEPENDENCE
     ]
     raise PressError(
         f"channels {', '.join(dependent_names)}: expected charges that are linearly independent, got channels of which "
