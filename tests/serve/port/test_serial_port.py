@@ -342,8 +342,9 @@ def test_udp_address_in_use_is_refused(address):
     [
         ([(0.003, b"1,2\n"), (0.0069, b"3\n")], [REPEAT_TIME_s, 0.007, QUIET_TIME_s]),
         ([(0.5 * REPEAT_TIME_s, b"")] * 2, [REPEAT_TIME_s, 0.5 * REPEAT_TIME_s, 0.0]),
+        ([(0.001, b"?\n"), (0.05, b"1,2\n")], [REPEAT_TIME_s, REPEAT_TIME_s - 0.001, QUIET_TIME_s]),
     ],
-    ids=["the answer and the rate", "no answer"],
+    ids=["the answer and the rate", "no answer", "the answer after the echo of the request"],
 )
 def test_the_next_request_waits(answers, waits_s, monkeypatch):
     clock = SimpleNamespace(now_s=100.0)
@@ -354,7 +355,7 @@ def test_the_next_request_waits(answers, waits_s, monkeypatch):
     waited_s = [requester.wait_s()]
     for pause_s, answer in answers:
         clock.now_s += pause_s
-        assert requester.remove_echo(answer) == answer
+        assert requester.remove_echo(answer) == answer.removeprefix(b"?\n")
         waited_s.append(requester.wait_s())
     assert waited_s == pytest.approx(waits_s)
 

@@ -187,7 +187,7 @@ class Requester:
         self._line = line
         self._request = request
         self._requested_s = -float("inf")  # time of the latest request
-        self._received_s = -float("inf")  # time of the latest received byte
+        self._received_s = -float("inf")  # time of the latest received byte of an answer
         self._expects_echo = False  # whether the next bytes may be an echo of the request
         self._kept_bytes = b""  # first bytes after the request, which may be the beginning of its echo
 
@@ -222,7 +222,7 @@ class Requester:
         """Return the time until the next request is due, s, or 0 if a request is due now.
 
         At least 1 / `rate_Hz` must pass between two requests. After a request without an answer, also at least
-        `REPEAT_TIME_s` must pass. After the latest received byte, also at least `QUIET_TIME_s` must pass.
+        `REPEAT_TIME_s` must pass. After the latest byte of an answer, also at least `QUIET_TIME_s` must pass.
         """
         now_s = time.monotonic()
         due_s = self._requested_s + 1.0 / self._request.rate_Hz
@@ -248,16 +248,16 @@ class Requester:
         Args:
             received: Bytes that arrived after the latest request; may be empty.
         """
+        if self._expects_echo:
+            self._kept_bytes += received
+            request = self._request.data
+            if request != self._kept_bytes and request.startswith(self._kept_bytes):
+                return b""
+            self._expects_echo = False
+            received = self._kept_bytes.removeprefix(request)
         if received:
             self._received_s = time.monotonic()
-        if not self._expects_echo:
-            return received
-        self._kept_bytes += received
-        request = self._request.data
-        if request != self._kept_bytes and request.startswith(self._kept_bytes):
-            return b""
-        self._expects_echo = False
-        return self._kept_bytes.removeprefix(request)
+        return received
 
 
 UDP_SCHEME = "udp://"
