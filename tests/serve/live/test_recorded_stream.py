@@ -163,14 +163,22 @@ def test_recording_that_begins_later_restarts_the_stream(film, predictor, tmp_pa
 
 
 def test_recording_that_begins_later_contains_the_header_of_the_board(film, predictor, tmp_path):
-    """The film is held when the recording begins, for longer than a first tare is searched."""
+    """The film is held when the recording begins, for longer than a first tare is searched.
+
+    An earlier recording was ended before any byte arrived.
+    """
     path = tmp_path / "later.rec"
     live = RecordedStream(TouchStream(predictor))
     rows = taps(film, rest=300, press=2_500)
     lines = [b"C,A,B\n", *(f"{c:.3f},{a:.3f},{b:.3f}\n".encode() for a, b, c in islice(rows, 5_500))]
     chunks = [Chunk(line, 1e9 + 0.005 * i, 5_000_000 * i) for i, line in enumerate(lines)]
-    request = {400: lambda: live.request_recording(Recorder(path, predictor.metadata.label, {}))}
-    records = list(live.follow(with_requests(chunks, request)))
+
+    def begin_and_end():
+        live.request_recording(Recorder(tmp_path / "empty.rec", predictor.metadata.label, {}))
+        live.request_recording(None)
+
+    requests = {150: begin_and_end, 400: lambda: live.request_recording(Recorder(path, predictor.metadata.label, {}))}
+    records = list(live.follow(with_requests(chunks, requests)))
     for record in (records[350], records[-1]):
         assert (record.x_mm, record.y_mm) == pytest.approx((3.0, -2.0), abs=0.1)
     replayed = replayed_lines(path, predictor)

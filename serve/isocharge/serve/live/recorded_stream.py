@@ -179,12 +179,13 @@ class RecordedStream:
             recording. The chunk then states an outage, so that the tare and the clock begin again.
         """
         self._is_recording_new = False
-        if self.recorder is None or not self._preamble:
+        if not self._preamble:
             return chunk
         had_frames = self._stream.totals().frames > 0
         preamble = chunk._replace(data=self._preamble, outage_s=0.0)
         deque(self._stream.feed(preamble), maxlen=0)
-        self.recorder.chunk(preamble, [])
+        if self.recorder is not None:  # the recording may have been ended before this chunk
+            self.recorder.chunk(preamble, [])
         return chunk._replace(outage_s=max(chunk.outage_s, RESTART_OUTAGE_s)) if had_frames else chunk
 
     def _end_recording(self) -> None:
