@@ -147,7 +147,10 @@ def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> Elec
     Raises:
         PressCheckError: If a press does not come, or the presses do not distinguish the channels.
     """
-    device = device_from_table(examination.device, "board")
+    table = dict(examination.device)
+    if examination.unit != "pC":
+        table.pop("gain", None)  # without the charge of one unit, it is incomplete
+    device = device_from_table(table, "board")
     channel_names = [channel.name for channel in examination.channels]
 
     # Determine the channel that each electrode is assumed to have before the check. If the device file does not assign
