@@ -149,7 +149,8 @@ class Capture:
     Attributes:
         received: The bytes of the frames.
         parser: The parser, with its counters.
-        frames: Good frames. Their times are those of the clock of the device if the frames contain a time.
+        frames: Good frames with one channel or more. Their times are those of the clock of the device if the frames
+            contain a time.
     """
 
     received: ReceivedData
@@ -164,9 +165,15 @@ class Capture:
         return 1.0 - self.parser.counts.bytes_dropped / self.received.bytes_seen
 
     @property
+    def times_s(self) -> Array:
+        """Times of the frames since the first frame, shape (n,), s. A step back, as after a restart, counts as 0."""
+        clock_s = [frame.clock_s for frame in self.frames]
+        return np.cumsum(np.maximum(np.diff(clock_s, prepend=clock_s[:1]), 0.0))
+
+    @property
     def rate_Hz(self) -> float:
         """Frame rate, Hz; 0 if there are fewer than two frames, or if the times of the frames do not increase."""
-        span_s = self.frames[-1].clock_s - self.frames[0].clock_s if self.frames else 0.0
+        span_s = float(self.times_s[-1]) if self.frames else 0.0
         return (len(self.frames) - 1) / span_s if span_s > 0.0 else 0.0
 
     @property
@@ -180,16 +187,15 @@ class Capture:
         Frames with another number of channels are left out, because the values form one array.
 
         Returns:
-            Values, shape (n, channels), and times since the first of these frames, shape (n,), s. A value that a model
+            Values, shape (n, channels), and times since the first frame, shape (n,), s. A value that a model
             cannot read in single precision is infinite.
         """
         channel_count = len(self.frames[-1].values)
-        frames = [frame for frame in self.frames if len(frame.values) == channel_count]
-        values = np.array([frame.values for frame in frames], dtype=float)
-        times_s = np.array([frame.clock_s for frame in frames])
+        rows = [row for row, frame in enumerate(self.frames) if len(frame.values) == channel_count]
+        values = np.array([self.frames[row].values for row in rows], dtype=float)
         is_too_large = np.abs(values) > LARGEST
         values[is_too_large] = np.copysign(np.inf, values[is_too_large])
-        return values, times_s - times_s[0]
+        return values, self.times_s[rows]
 
 
 def read_frames(received: ReceivedData, device: Device) -> Capture:
@@ -206,7 +212,7 @@ def read_frames(received: ReceivedData, device: Device) -> Capture:
     clock = DeviceClock()
     all_frames: list[Frame] = []
     for chunk in received.chunks:
-        frames = parser.feed(chunk.data)
+        frames = [frame for frame in parser.feed(chunk.data) if frame.values]  # not those with only a clock or counter
         clock.stamp(chunk, frames, parser.t_us_modulus)
         all_frames += frames
         for frame in frames:
