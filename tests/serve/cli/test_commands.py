@@ -90,6 +90,7 @@ def test_check_of_many_presses_shows_the_worst(measured, models, command):
         ("check linear measured.csv --force-std 0", "force_std: expected a positive share"),
         ("check linear measured.csv --position-std nan", "position_std_mm: expected"),
         ("stream linear --port frames.csv --device leak.toml", "expected a column t_ms, t_us or t_s"),
+        ("stream linear --port frames.csv --device currents.toml", "expected a column t_ms, t_us or t_s"),
         ("stream linear --port p --name ''", "--name: expected printable characters"),
         ("stream linear --port p --name 'a\nb'", "--name: expected printable characters"),
         ("doctor --port p --device gain.toml --pc-per-unit 1000", "--pc-per-unit: expected none beside --device"),
@@ -104,6 +105,7 @@ def test_wrong_options_are_refused_with_the_reason(measured, models, refused, mo
     """A file without times has no leak, and the device file already states the charge of a unit."""
     path = measured()
     path.with_name("leak.toml").write_text("[leak]\ntau_s = 5.0\n")
+    path.with_name("currents.toml").write_text('front_end = "current"\n')
     path.with_name("frames.csv").write_text("A,B,C\n" + "1,2,3\n" * 200)
     path.with_name("gain.toml").write_text("[gain]\npC_per_unit = 2.0\n")
     monkeypatch.chdir(path.parent)

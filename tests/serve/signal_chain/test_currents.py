@@ -77,6 +77,14 @@ def test_charge_survives_a_damaged_frame_in_a_rise(damage, predictor):
     np.testing.assert_allclose(last.charge_pC, current_pC.sum(axis=0), rtol=0.01)
 
 
+def test_many_missing_currents_cause_no_touch_and_give_a_touch_the_flag_gap():
+    values = currents(1000.0 * FORCE[:, None] * RATIOS)
+    values[750:1250] = values[2000:2500] = math.nan  # at rest, and during the first press
+    frames = run(values)
+    assert not any(frame.is_contact for frame in frames[:1450])
+    assert all("gap" in frame.flags for frame in frames[2500:2950])
+
+
 def test_currents_are_refused_in_c():
     with pytest.raises(DeviceError, match="b: front_end: this stage does not exist in the signal chain in C"):
         device_header(device_from_table({"front_end": "current"}, "b"), ("A", "B", "C"))

@@ -111,7 +111,8 @@ def _require_time(record: PredictionRecord) -> None:
     if record.t_device_us is None:
         raise InputError(
             "a file without times of the board: expected a column t_ms, t_us or t_s, because a correction of leak, hum "
-            "or warming needs the time between frames; add the column, or play a recording (--record)"
+            "or warming, and a sum of currents, need the time between frames; add the column, or play a recording "
+            "(--record)"
         )
 
 
@@ -264,7 +265,7 @@ def stream_command(
             # The page must not begin a recording if the command itself records the stream.
             new_recorder = None if recorder else partial(Recorder, device=board.table, name=name)
             writers.append(PageFeed(page, touch, stream, new_recorder).write)
-        needs_time = not {LeakRule, HumRule, ThermalRule}.isdisjoint(board.rules)
+        needs_time = board.has_currents or not {LeakRule, HumRule, ThermalRule}.isdisjoint(board.rules)
         if needs_time and isinstance(source, FileSource) and source.is_on_disk:
             writers.insert(0, _require_time)
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")

@@ -260,6 +260,13 @@ class Leak(Stage):
         return settings
 
 
+MAX_NOISY_FRAMES = 10
+"""Largest number of missing frames whose currents are estimated from currents that may be noise.
+
+The sum of more such estimates would be a false touch.
+"""
+
+
 class Integrator(Leak):
     """Integrates the currents of a board to charges, and estimates the offset of the currents.
 
@@ -278,25 +285,42 @@ class Integrator(Leak):
         """Discard the state."""
         super().reset()
         self._current_pC = np.zeros(len(self._tau_s))  # current of the previous valid frame
+        self._search_s = 0.0  # duration of the search for a tare, from which the sampling interval follows
+        self._search_frames = 0
 
     def step(self, frame: Frame) -> None:
         """Replace the currents by the charges, and the noise of the currents by the noise of the charges at rest.
 
         If frames are missing, each of their currents is assumed to be the mean of the currents before and after the
-        gap. A copy of the previous frame adds no charge, and neither does a frame that arrives late.
+        gap, or 0 if many frames are missing and the mean is not larger than the noise. If this may be wrong by more
+        than 1 % of the charge and the noise, the touch has the flag `gap`. A copy of the previous frame adds no charge,
+        and neither does a frame that arrives late.
 
         At rest, the charges decay with the time constant `relax_s`. The sum of independent currents then has the
         variance of a current times relax_s / (2 dt).
         """
         current_pC = frame.charge_pC
+        error_pC: Array | float = 0.0  # largest error of the charge because of missing frames
         if current_pC is not None and self._previous is not None:
-            missing_pC = (frame.intervals - 1) * (current_pC + self._current_pC) / 2.0
+            missing_count = frame.intervals - 1
+            mean_pC = (current_pC + self._current_pC) / 2.0
+            is_known = (np.abs(mean_pC) > 3.0 * frame.noise_pC) | (missing_count <= MAX_NOISY_FRAMES)
+            missing_pC = missing_count * np.where(is_known, mean_pC, 0.0)
+            error_pC = missing_count * np.abs(current_pC - self._current_pC) / 2.0
             frame.charge_pC = current_pC + missing_pC if frame.intervals > 0 else np.zeros_like(current_pC)
+        if self._previous is None:
+            self._search_s += frame.dt_s
+            self._search_frames += 1
         super().step(frame)
-        if current_pC is not None:
-            self._current_pC = current_pC
-        if frame.charge_pC is not None and frame.dt_s > 0.0:
-            frame.noise_pC = frame.noise_pC * math.sqrt(max(1.0, 0.5 * self._rule.relax_s / frame.dt_s))
+        if current_pC is None:
+            return
+        self._current_pC = current_pC
+        interval_s = max(self._search_s / self._search_frames, SUM_TOLERANCE_s)
+        frame.noise_pC = frame.noise_pC * math.sqrt(max(1.0, 0.5 * self._rule.relax_s / interval_s))
+        limit_pC = np.maximum(frame.noise_pC, 0.01 * np.abs(self._charge_pC))
+        if (error_pC > limit_pC).any():
+            self._is_falsified = True
+            frame.flags.append(GAP)
 
     def _innovation_pC(self, output_pC: Array, decay: Array) -> Array:
         """Return the charge that has arrived, minus the charge that has leaked, shape (n_electrode,), pC."""
