@@ -46,7 +46,7 @@ class TouchNode(Node):
         self.diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.flag_counts = Counter()
         self.n_records = 0
-        self.next_diagnostic_s = 0.0  # time of a record from which the next diagnostic is published, s
+        self.latest_diagnostic_s = 0.0  # time of the record with which the latest diagnostic was published, s
 
     def publish(self, record):
         """Publish the flags and the wrench of a prediction record and, if something touches the film, the pose."""
@@ -55,9 +55,10 @@ class TouchNode(Node):
         self.flags_publisher.publish(flags)
         self.flag_counts.update(record.flags)
         self.n_records += 1
-        if record.timestamp >= self.next_diagnostic_s:
+        # The difference is negative if the clock of the computer was set back.
+        if abs(record.timestamp - self.latest_diagnostic_s) >= DIAGNOSTIC_INTERVAL_s:
             self.publish_diagnostic(record)
-            self.next_diagnostic_s = record.timestamp + DIAGNOSTIC_INTERVAL_s
+            self.latest_diagnostic_s = record.timestamp
             self.flag_counts.clear()
             self.n_records = 0
         if record.force_N is None:  # the force is unknown, for example because the board has sent a value that is NaN
