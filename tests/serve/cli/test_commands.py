@@ -90,6 +90,7 @@ def test_check_of_many_presses_shows_the_worst(measured, models, command):
         ("check linear measured.csv --force-std 0", "force_std: expected a positive share"),
         ("check linear measured.csv --position-std nan", "position_std_mm: expected"),
         ("stream linear --port frames.csv --device leak.toml", "expected a column t_ms, t_us or t_s"),
+        ("stream linear --port frames.csv --track", "expected a column t_ms, t_us or t_s"),
         ("stream linear --port frames.csv --device currents.toml", "expected a column t_ms, t_us or t_s"),
         ("stream linear --port p --name ''", "--name: expected printable characters"),
         ("stream linear --port p --name 'a\nb'", "--name: expected printable characters"),

@@ -64,6 +64,7 @@ from isocharge.serve.port.file_source import FileSource
 from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.serve.signal_chain.leak import LeakRule
 from isocharge.serve.signal_chain.thermal import ThermalRule
+from isocharge.serve.tracking.tracker import TrackRule
 
 OutputOption = Annotated[
     list[str] | None,
@@ -111,8 +112,8 @@ def _require_time(record: PredictionRecord) -> None:
     if record.t_device_us is None:
         raise InputError(
             "a file without times of the board: expected a column t_ms, t_us or t_s, because a correction of leak, hum "
-            "or warming, and a sum of currents, need the time between frames; add the column, or play a recording "
-            "(--record)"
+            "or warming, a sum of currents, and tracking need the time between frames; add the column, or play a "
+            "recording (--record)"
         )
 
 
@@ -265,7 +266,7 @@ def stream_command(
             # The page must not begin a recording if the command itself records the stream.
             new_recorder = None if recorder else partial(Recorder, device=board.table, name=name)
             writers.append(PageFeed(page, touch, stream, new_recorder).write)
-        needs_time = board.has_currents or not {LeakRule, HumRule, ThermalRule}.isdisjoint(board.rules)
+        needs_time = board.has_currents or not {LeakRule, HumRule, ThermalRule, TrackRule}.isdisjoint(board.rules)
         if needs_time and isinstance(source, FileSource) and source.is_on_disk:
             writers.insert(0, _require_time)
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
