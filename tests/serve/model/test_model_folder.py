@@ -207,6 +207,9 @@ def test_find_model_takes_a_name_a_version_or_a_path_and_returns_the_numerically
         assert find_model(path) == find_model(str(path)) == folder / "10", path
     assert find_model("m", roots["given"]) == folder / "10"
     assert find_model("m/1", str(roots["given"])) == folder / "1"
+    (folder / "10/card.md").touch()
+    with pytest.raises(ModelError, match="no model; expected"):
+        find_model(folder / "10/card.md")
 
 
 def test_text_is_taken_as_a_path_if_no_model_has_the_name(roots):

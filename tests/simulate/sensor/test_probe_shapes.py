@@ -79,6 +79,13 @@ def test_area_reach_and_period_are_the_closed_forms(shape):
     assert shape.probe.reach == pytest.approx(shape.reach, rel=1e-12)
 
 
+def test_core_of_a_curved_footprint_has_the_rotational_symmetry_of_the_footprint():
+    class Trefoil(Ellipse):
+        period = 2.0 * np.pi / 3.0
+
+    assert Trefoil(4.0, 4.0).topology.n_corner == 3
+
+
 def test_farthest_distance_is_that_of_the_farthest_boundary_point(shape):
     at = (5.0, -3.0)
     expected = np.abs(complex(*at) + boundary_points(shape.probe, 20000)).max()

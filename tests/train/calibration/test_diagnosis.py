@@ -10,7 +10,14 @@ from tests.train.calibration.conftest import rig_presses
 
 from isocharge.common.errors import PressError
 from isocharge.train import calibrate
-from isocharge.train.calibration.diagnosis import check_places, expected_charges, find_mistakes
+from isocharge.train.calibration.diagnosis import (
+    OFFSET_STD,
+    SCATTER_STD,
+    check_places,
+    expected_charges,
+    find_mistakes,
+    misfit,
+)
 
 pytestmark = pytest.mark.usefixtures("never_solved")
 
@@ -67,6 +74,13 @@ def test_mistake_that_explains_the_presses_exactly_is_the_only_one_that_is_named
     _, charge, _ = expected_charges(synthetic, contact)
     in_kg = measured_presses(problem, contact / [1.0, 1.0, 9.80665], charge)
     assert find_mistakes(in_kg, synthetic) == ["the forces are in kg, not N"]
+
+
+def test_misfit_of_one_usual_offset_and_one_usual_scatter_is_two(problem, synthetic):
+    contact = rig_presses(problem, synthetic, 12, seed=7).contact
+    loosest, _, _ = expected_charges(synthetic, contact)
+    charge = loosest * np.exp(OFFSET_STD + SCATTER_STD * np.array([1.0, -1.0, -1.0, 1.0]))
+    assert misfit(measured_presses(problem, contact, charge), synthetic) == pytest.approx(2.0)
 
 
 def test_places_near_the_rim_of_an_oval_film(problem, synthetic):
