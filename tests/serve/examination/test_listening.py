@@ -14,17 +14,21 @@ REQUEST = Request(b"?", 200.0)
 
 
 @pytest.mark.parametrize(
-    ("silence_s", "bauds", "tried", "good"),
+    ("silence_s", "other_bytes", "bauds", "tried", "good"),
     [
-        (0.0, (115200, 57600, 9600), [115200, 57600, 57600], 200),
-        (0.0, (115200, 9600), [115200, 9600, 115200], 0),
-        (0.0, (57600,), [57600], 200),
-        (6.0, (115200, 57600, 9600), [115200, 57600, 57600], 200),
+        (0.0, b"\xf8\x80\xfe\xff", (115200, 57600, 9600), [115200, 57600, 57600], 200),
+        (0.0, b"\xf8\x80\xfe\xff", (115200, 9600), [115200, 9600, 115200], 0),
+        (0.0, b"\xf8\x80\xfe\xff", (57600,), [57600], 200),
+        (6.0, b"\xf8\x80\xfe\xff", (115200, 57600, 9600), [115200, 57600, 57600], 200),
+        (0.0, b"", (115200, 57600, 9600), [115200, 57600, 57600], 200),
     ],
-    ids=["found", "none is right", "one is not tried", "an Arduino, which restarts at each opening"],
+    ids=["found", "none is right", "one is not tried", "an Arduino, which restarts at each opening", "requests"],
 )
-def test_baud_rate_is_found(monkeypatch, silence_s, bauds, tried, good):
-    """The board sends a line every 10 ms at 57600 bit/s. At other speeds, other bytes arrive. The time is simulated."""
+def test_baud_rate_is_found(monkeypatch, silence_s, other_bytes, bauds, tried, good):
+    """The board sends a line every 10 ms at 57600 bit/s. At other speeds, other bytes arrive. The time is simulated.
+
+    A board that needs requests may send nothing at other speeds.
+    """
     clock = SimpleNamespace(now_s=0.0)
     opened_bauds = []
 
@@ -38,8 +42,8 @@ def test_baud_rate_is_found(monkeypatch, silence_s, bauds, tried, good):
             wait_s = max(first_s - clock.now_s, 0.01)
             clock.now_s += min(wait_s, timeout_s)
             line = b"A:%d.5,B:-2.25,C:7.5\n" % (round(100.0 * clock.now_s) % 7)
-            data = line if baud == 57600 else b"\xf8\x80\xfe\xff"
-            return Chunk(data, 1e9 + clock.now_s, 0) if wait_s <= timeout_s else None
+            data = line if baud == 57600 else other_bytes
+            return Chunk(data, 1e9 + clock.now_s, 0) if data and wait_s <= timeout_s else None
 
         yield SimpleNamespace(read=read, start_up_s=10.0)
 

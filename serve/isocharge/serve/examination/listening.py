@@ -85,8 +85,9 @@ def listen(
 ) -> ReceivedData:
     """Find the baud rate of a port, and listen to the port at this baud rate.
 
-    The function chooses the first baud rate at which most of the bytes belong to frames, or at which no bytes arrive.
-    A port that is silent at one baud rate is silent at every baud rate, so further attempts would be useless.
+    The function chooses the first baud rate at which most of the bytes belong to frames. A board that sends frames by
+    itself and is silent at one baud rate is silent at every baud rate, so further attempts would be useless. A board
+    that needs requests does not understand them at a wrong baud rate.
 
     Args:
         url: The port.
@@ -108,7 +109,7 @@ def listen(
     if has_speed(url) and len(bauds) > 1:
         for baud in bauds:
             received = _listen_at_baud(url, baud, try_s, request, wait)
-            if not received.chunks:
+            if not (received.chunks or request):
                 return received
             if has_frames(received):
                 chosen_baud = baud
@@ -173,7 +174,7 @@ class Capture:
     @property
     def rate_Hz(self) -> float:
         """Frame rate, Hz; 0 if there are fewer than two frames, or if the times of the frames do not increase."""
-        span_s = float(self.times_s[-1]) if self.frames else 0.0
+        span_s = float(self.times_s.max(initial=0.0))
         return (len(self.frames) - 1) / span_s if span_s > 0.0 else 0.0
 
     @property
