@@ -5,6 +5,7 @@ import os
 import re
 import threading
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -15,6 +16,7 @@ from tests.train.calibration.synthetic_film import SyntheticFilm
 
 from boards import encoded_frames
 from isocharge.cli.train import calibrate as calibrate_command
+from isocharge.cli.train import press as press_command
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents, SessionEnd
 from isocharge.common.errors import PortLost
 from isocharge.serve import Chunk, PressWatch, ReadingStream, read_presses, write_presses
@@ -24,7 +26,7 @@ from isocharge.serve.live.steady_press import (
     SteadyPress,
     WatchResult,
 )
-from isocharge.simulate import Circle, load_sensor
+from isocharge.simulate import Circle, Piezo, load_sensor
 from isocharge.train import CalibrationProblem, calibrate
 from isocharge.train.calibration import calibrate as calibrate_module
 from isocharge.train.calibration import session as session_module
@@ -249,6 +251,14 @@ def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(command, desk
     presses = read_presses(desk / "presses.csv", NAMES)
     np.testing.assert_allclose(presses.charge_pC, charges(PLACES), atol=1.0)  # 5 standard deviations of the means
     np.testing.assert_array_equal(presses.contact, PLACES)
+
+
+def test_charges_of_a_film_with_negative_coefficients_may_have_any_sign(command, problem, monkeypatch):
+    settings = {}
+    monkeypatch.setattr(press_command, "load_sensor", lambda _: replace(problem.sensor, piezo=Piezo(-8.0, -8.0)))
+    monkeypatch.setattr(press_command, "ReadingStream", lambda *_, **options: settings.update(options))
+    command(*PRESS, "--port", "no_board")
+    assert settings["has_any_sign"]
 
 
 @pytest.mark.usefixtures("few_hypotheses")

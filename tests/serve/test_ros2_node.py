@@ -98,20 +98,18 @@ def numbers(message):
 
 
 def test_the_node_publishes_flags_and_diagnostics_once_a_second(run_node, record):
-    """The clock of the computer is set back by an hour before the last record."""
     start_s = 1763600000.0
     flags = [(), ("gap",), (), ("invalid", "gap"), (), ()]  # of records 0.4 s apart
-    times_s = [start_s + 0.4 * number - 3600.0 * (number == 5) for number in range(6)]
-    records = [record(flags=one, timestamp=at_s, force_N=None) for one, at_s in zip(flags, times_s, strict=True)]
+    records = [record(flags=one, timestamp=start_s + 0.4 * number, force_N=None) for number, one in enumerate(flags)]
     sent = run_node(records)
     texts = [ROS.deserialize_cdr(data, "std_msgs/msg/String").data for topic, data in sent if topic.endswith("flags")]
     assert texts == ["", "gap", "", "invalid,gap", "", ""]
     kind = "diagnostic_msgs/msg/DiagnosticArray"
     diagnostics = [ROS.deserialize_cdr(data, kind) for topic, data in sent if topic == "/diagnostics"]
     assert [one.header.stamp.sec + 1e-9 * one.header.stamp.nanosec for one in diagnostics] == pytest.approx(
-        [times_s[0], times_s[3], times_s[5]]
+        [start_s, start_s + 1.2]
     )
-    first, second, _ = (one.status[0] for one in diagnostics)
+    first, second = (one.status[0] for one in diagnostics)
     assert (first.level, first.message, first.hardware_id) == (LEVELS["OK"], "no flags", "linear-film")
     assert (second.level, MEANINGS["gap"] in second.message) == (LEVELS["ERROR"], True)
     values = {pair.key: pair.value for pair in second.values}

@@ -118,7 +118,14 @@ def press_command(
         for number, contact in enumerate([] if contacts is None else contacts, start=1):
             with error_prefix(f"{press_list}, press {number}: ", PressError):
                 session.check(contact)
-        stream = ReadingStream(problem.electrodes, board, reader=f"sensor {problem.sensor.name}")
+        piezo = problem.sensor.piezo
+        stream = ReadingStream(
+            problem.electrodes,
+            board,
+            reader=f"sensor {problem.sensor.name}",
+            # If all charges were expected to be positive, the release of a negative press would be taken for a press.
+            has_any_sign=min(piezo.d31, piezo.d32) <= 0.0,
+        )
         try:
             with (
                 no_frames_advice_added(port, device),  # first, because it changes the errors of the next two
