@@ -260,13 +260,6 @@ class Leak(Stage):
         return settings
 
 
-MAX_NOISY_FRAMES = 10
-"""Largest number of missing frames whose currents are estimated from currents that may be noise.
-
-The sum of more such estimates would be a false touch.
-"""
-
-
 class Integrator(Leak):
     """Integrates the currents of a board to charges, and estimates the offset of the currents.
 
@@ -292,21 +285,19 @@ class Integrator(Leak):
         """Replace the currents by the charges, and the noise of the currents by the noise of the charges at rest.
 
         If frames are missing, each of their currents is assumed to be the mean of the currents before and after the
-        gap, or 0 if many frames are missing and the mean is not larger than the noise. If this may be wrong by more
-        than 1 % of the charge and the noise, the touch has the flag `gap`. A copy of the previous frame adds no charge,
-        and neither does a frame that arrives late.
+        gap, or 0 if the mean may be noise, which would be multiplied by the number of missing frames. If this may be
+        wrong by more than 1 % of the charge and the noise, the touch has the flag `gap`. A copy of the previous frame
+        adds no charge, and neither does a frame that arrives late.
 
         At rest, the charges decay with the time constant `relax_s`. The sum of independent currents then has the
         variance of a current times relax_s / (2 dt).
         """
         current_pC = frame.charge_pC
-        error_pC: Array | float = 0.0  # largest error of the charge because of missing frames
+        missing_count = 0
         if current_pC is not None and self._previous is not None:
             missing_count = frame.intervals - 1
             mean_pC = (current_pC + self._current_pC) / 2.0
-            is_known = (np.abs(mean_pC) > 3.0 * frame.noise_pC) | (missing_count <= MAX_NOISY_FRAMES)
-            missing_pC = missing_count * np.where(is_known, mean_pC, 0.0)
-            error_pC = missing_count * np.abs(current_pC - self._current_pC) / 2.0
+            missing_pC = missing_count * np.where(np.abs(mean_pC) > 3.0 * frame.noise_pC, mean_pC, 0.0)
             frame.charge_pC = current_pC + missing_pC if frame.intervals > 0 else np.zeros_like(current_pC)
         if self._previous is None:
             self._search_s += frame.dt_s
@@ -314,6 +305,7 @@ class Integrator(Leak):
         super().step(frame)
         if current_pC is None:
             return
+        error_pC = missing_count * np.abs(current_pC - self._current_pC) / 2.0  # if the current rose or fell steadily
         self._current_pC = current_pC
         interval_s = max(self._search_s / self._search_frames, SUM_TOLERANCE_s)
         frame.noise_pC = frame.noise_pC * math.sqrt(max(1.0, 0.5 * self._rule.relax_s / interval_s))
