@@ -3,14 +3,12 @@
 The time of most tests is simulated. A busy computer, which lets presses pass unread, then does not change the result.
 """
 
-from contextlib import nullcontext
 from itertools import islice, permutations
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from boards import received
 from isocharge.cli.serve import doctor
 from isocharge.cli.shared.virtual_sensor import film_charges
 from isocharge.common.errors import PressCheckError
@@ -28,7 +26,6 @@ from isocharge.serve.examination.electrode_check import (
     check_electrodes,
     corrected_table,
 )
-from isocharge.serve.examination.port_check import examine_received
 from isocharge.serve.virtual_sensor.script import VirtualScript
 from isocharge.simulate import Circle, ForwardMap, load_sensor
 from kept import kept
@@ -183,13 +180,6 @@ def test_doctor_writes_the_order_of_the_channels_found_by_presses(film, models, 
     assert "press near electrode A" in err
     assert "use it with: isocharge serve stream linear --port " in err
     assert dict(load_device(path).channels) == {"A": "2", "B": "1", "C": "3"}
-
-
-def test_doctor_checks_the_electrodes_of_a_board_whose_gain_is_not_known(monkeypatch):
-    lines = [b"5%d,7%d\n" % divmod(number, 9) for number in range(80)]
-    monkeypatch.setattr(doctor, "Port", lambda *_, **__: nullcontext())
-    monkeypatch.setattr(doctor, "check_electrodes", lambda *arguments: arguments)
-    assert "counts" in doctor._check_wiring(examine_received(received(lines, RATE_HZ)), ())
 
 
 def test_doctor_does_not_write_a_file_from_a_touched_film(film, command, tmp_path):

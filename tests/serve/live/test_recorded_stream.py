@@ -173,11 +173,8 @@ def test_recording_that_begins_later_contains_the_header_of_the_board(film, pred
     lines = [b"C,A,B\n", *(f"{c:.3f},{a:.3f},{b:.3f}\n".encode() for a, b, c in islice(rows, 5_500))]
     chunks = [Chunk(line, 1e9 + 0.005 * i, 5_000_000 * i) for i, line in enumerate(lines)]
 
-    def begin_and_end():
-        live.request_recording(Recorder(tmp_path / "empty.rec", predictor.metadata.label, {}))
-        live.request_recording(None)
-
-    requests = {150: begin_and_end, 400: lambda: live.request_recording(Recorder(path, predictor.metadata.label, {}))}
+    begin = lambda name: live.request_recording(Recorder(tmp_path / name, "linear/1", {}))  # noqa: E731
+    requests = {150: lambda: (begin("empty.rec"), live.request_recording(None)), 400: lambda: begin(path.name)}
     records = list(live.follow(with_requests(chunks, requests)))
     for record in (records[350], records[-1]):
         assert (record.x_mm, record.y_mm) == pytest.approx((3.0, -2.0), abs=0.1)

@@ -9,7 +9,7 @@ from msgspec import structs
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ChargeError, printable, shown
-from isocharge.serve.examination.listening import Capture
+from isocharge.serve.examination.listening import Capture, elapsed_times
 from isocharge.serve.examination.press_detector import HeldPress
 from isocharge.serve.port.source import has_speed
 from isocharge.serve.signal_chain.channels import Channels
@@ -155,7 +155,7 @@ def transmission_sentences(capture: Capture) -> Iterator[str]:
         yield f"{damaged}: {advice}"
     has_clock = bool(capture.frames) and all(frame.t_us is not None for frame in capture.frames)
     if has_clock and received.span_s > LIVE_TIME_s:
-        clock_span_s = float(capture.times_s[-1])
+        clock_span_s = float(elapsed_times(capture.frames)[-1])
         if not 0.5 < clock_span_s / received.span_s < 2.0:
             yield (
                 f"the frames took {clock_span_s:.3g} s by the clock of the board, but arrived within "

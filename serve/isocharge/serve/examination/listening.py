@@ -166,15 +166,9 @@ class Capture:
         return 1.0 - self.parser.counts.bytes_dropped / self.received.bytes_seen
 
     @property
-    def times_s(self) -> Array:
-        """Times of the frames since the first frame, shape (n,), s. A step back, as after a restart, counts as 0."""
-        clock_s = [frame.clock_s for frame in self.frames]
-        return np.cumsum(np.maximum(np.diff(clock_s, prepend=clock_s[:1]), 0.0))
-
-    @property
     def rate_Hz(self) -> float:
         """Frame rate, Hz; 0 if there are fewer than two frames, or if the times of the frames do not increase."""
-        span_s = float(self.times_s.max(initial=0.0))
+        span_s = float(elapsed_times(self.frames).max(initial=0.0))
         return (len(self.frames) - 1) / span_s if span_s > 0.0 else 0.0
 
     @property
@@ -188,15 +182,21 @@ class Capture:
         Frames with another number of channels are left out, because the values form one array.
 
         Returns:
-            Values, shape (n, channels), and times since the first frame, shape (n,), s. A value that a model
+            Values, shape (n, channels), and times since the first of these frames, shape (n,), s. A value that a model
             cannot read in single precision is infinite.
         """
         channel_count = len(self.frames[-1].values)
-        rows = [row for row, frame in enumerate(self.frames) if len(frame.values) == channel_count]
-        values = np.array([self.frames[row].values for row in rows], dtype=float)
+        frames = [frame for frame in self.frames if len(frame.values) == channel_count]
+        values = np.array([frame.values for frame in frames], dtype=float)
         is_too_large = np.abs(values) > LARGEST
         values[is_too_large] = np.copysign(np.inf, values[is_too_large])
-        return values, self.times_s[rows]
+        return values, elapsed_times(frames)
+
+
+def elapsed_times(frames: Sequence[Frame]) -> Array:
+    """Return the times of frames since the first frame, shape (n,), s. A step back, as after a restart, counts as 0."""
+    clock_s = [frame.clock_s for frame in frames]
+    return np.cumsum(np.maximum(np.diff(clock_s, prepend=clock_s[:1]), 0.0))
 
 
 def read_frames(received: ReceivedData, device: Device) -> Capture:
