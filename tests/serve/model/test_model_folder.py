@@ -14,6 +14,7 @@ import pytest
 
 from isocharge.common.errors import ChargeError, ModelError, OutputExists
 from isocharge.serve import ModelMetadata, find_labelled_model, find_model, load_model, write_model
+from isocharge.serve.model.model_folder import model_names
 from isocharge.serve.model.session import contact_floors, make_golden
 from model_files import put_graph
 
@@ -30,6 +31,12 @@ def test_existing_version_is_not_overwritten(film, tmp_path):
     with pytest.raises(OutputExists, match="linear/1 is already there and is not overwritten"):
         film.write(tmp_path)
     assert (tmp_path / "linear/1/model.onnx").stat().st_mtime_ns == before
+
+
+def test_folder_whose_name_no_model_can_have_is_skipped(film, tmp_path):
+    film.write(tmp_path)
+    (tmp_path / "lost+found" / "1").mkdir(parents=True)
+    assert model_names(tmp_path) == ["linear"]
 
 
 def test_file_with_the_name_of_the_model_folder_is_not_overwritten(film, tmp_path):

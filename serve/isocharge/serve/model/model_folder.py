@@ -107,8 +107,13 @@ def repositories(models: str | Path | None = None) -> list[Path]:
 
 
 def model_names(root: Path) -> list[str]:
-    """Return the names of the models in a repository, which is a folder of models, in alphabetical order."""
-    return sorted(folder.name for folder in _subfolders(root) if version_folders(folder))
+    """Return the names of the models in a repository, which is a folder of models, in alphabetical order.
+
+    A folder whose name cannot be that of a model is skipped. An example is `lost+found` on a mounted volume, which only
+    the superuser may list.
+    """
+    folders = [folder for folder in _subfolders(root) if NAME.fullmatch(folder.name)]
+    return sorted(folder.name for folder in folders if version_folders(folder))
 
 
 def _released_models() -> Path:
