@@ -250,8 +250,11 @@ class Columns:
             numbers: One number for each column.
 
         Raises:
-            ValueError, OverflowError: If the frame counter, the clock or the flags are not a finite number.
+            ValueError, OverflowError: If the frame counter, the clock or the flags are not a finite number, or if the
+                row has no channel.
         """
+        if not self.channels:
+            raise ValueError("expected a channel")
         return Frame(
             seq=None if self.seq_column is None else round(numbers[self.seq_column]),
             t_us=None if self.clock_column is None else round(numbers[self.clock_column] * self.clock_unit_us),
