@@ -41,7 +41,7 @@ def test_baud_rate_is_found(monkeypatch, silence_s, other_bytes, bauds, tried, g
         def read(timeout_s):
             wait_s = max(first_s - clock.now_s, 0.01)
             clock.now_s += min(wait_s, timeout_s)
-            line = b"A:%d.5,B:-2.25,C:7.5\n" % (round(100.0 * clock.now_s) % 7)
+            line = b"A:%d.5,B:-2.25,C:7.5\n" % (round(300.0 * clock.now_s) % 7)
             data = line if baud == 57600 else other_bytes
             return Chunk(data, 1e9 + clock.now_s, 0) if data and wait_s <= timeout_s else None
 

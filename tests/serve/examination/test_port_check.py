@@ -93,14 +93,19 @@ def test_check_of_a_channel_without_a_number(others):
         (charges(encode=lambda f: encode_frame(Frame(f.seq, f.t_us // 1000, f.values))), "took 0.00199 s by the clock"),
         (charges(encode=lambda f: encode_frame(Frame(f.seq, 1000, f.values))), "took 0 s by the clock of the board"),
         (lambda k: charges()(k) + b"\x07\0" * (k % 4 == 0), "2.0% of the bytes do not belong to good frames"),
-        (lambda k: b'{"A":%s,"B":%d}\n' % (b"null" if k % 20 == 7 else b"3", k % 7), """the line '{"A":null,"B":"""),
+        (lambda k: b'{"A":%s,"B":%d}\n' % (b"null" if k % 20 == 7 else b"3", k % 2), """the line '{"A":null,"B":"""),
         (lambda _: b"", "no bytes were received"),
         (lambda _: b"\xf8\x80\xfe\xff" * 5, "no frames were recognised: try another baud rate"),
         (lambda _: b"3.1,-2.0,5.2;", "such as b'3.1,-2.0,5.2;', but no frames"),
         # The board is restarted after ten frames, because its port was opened.
-        (lambda k: b"t_ms:%d,A:%d,B:1\n" % (5 * k + 1_000_000 * (k < 9), k % 7), "channel B is dead"),
+        (lambda k: b"t_ms:%d,A:%d,B:1\n" % (5 * k + 1_000_000 * (k < 9), 3 * k % 7), "channel B is dead"),
         (lambda _: b"t_ms:5\n", "lines of text are not understood, for example 't_ms:5'"),
         (lambda k: f"#{k} 3.1 -2.0 5.2\n".encode(), "lines of text are not understood, for example '#"),
+        (
+            lambda k: b"%d,%d,3.1\n" % (k // 3, k % 3),
+            "for example '133,0,3.1': send the numbers of all channels in each",
+        ),
+        (lambda _: b"12:34:56\n", "not understood, for example '12:34:56'"),  # the times of an empty log
         (
             lambda k: f"{1e-3 * (k % 7):.4f};{1.65 + 1e-3 * (k % 5):.4f}\n".encode(),
             "seem to be in V: state the charge",

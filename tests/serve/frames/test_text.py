@@ -218,10 +218,10 @@ def test_word_that_changes_is_no_name(notation):
 @pytest.mark.parametrize(("columns", "header"), [((), "n,T,A,B"), (("n", "T", "A", "B"), "")])
 def test_names_of_the_counter_and_the_clock_in_a_header_have_their_meaning(columns, header):
     parser = TextParser(columns, {"n": "seq", "T": "t_ms"})
-    frames = feed("", header, *[f"{k},{5 * k},{k}.5,-1.5" for k in range(5)], parser=parser)
+    frames = feed("", header, *[f"{k},{5 * k},{k}.5,-1.5" for k in range(9)], parser=parser)
     for k, frame in enumerate(frames):
         assert (frame.seq, frame.t_us, frame.values, frame.names) == (k, 5000 * k, (k + 0.5, -1.5), ("A", "B"))
-    assert len(frames) == 5
+    assert len(frames) == 9
 
 
 LEVELS = st.tuples(*[st.integers(-9999, 9999).map(lambda value: value / 10)] * 3)
@@ -244,7 +244,7 @@ def test_numbers_are_taken_out_of_any_text(notation, rows, line_end):
 @pytest.mark.parametrize("message", ["OK", "the tare is done", "ready ; go"])
 @pytest.mark.parametrize("lines_before", [0, 3])
 def test_header_and_no_message_names_the_frames_after_it(message, lines_before):
-    lines = [f"{k},2,3,4" for k in range(5)]
+    lines = [f"{2 * k},2,3,4" for k in range(5)]
     lines.insert(lines_before, "b,a,c,d")
     frames = feed(message, *lines[:4], message, *lines[4:])
     assert [frame.names for frame in frames] == [()] * lines_before + [("b", "a", "c", "d")] * (5 - lines_before)
@@ -258,10 +258,10 @@ MESSAGES = ["Sensor 1 ready", "Sensor 2 ready", "Sensor 3 ready", "load:0x3fff00
     [
         (["A,B", "1,2", "3,4", "5,6", "A,B", "7,8"], [(1, 2), (3, 4), (5, 6), (7, 8)]),
         ([*MESSAGES, "1,2,3", "4,5,6", "7,8,9"], [(1, 2, 3), (4, 5, 6), (7, 8, 9)]),
-        (["READ 1", "0,2", "READ 1", "1,2", "READ 1", "2,2"], [(0, 2), (1, 2), (2, 2)]),
-        (["0x7FF0 0x8001", "0x7FF1 0x8001", "0x7FF2 0x8011"], [(0x7FF0, 0x8001), (0x7FF1, 0x8001), (0x7FF2, 0x8011)]),
+        (["READ 1", "0,2", "READ 1", "1,2", "READ 1", "1,2"], [(0, 2), (1, 2), (1, 2)]),
+        (["0x7FF0 0x8001", "0x7FF1 0x8001", "0x7FF9 0x8011"], [(0x7FF0, 0x8001), (0x7FF1, 0x8001), (0x7FF9, 0x8011)]),
         (["A 1 B 2", "A 3 B 4", "T 5"] * 12, [(1, 2), (3, 4)] * 12),
-        (["7,0x1F", "8,-0x20", "9,0x0"], [(7, 31), (8, -32), (9, 0)]),
+        (["5,0x1F", "8,-0x20", "9,0x0"], [(5, 31), (8, -32), (9, 0)]),
         ([f"seq=0x{n:X} A=-{n}" for n in range(12)], [(-n,) for n in range(12)]),
         (["x 0 7 y 1 8", "x 0 7 y 2 8", "x 1 7 y 2 8"] * 4, [(0, 7, 1, 8), (0, 7, 2, 8), (1, 7, 2, 8)] * 4),
     ],
@@ -286,6 +286,23 @@ def test_line_in_another_unit_is_rejected(notation):
     parser = TextParser()
     frames = feed(*[notation.format("850 pC")] * 12, notation.format("1.2 nC"), parser=parser)
     assert {frame.values[0] for frame in frames} == {850.0}
+@pytest.mark.parametrize("numbers", [(0, 1, 2), (1, 2, 3, 4), range(14, 22)])
+@pytest.mark.parametrize(
+    "notation",
+    ["{t},{n},{q}", "{q};{n:.2f};{t}", "ch 0x{n:X} {q}", "ADC1 Channel[{n}] Raw Data: {q}", "ch={n} A={q} B={t}"],
+)
+def test_line_with_the_number_and_the_charge_of_one_channel_is_no_frame(notation, numbers):
+    lines = [notation.format(t=1000 + k, n=n, q=n + k % 7 / 4) for k in range(20) for n in numbers]
+    del lines[7::10]  # lost lines
+    assert feed(*lines) == []
+
+
+@pytest.mark.parametrize("notation", ["{0},5,7", "{1},{2}.5,-{0},{3}", "{4},0,{0}.5", "{2},{3},{4}", "50{1},5,7"])
+def test_column_that_counts_or_has_few_values_is_a_column(notation):
+    lines = [notation.format(k, k % 4, -k % 3, 5 * k % 7, k // 5) for k in range(12)]
+    assert len(feed(*lines)) == 12
+
+
     assert parser.counts.malformed == 1
 
 

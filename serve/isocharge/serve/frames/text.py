@@ -7,6 +7,10 @@ occurred three times in succession. Lines that resemble a message, such as `Chan
 because a board that starts often sends several similar messages. After the recognition, lines with another layout are
 dropped and counted.
 
+If a column contains the number of the channel, each line contains the charge of one channel, as in `1000,0,3.2` and
+`1000,1,4.1`. Such lines are not recognised, because they could be mistaken for frames with three values. A frame
+counter that begins at 0 is distinguished from the number of a channel after nine lines.
+
 Reading may start in the middle of a cycle. A cycle therefore begins with the line whose name is that of the frame
 counter, or else comes first in the order of names.
 
@@ -30,6 +34,8 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from string import ascii_uppercase
 from typing import Literal
+
+import numpy as np
 
 from isocharge.common.errors import printable
 from isocharge.serve.frames.frame import (
@@ -230,8 +236,9 @@ class TextParser(DelimitedParser):
         """
         self._collected_lines.append((line._replace(names=self._meant(line.names)), size))
         repeats = MESSAGE_REPEATS if line.is_prose else RECOGNITION_REPEATS
-        frame_lines = _frame_lines([line for line, _ in self._collected_lines], repeats)
-        if not frame_lines:
+        lines = [line for line, _ in self._collected_lines]
+        frame_lines = _frame_lines(lines, repeats)
+        if not frame_lines or (len(frame_lines) == 1 and _has_channel_number(frame_lines[0], lines)):
             # Keep as many lines as the longest cycles need, and reject the older lines.
             while len(self._collected_lines) > RECOGNITION_REPEATS * MAX_CYCLE_LINES:
                 self._reject(self._collected_lines.pop(0)[1])
@@ -347,6 +354,35 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
     texts = [{line.text for line in lines[position::cycle_length]} for position in range(cycle_length)]
     varying = [line for line, texts_of_line in zip(cycle, texts, strict=True) if len(texts_of_line) > 1]
     return varying if len(varying) == 1 else []
+
+
+def _has_channel_number(frame_line: Line, lines: Sequence[Line]) -> bool:
+    """Return whether a line contains the number of a channel and only the charge of this channel.
+
+    The numbers of the channels increase by 1 from line to line and begin again after the last channel, as in
+    `1000,0,3.2`, `1000,1,4.1`, `1000,2,3.7` and `1005,0,3.3`. A column is taken for such numbers if it contains three
+    to eight consecutive numbers from a number below 100 on, and if at least half of the steps from line to line lead to
+    the next number. The other steps are due to missing lines. A line with three other columns that sometimes decrease
+    may contain all charges of a film.
+
+    The result is also true for a frame counter in its first eight lines.
+
+    Args:
+        frame_line: The line that is taken for a frame.
+        lines: The lines since the beginning.
+    """
+    pattern = skeleton_pattern(frame_line)
+    rows = [row for line in lines[-MAX_CYCLE_LINES:] if (row := line_values(pattern, line.text))]
+    columns = np.array(rows).T  # shape (columns, lines)
+    decreases = np.any(columns != np.sort(columns), axis=1)
+    for column, column_decreases in zip(columns, decreases, strict=True):
+        numbers, ranks = np.unique(column, return_inverse=True)
+        leads_to_next = np.diff(ranks) % len(numbers) == 1
+        are_consecutive = np.diff(numbers) == 1.0
+        are_channels = 3 <= len(numbers) <= 8 and numbers[0] < 100 and are_consecutive.all()
+        if are_channels and leads_to_next.mean() >= 0.5 and decreases.sum() - column_decreases < 3:
+            return True
+    return False
 
 
 def _first_line(lines: Sequence[Line], cycle_length: int) -> int:

@@ -156,7 +156,8 @@ class ReadingStream:
         line = f", such as {shown(self.parser.unread_line)}" if self.parser.unread_line else ""
         raise NoFramesError(
             f"no intact frame among the first {counts.bytes_dropped} bytes ({counts.crc_errors} with a wrong CRC, "
-            f"{counts.malformed} of another form{line}); {self.parser.format}: check baud rate and device"
+            f"{counts.malformed} of another form{line}); {self.parser.format}: check baud rate and device; "
+            "each line of text needs the numbers of all channels"
         )
 
     def _reconnect(self, outage_s: float) -> None:
