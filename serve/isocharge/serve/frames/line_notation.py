@@ -40,7 +40,7 @@ def clean_text(text: str) -> str:
         text = re.sub(_COLOURS, "", text)
     if not text.isascii():
         text = re.sub(r"[^\S\t]", " ", text)  # some programs write blanks of fixed width
-    text = text.strip().replace("\N{MINUS SIGN}", "-")  # programs with some locales, such as Swedish, write this sign
+    text = re.sub("[\u2010-\u2015\u2212]", "-", text.strip())  # dashes, and the minus sign of some locales
     text = re.sub(r"(^|[:=,;(\[] *)([-+]) +(?=[.0-9])", r"\1\2", text)  # a sign apart from its number, as in `A: - 3.5`
     if re.fullmatch(_SIGNED_NUMBERS, text):
         text = re.sub(r"(?<=[0-9])(?=[-+])", " ", text)

@@ -63,6 +63,9 @@ _CODES = {kind: chr(code) for code, kind in enumerate(_PATTERNS)}
 _END = r"[\s,;]*+"
 """Regular expression of marks without a meaning at the end of a line."""
 
+_UNCLEAR_SIGN = r"(?:^|[\s;])[-+]?[0-9.]+(?:(?:\s*[fnpuµμm]?[CV])?\s+-\s+[.0-9]|-(?:[\s,;]|$))"
+"""Regular expression of a minus after a number, as in `3.5 - 2.5` and `3.5-`, which may be a sign or a separator."""
+
 _NUMBER_KINDS = ("time", "uptime", "hexadecimal", "number")
 
 _NAMES_OF_TIMES = {"time": "t_s", "uptime": "t_ms"}
@@ -144,6 +147,8 @@ class Line(NamedTuple):
 def parse_line(text: str, *, has_header: bool = False, counters: Collection[str] = (SEQ,)) -> Line:
     """Take the numbers out of a line of text.
 
+    A line with an unclear minus is returned without numbers.
+
     Args:
         text: The line, as `clean_text` returns it.
         has_header: Whether a header names the numbers, so that words between the numbers are not names.
@@ -155,7 +160,7 @@ def parse_line(text: str, *, has_header: bool = False, counters: Collection[str]
     if not text.replace("\t", " ").isprintable():
         raise ValueError(f"expected printable characters, got {text[:100]!r}")
     number_kind = "number with a decimal comma" if _has_decimal_commas(text) else "number"
-    tokens = _tokens(text.rstrip(",; \t"), number_kind)
+    tokens = [] if re.search(_UNCLEAR_SIGN, text) else _tokens(text.rstrip(",; \t"), number_kind)
     tokens = _with_alternating_names(tokens, has_header=has_header)
     names = _names(tokens, counters)
     starts = tuple(token.start for token in tokens if token.kind in _NUMBER_KINDS)
