@@ -196,6 +196,7 @@ def test_level_at_rest_is_proposed_as_offset(gain, levels, has_offset):
     ("names", "channels", "message"),
     [
         ("A_nC B_nC C_nC", "A_nC B_nC C_nC", "the channels seem to be in nC"),
+        ("A B C_nC", "A B C_nC", "their units differ: state pC_per_unit of each electrode"),
         ("c b a", "a b c", ""),
         ("A B z", None, "('A', 'B', 'z')"),
         ("x y z", "x y z", ""),
@@ -214,6 +215,11 @@ def test_channels_are_proposed_by_their_names(names, channels, message):
     expected = channels and dict(zip("ABC", channels.split(), strict=True))
     assert (report.device.get("channels"), not report.missing) == (expected, not message)
     assert message in missing(report)
+
+
+def test_channels_without_names_beside_others_are_proposed_by_their_numbers():
+    report = examined(lambda k: b"left: %d 2, right: 3 4\n" % (3 * k % 5), electrodes=FOUR)
+    assert report.device["channels"] == {"A": "left", "B": "2", "C": "right", "D": "4"}
 
 
 @pytest.mark.parametrize("noise", [0.3, 1.0])

@@ -38,7 +38,9 @@ class Channels(Stage):
             setup: Settings of all stages.
             any_unit: Whether the names of the channels may contain any unit, even if the gain is not known.
         """
-        self._allows_any_unit = any_unit or setup.device.rule(GainRule) is not None
+        gain = setup.device.rule(GainRule)
+        self._allows_any_unit = any_unit or gain is not None
+        self._has_gains = gain is not None and isinstance(gain.pC_per_unit, dict)  # one for each electrode
         self._electrodes = setup.electrodes
         self._channels = setup.device.channels
         self._setup = setup
@@ -71,14 +73,18 @@ class Channels(Stage):
         their names, and otherwise by their order.
 
         Raises:
-            ChargeError: If the frame lacks a channel that the device file names, or if the channels cannot be assigned
-                by their names or by their order.
+            ChargeError: If the frame lacks a channel that the device file names, if the channels cannot be assigned by
+                their names or by their order, or if they have different units and the same gain.
         """
         if self._channels:
-            return tuple(self._assigned_index(electrode, frame) for electrode in self._electrodes)
-        indices = self.indices_by_name_or_order(frame)
-        if indices is None:
+            indices = tuple(self._assigned_index(electrode, frame) for electrode in self._electrodes)
+        else:
+            indices = self.indices_by_name_or_order(frame) or ()
+        units = {stated_unit(channel_names(frame)[index]) or "pC" for index in indices}
+        if not indices:
             raise self._assignment_error(frame)
+        if len(units) > 1 and not self._has_gains:
+            raise self._assignment_error(frame, "; their units differ: state pC_per_unit of each electrode in [gain]")
         return indices
 
     def indices_by_name_or_order(self, frame: Frame) -> tuple[int, ...] | None:
@@ -167,10 +173,9 @@ class Channels(Stage):
 
 
 def channel_names(frame: Frame) -> tuple[str, ...]:
-    """Return the names of the channels of a frame, or their numbers from 1 as texts if the frame contains no names."""
-    if frame.names:
-        return frame.names
-    return tuple(str(number) for number in range(1, len(frame.values) + 1))
+    """Return the names of the channels of a frame. The name of a channel without a name is its number from 1."""
+    names = frame.names or ("",) * len(frame.values)
+    return tuple(name or str(number) for number, name in enumerate(names, 1))
 
 
 def channel_index(name: str, frame: Frame) -> int | None:
