@@ -145,7 +145,9 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
             continue
         earlier = _changed_press(solved, -changes)
         distance, _ = solved.at
-        if column == "y" and distance < 10.0 * step:  # the direction of the press changes by a large angle
+        # Near the centre, the direction of the press changes by a large angle, and the mesh turns with it.
+        turned_distance = {"x": 1.0, "y": 10.0}.get(column, 0.0) * step
+        if distance < turned_distance:
             change = _change_at_fixed_points(solved, earlier, later, surface)
         else:
             # The nodes move with the press. Subtract the change of the stress that their movement causes.
