@@ -19,7 +19,7 @@ import scipy  # loads each of its subpackages on first use
 
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
-from isocharge.common.errors import InputError, SolveError
+from isocharge.common.errors import InputError, SceneError, SolveError
 from isocharge.common.progress import track
 from isocharge.simulate.execution import in_order
 from isocharge.simulate.forward.charge_map import ChargeMap
@@ -395,7 +395,7 @@ def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMa
     force_range = (min(default_min_force, case.force), max(default_max_force, case.force))
     try:
         return ForwardMap.build(case.sensor, case.probe, case.radius, force_range, executor=executor)
-    except SolveError:
+    except (SceneError, SolveError):
         return None
 
 
