@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from isocharge.simulate import Circle, ForwardMap, load_sensor
+from isocharge.simulate import Calibration, Circle, ForwardMap, load_sensor, write_sensor
 from isocharge.simulate.forward.family import NodeCount
 from isocharge.simulate.layout import case as case_module
 from isocharge.simulate.layout import design as design_module
@@ -50,3 +50,16 @@ def test_a_design_is_a_folder_that_other_commands_read(command, tmp_path, monkey
     assert f"{numbers['after']['noise_alone']['worst_mm']:.5g}" in out
     assert (folder / "design.png").read_bytes().startswith(b"\x89PNG")
     assert command(*words)[0] == 1  # nothing is overwritten
+
+
+def test_kept_names_may_contain_blanks(command, tmp_path):
+    """The error is raised after the kept electrodes have been found."""
+    sensor = load_sensor("three-25um-biaxial")
+    first, *others = sensor.electrodes
+    renamed = replace(
+        sensor, electrodes=(replace(first, name="left pad"), *others), calibration=Calibration(rotation=0.1)
+    )
+    write_sensor(renamed, tmp_path / "mine.toml")
+    words = ("--electrodes", "4", "--keep", "left pad, B", "--radius", "4", "-o", tmp_path / "new")
+    code, _, err = command("simulate", "design", tmp_path / "mine.toml", *words)
+    assert (code, "is calibrated" in err) == (2, True), err
