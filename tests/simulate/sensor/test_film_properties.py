@@ -114,3 +114,10 @@ def test_electrode_near_the_rim_is_refused_with_the_largest_distance():
     sensor = sensor_from_dict(sensor_to_dict(SENSOR) | {"electrodes": {"side_mm": 3.0, "A": [43.3, 0.0]}})
     with pytest.raises(SensorError, match=r"within 44\.5 mm.*reaches 44\.83 mm; move it inwards"):
         FilmPrior(sensor, PROBE)
+
+
+def test_electrode_beside_the_rim_of_a_large_film_is_accepted():
+    """The standard deviation of an oval clamp is 0.9 mm, which is more than the gap of 0.65 mm."""
+    film = sensor_to_dict(with_film(SENSOR, radius=150.0))
+    sensor = sensor_from_dict(film | {"electrodes": {"side_mm": 3.0, "A": [0.0, 147.84]}})
+    assert FilmPrior(sensor, PROBE).changes_stress.sum() == PRIOR.changes_stress.sum()

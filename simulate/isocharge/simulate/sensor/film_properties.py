@@ -285,7 +285,7 @@ class FilmPrior:
         """
         mean_sensor, mean_probe = self.film(self.mean)
         changes = []
-        for values in self.mean + np.diag(self.std):  # one property differs from its mean
+        for values in np.clip(self.mean + np.diag(self.std), *self.bounds):  # one property differs from its mean
             sensor, probe = self.film(values)
             changes.append(sensor.film != mean_sensor.film or probe != mean_probe)
         return np.array(changes)
