@@ -13,6 +13,7 @@ from isocharge.train import calibrate
 from isocharge.train.calibration.diagnosis import (
     OFFSET_STD,
     SCATTER_STD,
+    SUSPICIOUS_MISFIT,
     check_places,
     expected_charges,
     find_mistakes,
@@ -81,6 +82,18 @@ def test_misfit_of_one_usual_offset_and_one_usual_scatter_is_two(problem, synthe
     loosest, _, _ = expected_charges(synthetic, contact)
     charge = loosest * np.exp(OFFSET_STD + SCATTER_STD * np.array([1.0, -1.0, -1.0, 1.0]))
     assert misfit(measured_presses(problem, contact, charge), synthetic) == pytest.approx(2.0)
+
+
+@pytest.mark.usefixtures("few_hypotheses")
+def test_centimetres_near_the_centre_are_refused_although_the_charges_are_not_suspicious(problem, synthetic):
+    def shrunk(contact, _charge):
+        contact = contact * [0.4, 0.4, 1.0]
+        return contact / [10.0, 10.0, 1.0], synthetic.charges(synthetic.values, contact)
+
+    presses = with_mistake(problem, synthetic, shrunk)
+    assert misfit(presses, synthetic) < SUSPICIOUS_MISFIT
+    with pytest.raises(PressError, match=r"scatter about 3 times as much as stated.* positions are in cm, not mm"):
+        calibrate(presses, problem, start=synthetic, accurate=False)
 
 
 def test_places_near_the_rim_of_an_oval_film(problem, synthetic):

@@ -113,6 +113,10 @@ def calibrate(
             raise unexplained_error(used_presses, charges, "their charges are very different from those of its films")
         data = PressData.of(used_presses, problem.noise, problem.solved_domain)
         estimation = _fit_even_film(problem, data, charges, executor)
+        position_ratio = estimation.hypothesis.errors.position_ratio
+        if position_ratio > 1.0 and find_mistakes(used_presses, charges):
+            reason = f"their positions scatter about {position_ratio:.0f} times as much as stated"
+            raise unexplained_error(used_presses, charges, reason)
         if accurate:
             estimation = _fit_uneven_film(problem, data, estimation, executor)
             if not _is_exact(estimation.charges, estimation.film.film_values, estimation.contact):
