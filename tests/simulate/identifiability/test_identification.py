@@ -15,6 +15,7 @@ from isocharge.simulate import (
     limits_at,
     load_sensor,
     noise_model,
+    parse_probe,
 )
 from isocharge.simulate.identifiability.identification import Identification, map_to_search
 from kept import kept
@@ -35,8 +36,9 @@ def identification(film):
 
 
 def test_identification_to_dict_can_be_written_as_json(identification):
-    numbers = json.loads(json.dumps(identification.to_dict(), allow_nan=False))
-    assert numbers["probe"] == "circle:2.0"
+    turned = replace(identification, probe=parse_probe("rectangle:4.0x2.0@30"))
+    numbers = json.loads(json.dumps(turned.to_dict(), allow_nan=False))
+    assert numbers["probe"] == "rectangle:4.0x2.0@30"
     assert numbers["noise"] == {"name": "reference", "white_pC": 1.0, "gain": 0.002}
     area = numbers["working_area"]
     assert (area["radius_mm"], area["why"], area["fold_radius_mm"]) == (5.0, "searched", None)

@@ -161,7 +161,7 @@ class Identification:
         area = self.area
         table = {
             "sensor": self.sensor.name,
-            "probe": self.probe.notation,
+            "probe": self.probe.rotated_notation,
             "noise": self.noise.to_dict(),
             "force_N": area.force_range,
             "working_area": {
