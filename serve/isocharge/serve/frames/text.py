@@ -238,21 +238,26 @@ class TextParser(DelimitedParser):
         repeats = MESSAGE_REPEATS if line.is_prose else RECOGNITION_REPEATS
         lines = [line for line, _ in self._collected_lines]
         frame_lines = _frame_lines(lines, repeats)
-        if not frame_lines or (len(frame_lines) == 1 and _has_channel_number(frame_lines[0], lines)):
+        layout = self._named_layout(frame_lines) if frame_lines else None
+        if layout is None or _has_channel_number(layout, lines):
             # Keep as many lines as the longest cycles need, and reject the older lines.
             while len(self._collected_lines) > RECOGNITION_REPEATS * MAX_CYCLE_LINES:
                 self._reject(self._collected_lines.pop(0)[1])
             return []
 
-        layout = Layout(frame_lines)
-        is_named = layout.name_unnamed(self._meant(self._columns))
-        while self._headers and not is_named:
-            is_named = layout.name_unnamed(self._meant(header_names(self._headers.pop(), layout.example)))
         self.layout = layout
         self._describe_layout(layout)
         collected_lines = self._collected_lines
         self._collected_lines = []
         return [frame for line, line_size in collected_lines for frame in self._read_line(line.text, line_size)]
+
+    def _named_layout(self, frame_lines: Sequence[Line]) -> Layout:
+        """Return the layout of the lines of a frame, with names from the device file or from the latest header."""
+        layout = Layout(frame_lines)
+        is_named = layout.name_unnamed(self._meant(self._columns))
+        for header in reversed(self._headers):
+            is_named = is_named or layout.name_unnamed(self._meant(header_names(header, layout.example)))
+        return layout
 
     def _read_line(self, text: str, size: int) -> list[Frame]:
         """Return the frames that a line completes. If a line of a cycle is lost, reject the other lines of the cycle.
@@ -356,31 +361,36 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
     return varying if len(varying) == 1 else []
 
 
-def _has_channel_number(frame_line: Line, lines: Sequence[Line]) -> bool:
+def _has_channel_number(layout: Layout, lines: Sequence[Line]) -> bool:
     """Return whether a line contains the number of a channel and only the charge of this channel.
 
     The numbers of the channels increase by 1 from line to line and begin again after the last channel, as in
     `1000,0,3.2`, `1000,1,4.1`, `1000,2,3.7` and `1005,0,3.3`. A column is taken for such numbers if it contains three
-    to eight consecutive numbers from a number below 100 on, and if at least half of the steps from line to line lead to
-    the next number. The other steps are due to missing lines. A line with three other columns that sometimes decrease
-    may contain all charges of a film.
+    to eight consecutive whole numbers from a number below 100 on, and if at least half of the steps from line to line
+    lead to the next number. The other steps are due to missing lines. A column with the name of a frame counter or of
+    an electrode, such as A, contains no such numbers.
 
-    The result is also true for a frame counter in its first eight lines.
+    A line may contain all charges of a film if three other columns sometimes decrease, or if all of them are constant.
+    The result is also true for a frame counter without a name in its first eight lines.
 
     Args:
-        frame_line: The line that is taken for a frame.
+        layout: Layout of a frame with its names.
         lines: The lines since the beginning.
     """
-    pattern = skeleton_pattern(frame_line)
-    rows = [row for line in lines[-MAX_CYCLE_LINES:] if (row := line_values(pattern, line.text))]
+    if len(layout.patterns) > 1:
+        return False
+    rows = [row for line in lines[-MAX_CYCLE_LINES:] if (row := line_values(layout.patterns[0], line.text))]
     columns = np.array(rows).T  # shape (columns, lines)
     decreases = np.any(columns != np.sort(columns), axis=1)
-    for column, column_decreases in zip(columns, decreases, strict=True):
+    varies = np.ptp(columns, axis=1) > 0.0
+    for name, column, column_decreases in zip(layout.names, columns, decreases, strict=True):
         numbers, ranks = np.unique(column, return_inverse=True)
         leads_to_next = np.diff(ranks) % len(numbers) == 1
         are_consecutive = np.diff(numbers) == 1.0
-        are_channels = 3 <= len(numbers) <= 8 and numbers[0] < 100 and are_consecutive.all()
-        if are_channels and leads_to_next.mean() >= 0.5 and decreases.sum() - column_decreases < 3:
+        are_channels = 3 <= len(numbers) <= 8 and numbers[0] in range(100) and are_consecutive.all()
+        may_be_frame = decreases.sum() - column_decreases >= 3 or (varies.sum() == 1 and len(columns) > 3)
+        is_other_column = name in {SEQ, *ascii_uppercase}
+        if are_channels and leads_to_next.mean() >= 0.5 and not (may_be_frame or is_other_column):
             return True
     return False
 
