@@ -207,7 +207,9 @@ SCHEMA = jsonschema_rs.Draft7Validator(record_schema(ELECTRODES))
 @settings(max_examples=40, deadline=None)
 @given(record=records())
 def test_every_record_is_valid_under_its_schema(record):
-    SCHEMA.validate(json.loads(record.to_json()))
+    content = json.loads(record.to_json())
+    SCHEMA.validate(content)
+    assert not SCHEMA.is_valid(content | {"charge_pC": {"A": "1"}})
 
 
 def test_wrench_and_pose_describe_the_tracked_contact(tmp_path, press):

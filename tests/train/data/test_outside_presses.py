@@ -60,10 +60,11 @@ def test_few_presses_leave_no_presses_outside():
 def test_answers_wrong_by_more_than_four_standard_deviations_without_a_flag_are_unnoticed():
     """The answers for y > 0 are wrong, and those for x > 0 have the flag `misfit`."""
     outside = OutsidePresses.of(Domain(10.0, FORCES_N), INSIDE, OUTSIDE)
-    x, y, _ = outside.test.contact.T
-    contact = outside.test.contact * [0.1, 0.1, 0.9]
-    std = np.abs(contact - outside.test.contact) / np.where(y > 0.0, 4.1, 3.9)[:, None]
-    misfit = np.where(x > 0.0, 100.0, 0.0)[:, None]
-    fitted = SimpleNamespace(outside=outside, noise=noise_model("reference"), predict=lambda _: (contact, std, misfit))
+    truth = outside.test.contact
+    is_flagged, is_wrong, _ = np.hsplit(truth > 0.0, 3)
+    contact = truth * [0.1, 0.1, 0.9]
+    std = np.abs(contact - truth) / np.where(is_wrong, 4.1, 3.9)
+    answers = (contact, std, 100.0 * is_flagged)
+    fitted = SimpleNamespace(outside=outside, noise=noise_model("reference"), predict=lambda _: answers)
     unnoticed = unnoticed_presses(fitted, Predictor("three-25um-biaxial").metadata)
-    assert unnoticed == outside.unnoticed_shares((y > 0.0) & (x <= 0.0))
+    assert unnoticed == outside.unnoticed_shares((is_wrong & ~is_flagged).ravel())
