@@ -27,7 +27,7 @@ def test_theory_by_name_finds_the_theory_with_this_name(bending):
     ],
 )
 def test_modelling_error_is_an_upper_bound_of_the_effect_of_bending(thickness, poisson, radius, at, force):
-    """The charges without bending differ from those with bending by at most the modelling error.
+    """The charges without bending differ from those with bending by a sixth to the whole of the modelling error.
 
     The difference is relative to the largest charge of the press, and both theories use the same mesh.
     """
@@ -36,7 +36,8 @@ def test_modelling_error_is_an_upper_bound_of_the_effect_of_bending(thickness, p
     full = press(sensor.film, probe, at, force)
     same_mesh = SolveSettings(theory=MEMBRANE, resolution=full.mesh.resolution, layer=full.mesh.layer)
     charge = solved_charge(sensor, probe, at, force, same_mesh)
-    assert relative_error(charge, touch_charge(sensor, full)) <= modelling_error(sensor.film, probe, force, MEMBRANE)
+    difference = relative_error(charge, touch_charge(sensor, full))
+    assert difference <= modelling_error(sensor.film, probe, force, MEMBRANE) <= 6.0 * difference
 
 
 @pytest.mark.parametrize(("pretension", "thickness"), [(0.0, 0.11), (0.5, 0.11), (5.0, 0.025)])
