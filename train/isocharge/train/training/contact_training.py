@@ -1,18 +1,26 @@
-"""Training of the contact perceptron: its losses and the noise of the charges."""
+"""Training of the contact perceptron: its losses, the noise of the charges, and the final fit of its covariance."""
 
+import numpy as np
 import torch
-from scipy.special import chdtr, chdtrc
+from scipy.optimize import minimize
 from torch import Tensor
 
+from isocharge.common.arrays import Array
 from isocharge.train.data.channel_noise import Noise
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.config import TrainingConfig
 from isocharge.train.training.descent import TrainingStage
 from isocharge.train.training.network import InverseNetwork, Posterior, as_tensor
 
-MAX_NORMAL_ERROR = 2.0
-"""Error in standard deviations above which the loss of the covariance grows with the logarithm of the error instead of
-its square."""
+DEGREES_OF_FREEDOM = 5.0
+"""Degrees of freedom nu of the t distribution that determines how the loss of the covariance counts large errors."""
+
+TAIL_FACTOR = 3.71
+"""Factor of the logarithm in the loss of the covariance, for the degrees of freedom nu above, dimensionless.
+
+With the factor 1 / (2 - 2 sqrt(pi nu / 2) erfcx(sqrt(nu / 2))), the loss of normally distributed errors is smallest at
+their standard deviation, because the mean of z times the derivative of the loss is 1 for a standard normal z.
+"""
 
 MIN_SINE = 0.003
 """Smallest sine of an angle of the correlations in the loss. Smaller sines count as this value."""
@@ -36,51 +44,30 @@ def mean_loss(posterior: Posterior, target: Tensor) -> Tensor:
 
 
 def covariance_loss(posterior: Posterior, error: Tensor) -> Tensor:
-    """Compute the sum of the losses of the standard deviations and of the correlations for each press, shape (n,).
+    """Compute the negative logarithm of the likelihood of the errors of each press, without constants, shape (n,).
 
-    Both are negative logarithms of likelihoods, without constants. The standard deviations are fitted to the errors,
-    and the correlations to the errors divided by the standard deviations. The likelihoods are Gaussian for errors up to
-    `MAX_NORMAL_ERROR` standard deviations, and have longer tails beyond (Huber 1964, proposal 2). Where the map from
-    contacts to charges nearly folds, the errors have longer tails than a normal distribution. A Gaussian likelihood
-    would enlarge the intervals of all contacts because of these errors.
+    The errors are divided by the standard deviations, and their correlations are removed. The three results are
+    independent. Their distribution has longer tails than a normal distribution: where the map from contacts to charges
+    nearly folds, a few errors are large, and a Gaussian likelihood would enlarge the intervals of all contacts because
+    of these errors.
 
     Args:
         posterior: Standard deviations and angles of the correlations (`isocharge.train.training.folded_network`).
         error: Errors of the unit coordinates, shape (n, 3), which are constants in this loss.
     """
-    deviation = error.detach() * torch.exp(-posterior.log_std)
-    std_loss = posterior.log_std.sum(dim=1) + _half_long_tailed_square(deviation)
+    x_deviation, y_deviation, force_deviation = (error.detach() * torch.exp(-posterior.log_std)).unbind(dim=1)
 
     # The Cholesky factor of the correlations has the rows (1, 0, 0), (cos a, sin a, 0) and (cos b, sin b cos c,
     # sin b sin c), where the angles a, b and c are pi / 2 + turn. It is inverted row by row, which gives errors with
     # unit covariance.
     sin_a, sin_b, sin_c = torch.cos(posterior.turn).clamp(min=MIN_SINE).unbind(dim=1)
     cos_a, cos_b, cos_c = torch.sin(-posterior.turn).unbind(dim=1)
-    x_deviation, y_deviation, force_deviation = deviation.detach().unbind(dim=1)
     white_y = (y_deviation - cos_a * x_deviation) / sin_a
     white_force = (force_deviation - cos_b * x_deviation - sin_b * cos_c * white_y) / (sin_b * sin_c)
-    log_determinant = torch.log(sin_a * sin_b * sin_c)
-    return std_loss + log_determinant + _half_long_tailed_square(torch.stack([white_y, white_force], dim=1))
+    log_determinant = posterior.log_std.sum(dim=1) + torch.log(sin_a * sin_b * sin_c)
 
-
-def _half_long_tailed_square(deviation: Tensor) -> Tensor:
-    """Compute half of the sum of the squares of each row, shape (n,). Large squares are replaced by smaller values.
-
-    These values increase logarithmically. At `MAX_NORMAL_ERROR`, the logarithmic function has the same value and the
-    same slope as the square. The result is divided by the mean square of a normal variable with this limit. If the
-    errors are normally distributed, the minimum of the loss is therefore at their standard deviation.
-
-    Args:
-        deviation: Errors in standard deviations, shape (n, k).
-    """
-    squares = deviation**2
-    largest_square = MAX_NORMAL_ERROR**2
-    tail = largest_square * (1.0 + torch.log(squares.clamp(min=largest_square) / largest_square))
-    long_tailed_square = torch.where(squares < largest_square, squares, tail)
-    # The mean square of a limited normal variable is the integral of the square within the limits, which follows from a
-    # chi-squared distribution with three degrees of freedom, plus the squared limit times the probability beyond them.
-    mean_square = float(chdtr(3, largest_square) + largest_square * chdtrc(1, largest_square))
-    return 0.5 * long_tailed_square.sum(dim=1) / mean_square
+    squares = torch.stack([x_deviation, white_y, white_force]) ** 2
+    return log_determinant + TAIL_FACTOR * torch.log1p(squares / DEGREES_OF_FREEDOM).sum(dim=0)
 
 
 def contact_stage(
@@ -118,3 +105,56 @@ def contact_stage(
     sizes = config.sizes(network.features.n_electrode)
     rate = config.learning_rate * sizes.rate_factor
     return TrainingStage("contact", network.contact, loss, sizes.steps, rate, config.seed)
+
+
+REFIT_PRESSES = 65_536
+"""Smallest number of presses with noise to which `refit_covariance` fits the covariance."""
+
+RIDGE = 10.0
+"""Value that is added to the sums of the squares of the hidden units in `refit_covariance`, dimensionless.
+
+Without this value, the weights of units that are nearly linear functions of other units would be very large.
+"""
+
+LOSS_TOLERANCE = 1e-5
+"""Relative decrease of the loss in one iteration below which `refit_covariance` ends, dimensionless."""
+
+
+def refit_covariance(network: InverseNetwork, train: LabelledPresses, noise: Noise) -> None:
+    """Fit the last layer for the standard deviations and the correlations to the errors of the trained mean.
+
+    During the training, the errors of the mean decrease until the last step. The covariance therefore belongs partly to
+    the larger errors of earlier steps. This function minimises the loss of the covariance on a large sample of presses
+    by the method L-BFGS. The loss does not change the mean.
+
+    The hidden units are correlated, and a fit of their weights would take hundreds of iterations. The change of the
+    weights is therefore a product of two matrices. The first matrix is fitted. The second matrix is the inverse of the
+    Cholesky factor of the Gram matrix of the hidden units. The entries of the first matrix are then the weights of
+    values that are nearly orthonormal over the presses.
+
+    Args:
+        network: Network that learns the force, with a trained contact perceptron.
+        train: Presses for training, which are repeated if they are few.
+        noise: Noise that is added to the charges.
+    """
+    presses = train.repeated(REFIT_PRESSES)
+    target = as_tensor(network.domain.to_unit(presses.contact))
+    weight = network.contact.linear_layers[-1].weight.data
+    with torch.no_grad():
+        inputs = network.inputs(as_tensor(presses.noisy(noise, seed=0)))
+        outputs = network.contact(inputs)
+        hidden = network.contact.last_hidden(inputs)
+        gram_matrix = hidden.T @ hidden
+        gram_matrix.diagonal().add_(RIDGE)
+        inverse_factor = torch.linalg.inv(torch.linalg.cholesky(gram_matrix))
+
+    def loss_and_gradient(change: Array) -> tuple[float, Array]:
+        """Return the loss and its gradient with respect to the first matrix; the matrix and the gradient are flat."""
+        matrix = as_tensor(change).view_as(weight).requires_grad_()
+        posterior = Posterior(*(outputs + hidden @ (matrix @ inverse_factor).T).split(3, dim=1))
+        loss = covariance_loss(posterior, target - posterior.mean).sum()
+        (gradient,) = torch.autograd.grad(loss, matrix)
+        return loss.item(), gradient.numpy().ravel()
+
+    result = minimize(loss_and_gradient, np.zeros(weight.numel()), jac=True, method="L-BFGS-B", tol=LOSS_TOLERANCE)
+    weight += as_tensor(result.x).view_as(weight) @ inverse_factor

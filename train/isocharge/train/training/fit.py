@@ -24,7 +24,7 @@ from isocharge.train.data.channel_noise import Noise, misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
 from isocharge.train.data.presses import LabelledPresses
 from isocharge.train.training.config import FitConfig
-from isocharge.train.training.contact_training import contact_stage
+from isocharge.train.training.contact_training import contact_stage, refit_covariance
 from isocharge.train.training.descent import TrainingStage
 from isocharge.train.training.folded_network import FoldedNetwork
 from isocharge.train.training.misfit_training import misfit_examples, misfit_stage
@@ -137,6 +137,7 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
         misfit_training = executor.submit(train_misfit)
         stage = contact_stage(network, split.train, training.noise_model, training)
         train_perceptron(stage, settings)
+        refit_covariance(network, split.train, training.noise_model)
         misfit_training.result()
 
     made_with: dict[str, object] = {"config": settings.to_dict()}

@@ -29,7 +29,6 @@ from isocharge.train.training.folded_network import (
     LARGEST_INT8,
     LOG_FORCE,
     LOG_STD,
-    MEAN,
     TURN,
     ChargeFeatures,
     FoldedNetwork,
@@ -152,20 +151,16 @@ class TrainablePerceptron(nn.Module):
             first.weight.copy_(slope * direction)
             first.bias.copy_(-(first.weight * centre).sum(dim=1))  # weight @ centre + bias = 0
 
-    def forward(self, inputs: Tensor) -> Tensor:
-        """Compute the outputs of the perceptron.
-
-        Args:
-            inputs: Inputs, shape (n, n_input).
-
-        Returns:
-            Outputs, shape (n, n_output).
-        """
-        *hidden, last = self.linear_layers
+    def last_hidden(self, inputs: Tensor) -> Tensor:
+        """Compute the last hidden layer, shape (n, n_unit), from the inputs, shape (n, n_input)."""
         value = inputs
-        for layer in hidden:
+        for layer in self.linear_layers[:-1]:
             value = torch.tanh(layer(value))
-        outputs: Tensor = last(value) + self.skip(inputs)
+        return value
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Compute the outputs, shape (n, n_output), from the inputs, shape (n, n_input)."""
+        outputs: Tensor = self.linear_layers[-1](self.last_hidden(inputs)) + self.skip(inputs)
         return outputs
 
     def to_numpy(self) -> Perceptron:
@@ -259,7 +254,7 @@ class InverseNetwork(nn.Module):
     def posterior(self, charge: Tensor) -> Posterior:
         """Estimate the contacts of n presses from their charges, shape (n, n_electrode), pC."""
         outputs = self.contact(self.inputs(charge)) * self.output_factor + self.output_offset
-        return Posterior(outputs[:, MEAN], outputs[:, LOG_STD], outputs[:, TURN])
+        return Posterior(*outputs.split(3, dim=1))
 
 
 def feature_values(features: ChargeFeatures, charge: Tensor) -> Tensor:
