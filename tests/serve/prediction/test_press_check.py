@@ -8,7 +8,6 @@ presses whose errors do not follow the model.
 
 import math
 import re
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -144,13 +143,6 @@ def test_presses_outside_the_domain_or_with_unknown_values_are_excluded(predicto
     assert "0.05 to 2 N); if these are most, look at the units (lines 2, 3)" in check.notes[2]
     row = check.to_dict()["each"][3]
     assert (row["x_mm"], row["x_error_mm"], row["left_out"]) == (None, None, "a charge is unknown")
-
-
-def test_time_of_a_check_grows_linearly_with_the_number_of_presses(checked):
-    check = checked(20_000)
-    start_s = time.process_time()
-    assert len(check.to_dict()["each"]) == 20_000
-    assert time.process_time() - start_s < 10.0
 
 
 def test_note_for_a_film_that_does_not_fit_states_the_explaining_rig_std(predictor, measure):
