@@ -52,30 +52,6 @@ def plate_stiffness(film: Film) -> float:
     return film.young * film.thickness**3 / (12.0 * (1.0 - film.poisson**2))
 
 
-# Schwerin (1929): point load, Poisson 1/3
-
-
-def test_schwerin_point_load():
-    """Away from a small probe, the deflection and the stress resultants are those of Schwerin's point load.
-
-    The solution is w = k (1 - (r/a)^(2/3)), N_r = 3 F / (4 pi k) (r/a)^(-2/3) and N_theta = N_r / 3.
-    """
-    film = replace(SLACK, poisson=1.0 / 3.0)
-    force = TINY
-    solved = press(
-        film, Circle(0.02), (0.0, 0.0), force, SolveSettings(theory=MEMBRANE, resolution=Resolution(6, 8, 10))
-    )
-    k = np.cbrt(3.0 / np.pi * force * film.radius**2 / (film.young * film.thickness))
-    for share in (0.2, 0.9):
-        points = ring(share * film.radius)
-        np.testing.assert_allclose(deflection(solved, points), k * (1.0 - share ** (2 / 3)), rtol=2e-5)
-        radial, hoop, shear = radial_and_hoop(touch_stress(solved, points) * film.thickness, points)
-        expected = 3.0 * force / (4.0 * np.pi * k) * share ** (-2 / 3)
-        np.testing.assert_allclose(radial, expected, rtol=2e-5)
-        np.testing.assert_allclose(hoop, expected / 3.0, rtol=1e-4)
-        np.testing.assert_allclose(shear, 0.0, atol=1e-5 * expected)
-
-
 # Green's functions of the disk. Positions are complex numbers x + i y in film radii: z is the position of the
 # deflection, and c is the position of the point load.
 
