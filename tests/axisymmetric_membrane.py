@@ -14,8 +14,8 @@ def harmonic(z: np.ndarray, c: complex) -> np.ndarray:
     return np.log(np.abs((1.0 - np.conj(c) * z) / (z - c))) / (2.0 * np.pi)
 
 
-def axisymmetric_membrane(film: Film, probe_radius: float, force: float, pressure: float = 0.0, tolerance=1e-9):
-    """Solve a membrane under a force on a disk at its centre, N, and a uniform pressure, MPa.
+def axisymmetric_membrane(film: Film, probe_radius: float, force: float):
+    """Solve a membrane under a force on a disk at its centre, N.
 
     The unknowns are u, phi = r S_r (1 + A^2 u') and w in the scaled variables of mechanics.energy, for the load one.
     The radial balance is phi' = S_theta (1 + A^2 u / r). The vertical balance is r S_r w' = -L(r) / 2 pi with the load
@@ -26,9 +26,7 @@ def axisymmetric_membrane(film: Film, probe_radius: float, force: float, pressur
         and of the hoop stress, MPa, shape (3, n).
     """
     share = probe_radius / film.radius
-    pressure_load = pressure * np.pi * film.radius**2
-    scale = force + abs(pressure_load)
-    squared_amplitude = np.cbrt(scale / (film.young * film.thickness * film.radius)) ** 2
+    squared_amplitude = np.cbrt(force / (film.young * film.thickness * film.radius)) ** 2
     poisson = film.poisson
     plane = 1.0 / (1.0 - poisson**2)
     tension = film.pretension / (film.young * squared_amplitude)
@@ -39,7 +37,7 @@ def axisymmetric_membrane(film: Film, probe_radius: float, force: float, pressur
 
         The slope u' is the solution of one equation for each radius. Newton's method begins at u' = 0.
         """
-        load = (force * np.minimum(1.0, (r / share) ** 2) + pressure_load * r**2) / scale
+        load = np.minimum(1.0, (r / share) ** 2)
         hoop_strain = u / r + 0.5 * squared_amplitude * (u / r) ** 2
         tilt = -load / (2.0 * np.pi * phi)  # w' over 1 + A^2 u'
         slope = np.zeros_like(r)
@@ -69,7 +67,7 @@ def axisymmetric_membrane(film: Film, probe_radius: float, force: float, pressur
     r = np.unique(np.concatenate([np.geomspace(start, 1.0, 200), np.linspace(start, share, 50), [share]]))
     bend = np.cbrt(r**2 + share**2)
     guess = np.stack([0.1 * r * (1 - r), (0.3 / bend + tension) * r, 0.8 * (bend[-1] - bend)])
-    found = solve_bvp(equations, ends, r, guess, tol=tolerance, max_nodes=100_000)
+    found = solve_bvp(equations, ends, r, guess, tol=1e-9, max_nodes=100_000)
     assert found.success, found.message
 
     def at(distance_mm: np.ndarray) -> np.ndarray:
