@@ -4,8 +4,6 @@ import json
 from contextlib import nullcontext
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from headless_chromium import start_chromium
 from infer_requests import INFER, infer_request
@@ -111,13 +109,6 @@ def test_allow_host_accepts_pages_behind_a_proxy_and_none_of_another_port(host, 
 def test_allow_host_expects_a_plain_name(name):
     with pytest.raises(InputError, match="--allow-host: expected a host name without scheme, port and path"):
         host_name(name)
-
-
-@given(st.from_regex(r"[a-z]{1,10}(\.[a-z]{1,10}){1,3}(:[0-9]{1,5})?", fullmatch=True))
-def test_no_name_but_localhost_is_served(name):
-    if name.partition(":")[0] != "localhost":
-        with pytest.raises(OriginError, match="Host"):
-            AccessCheck().check("GET", {b"host": name.encode()})
 
 
 def test_with_a_token_any_host_name_is_served(store):
