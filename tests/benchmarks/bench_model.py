@@ -6,11 +6,12 @@ The presses of a circle of 1 mm are simulated separately and were not in the tra
 and the forces of the model. Computing the Bayes limit takes half a minute for a thousand presses.
 """
 
+from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
-from shared import LimitedPresses, arguments, inner_radius_mm, model_film, print_results
+from scipy.stats import chi2, norm
+from shared import LimitedPresses, arguments, inner_radius_mm, model_film, print_results, whitened_errors
 
 from isocharge.serve import Predictor
 from isocharge.simulate import Sweep, noise_model
@@ -25,26 +26,27 @@ LEVELS = (0.68, 0.95)
 
 
 def coverage(truth: np.ndarray, estimate: np.ndarray) -> dict[str, list[float]]:
-    """Measure how often the central 68 and 95 % intervals of normal distributions contain the true coordinates.
+    """Measure how often the central 68 and 95 % intervals and ellipsoids contain the true contacts.
 
     Args:
         truth: Contacts (x, y, F), shape (n, 3), mm and N.
-        estimate: Estimated contacts and their standard deviations, shape (n, 6).
+        estimate: Outputs of a model, shape (n, 10).
 
     Returns:
-        Smallest and largest coverage of x, y and the force: over all presses, and over thirds of the presses by radius
-        and by force.
+        Smallest and largest coverage by intervals of x, y and the force, and by ellipsoids: over all presses, and over
+        thirds of the presses by radius and by force.
     """
-    standardised_error = np.abs(estimate[:, :3] - truth) / estimate[:, 3:6]
+    contact, std, _, correlation = np.split(estimate, [3, 6, 7], axis=1)
+    squared_distance = np.sum(whitened_errors(contact, truth, std, correlation) ** 2, axis=1, keepdims=True)
+    regions = {"": 2.0 * norm.cdf(np.abs(contact - truth) / std) - 1.0, "ellipsoid, ": chi2.cdf(squared_distance, 3)}
     by_radius = np.argsort(np.hypot(truth[:, 0], truth[:, 1]))
     by_force = np.argsort(truth[:, 2])
     groups = {"all": [by_force], "a third": [*np.array_split(by_radius, 3), *np.array_split(by_force, 3)]}
     results = {}
-    for level in LEVELS:
-        is_inside = standardised_error <= norm.ppf(0.5 + 0.5 * level)
-        for name, row_groups in groups.items():
-            shares = [is_inside[rows].mean(axis=0) for rows in row_groups]
-            results[f"{level:.0%} of {name}"] = [float(np.min(shares)), float(np.max(shares))]
+    for level, region, name in product(LEVELS, regions, groups):
+        is_inside = regions[region] <= level
+        shares = [is_inside[rows].mean(axis=0) for rows in groups[name]]
+        results[f"{region}{level:.0%} of {name}"] = [float(np.min(shares)), float(np.max(shares))]
     return results
 
 
@@ -62,8 +64,8 @@ def measure(model: str, presses: int, draws: int, seed: int) -> dict[str, Any]:
     film = model_film(predictor, radius + MARGIN_mm)
 
     def estimate(charge: np.ndarray) -> np.ndarray:
-        """Return contacts and their standard deviations, shape (n, 6)."""
-        return np.stack(predictor.predict_batch(charge), axis=1).astype(float)[:, :6]
+        """Return the outputs of the model, shape (n, 10)."""
+        return np.stack(predictor.predict_batch(charge), axis=1).astype(float)
 
     limited = LimitedPresses.draw(film, radius, presses, NOISE, seed)
     truth = Sweep(radius, film.domain.force_range, draws, seed).contacts()
