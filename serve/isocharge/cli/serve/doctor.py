@@ -156,12 +156,12 @@ def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> Elec
     # Determine the channel that each electrode is assumed to have before the check. If the device file does not assign
     # the channels, they are assigned by their order, or each channel is an electrode with the name of the channel.
     is_by_order = len(electrodes) == len(channel_names) and set(electrodes) != set(channel_names)
-    names = electrodes if is_by_order else channel_names
-    channel_of_electrode = device.channels or dict(zip(names, channel_names, strict=True))
+    assumed_electrodes = electrodes if is_by_order else channel_names
+    channels = device.channels or dict(zip(assumed_electrodes, channel_names, strict=True))
 
     with Port(examination.url, baud=examination.baud, request=device.request) as port:
         rest_span = max(channel.span_pC or 0.0 for channel in examination.channels)
-        return check_electrodes(port, device, channel_of_electrode, say, examination.unit, rest_span)
+        return check_electrodes(port, device, channels, say, examination.unit, rest_span)
 
 
 def _parse_gain(text: str) -> Any:

@@ -73,7 +73,7 @@ def design_command(
         electrodes,
         radius,
         goal=goal,
-        keep=tuple(name.strip() for name in keep.split(",")) if keep else (),
+        keep=tuple(map(str.strip, keep.split(","))) if keep else (),
         probe=footprint,
         force=force,
         noise=noise_model(noise),

@@ -113,8 +113,9 @@ def press_command(
         raise OutputError(f"{output}: expected a file in an existing folder; choose another output")
     with executor_for() as executor:
         say("solving the film of the sensor file")
-        save = partial(_save, output)
-        session = PressSession(problem, save=save, presses=presses, until=until, executor=executor, **stds)
+        session = PressSession(
+            problem, save=partial(_save, output), presses=presses, until=until, executor=executor, **stds
+        )
         for number, contact in enumerate([] if contacts is None else contacts, start=1):
             with error_prefix(f"{press_list}, press {number}: ", PressError):
                 session.check(contact)
