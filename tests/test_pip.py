@@ -71,6 +71,7 @@ BASE_TESTS = (
 """Tests that run with the lower bounds of all packages. They need only the extra `all` and `TEST_PACKAGES`."""
 
 TEST_PACKAGES = (
+    "anyio",
     "crcmod",
     "filelock",
     "hypothesis",
