@@ -9,7 +9,7 @@ dropped and counted.
 
 If a column contains the number of the channel, each line contains the charge of one channel, as in `1000,0,3.2` and
 `1000,1,4.1`. Such lines are not recognised, because they could be mistaken for frames with three values. A frame
-counter that begins at 0 is distinguished from the number of a channel after nine lines.
+counter without a name may look like the number of a channel during the first eight lines.
 
 Reading may start in the middle of a cycle. A cycle therefore begins with the line whose name is that of the frame
 counter, or else comes first in the order of names.
@@ -326,8 +326,8 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
     """Return the lines of one frame; empty if the lines do not repeat, or if it is not clear which lines are frames.
 
     A cycle is a sequence of lines that repeats. It is recognised if the last lines consist of several equal cycles.
-    Lines are equal if their skeletons are equal. The length of a cycle is the number of lines from the last line back
-    to the nearest earlier line that is equal to it.
+    Lines are equal if their skeletons are equal. A cycle contains the lines after the previous occurrence of the last
+    line, up to the last line itself.
 
     If lines occur several times in a cycle, the most frequent line is a frame. Otherwise, if every value has a name, a
     frame consists of all lines of a cycle. Otherwise, a frame is a single line, and the other lines of the cycle never
@@ -362,15 +362,18 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
 
 
 def _has_channel_number(layout: Layout, lines: Sequence[Line]) -> bool:
-    """Return whether a line contains the number of a channel and only the charge of this channel.
+    """Return whether each line seems to contain the number of a channel and only the charge of this channel.
 
     The numbers of the channels increase by 1 from line to line and begin again after the last channel, as in
-    `1000,0,3.2`, `1000,1,4.1`, `1000,2,3.7` and `1005,0,3.3`. A column is taken for such numbers if it contains three
-    to eight consecutive whole numbers from a number below 100 on, and if at least half of the steps from line to line
-    lead to the next number. The other steps are due to missing lines. A column with the name of a frame counter or of
-    an electrode, such as A, contains no such numbers.
+    `1000,0,3.2`, `1000,1,4.1`, `1000,2,3.7` and `1005,0,3.3`. A column is taken for such numbers if it fulfils these
+    conditions:
 
-    A line may contain all charges of a film if three other columns sometimes decrease, or if all of them are constant.
+    - It contains three to eight different numbers, which are consecutive whole numbers. The smallest is below 100.
+    - At least half of the steps from line to line lead to the next number. Other steps may be due to missing lines.
+    - It does not have the name of a frame counter or of an electrode, such as A.
+    - The other columns cannot be the charges of a film: fewer than three of them sometimes decrease. Three or more
+      columns that are all constant may be charges, too.
+
     The result is also true for a frame counter without a name in its first eight lines.
 
     Args:
@@ -388,9 +391,10 @@ def _has_channel_number(layout: Layout, lines: Sequence[Line]) -> bool:
         leads_to_next = np.diff(ranks) % len(numbers) == 1
         are_consecutive = np.diff(numbers) == 1.0
         are_channels = 3 <= len(numbers) <= 8 and numbers[0] in range(100) and are_consecutive.all()
-        may_be_frame = decreases.sum() - column_decreases >= 3 or (varies.sum() == 1 and len(columns) > 3)
-        is_other_column = name in {SEQ, *ascii_uppercase}
-        if are_channels and leads_to_next.mean() >= 0.5 and not (may_be_frame or is_other_column):
+        only_this_column_varies = varies.sum() == 1 and len(columns) > 3
+        may_be_frame = decreases.sum() - column_decreases >= 3 or only_this_column_varies
+        has_other_meaning = name in {SEQ, *ascii_uppercase}
+        if are_channels and leads_to_next.mean() >= 0.5 and not (may_be_frame or has_other_meaning):
             return True
     return False
 

@@ -195,8 +195,8 @@ def _is_prose(tokens: list[_Token]) -> bool:
     """Return whether a line resembles a message of a board instead of a frame.
 
     A message has at least as many words as numbers, as in `Channel 3 is ready`. Keys, units of charge, and words after
-    a comma or another mark do not count. A line with a decimal number after a hexadecimal number is a message, too. For
-    example, boards print the address of a part of their program and then its size.
+    a comma or another mark are not counted as words. A line with a decimal number after a hexadecimal number is a
+    message, too. For example, boards print the address of a part of their program and then its size.
 
     Args:
         tokens: Parts of the line.

@@ -226,8 +226,8 @@ class Predictor:
 
         Each charge is raised and lowered by the standard deviation of its additional noise. Half of the difference
         between the two contacts is the effect of the additional noise of this charge (central difference). The effects
-        of all charges are added to the covariance. The misfit is divided by the mean factor by which the noise is
-        larger.
+        of all charges are added to the covariance. The misfit is divided by the ratio of the present noise to the noise
+        of the training (root mean square over the electrodes).
 
         Args:
             charge_pC: Touch charges, shape (n, electrodes), pC.

@@ -80,9 +80,9 @@ class Channels(Stage):
             indices = tuple(self._assigned_index(electrode, frame) for electrode in self._electrodes)
         else:
             indices = self.indices_by_name_or_order(frame) or ()
-        units = {stated_unit(channel_names(frame)[index]) or "pC" for index in indices}
         if not indices:
             raise self._assignment_error(frame)
+        units = {stated_unit(channel_names(frame)[index]) or "pC" for index in indices}
         if len(units) > 1 and not self._has_gains:
             raise self._assignment_error(frame, "; their units differ: state pC_per_unit of each electrode in [gain]")
         return indices

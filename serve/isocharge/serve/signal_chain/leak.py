@@ -285,9 +285,9 @@ class Integrator(Leak):
         """Replace the currents by the charges, and the noise of the currents by the noise of the charges at rest.
 
         If frames are missing, each of their currents is assumed to be the mean of the currents before and after the
-        gap, or 0 if the mean may be noise, which would be multiplied by the number of missing frames. If this may be
-        wrong by more than 1 % of the charge and the noise, the touch has the flag `gap`. A copy of the previous frame
-        adds no charge, and neither does a frame that arrives late.
+        gap. A mean that may be noise counts as 0, because it would be multiplied by the number of missing frames. The
+        touch gets the flag `gap` if the error of this assumption may exceed both the noise and 1 % of the charge. A
+        copy of the previous frame adds no charge, and neither does a frame that arrives late.
 
         At rest, the charges decay with the time constant `relax_s`. The sum of independent currents then has the
         variance of a current times relax_s / (2 dt).

@@ -220,8 +220,7 @@ class Stage(ABC):
     def continue_touch(self, previous: "Stage") -> None:  # noqa: B027  # most stages begin again
         """Continue the touch of the stage that this stage replaces because the model changes.
 
-        Both stages have the same class. By default, the stage begins as if nothing touched
-        the film.
+        Both stages have the same class. By default, the stage begins as if nothing touched the film.
         """
 
     @classmethod

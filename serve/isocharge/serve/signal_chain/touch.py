@@ -176,7 +176,7 @@ class Touch(Stage):
             self._touch_direction = direction + charge / size
 
     def _await(self, frame: Frame, charge: Array, direction: Array) -> None:
-        """Update the base, which are the charges that belong to no touch, or begin a touch.
+        """Update the base, which contains the charges that belong to no touch, or begin a touch.
 
         A touch begins if the charges above the base exceed the threshold in the expected direction. The base decays to
         zero, and takes over charges that change against this direction.

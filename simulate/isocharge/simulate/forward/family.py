@@ -244,8 +244,8 @@ class Family:
         Returns:
             Values that `read` computes, shape (n_force, n_value).
         """
-        # The press is moved onto the positive x axis: the film is rotated by the opposite angle. The turn states the
-        # direction plus the rotation of the probe, so that the angle is the difference.
+        # The film is rotated by the opposite of the angle of the press, so that the press lies on the positive x axis.
+        # The direction of a turn contains the rotation of the probe, which is subtracted here.
         distance, (direction, rotation) = chain
         film = sensor.film.rotated(rotation - direction)
         rotated_probe = probe.rotated(rotation)

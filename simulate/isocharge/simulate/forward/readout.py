@@ -276,8 +276,8 @@ def _area_pieces(electrode: Electrode) -> Iterator[tuple[Array, float, int]]:
         electrode: Electrode over whose area the stress is averaged.
 
     Yields:
-        Nominal corners (x, y), shape (4, 2), mm. The area of the line, which is zero. The kind of the piece, which is
-        its index in `STRESS_WEIGHTS`.
+        Nominal corners (x, y) of a quadrilateral, shape (4, 2), mm. The area that a line represents, which is zero for
+        a quadrilateral. The kind of the piece, which is the row of its weights in `STRESS_WEIGHTS`.
     """
     for polygon in electrode.collecting_polygons:
         # The quadrilaterals share the first corner. If a corner is missing, the last one is repeated.
@@ -287,26 +287,26 @@ def _area_pieces(electrode: Electrode) -> Iterator[tuple[Array, float, int]]:
 
 
 def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[tuple[Array, float, int]]:
-    """Return the lines of the edge readout (Mirbagheri et al., 2007, equation 3).
+    """Yield the lines of the edge readout (Mirbagheri et al., 2007, equation 3).
 
-    The stress s11 is averaged over the left and right edges of the turned electrode, and the stress s22 over its lower
-    and upper edges. Each edge is divided into two lines, on which the quadrature has enough points.
+    The stress s11 is averaged over the left and right edges of the rotated electrode, and the stress s22 over its lower
+    and upper edges. Each edge is divided into two lines, because the number of integration points is that of a line.
 
     Args:
         electrode: A square electrode.
-        rotation: Angle by which the electrode is turned, rad.
+        rotation: Angle by which the electrode is rotated, rad.
 
     Yields:
-        The same as `_area_pieces`, with the area that the line represents. A line is a quadrilateral whose corners
-        coincide in pairs.
+        Ends of a line as the corners of a quadrilateral without width: the first end, twice the last end, and the first
+        end again, shape (4, 2), mm. The area that the line represents, mm^2. The kind of the piece, which is the row of
+        its weights in `STRESS_WEIGHTS`.
     """
-    # Each edge leads from a corner to the next one. Each mean is over two edges, so each half of an edge represents a
-    # quarter of the area.
+    # Each mean is over two edges, so each half of an edge represents a quarter of the area of the electrode.
     corners = np.array(electrode.corners)
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         middle = 0.5 * (start + end)
-        turned_edge = complex(*(end - start)) * cmath.rect(1.0, rotation)
-        is_lower_or_upper = abs(turned_edge.real) > abs(turned_edge.imag)
+        rotated_edge = complex(*(end - start)) * cmath.rect(1.0, rotation)
+        is_lower_or_upper = abs(rotated_edge.real) > abs(rotated_edge.imag)
         for first, last in ((start, middle), (middle, end)):
             yield np.array([first, last, last, first]), 0.25 * electrode.area, int(is_lower_or_upper)
 

@@ -213,9 +213,13 @@ class Dialogue:
             ) from end
 
     def _wait_for(self, *phases: Phase) -> WatchResult:
-        """Wait for the next reading in one of the given phases.
+        """Wait until the detector of steady presses reports one of the given phases, and return its result.
 
-        Readings in other phases are only displayed. Typed lines are ignored, because a machine makes the presses.
+        The results with other phases are displayed. Lines that a person types are ignored, because a machine makes the
+        presses.
+
+        Args:
+            phases: Phases of which each ends the waiting.
 
         Raises:
             SessionEnd: If the port or the input has ended.

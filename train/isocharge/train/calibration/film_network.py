@@ -123,10 +123,14 @@ def _fit_followable_nodes(
 
 
 def _fit_directions(series: ChargeSeries, contact: Array, charge: Array, changes: Array) -> Array:
-    """Fit the coefficients of the directions of a series.
+    """Fit polynomials to the effects of the directions, in which the charges are uncertain.
+
+    A charge map contains values v instead of charges. If v is the logarithm of the charge, a small change of the charge
+    divided by the charge is the change of v. Otherwise, v is the charge divided by the typical size of the charges at
+    the same force.
 
     Args:
-        series: Series of the charges, whose values are the charges divided by the size of a contact.
+        series: Map of the charges without directions.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         charge: Their charges, shape (n, n_electrode), pC.
         changes: Changes of the charges by each direction, shape (n, n_direction, n_electrode), pC.
@@ -135,9 +139,9 @@ def _fit_directions(series: ChargeSeries, contact: Array, charge: Array, changes
         Coefficients, as in `ChargeSeries.directions`.
     """
     unit_contact = series.domain.to_unit(contact)
-    size = charge if series.log_size is None else series_size(series.log_size, unit_contact[:, 2])[0]
-    values = changes / size[:, None]
-    coefficients = fit_series(unit_contact, values.reshape(len(contact), -1), *DIRECTION_DEGREES)
+    charge_per_value = charge if series.log_size is None else series_size(series.log_size, unit_contact[:, 2])[0]
+    value_changes = changes / charge_per_value[:, None]
+    coefficients = fit_series(unit_contact, value_changes.reshape(len(contact), -1), *DIRECTION_DEGREES)
     return coefficients.reshape(*coefficients.shape[:3], *changes.shape[1:])
 
 
@@ -241,10 +245,12 @@ def training_data(
     domain = series.domain
     contact = draw_contacts(rng, domain, PRESSES)
     charge = _drawn_charges(series, rng, contact)
-    # The gain changed linearly by the drift during the session. A uniform distribution of this width has the standard
-    # deviation drift / sqrt(12). The mean square of the drift is that of its estimate plus its variance.
-    drift_std = np.hypot(film.value("drift"), film.std("drift")) / np.sqrt(12.0)
-    charge = charge * (1.0 + drift_std * rng.standard_normal((PRESSES, 1)))
+    # During the session, the gain changed linearly by the drift. The gains of the presses are therefore uniformly
+    # distributed over an interval of this width, which has the standard deviation drift / sqrt(12). The drift itself is
+    # uncertain: its root mean square follows from its estimate and its standard deviation.
+    drift_rms = np.hypot(film.value("drift"), film.std("drift"))
+    gain_std = drift_rms / np.sqrt(12.0)
+    charge = charge * (1.0 + gain_std * rng.standard_normal((PRESSES, 1)))
     charge = charge + film.std("offset") * rng.standard_normal((PRESSES, 1))
     sensor, probe = charges.prior.film(film.film_values)
     return TrainingData(

@@ -152,12 +152,13 @@ def check_graph(
     noise: Noise,
     floors: Sequence[float] = FLOORS["contact"],
 ) -> Singles:
-    """Compare a graph with its network, and choose charges for the golden vectors.
+    """Compare the outputs of an ONNX graph with those of its network, and choose charges for the golden vectors.
 
-    Golden vectors are stored with a model, so that every computer can check its answers. The outputs of the graph and
-    of the network are compared for noisy charges of presses and for extreme charges. Some outputs depend so strongly on
-    the charges that the rounding of float32 numbers matters. Their charges do not become golden vectors. For many
-    further extreme charges, only whether the outputs are finite is checked.
+    Golden vectors are charges and their outputs, which are stored with a model, so that every computer can check its
+    answers. The outputs of the graph and of the network are compared for noisy charges of presses and for extreme
+    charges. At some charges, the outputs depend so strongly on the charges that the rounding of float32 numbers
+    matters. Such charges do not become golden vectors. For many further extreme charges, the function only checks that
+    the outputs are finite.
 
     Args:
         graph: The ONNX file.

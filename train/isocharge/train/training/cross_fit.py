@@ -127,7 +127,7 @@ def fit_presses(
     level = noise.level(labelled.charge)  # charges on a scale on which the noise has the standard deviation 1
     with threads_and_seed(training.threads, training.seed):
         features = signed_features(labelled.charge, noise.transition_charge(labelled.charge))
-        # The first network learns from the others, and is returned. The others are those of the cross-validation.
+        # The first network is returned. It learns from the other networks, which are those of the cross-validation.
         network, *fold_networks = (
             InverseNetwork(domain, features, labelled.charge, settings.network, force_std)
             for _ in range(1 + HELD_PARTS)
@@ -329,7 +329,8 @@ def _train_fold_networks(
 def _misfit_examples(charge: Array, unit_contact: Array, noise: ChannelNoise, config: TrainingConfig) -> Array:
     """Draw charges, and compute the differences between their levels and those of the most similar contacts.
 
-    The charges of contacts are known only at the presses. Near each press, planes approximate the levels of contacts.
+    The charges of contacts are known only at the presses. Therefore, the levels of the contacts near each press are
+    approximated by a linear function of the contact (a plane).
 
     Args:
         charge: Charges of the presses, shape (n, n_electrode), pC.

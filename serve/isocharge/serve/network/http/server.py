@@ -288,7 +288,10 @@ class HttpServer(uvicorn.Server):
         return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to close the context beside the server, and wait for open requests. Then refuse those that remain."""
+        """Finish the open requests within the grace period, and then refuse the remaining requests.
+
+        Meanwhile, the context that was passed to `run` is closed.
+        """
         closing = asyncio.create_task(self._beside.aclose())
         await super().shutdown(sockets)
         connections: Any = list(self.server_state.connections)
