@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from isocharge.common.errors import OutputError, OutputExists
-from isocharge.common.files import AtomicWriter, bounded_lines, new_file, read_whole
+from isocharge.common.files import AtomicWriter, bounded_lines, new_file, new_folder, read_whole
 
 
 def test_a_file_is_read_whole(tmp_path):
@@ -56,6 +56,8 @@ def test_a_new_file_is_there_whole_or_not_at_all(tmp_path):
         fill(other, "late", lambda: other.write_text("faster"))
     with pytest.raises(OutputError, match="third cannot be written"):
         fill(tmp_path / "third", "half", lambda: (tmp_path / "no" / "file").touch())
+    with pytest.raises(OutputError, match="File name too long"), new_folder(tmp_path / ("a" * 300) / "folder"):
+        pass
     assert {each.name: each.read_text() for each in tmp_path.iterdir()} == {"file": "whole", "other": "faster"}
 
 

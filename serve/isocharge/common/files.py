@@ -224,14 +224,14 @@ def new_folder(path: Path) -> Iterator[Path]:
         OutputExists: If `path` exists already, or another process creates it in the meantime.
         OutputError: If the folder cannot be written.
     """
-    missing_parents = [parent for parent in path.parents if not parent.exists()]
+    missing_parents = [parent for parent in path.parents if not os.path.lexists(parent)]
     try:
         with new_file(path) as temporary_path:
             temporary_path.mkdir(parents=True)
             yield temporary_path
     finally:
-        for parent in missing_parents:  # they are only empty after an error; otherwise they contain the new folder
-            if parent.is_dir() and not any(parent.iterdir()):
+        for parent in missing_parents:
+            with suppress(OSError):  # without an error, the parent contains the new folder
                 parent.rmdir()
 
 

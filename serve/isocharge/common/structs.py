@@ -265,7 +265,7 @@ def _item_types(value: Any, expected_type: Any) -> dict[str | int, Any]:
             tag_key = struct.__struct_config__.tag_field  # all structs of a union have the same tag key
             if tag_key is not None:
                 types[tag_key] = Literal[tuple(tags)]
-            if len(structs) == 1 or value.get(tag_key) == tag:
+            if value.get(tag_key) == tag:  # both are None if the struct has no tag
                 types |= {field.encode_name: field.type for field in msgspec.structs.fields(struct)}
     for member in members:
         arguments = get_args(member)

@@ -27,6 +27,8 @@ def test_electrode_polygons_include_the_calibration(film):
     angle = np.radians([-90.0, 30.0, 150.0])
     np.testing.assert_allclose(squares.mean(axis=1), 10.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1), atol=1e-6)
     np.testing.assert_allclose(np.ptp(squares, axis=1), 3.0)
+    large = load_model(find_model("eight-25um-biaxial-36mm")).metadata
+    assert describe_film("large", large)["misfit_limit"] == large.errors["misfit_p999"] > 5.0
     trace = {"more_mm": [[[2, 0], [2, -9], [3, -9]]], "back_mm": [[[2, 0], [3, 0], [2, 1]]]}
     electrodes = {name: {"polygon_mm": [[2, 0], [3, 0], [2, 1]]} | trace for name in "ABC"}
     turned = {"name": "mine", "electrodes": electrodes, "calibration": {"rotation_deg": 90.0, "shift_mm": [0.5, 0.25]}}
@@ -122,3 +124,13 @@ def test_sheet_of_the_page_has_the_deflection_of_its_places():
     assert got["at"] == pytest.approx(nodes[:, 2], abs=1e-9)
     assert np.hypot(nodes[:, 0] + 12.0, nodes[:, 1] - 9.0)[0] < 0.1  # the first ring is the centre of the probe
     assert np.hypot(*nodes[-1, :2]) == pytest.approx(45.0)
+
+
+def test_page_reads_a_token_with_a_percent_sign_as_it_is():
+    """A server accepts no such token, so the page then asks for another one."""
+    token = node(
+        f"""globalThis.location = {{ hash: "#100%" }};
+        const {{ Connection }} = await import("{(VIEWER / "page/connection.js").as_uri()}");
+        console.log(JSON.stringify(new Connection({{}}).token));"""
+    )
+    assert token == "100%"

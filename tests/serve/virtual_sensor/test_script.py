@@ -25,7 +25,7 @@ def test_wander_stays_inside_radius_and_forces(script):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"force_range_N": (2.0, 1.0)}, {"radius_mm": 0.0}, {"rate_Hz": 0.0}, {"seconds": 0.0}]
+    "wrong", [{"force_range_N": (2.0, 1.0)}, {"radius_mm": 0.0}, {"rate_Hz": 0.0}, {"seconds": 0.0}, {"rest_s": -1.0}]
 )
 def test_impossible_script_is_refused(wrong):
     with pytest.raises(SceneError, match="wander: expected 0 < smallest"):

@@ -63,6 +63,11 @@ def test_forward_map_with_wrong_charges_is_refused(charges):
         VirtualSensor(lambda *_: charges, steady())
 
 
+def test_another_number_of_offsets_than_electrodes_is_refused(film):
+    with pytest.raises(ValueError, match="could not be broadcast"):
+        VirtualSensor(film.charges, steady(), offset_pC=[1.0, 2.0])
+
+
 def read(url, count):
     """Return the next frames from a port, and the counters of the parser."""
     parser = BinaryParser()

@@ -278,7 +278,6 @@ class TouchStream(ReadingStream):
             contact_fields = frame.contact._asdict()
         else:
             contact_fields = NO_CONTACT if frame.is_valid else UNKNOWN_CONTACT
-        flags = (*frame.flags, *frame.contact_flags)
         return PredictionRecord(
             timestamp=frame.host_s,
             t_device_us=frame.device_us,
@@ -288,7 +287,7 @@ class TouchStream(ReadingStream):
             charge_pC=self._by_electrode(frame.charge_pC),
             charge_raw_pC=self._by_electrode(frame.raw_pC),
             tare_pC=self._by_electrode(frame.tare_pC),
-            flags=flags if len(flags) < 2 else in_order(flags),
+            flags=in_order([*frame.flags, *frame.contact_flags]),
             latency_us=(time.perf_counter_ns() - chunk.clock_ns) / 1e3,  # includes the time that the stages have taken
             model=self._label,
             frame_id=self.frame_id,

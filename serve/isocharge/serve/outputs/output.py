@@ -49,12 +49,6 @@ class Output(Protocol):
         """
 
 
-def discard(output: Output) -> None:
-    """Call the method `discard` of an output. If the output has no such method, call `close` instead."""
-    discard_or_close = getattr(output, "discard", output.close)
-    discard_or_close()
-
-
 @dataclass(frozen=True, kw_only=True)
 class OutputContext:
     """Properties of a stream of records, which are passed to the outputs.

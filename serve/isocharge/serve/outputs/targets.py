@@ -14,7 +14,6 @@ from isocharge.serve.outputs.output import (
     OutputContext,
     OutputKind,
     WriterQueue,
-    discard,
     is_file_with,
     output_error,
 )
@@ -218,7 +217,8 @@ class Outputs:
                     return
             has_failed = target not in self._writers
             if self._is_discarded or has_failed:
-                discard(output)
+                discard_or_close = getattr(output, "discard", output.close)
+                discard_or_close()
                 if self._is_discarded and self._context.is_live and isinstance(output, FileOutput):
                     output.path.unlink()  # another output could not be opened, so the file has no records
             else:

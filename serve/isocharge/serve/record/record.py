@@ -162,15 +162,10 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     sections: tuple[str, ...] = ()
 
     @property
-    def fields(self) -> tuple[Field, ...]:
-        """The fields that this record has, in their order."""
-        return record_fields(self.sections)
-
-    @property
     def json_values(self) -> dict[str, Any]:
         """Values of the fields by name, as JSON contains them. Numbers are rounded to six decimals."""
         json_values: dict[str, Any] = {}
-        for field in self.fields:
+        for field in record_fields(self.sections):
             value = getattr(self, field.name)
             value_class = value.__class__  # comparing the class is faster than a call of `isinstance`
             if value_class is float:

@@ -44,7 +44,6 @@ class Channels(Stage):
         self._electrodes = setup.electrodes
         self._channels = setup.device.channels
         self._setup = setup
-        self._where = setup.device.where
         # Names and number of values of the previous frame, and its channel indices. `step` uses the indices again.
         self._previous_layout: tuple[tuple[str, ...], int] | None = None  # None before the first frame
         self._channel_indices: tuple[int, ...] = ()
@@ -166,8 +165,8 @@ class Channels(Stage):
         index = channel_index(channel, frame)
         if index is None:
             raise ChargeError(
-                f"{self._where}: [channels] {electrode} = {dumps(cut(channel))}: no channel is called that; the frames "
-                f"have {cut(', '.join(channel_names(frame)))}, or 1 to {len(frame.values)} in their order"
+                f"{self._setup.device.where}: [channels] {electrode} = {dumps(cut(channel))}: no channel is called "
+                f"that; the frames have {cut(', '.join(channel_names(frame)))}, or 1 to {len(frame.values)} in their order"
             )
         return index
 

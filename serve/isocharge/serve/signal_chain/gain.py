@@ -64,7 +64,7 @@ class Gain(Stage):
         rule = setup.device.rule(GainRule) or GainRule(pC_per_unit=1.0)
         self.gain_pC = setup.for_each_electrode("gain.pC_per_unit", rule.pC_per_unit)
         self.zero = setup.for_each_electrode("gain.offset", rule.offset)
-        self.largest = LARGEST / float(np.abs(self.gain_pC).max(initial=np.finfo(float).tiny))
+        self.largest = LARGEST / float(np.abs(self.gain_pC).max())
         self._skipped_s = 0.0  # duration of the invalid frames since the last valid frame
         self._skipped_intervals = 0
 
@@ -117,16 +117,15 @@ class Saturation(Stage):
     def __init__(self, setup: Setup) -> None:
         """Begin without a press."""
         rule = setup.device.rule(SaturationRule)
-        self._limit_pC = None if rule is None else rule.limit_pC
+        self._limit_pC = math.inf if rule is None else rule.limit_pC
         self._is_saturated = False
 
     def step(self, frame: Frame) -> None:
         """Add the flag to a frame, unless the frame is invalid."""
         if not frame.is_valid:
             return
-        is_at_limit = bool(frame.bits & SATURATED_BIT)
-        if self._limit_pC is not None and not is_at_limit:
-            is_at_limit = bool((np.abs(frame.raw_pC) >= self._limit_pC).any())
+        largest_pC = max(map(abs, frame.raw_pC.tolist()))
+        is_at_limit = bool(frame.bits & SATURATED_BIT) or largest_pC >= self._limit_pC
         self._is_saturated = is_at_limit or (self._is_saturated and frame.is_contact)
         if self._is_saturated:
             frame.flags.append(SATURATED)

@@ -75,7 +75,7 @@ class Hum(Stage):
         raw_pC = frame.charge_pC
         unit_phasor = cmath.exp(2j * math.pi * rule.frequency_Hz * frame.clock_s)
         phasor_step = unit_phasor - self._reference_phasor
-        squared_step = phasor_step.real * phasor_step.real + phasor_step.imag * phasor_step.imag
+        squared_step = abs(phasor_step) ** 2
 
         self._elapsed_s += frame.dt_s
 
@@ -85,7 +85,7 @@ class Hum(Stage):
             expected_change_pC = (self._phasor_pC * phasor_step).real
             error_pC = raw_pC - self._reference_pC - expected_change_pC
             # Clipping limits the influence of a touch, which may change the charges by more than the hum.
-            clipped_error_pC = np.minimum(np.maximum(error_pC, -rule.limit_pC), rule.limit_pC)
+            clipped_error_pC = error_pC.clip(-rule.limit_pC, rule.limit_pC)
             # The charges contain only the real part of the product. With a gain of 1, a frame therefore corrects only
             # half of the error of the phasor on average. With the factor 2, the time constant is `settle_s`.
             gain = min(1.0, 2.0 * self._elapsed_s / rule.settle_s)

@@ -114,7 +114,7 @@ class Inflow:
         # Without a touch, the surplus is the difference of the noise of two frames. The standard deviation of this
         # difference is sqrt(2) times that of one frame.
         limit_pC = np.maximum(rule.clip_pC, rule.clip_sigmas * math.sqrt(2.0) * noise_pC)
-        clipped_surplus_pC = np.minimum(np.maximum(surplus_pC, -limit_pC), limit_pC)
+        clipped_surplus_pC = surplus_pC.clip(-limit_pC, limit_pC)
 
         # Until `settle_s` has passed, the surplus is averaged over the time for which the inflow has been learned. The
         # averaging time is at least `dt_s`, so that the corrected inflow explains at most the whole surplus.
@@ -292,19 +292,18 @@ class Integrator(Leak):
         At rest, the charges decay with the time constant `relax_s`. The sum of independent currents then has the
         variance of a current times relax_s / (2 dt).
         """
-        current_pC = frame.charge_pC
-        missing_count = 0
-        if current_pC is not None and self._previous is not None:
-            missing_count = frame.intervals - 1
-            mean_pC = (current_pC + self._current_pC) / 2.0
-            missing_pC = missing_count * np.where(np.abs(mean_pC) > 3.0 * frame.noise_pC, mean_pC, 0.0)
-            frame.charge_pC = current_pC + missing_pC if frame.intervals > 0 else np.zeros_like(current_pC)
+        missing_count = frame.intervals - 1
         if self._previous is None:
+            missing_count = 0
             self._search_s += frame.dt_s
             self._search_frames += 1
-        super().step(frame)
+        current_pC = frame.charge_pC
         if current_pC is None:
             return
+        mean_pC = (current_pC + self._current_pC) / 2.0
+        missing_pC = missing_count * np.where(np.abs(mean_pC) > 3.0 * frame.noise_pC, mean_pC, 0.0)
+        frame.charge_pC = current_pC + missing_pC if frame.intervals > 0 else np.zeros_like(current_pC)
+        super().step(frame)
         error_pC = missing_count * np.abs(current_pC - self._current_pC) / 2.0  # if the current rose or fell steadily
         self._current_pC = current_pC
         interval_s = max(self._search_s / self._search_frames, SUM_TOLERANCE_s)

@@ -147,7 +147,7 @@ class Tare(Stage):
         rule = self._rule
         if frame.is_contact or rule is None or frame.charge_pC is None:
             return frame.warming_pC
-        difference_pC = np.minimum(np.maximum(frame.charge_pC, -rule.noise_limit_pC), rule.noise_limit_pC)
+        difference_pC = frame.charge_pC.clip(-rule.noise_limit_pC, rule.noise_limit_pC)
         return difference_pC * -math.expm1(-frame.dt_s / rule.relax_s)
 
     def _search(self, frame: Frame) -> None:

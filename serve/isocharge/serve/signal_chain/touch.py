@@ -43,11 +43,9 @@ class TouchRule(Rule, frozen=True, kw_only=True):
     def resolved(self, *, has_currents: bool) -> "TouchRule":
         """Return the settings with the default values for a board that sends charges, or currents."""
         floor_pC, release_share = (0.0, 0.3) if has_currents else (10.0, 0.05)
-        return TouchRule(
-            sigmas=self.sigmas,
-            floor_pC=floor_pC if self.floor_pC is None else self.floor_pC,
-            release_share=release_share if self.release_share is None else self.release_share,
-        )
+        defaults = {"floor_pC": floor_pC, "release_share": release_share}
+        stated = {name: value for name, value in structs.asdict(self).items() if value is not None}
+        return TouchRule(**defaults | stated)
 
     def threshold_pC(self, noise_pC: Array) -> Array:
         """Return the touch threshold of each electrode, shape (n_electrode,), pC. The settings must be resolved.

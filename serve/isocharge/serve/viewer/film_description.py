@@ -7,6 +7,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.structs import plain_values
+from isocharge.serve.model.contact import Validity
 from isocharge.serve.model.metadata import ModelMetadata
 
 
@@ -27,6 +28,7 @@ def describe_film(name: str, metadata: ModelMetadata) -> dict[str, Any]:
         "film": metadata.sensor.get("film"),
         "working_area_mm": metadata.working_area_mm,
         "force_range_N": metadata.force_range_N,
+        "misfit_limit": Validity.of(metadata).misfit_limit,
         "probes": metadata.probes,
         "unnoticed": metadata.unnoticed,
     }

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from isocharge.serve.flags import BEYOND, MEANINGS, MISFIT, OUTSIDE, STRESS
-from isocharge.serve.model.contact import Validity
 from isocharge.serve.model.model_folder import find_model, load_model
 from isocharge.serve.viewer.film_description import describe_film
 
@@ -81,7 +80,6 @@ def _describe_model(name: str) -> dict[str, Any]:
     return describe_film(metadata.name, metadata) | {
         "piezo_pC_per_N": metadata.sensor["piezo"]["d31"],
         "noise": {"white_pC": metadata.noise.white_pC, "gain": metadata.noise.gain},
-        "misfit_limit": Validity.of(metadata).misfit_limit,
         "yield_force_N": metadata.yield_force_N,
         "network": base64.b64encode(compressed_network).decode(),
     }

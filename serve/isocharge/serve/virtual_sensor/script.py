@@ -166,10 +166,10 @@ def wander(
     min_force_N, max_force_N = force_range_N
     has_valid_forces = 0.0 < min_force_N <= max_force_N
     has_frames = rate_Hz > 0.0 and seconds * rate_Hz >= 1.0
-    if not (has_valid_forces and radius_mm > 0.0 and has_frames):
+    if not (has_valid_forces and radius_mm > 0.0 and rest_s >= 0.0 and has_frames):
         raise SceneError(
-            "wander: expected 0 < smallest <= largest force, a positive radius and at least one frame, got "
-            f"{force_range_N} N, {radius_mm} mm, {seconds} s at {rate_Hz} Hz"
+            "wander: expected 0 < smallest <= largest force, a positive radius, no negative rest and at least one frame"
+            f", got {force_range_N} N, {radius_mm} mm, a rest of {rest_s} s and {seconds} s at {rate_Hz} Hz"
         )
     rng = np.random.default_rng(seed)
     rows = [(0.0, 0.0, 0.0, 0.0)]

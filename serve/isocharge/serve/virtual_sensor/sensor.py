@@ -160,6 +160,7 @@ class VirtualSensor:
 
         Raises:
             SceneError: If the forward map returns charges of another shape, or charges that are not finite.
+            ValueError: If there are more or fewer offsets than electrodes.
         """
         self._rng = np.random.default_rng(seed)
         self.script = script
@@ -170,7 +171,7 @@ class VirtualSensor:
         self._clean_pC = _clean_charges(charges, script)  # touch charges of the script, shape (n, electrodes)
         n_electrode = self._clean_pC.shape[1]
         random_pC = self._rng.uniform(-MAX_RANDOM_OFFSET_pC, MAX_RANDOM_OFFSET_pC, n_electrode)
-        self._offset_pC = random_pC if offset_pC is None else np.asarray(offset_pC)
+        self._offset_pC = random_pC if offset_pC is None else np.broadcast_to(offset_pC, n_electrode)
 
         self._reset_counters()
         self._stop = threading.Event()

@@ -72,8 +72,9 @@ export class Connection {
 
 /** The token in the address after #, which is taken out of it and never sent as part of it. */
 function takeToken() {
-  const given = decodeURIComponent(location.hash.slice(1));
+  let given = location.hash.slice(1);
   try {
+    given = decodeURIComponent(given);
     if (given) sessionStorage.setItem(KEY, given);
     if (given) history.replaceState(null, "", location.pathname);
     return given || sessionStorage.getItem(KEY) || "";

@@ -1,4 +1,4 @@
-// Samples of the server as objects; serve/isocharge/serve/viewer/samples.py describes them.
+// Samples of the server as objects; serve/isocharge/serve/viewer/tape.py describes them.
 
 /** Short names that the page uses for some numbers of a record; the other numbers keep the names of the record. */
 const SHORT_NAMES = {

@@ -7,7 +7,7 @@ import { Traces } from "./traces.js";
 
 const SILENT_MS = 1500, SPOKEN_MS = 150, FLAG_MS = 2500, NOTE_S = 12, SEEN_IN_VERDICT = new Set(["tare", "misfit", "outside", "invalid"]);
 const COUNTERS = { frames: "frames", lost: "lost", repeated: "repeated", restarts: "restarts of the board", crc_errors: "wrong checksums",
-  malformed: "malformed", bytes_dropped: "bytes dropped", resyncs: "resynchronised", reconnects: "reconnected", not_shown: "not shown here" };
+  malformed: "malformed", bytes_dropped: "bytes dropped", reconnects: "reconnected", not_shown: "not shown here" };
 
 export class FilmView {
   constructor(session, act) {

@@ -3,7 +3,7 @@
 import { lineStyle, theme } from "./theme.js";
 
 export const WINDOW_S = 10;
-const HEIGHT = 172, MISFIT_LIMIT = 5;
+const HEIGHT = 172;
 
 export class Traces {
   /** @param figures {{charges, force, misfit}} figure elements */
@@ -23,7 +23,7 @@ export class Traces {
     this.plots = {
       charges: this.plot("charges", charges),
       force: this.plot("force", [{ label: "force", stroke: theme.touch, width: 1.8, fill: `${theme.touch}22` }], [0, 0.2]),
-      misfit: this.plot("misfit", [{ label: "misfit", stroke: theme.accent, width: 1.6 }], [0, 6]),
+      misfit: this.plot("misfit", [{ label: "misfit", stroke: theme.accent, width: 1.6 }], [0, 1.2 * this.film.misfit_limit]),
     };
     this.nameCharges(charges);
   }
@@ -63,7 +63,7 @@ export class Traces {
     const g = plot.ctx, { left, top, width, height } = plot.bbox, pixel = devicePixelRatio || 1;
     g.save(); g.beginPath(); g.rect(left, top, width, height); g.clip(); g.lineWidth = pixel;
     if (name === "misfit") {
-      const y = plot.valToPos(MISFIT_LIMIT, "y", true);
+      const y = plot.valToPos(this.film.misfit_limit, "y", true);
       g.strokeStyle = theme.warn; g.setLineDash([5 * pixel, 4 * pixel]); stroke(g, left, y, left + width, y);
       g.fillStyle = theme.warn; g.font = `${11 * pixel}px system-ui, sans-serif`; g.textAlign = "right"; g.textBaseline = "bottom";
       g.fillText("no single contact above", left + width - 4 * pixel, y - 4 * pixel);

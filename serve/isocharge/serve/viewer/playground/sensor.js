@@ -35,7 +35,7 @@ class PlaygroundSensor {
     return { x, y, force, xStd, yStd, forceStd, correlation, misfit };
   }
 
-  /** Return the reasons not to trust an answer, as isocharge.serve.prediction.contact defines them. */
+  /** Return the reasons not to trust an answer, as isocharge.serve.model.contact defines them. */
   flags(answer) {
     const { force_range_N: [low, high], misfit_limit: misfitLimit, yield_force_N: yieldForce } = this.description;
     const flags = [];
