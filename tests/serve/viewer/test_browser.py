@@ -24,6 +24,14 @@ LATENCY = """() => {
   return film.find(".age").textContent;
 }"""
 
+NOTE = """() => {
+  const { film } = isocharge.page, at = Date.now() / 1000 + 60;
+  film.take({ samples: [], missed: 0, sent_s: at });
+  film.update({ ...film.state, note: { text: "hot", at } });
+  film.showHealth();
+  return film.find(".note").textContent;
+}"""
+
 
 @pytest.fixture
 def touch():
@@ -78,6 +86,7 @@ def test_live_page_shows_numbers_and_sends_tare_pause_record_and_marker(page, to
     assert min(np.hypot(px - x, py - y) + abs(pressed - force) for px, py, pressed in PRESSES) < 0.3
     latency = page.evaluate(LATENCY)
     assert latency == "6 ms"  # the board's clock is 56 ms ahead
+    assert page.evaluate(NOTE) == "hot"  # the server's clock is a minute ahead
     page.get_by_role("button", name="Tare").click()
     wait_for(page, "isocharge.page.film.drawnKind === 'tare'")
     wait_for(page, "isocharge.page.film.drawnKind === 'contact'")

@@ -166,7 +166,8 @@ class Channels(Stage):
         if index is None:
             raise ChargeError(
                 f"{self._setup.device.where}: [channels] {electrode} = {dumps(cut(channel))}: no channel is called "
-                f"that; the frames have {cut(', '.join(channel_names(frame)))}, or 1 to {len(frame.values)} in their order"
+                "that; the frames have "
+                f"{cut(', '.join(channel_names(frame)))}, or 1 to {len(frame.values)} in their order"
             )
         return index
 

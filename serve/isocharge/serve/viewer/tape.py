@@ -9,10 +9,12 @@ frame.
 
 import tempfile
 from bisect import bisect_right
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from isocharge.common.files import as_output_errors
 from isocharge.serve.flags import MEANINGS
 from isocharge.serve.record.record import PredictionRecord
 
@@ -183,35 +185,32 @@ class Tape:
 
 
 class RecordedTape(Tape):
-    """Tape that stores the samples of a recording in a temporary file.
+    """Tape that stores all samples of a recording, in a temporary file if there are many.
 
     If the time of a sample is missing or is earlier than the time of the previous sample, the previous time is stored
     instead. The stored times therefore never decrease.
     """
 
-    def __init__(self, dtype: "np.dtype[Any]") -> None:
-        """Create the temporary file, which is removed when the tape is no longer used.
-
-        Args:
-            dtype: NumPy type of a sample.
-        """
-        super().__init__(dtype)
-        self._map_file(LIVE_SAMPLES)
-
     def append(self, values: tuple[float | None, ...]) -> None:
-        """Append a sample. If the file is full, a file of twice its size replaces it."""
+        """Append a sample. If the buffer is full, its size is doubled."""
         if self.total == len(self._ring):
-            self._map_file(2 * self.total)
+            self._double()
         time_s, *others = values
         _, latest_time_s = self.span()
         super().append((max(latest_time_s, time_s or 0.0), *others))
 
-    def _map_file(self, capacity: int) -> None:
-        """Copy the stored samples to a file with room for `capacity` samples, and map the file to memory."""
-        with tempfile.TemporaryFile() as file:  # the mapping keeps the closed file
-            ring = np.memmap(file, self._ring.dtype, "r+", shape=(capacity,))
-        ring[: self.total] = self._ring[: self.total]
-        self._ring = ring
+    def _double(self) -> None:
+        """Replace the buffer by a file of twice its size that is mapped to memory.
+
+        Raises:
+            OutputError: If the disk is full. The file is written completely, because an access to a part that the disk
+                cannot store would end the process.
+        """
+        with as_output_errors(Path(tempfile.gettempdir())), tempfile.TemporaryFile() as file:
+            file.write(self._ring)
+            file.write(bytes(self._ring.nbytes))
+            file.flush()
+            self._ring = np.memmap(file, self._ring.dtype, "r+")  # the mapping keeps the closed file
 
     def overview(self) -> list[float]:
         """Return the largest force in each of `MAX_DRAWN_SAMPLES` pieces of the recording, N."""

@@ -12,7 +12,7 @@ const COUNTERS = { frames: "frames", lost: "lost", repeated: "repeated", restart
 export class FilmView {
   constructor(session, act) {
     const description = session.film;
-    Object.assign(this, { description, act, isReplay: session.is_replay, state: {}, isPaused: false, missed: 0, arrivedMs: -Infinity, spokenMs: 0, recent: new Map() });
+    Object.assign(this, { description, act, isReplay: session.is_replay, state: {}, isPaused: false, missed: 0, arrivedMs: -Infinity, spokenMs: 0, ahead_s: 0, recent: new Map() });
     this.words = new Map(session.flags.map(({ word, bit, says }) => [word, { bit, says }]));
     this.root = document.getElementById("film-template").content.firstElementChild.cloneNode(true);
     this.history = new History(description.electrodes.length, this.isReplay);
@@ -49,6 +49,7 @@ export class FilmView {
     }
     this.history.trim();
     this.missed += message.missed;
+    this.ahead_s = message.sent_s - Date.now() / 1000;
     if (message.samples.length) Object.assign(this, { arrivedMs: nowMs, sent_s: message.sent_s, receivedMs: nowMs, isNew: true });
   }
 
@@ -128,13 +129,13 @@ export class FilmView {
   }
 
   showHealth() {
-    const { counters, rate_Hz: rate, note, recording_failed: failed, film } = this.state, now_s = Date.now() / 1000;
+    const { counters, rate_Hz: rate, note, recording_failed: failed, film } = this.state;
     setText(this.find(".rate"), rate ? `${rate.toFixed(0)} Hz` : "–");
     setText(this.find(".latency"), this.latencies.length ? `${percentile(this.latencies, 0.5).toFixed(0)} µs` : "–");
     setText(this.find(".age"), this.isReplay || !this.ages.length ? "–" : `${this.age.toFixed(0)} ms`);
     setText(this.find(".lost"), counters ? String(counters.lost) : "–");
     if (this.latencies.length > 2000) this.latencies.splice(0, this.latencies.length - 1000);
-    const fresh = note && Math.abs(now_s - note.at) < NOTE_S ? note.text : "";
+    const fresh = note && Math.abs(this.server_s - note.at) < NOTE_S ? note.text : "";
     const followed = film ? `film at ${film.pretension_MPa.toFixed(2)} ± ${film.pretension_std_MPa.toFixed(2)} MPa` : "";
     const recording = this.state.recording ? `recording ${this.state.recording}` : followed;
     setText(this.find(".note"), failed ? "recording stopped: the disk is full" : fresh || recording);
@@ -156,6 +157,9 @@ export class FilmView {
    * Then the shortest of the times is negative, and the clocks differ by at least its amount.
    */
   get age() { return percentile(this.ages, 0.5) - Math.min(...this.ages, 0); }
+
+  /** Present time by the server's clock, s. The clocks of the two machines may differ. */
+  get server_s() { return Date.now() / 1000 + this.ahead_s; }
 
   /** From the reading to this picture: to the sending by the server's clock, from the arrival by this one's. */
   noteAge(sample, nowMs) {

@@ -27,7 +27,7 @@ function samples(message) {
 
 function state(changed) { page.film.update(changed); page.timeline?.update(changed); }
 
-function error(text) { page.film.update({ ...page.film.state, note: { text, at: Date.now() / 1000 } }); }
+function error(text) { page.film.update({ ...page.film.state, note: { text, at: page.film.server_s } }); }
 
 /** The position in a recording after some more seconds, s; nothing for a live stream. */
 function position(elapsed_s) { return page.timeline?.advance(elapsed_s) ?? {}; }
