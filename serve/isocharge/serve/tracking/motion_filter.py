@@ -17,7 +17,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import BEYOND, MISFIT, SATURATED
-from isocharge.serve.model.contact import CORRELATION_COLUMNS, Contact
+from isocharge.serve.model.contact import Contact
 from isocharge.serve.record.record import TrackedContact
 
 VALUES = slice(0, 3)
@@ -340,6 +340,9 @@ def _measured_values(contact: Contact) -> tuple[Array, Array]:
     smallest_force_N = float(np.finfo(np.float32).tiny)  # ln F would be infinite if the force were zero
     force_N = max(smallest_force_N, contact.force_N)
     std = np.minimum([contact.x_std_mm, contact.y_std_mm, contact.force_std_N / force_N], LARGEST_STD)
-    xy, xF, yF = (0.0 if math.isnan(value) else value for value in contact[CORRELATION_COLUMNS])
-    correlation = np.array([[1.0, xy, xF], [xy, 1.0, yF], [xF, yF, 1.0]]) + CORRELATION_RIDGE * _IDENTITY
+    xy, xF, yF = contact.xy_correlation, contact.xF_correlation, contact.yF_correlation
+    correlation = np.array([[1.0, xy, xF], [xy, 1.0, yF], [xF, yF, 1.0]])
+    if math.isnan(xy):
+        correlation = _IDENTITY
+    correlation = correlation + CORRELATION_RIDGE * _IDENTITY
     return np.array([contact.x_mm, contact.y_mm, math.log(force_N)]), correlation * np.outer(std, std)

@@ -207,7 +207,7 @@ class RecordedTape(Tape):
                 cannot store would end the process.
         """
         with as_output_errors(Path(tempfile.gettempdir())), tempfile.TemporaryFile() as file:
-            file.write(self._ring)
+            file.write(self._ring.data)
             file.write(bytes(self._ring.nbytes))
             file.flush()
             self._ring = np.memmap(file, self._ring.dtype, "r+")  # the mapping keeps the closed file
