@@ -107,7 +107,7 @@ def contact_stage(
     return TrainingStage("contact", network.contact, loss, sizes.steps, rate, config.seed)
 
 
-REFIT_PRESSES = 65_536
+REFIT_PRESSES = 32_768
 """Smallest number of presses with noise to which `refit_covariance` fits the covariance."""
 
 RIDGE = 10.0
