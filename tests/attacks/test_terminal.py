@@ -132,7 +132,7 @@ def test_names_of_a_board_through_the_doctor(notation, attack):
             comments = [line for line in device_text(examination).splitlines() if line.startswith("#")]
             check_terminal_text("\n".join(comments))
 
-    attack(f"doctor {notation}", read, foreign_names, 200, longest_s=10.0)
+    attack(f"doctor {notation}", read, foreign_names, 100, longest_s=10.0)
 
 
 @pytest.mark.parametrize("notation", NOTATIONS)

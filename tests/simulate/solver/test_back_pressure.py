@@ -65,6 +65,7 @@ def test_deflection_with_trapped_air_equals_that_of_a_taut_membrane(volume, at):
     assert relative_error(deflection(solved, points), expected) <= 1e-4
 
 
+@pytest.mark.first_cases(4)
 @pytest.mark.parametrize("case", SKFEM_CASES["cases"])
 def test_charges_with_back_pressure_equal_those_of_scikit_fem(case):
     sensor = with_film(

@@ -43,7 +43,7 @@ def solve_even_at(problem, distances, forces) -> FilmCharges:
 @pytest.fixture(scope="module")
 def solved(problem) -> FilmCharges:
     """The solved film of the sensor file, for presses like those of `CONTACT`."""
-    return solve_even_at(replace(problem, radius=6.0, force_range=(0.2, 1.0)), 5, 5)
+    return solve_even_at(replace(problem, radius=6.0, force_range=(0.2, 1.0)), 4, 4)
 
 
 @pytest.fixture
