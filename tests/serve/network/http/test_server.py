@@ -177,6 +177,15 @@ def test_slow_bytes_do_not_extend_the_deadline(limited):
         drip(connection, b"X", 1000, pause=0.05)
 
 
+def test_empty_lines_do_not_extend_the_time_between_requests(limited):
+    with connect(limited(idle_seconds=0.3)) as connection:
+        connection.settimeout(5.0)
+        connection.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
+        connection.recv(1)
+        connection.sendall(b"\r\n")
+        everything(connection)
+
+
 def test_connections_above_the_limit_are_refused(limited):
     server = limited(connections=3)
     with ExitStack() as stack:
@@ -282,6 +291,11 @@ def test_trailers_and_chunk_extensions_have_the_limit_of_headers(server, endless
         time.sleep(0.2)  # the bytes after the latest part of the body count
         send(connection, endless)
         assert statuses(everything(connection)) == [431]
+
+
+def test_trailers_are_not_read_as_headers(server):
+    head = b"POST /v2/repository/index HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n%s\r\n" % LAST
+    assert statuses(exchange(server, head + b"2\r\n{}\r\n0\r\nOrigin: http://evil.example\r\n\r\n")) == [200]
 
 
 @pytest.fixture

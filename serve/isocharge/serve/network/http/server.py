@@ -115,10 +115,11 @@ class Connection(HttpToolsProtocol):
         super().on_message_begin()
 
     def on_headers_complete(self) -> None:
-        """Set the deadline of the body."""
+        """Set the deadline of the body, and discard the trailers that may follow the body (RFC 9110, 6.5.1)."""
         self._pending_bytes = 0
         self._allow(self._limits.body_seconds)
         super().on_headers_complete()
+        self.headers = []  # uvicorn adds trailers to this list, which the request no longer uses
 
     def on_body(self, body: bytes) -> None:
         """Pass a part of the body to the application, which limits the size of the body."""
@@ -126,20 +127,23 @@ class Connection(HttpToolsProtocol):
         super().on_body(body)
 
     def on_message_complete(self) -> None:
-        """Remove the deadline, because the request is complete. After the response, uvicorn limits the idle time."""
+        """Remove the deadline, because the request is complete."""
         self._is_reading = False
         self._pending_bytes = 0
         self.deadline = math.inf
-        if self.cycle.response_complete:  # the application has not read the whole body
-            self._allow(self._limits.idle_seconds)
         super().on_message_complete()
 
     def close_if_overdue(self, now: float) -> None:
         """End the connection if a deadline has passed. If a request has begun, the client receives the reason.
 
+        The time between two requests has a deadline, too. Any byte would stop the timer of uvicorn, even an empty line,
+        with which no request begins.
+
         Args:
             now: Present time on the clock of the event loop, s.
         """
+        if self.is_idle and self.deadline == math.inf:
+            self._allow(self._limits.idle_seconds)
         if not self.flow.write_paused:  # uvicorn pauses if the client does not read its responses
             self._write_deadline = now + self._limits.body_seconds
         if min(self.deadline, self._write_deadline) > now:
