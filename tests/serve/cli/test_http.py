@@ -3,11 +3,14 @@
 import json
 import signal
 import socket
+from unittest.mock import Mock
 
 import pytest
 import tritonclient.grpc
 
 from infer_requests import BODY, INFER
+from isocharge.cli.serve.http import _load_all
+from isocharge.common.errors import ModelError
 from one_request import send
 
 
@@ -33,6 +36,11 @@ def test_sighup_loads_all_models_again(start, film, tmp_path):
     assert lines[1].startswith(f"refused: {tmp_path}/broken/1/golden.json: missing")
     assert lines[2] == "serving linear/1, linear/2, other/1; Ctrl-C stops\n"
     assert json.loads(send(url, "POST", INFER, BODY)[2])["model_version"] == "2"
+
+
+def test_sighup_reports_a_folder_of_models_that_cannot_be_listed(caplog):
+    _load_all(Mock(index=Mock(side_effect=ModelError("models: cannot be listed"))))
+    assert caplog.messages == ["models: cannot be listed"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

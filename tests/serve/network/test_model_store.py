@@ -8,6 +8,7 @@ import shutil
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
+from pathlib import Path
 
 import grpc
 import pytest
@@ -91,6 +92,29 @@ def test_a_model_in_another_ones_folder_is_refused(film, tmp_path):
     copied_version, copied_model = store.refusals()
     assert "expected linear/2, as the folders are called, got linear/1" in copied_version
     assert "expected other/1, as the folders are called" in copied_model
+
+
+def test_folder_that_cannot_be_listed_affects_no_other_model(film, tmp_path, monkeypatch):
+    """The errors of the operating system are simulated, because the superuser may list every folder."""
+    film.write(tmp_path)
+    film.write(tmp_path, name="secret")
+    list_folder = Path.iterdir
+
+    def refuse(folder):
+        if folder.name == "secret":
+            raise PermissionError(13, "Permission denied")
+        return list_folder(folder)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "iterdir", refuse)
+        patch.setattr(os, "access", lambda folder, _: folder.name != "secret")
+        store = ModelStore(tmp_path)
+        assert states(store) == [("linear", "1", "READY"), ("secret", "", "UNAVAILABLE")]
+        with pytest.raises(ModelError, match="secret: cannot be listed"):
+            store.load("secret")
+    store.load("secret")
+    assert labels(store) == ["linear/1", "secret/1"]
+    assert store.refusals() == []
 
 
 def test_load_and_unload_add_and_remove_versions(film, store, folder):

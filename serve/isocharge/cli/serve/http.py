@@ -104,7 +104,12 @@ def _load_all(store: ModelStore) -> None:
 
     If a model cannot be loaded, the reason is logged, and its loaded version is kept.
     """
-    for name in sorted({row["name"] for row in store.index()}):
+    try:
+        names = {row["name"] for row in store.index()}
+    except IsochargeError as error:  # a folder of models cannot be listed
+        log.warning("%s", error)
+        return
+    for name in sorted(names):
         try:
             store.load(name)
         except IsochargeError as error:

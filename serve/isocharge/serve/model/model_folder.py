@@ -110,10 +110,12 @@ def model_names(root: Path) -> list[str]:
     """Return the names of the models in a repository, which is a folder of models, in alphabetical order.
 
     A folder whose name cannot be that of a model is skipped. An example is `lost+found` on a mounted volume, which only
-    the superuser may list.
+    the superuser may list. Any other folder that must not be listed is assumed to be a model.
     """
     folders = [folder for folder in _subfolders(root) if NAME.fullmatch(folder.name)]
-    return sorted(folder.name for folder in folders if version_folders(folder))
+    return sorted(
+        folder.name for folder in folders if not os.access(folder, os.R_OK | os.X_OK) or version_folders(folder)
+    )
 
 
 def _released_models() -> Path:

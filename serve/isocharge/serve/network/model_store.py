@@ -59,7 +59,7 @@ class Version(NamedTuple):
 
     Attributes:
         name: Name of the model.
-        number: Number of the version.
+        number: Number of the version; 0 if the versions of the model are not known.
         loaded: The loaded version, or None if the version is not available for requests.
         reason: Reason why the version was refused or unloaded, or an empty text. The new files of a loaded version may
             be refused, too.
@@ -213,7 +213,12 @@ class ModelStore:
         """
         earlier = {row.number: row._replace(reason="") for row in self._find(name) if row.loaded}
         rows: dict[int, Version] = {}
-        folders = version_folders(folder) if folder else {}
+        try:
+            folders = version_folders(folder) if folder else {}
+        except ModelError as error:  # the folder cannot be listed
+            folders = {}
+            rows[0] = Version(name, 0, reason=str(error))
+            self.metrics.of(name, 0)  # the gauge of a model that is not ready
         for number, version_folder in folders.items():
             try:
                 rows[number] = Version(name, number, self._load_version(name, number, version_folder))
