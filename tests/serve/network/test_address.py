@@ -41,6 +41,15 @@ def test_server_on_a_unix_socket_takes_over_a_socket_left_by_a_killed_server(han
         assert connection.recv(1000).startswith(b"HTTP/1.1 200")
 
 
+def test_server_that_accepts_no_connection_keeps_its_unix_socket(tmp_path):
+    """A blocking connection to a socket whose queue is full would wait for ever."""
+    path = tmp_path / "touch.sock"
+    with Address(uds=path).listen(0), socket.socket(socket.AF_UNIX) as waiting:
+        waiting.connect(str(path))
+        with pytest.raises(ListenError, match=r"touch.sock: .*in use"):
+            Address(uds=path).listen(0)
+
+
 def test_addresses_in_use_or_impossible_are_refused(handler, start_http, tmp_path):
     start_http(handler, uds=tmp_path / "touch.sock")
     (tmp_path / "file").write_text("mine")

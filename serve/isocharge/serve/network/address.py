@@ -114,17 +114,6 @@ class Tls:
             ) from error
         return context
 
-    def key_and_certificate(self) -> tuple[bytes, bytes]:
-        """Read the private key and the certificate chain, and return both in this order.
-
-        The function `grpc.ssl_server_credentials` requires this order.
-
-        Raises:
-            InputError: If a file cannot be read, or if the certificate and the key do not belong together.
-        """
-        self.context()  # checks the files
-        return read_whole(self.key), read_whole(self.certificate)
-
 
 @dataclass(frozen=True, kw_only=True)
 class ServerLimits:
@@ -217,6 +206,7 @@ def _remove_stale_socket(path: Path) -> None:
     if not path.is_socket():
         return
     with socket.socket(socket.AF_UNIX) as client:
+        client.setblocking(False)  # a server that hangs does not accept the connection
         error_number = client.connect_ex(str(path))  # 0 if a server accepts the connection
     if error_number == errno.ECONNREFUSED:  # the system refuses a connection only if no server listens
         path.unlink(missing_ok=True)

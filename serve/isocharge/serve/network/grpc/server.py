@@ -11,6 +11,7 @@ import grpc
 import grpc.aio
 
 from isocharge.common.errors import ListenError
+from isocharge.common.files import read_whole
 from isocharge.serve.network.address import ServerLimits, Tls, url_host
 from isocharge.serve.network.grpc.service import METHODS, SERVICE, Service
 from isocharge.serve.network.protocol.handler import Handler
@@ -36,14 +37,13 @@ async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = 
             in the metadata field `authorization`.
         host: Host name or IP address on which to listen.
         port: TCP port. The port 0 selects a free port.
-        tls: Certificate and private key for TLS, or None for a server without TLS.
+        tls: Certificate and private key for TLS, which the HTTP server has checked, or None for a server without TLS.
 
     Yields:
         The URL of the server, `grpc://host:port` or, with TLS, `grpcs://host:port`.
 
     Raises:
         ListenError: If the address is in use or cannot be used.
-        InputError: If a TLS file cannot be used.
     """
     limits = handler.limits
     address = f"{url_host(host)}:{port}"
@@ -59,7 +59,7 @@ async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = 
             actual_port = server.add_insecure_port(address)
         else:
             scheme = "grpcs"
-            credentials = grpc.ssl_server_credentials([tls.key_and_certificate()])
+            credentials = grpc.ssl_server_credentials([(read_whole(tls.key), read_whole(tls.certificate))])
             actual_port = server.add_secure_port(address, credentials)
     except RuntimeError as error:
         raise ListenError(
