@@ -33,7 +33,7 @@ def test_sighup_loads_all_models_again(start, film, tmp_path):
     process.send_signal(signal.SIGHUP)
     lines = [process.stderr.readline() for _ in range(3)]
     assert lines[0] == "serving linear/1; Ctrl-C stops\n"
-    assert lines[1].startswith(f"refused: {tmp_path}/broken/1/golden.json: missing")
+    assert lines[1].startswith(f"refused: {tmp_path}/broken/1/golden.json: cannot be read")
     assert lines[2] == "serving linear/1, linear/2, other/1; Ctrl-C stops\n"
     assert json.loads(send(url, "POST", INFER, BODY)[2])["model_version"] == "2"
 

@@ -7,6 +7,7 @@ reason. Models are found by name, version and path, in the documented order.
 import json
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import onnx
@@ -118,6 +119,9 @@ def test_version_with_other_electrodes_in_the_same_model_folder_is_refused(film,
     film.write(tmp_path)
     with pytest.raises(ModelError, match=r"config.pbtxt: describes a model other than .*'D'"):
         film.with_electrodes(4).write(tmp_path, version=2)
+    (tmp_path / "linear/config.pbtxt").write_bytes(b"\xff")
+    with pytest.raises(ModelError, match=r"config.pbtxt: describes a model other than"):
+        film.write(tmp_path, version=2)
 
 
 @pytest.mark.parametrize(
@@ -151,6 +155,13 @@ def test_damaged_golden_json_is_refused(own_model, damage, message):
     golden = own_model / "golden.json"
     golden.write_text(damage(json.loads(golden.read_text())))
     with pytest.raises(ModelError, match=message):
+        load_model(own_model)
+
+
+def test_version_folder_that_may_not_be_searched_is_refused(own_model, monkeypatch):
+    """The error of the operating system is simulated, because the superuser may search every folder."""
+    monkeypatch.setattr(Path, "stat", Mock(side_effect=PermissionError(13, "Permission denied")))
+    with pytest.raises(ModelError, match=r"golden.json: cannot be read \(Permission denied\)"):
         load_model(own_model)
 
 

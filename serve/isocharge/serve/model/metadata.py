@@ -29,12 +29,11 @@ VERSION_PATTERN = "[1-9][0-9]{0,17}"
 
 NAME = re.compile(NAME_PATTERN)
 VERSION = re.compile(VERSION_PATTERN)
+LABEL = re.compile(f"{NAME_PATTERN}/{VERSION_PATTERN}")
 
 ModelName = Annotated[str, Meta(pattern=rf"\A{NAME_PATTERN}\Z", description="letters, digits, '-', '_' and '.'")]
 
-ModelLabel = Annotated[
-    str, Meta(pattern=rf"\A{NAME_PATTERN}/{VERSION_PATTERN}\Z", description="the label NAME/VERSION of a model")
-]
+ModelLabel = Annotated[str, Meta(pattern=rf"\A{LABEL.pattern}\Z", description="the label NAME/VERSION of a model")]
 
 Names = Annotated[tuple[Text, ...], Meta(min_length=1)]
 
@@ -73,9 +72,7 @@ class ModelNoise(Struct, frozen=True, kw_only=True):
         Returns:
             Variances, shape (..., n_electrode), pC^2.
         """
-        white_pC = np.asarray(self.white_pC)
-        gain = np.asarray(self.gain)
-        return white_pC**2 + (gain * charge_pC) ** 2
+        return np.asarray(np.square(self.white_pC) + np.multiply(self.gain, charge_pC) ** 2)
 
 
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]

@@ -31,7 +31,7 @@ from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import ModelError, OutputError, OutputExists, error_prefix, shown
 from isocharge.common.files import new_folder, read_needed, refuse_existing, sha256_of, write_whole
 from isocharge.serve.model.contact import as_charges
-from isocharge.serve.model.metadata import NAME, VERSION, ModelMetadata
+from isocharge.serve.model.metadata import LABEL, NAME, VERSION, ModelMetadata
 from isocharge.serve.model.session import (
     GRAPH_FILE,
     INPUT,
@@ -78,9 +78,7 @@ def find_labelled_model(label: str, models: Path | None = None) -> Path:
     Raises:
         ModelError: If the text is not a label, or if no repository contains the model.
     """
-    name, _slash, version = label.partition("/")
-    is_label = NAME.fullmatch(name) and VERSION.fullmatch(version)
-    if not is_label:
+    if not LABEL.fullmatch(label):
         raise ModelError(f"model {shown(label)}: expected the label NAME/VERSION of a model; give the model by --model")
     roots = repositories(models)
     return _first_model([root / label for root in roots], label, roots, is_path=False)
@@ -95,15 +93,11 @@ def repositories(models: str | Path | None = None) -> list[Path]:
     Raises:
         ModelError: If `models` is given and is not a folder.
     """
-    roots: list[Path] = []
-    if models is not None:
-        roots.append(Path(models))
-        if not roots[0].is_dir():
-            raise ModelError(f"{models}: expected a folder of models, got no folder; correct --models or leave it out")
-    environment_folder = os.environ.get("ISOCHARGE_MODELS")
-    if environment_folder:
-        roots.append(Path(environment_folder))
-    return [*roots, Path("models"), _released_models()]
+    if models is not None and not Path(models).is_dir():
+        raise ModelError(f"{models}: expected a folder of models, got no folder; correct --models or leave it out")
+    environment_folder = os.environ.get("ISOCHARGE_MODELS") or None
+    folders = (models, environment_folder, "models", _released_models())
+    return [Path(folder) for folder in folders if folder is not None]
 
 
 def model_names(root: Path) -> list[str]:
@@ -399,7 +393,7 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
     if not NAME.fullmatch(name):
         raise ModelError(f"model name {name!r}: expected letters, digits, '-', '_' and '.'; rename the folder")
     config_path = folder / "config.pbtxt"
-    if config_path.exists() and config_path.read_text(encoding="utf-8") != triton_config(name, len(electrodes)):
+    if config_path.exists() and config_path.read_bytes() != triton_config(name, len(electrodes)).encode():
         raise ModelError(
             f"{config_path}: describes a model other than {name!r} with the electrodes {electrodes}; use another model "
             "name or, if the folder was copied or renamed, its old name"

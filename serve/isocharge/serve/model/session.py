@@ -322,8 +322,6 @@ def read_golden(path: Path) -> Golden:
     Raises:
         ModelError: If the file is missing or damaged.
     """
-    if not path.exists():
-        raise ModelError(f"{path}: missing; every model has this file: copy the whole folder of the model again")
     try:
         golden = read_json(path, "golden vectors", ModelError, Golden)
         n_press = len(golden.charge_pC)
@@ -336,5 +334,5 @@ def read_golden(path: Path) -> Golden:
                 )
     except (ModelError, ValueError, KeyError) as error:  # rows of different lengths, or a missing entry
         where = "" if isinstance(error, ModelError) else f"{path}: "
-        raise ModelError(f"{where}{error}; the file is damaged: copy or export the model again") from error
+        raise ModelError(f"{where}{error}; the file is damaged or missing: copy or export the model again") from error
     return golden
