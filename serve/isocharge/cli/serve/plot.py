@@ -87,12 +87,11 @@ def recording_picture(samples: Samples, title: str) -> Figure:
     for row, flag_time_s in enumerate(flags.values()):
         flag_axes.plot(flag_time_s, np.full(len(flag_time_s), row), "|", color=INK)
 
-    charge_axes.set_ylabel("touch charge, pC")
-    position_axes.set_ylabel("position, mm")
-    force_axes.set_ylabel("force, N")
     flag_axes.set(yticks=range(len(flags)), yticklabels=flags, ylim=(-0.7, max(len(flags), 1) - 0.3))
     flag_axes.set_xlabel(f"time since {datetime.fromtimestamp(start_s, UTC):%Y-%m-%d %H:%M:%S} UTC, s")
-    for axes in (charge_axes, position_axes, force_axes):
+    labels = {charge_axes: "touch charge, pC", position_axes: "position, mm", force_axes: "force, N"}
+    for axes, label in labels.items():
+        axes.set_ylabel(label)
         axes.grid(alpha=0.3)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(loc="upper right", fontsize=8, ncols=8, markerscale=4.0)

@@ -26,12 +26,6 @@ import typer
 from isocharge.common.errors import printable, printable_lines
 from isocharge.common.progress import Listener, listening
 
-STANDARD_DESCRIPTORS = (STDIN_FILENO, STDOUT_FILENO, STDERR_FILENO)
-"""File descriptors of the three standard streams, in increasing order."""
-
-STREAM_MODES = {"stdin": "r", "stdout": "w", "stderr": "w"}
-"""Mode of each standard stream by its name in the module `sys`, in the order of the descriptors."""
-
 
 def open_closed_streams() -> None:
     """Open the null device in place of standard streams that were closed when the command started.
@@ -39,7 +33,7 @@ def open_closed_streams() -> None:
     Without this replacement, the next file that is opened would get the file descriptor of stdout, and printed text
     would be written into that file.
     """
-    for name, mode in STREAM_MODES.items():
+    for name, mode in {"stdin": "r", "stdout": "w", "stderr": "w"}.items():  # in the order of the descriptors
         if getattr(sys, name) is None:  # Python found the descriptor closed
             descriptor = os.open(os.devnull, os.O_RDWR)  # the lowest free file descriptor, which is that of the stream
             setattr(sys, name, open(descriptor, mode, closefd=False))  # noqa: SIM115
@@ -214,7 +208,7 @@ def unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
     Args:
         act: Function that the handler calls while the terminal is open.
     """
-    terminals = [descriptor for descriptor in STANDARD_DESCRIPTORS if os.isatty(descriptor)]
+    terminals = list(filter(os.isatty, (STDIN_FILENO, STDOUT_FILENO, STDERR_FILENO)))
     return lambda: act() if all(map(os.isatty, terminals)) else signal.raise_signal(signal.SIGINT)
 
 

@@ -30,12 +30,6 @@ from urllib.parse import urlsplit
 from isocharge.common.errors import InputError, OriginError, RequestError, TokenError
 from isocharge.serve.network.address import ip_address
 
-TRUSTED_FETCH_SITES = (b"same-origin", b"none")
-"""Values of the header `Sec-Fetch-Site` that are accepted.
-
-Browsers send `same-origin` if a page of this server sends the request, and `none` if the user has typed in the address.
-"""
-
 _TOKEN_PATTERN = re.compile(r"(?! )[ -$&-~]+(?<! )")
 """Accepted token: printable ASCII characters without blanks at the ends and without the percent sign."""
 
@@ -131,12 +125,13 @@ class AccessCheck:
                     "itself, or name the page's host by --allow-host"
                 )
             return
-        # Programs other than browsers do not send the header Sec-Fetch-Site. A link on another site may open a page of
-        # this server, because the other site cannot read the response.
+        # Browsers send `same-origin` if a page of this server sends the request, and `none` if the user has typed the
+        # address. Other programs do not send the header. A link on another site may open a page of this server, because
+        # the other site cannot read the response.
         fetch_site = headers.get(b"sec-fetch-site", b"none")
         is_navigation = headers.get(b"sec-fetch-mode") == b"navigate" and headers.get(b"sec-fetch-dest") == b"document"
         is_link = is_navigation and method in ("GET", "HEAD")
-        if fetch_site.lower() not in TRUSTED_FETCH_SITES and not is_link:
+        if fetch_site.lower() not in (b"same-origin", b"none") and not is_link:
             raise OriginError(
                 f"Sec-Fetch-Site: expected a request by a page of this server, got {_quoted(fetch_site)}; open the "
                 f"page of {_quoted(host)}"

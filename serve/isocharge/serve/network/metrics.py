@@ -25,9 +25,6 @@ from isocharge.common.errors import package_version
 CONTENT_TYPE = b"text/plain; version=0.0.4; charset=utf-8"
 """Content type of the text format, which every version of Prometheus can read."""
 
-VERSION_LABELS = ("model", "version")
-"""Labels of the metrics that have one value for each version of a model."""
-
 LATENCY_BOUNDS_S = (1e-5, 2e-5, 3e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 2e-2)
 """Upper bounds of the buckets of the latency histogram, s.
 
@@ -48,7 +45,7 @@ class ModelMetrics:
         ProcessCollector(registry=registry)
         versions = Info("isocharge", "Versions of the server.", registry=registry)
         versions.info({"version": package_version(), "onnxruntime": ort.__version__})
-        settings: dict[str, Any] = {"labelnames": VERSION_LABELS, "registry": registry}
+        settings: dict[str, Any] = {"labelnames": ("model", "version"), "registry": registry}
         # Each name is a field of `Statistics`.
         self._metrics: dict[str, Any] = {
             "description": Info("isocharge_model", "Versions of the models.", **settings),

@@ -97,8 +97,8 @@ def _show_server(_: Request) -> dict[str, Any]:
 
 
 def _show_metrics(request: Request) -> Response:
-    texts = [generate_latest(registry) for registry in (request.store.metrics.registry, request.traffic.registry)]
-    return response_of(200, CONTENT_TYPE, b"".join(texts))
+    text = generate_latest(request.store.metrics.registry) + generate_latest(request.traffic.registry)
+    return response_of(200, CONTENT_TYPE, text)
 
 
 def _is_ready(request: Request) -> dict[str, bool]:
