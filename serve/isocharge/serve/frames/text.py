@@ -92,17 +92,14 @@ class Layout:
     def set_names(self, names: Sequence[str]) -> None:
         """Store the names of all values, and find the columns of the frame counter, the clock and the channels."""
         self.names = names
-        scales = (1.0,) * len(names)  # values in text have no scale
-        self.columns = Columns(names, scales, words=self._words)
+        self.columns = Columns(names, (1.0,) * len(names), words=self._words)  # values in text have no scale
 
     def name_unnamed(self, names: Sequence[str]) -> bool:
         """Give names to the values that have none in the lines, and return whether the number of names fits."""
         if not names or len(names) != len(self.unnamed):
             return False
-        all_names = list(self.names)
-        for index, name in zip(self.unnamed, names, strict=True):
-            all_names[index] = name
-        self.set_names(all_names)
+        new_names = dict(zip(self.unnamed, names, strict=True))
+        self.set_names([new_names.get(index, name) for index, name in enumerate(self.names)])
         return True
 
 
@@ -409,18 +406,17 @@ def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
         lines: Lines of whole cycles, in which every value has a name.
         cycle_length: Number of lines in a cycle.
     """
-    names = [next((name for name in line.names if name not in TIMES_US), "") for line in lines]
-    clocks = [
-        value
-        for line in lines
-        for name, value in zip(line.names, line_values(skeleton_pattern(line), line.text) or (), strict=False)
-        if name in TIMES_US
+    fields_of_lines = [
+        dict(zip(line.names, line_values(skeleton_pattern(line), line.text) or (), strict=False)) for line in lines
     ]
-    has_clocks = len(clocks) == len(lines)
 
     def order(first: int) -> tuple[float, bool, str]:
-        duration = clocks[first + cycle_length - 1] - clocks[first] if has_clocks else 0.0
-        return duration, names[first] != SEQ, names[first]
+        """Return a key that is the smallest for the first line of a frame."""
+        frame = fields_of_lines[first : first + cycle_length]
+        clocks = [fields[name] for fields in frame for name in TIMES_US if name in fields]
+        duration = clocks[-1] - clocks[0] if len(clocks) == cycle_length else 0.0
+        first_name = next((name for name in frame[0] if name not in TIMES_US), "")
+        return duration, first_name != SEQ, first_name
 
     return min(range(cycle_length), key=order)
 

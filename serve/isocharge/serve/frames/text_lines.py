@@ -20,7 +20,7 @@ line, except units of charge and voltage. Quotes around a number have no meaning
 import math
 import re
 from collections.abc import Collection
-from itertools import dropwhile, pairwise
+from itertools import pairwise, takewhile
 from typing import NamedTuple
 
 from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, SEQ, TIMES_US
@@ -60,8 +60,8 @@ _PATTERNS = {
 _CODES = {kind: chr(code) for code, kind in enumerate(_PATTERNS)}
 """Control characters that stand for these parts in a skeleton. A line with control characters is not parsed."""
 
-_END = r"[\s,;]*+"
-"""Regular expression of marks without a meaning at the end of a line."""
+_IGNORED_AT_END = ",; \t"
+"""Marks without a meaning at the end of a line."""
 
 _UNCLEAR_SIGN = r"(?:^|[\s;])[-+]?[0-9.]+(?:(?:\s*[fnpuµμm]?[CV])?\s+-\s+[.0-9]|-(?:[\s,;]|$))"
 """Regular expression of a minus after a number, as in `3.5 - 2.5` and `3.5-`, which may be a sign or a separator."""
@@ -118,6 +118,11 @@ class _Token(NamedTuple):
         """Content without quotes."""
         return self.content.strip("\"'")
 
+    @property
+    def is_number(self) -> bool:
+        """Whether the part is a number or a time."""
+        return self.kind in _NUMBER_KINDS
+
 
 _EDGE = _Token("", "", 0, False)
 """Token that stands for the beginning and the end of a line."""
@@ -151,7 +156,7 @@ def parse_line(text: str, *, has_header: bool = False, counters: Collection[str]
 
     Args:
         text: The line, as `clean_text` returns it.
-        has_header: Whether a header names the numbers, so that words between the numbers are not names.
+        has_header: Whether a header names the numbers, so that words that alternate with the numbers are not names.
         counters: Names of counters and clocks. They are names even if no other number of the line has one.
 
     Raises:
@@ -160,13 +165,17 @@ def parse_line(text: str, *, has_header: bool = False, counters: Collection[str]
     if not text.replace("\t", " ").isprintable():
         raise ValueError(f"expected printable characters, got {text[:100]!r}")
     number_kind = "number with a decimal comma" if _has_decimal_commas(text) else "number"
-    tokens = [] if re.search(_UNCLEAR_SIGN, text) else _tokens(text.rstrip(",; \t"), number_kind)
-    tokens = _with_alternating_names(tokens, has_header=has_header)
-    names = _names(tokens, counters)
-    starts = tuple(token.start for token in tokens if token.kind in _NUMBER_KINDS)
-    words = tuple(token.name for token in tokens if token.kind not in ("mark", *_NUMBER_KINDS))
+    tokens = [] if re.search(_UNCLEAR_SIGN, text) else _tokens(text.rstrip(_IGNORED_AT_END), number_kind)
+    gaps = _gaps(tokens)
+    times = [_NAMES_OF_TIMES.get(token.kind, "") for token in tokens if token.is_number]
+    # A single word and a single number, as in `A,3.5`, are a name and its value even below a header with two columns.
+    is_pair = re.fullmatch("[,;]?w[,;|]0w?", _shape(tokens)) is not None
+    may_alternate = is_pair or (times.count("") > 1 and not has_header)
+    names = (_alternating_names(times, gaps) if may_alternate else []) or _preceding_names(times, gaps, counters)
+    starts = tuple(token.start for token in tokens if token.is_number)
+    words = tuple(token.name for gap in gaps for token in gap if token.kind != "mark")
     skeleton = _skeleton(tokens, names, number_kind)
-    return Line(text, skeleton, tuple(_with_units(names, tokens)), starts, _is_prose(tokens), words)
+    return Line(text, skeleton, tuple(_with_units(names, gaps)), starts, _is_prose(tokens), words)
 
 
 def _skeleton(tokens: list[_Token], names: list[str], number_kind: str) -> str:
@@ -184,7 +193,7 @@ def _skeleton(tokens: list[_Token], names: list[str], number_kind: str) -> str:
             skeleton += _CODES["optional blanks"]
         elif token.is_after_blank:
             skeleton += _CODES["blanks"]
-        if token.kind in ("key", "name", "mark") or (token.kind == "word" and token.content in fixed_words):
+        if token.kind in ("key", "mark") or (token.name in fixed_words and not token.is_number):
             skeleton += token.content
         else:
             skeleton += _CODES[number_kind if token.kind == "number" else token.kind]
@@ -194,21 +203,21 @@ def _skeleton(tokens: list[_Token], names: list[str], number_kind: str) -> str:
 def _is_prose(tokens: list[_Token]) -> bool:
     """Return whether a line resembles a message of a board instead of a frame.
 
-    A message has at least as many words as numbers, as in `Channel 3 is ready`. Keys, units of charge, and words after
-    a comma or another mark are not counted as words. A line with a decimal number after a hexadecimal number is a
-    message, too. For example, boards print the address of a part of their program and then its size.
+    A message has at least as many words as numbers, as in `Channel 3 is ready`. Words after a comma or another mark,
+    units of charge, and the key of a single number are not counted. A line with a hexadecimal number may be a message,
+    too. For example, boards print the address and the size of each part of their program when they start.
 
     Args:
         tokens: Parts of the line.
     """
-    number_kinds = [token.kind for token in tokens if token.kind in _NUMBER_KINDS]
+    number_kinds = [token.kind for token in tokens if token.is_number]
+    word_kinds = ("word", "key") if len(number_kinds) > 1 else ("word",)
     words = [
         token
         for previous, token in pairwise([_EDGE, *tokens])
-        if token.kind in ("word", "name") and previous.kind != "mark" and token.content not in _ALL_CHARGE_UNITS
+        if token.kind in word_kinds and previous.kind != "mark" and token.content not in _ALL_CHARGE_UNITS
     ]
-    has_address_and_size = "number" in dropwhile(lambda kind: kind != "hexadecimal", number_kinds)
-    return has_address_and_size or len(words) >= len(number_kinds)
+    return "hexadecimal" in number_kinds or len(words) >= len(number_kinds)
 
 
 def _has_decimal_commas(text: str) -> bool:
@@ -254,25 +263,34 @@ def _tokens(text: str, number_kind: str) -> list[_Token]:
 def _index_positions(tokens: list[_Token]) -> list[int]:
     """Return the positions of the numbers that are indices of channels, and therefore names.
 
-    If a line ends with pairs such as `1:801,2:799` or `ch 1 = 801 pC`, the first number of each pair is an index. In
-    pairs such as `pad #1 801 pad #2 799`, the indices count from 0 or 1, and follow the same word or mark.
+    If a line ends with pairs of numbers, the first number of each pair is an index in these cases:
+
+    - A colon or an equals sign follows it, as in `1:801,2:799` and `ch 1 = 801 pC`. There are several pairs, or no
+      other numbers.
+    - In several pairs, the first numbers count from 0 or 1, and follow the same word or mark, as in `pad #1 801 pad #2
+      799` and `[1] 801 [2] 799`.
 
     Args:
         tokens: Parts of the line.
     """
     shape = _shape(tokens)
     numbers = [position for position, token in enumerate(tokens) if _SHAPES.get(token.kind) == "0"]
-    before_colons = re.search(r"(?:[^0]*+0[)\]]?[:=]0)+[^0]*+$", shape)
-    if before_colons is not None and (before_colons.start() == 0 or before_colons[0].count("0") > 2):
-        return numbers[-before_colons[0].count("0") :: 2]
 
-    after_words = re.search(r"(?:[^0]*[w#(\[=]0[)\]>(\[]?0)+[^0]*$", shape)
-    positions = numbers[-after_words[0].count("0") :: 2] if after_words is not None else []
-    indices = [tokens[position].content for position in positions]
+    def first_numbers(pair: str) -> list[int]:
+        """Return the positions of the first numbers of all pairs at the end that have a given shape."""
+        pairs = re.search(rf"(?:[^0]*{pair})+[^0]*$", shape)
+        return [] if pairs is None else numbers[-pairs[0].count("0") :: 2]
+
+    indices = first_numbers(r"0[)\]]?[:=]0")
+    if len(indices) > 1 or 2 * len(indices) == len(numbers):
+        return indices
+
+    indices = first_numbers(r"[w#(\[=]0[)\]>(\[]?0")
+    contents = [tokens[position].content for position in indices]
     counts = [str(count) for count in range(len(indices) + 1)]
-    are_counts = len(indices) > 1 and indices in (counts[:-1], counts[1:])
-    is_prefix_equal = len({tokens[position - 1].content for position in positions}) == 1
-    return positions if are_counts and is_prefix_equal else []
+    are_counts = len(indices) > 1 and contents in (counts[:-1], counts[1:])
+    previous_contents = {tokens[position - 1].content for position in indices}
+    return indices if are_counts and len(previous_contents) == 1 else []
 
 
 def _shape(tokens: list[_Token]) -> str:
@@ -280,42 +298,67 @@ def _shape(tokens: list[_Token]) -> str:
     return "".join(_SHAPES.get(token.kind, token.content) for token in tokens)
 
 
-def _names(tokens: list[_Token], counters: Collection[str]) -> list[str]:
-    """Return the names of the numbers. A number without a name has an empty text.
+def _gaps(tokens: list[_Token]) -> list[list[_Token]]:
+    """Return the parts before the first number, between each two numbers, and after the last number."""
+    gaps: list[list[_Token]] = [[]]
+    for token in tokens:
+        if token.is_number:
+            gaps.append([])
+        else:
+            gaps[-1].append(token)
+    return gaps
 
-    If `_with_alternating_names` has marked names, these are the names. Otherwise, the name of a number is the last word
-    or key between this number and the previous number or separator, as in `A: 3.5`, `A -> 3.5` and `<A>3.5</A>`. These
-    rules apply in this order:
 
-    - If several numbers have the same name, the word or key before it is the name, as in `{"A": {"pC": 3.5}}`. A name
-      that still occurs several times is removed.
-    - If no word precedes the first number, but a word follows the last number, the words are units and no names.
-    - If only one of several numbers has a name, the name is a label of the line and is removed. This applies if the
-      name is a word or belongs to the first number. Names of counters and clocks are kept.
+def _alternating_names(times: list[str], gaps: list[list[_Token]]) -> list[str]:
+    """Return the names of the numbers in a line in which names and numbers alternate; empty for another line.
+
+    The name of a number is the word that is next to the number, either before each number, as in `C,7,A,3` and
+    `C[7] A[3]`, or behind each number, as in `7 C, 3 A`. All names are different, because words that repeat are units
+    or states. Words of another meaning that alternate with the numbers are taken for names, too.
 
     Args:
-        tokens: Parts of the line.
+        times: Name of each number that is a time; empty for the other numbers.
+        gaps: Parts between the numbers.
+    """
+    words = [[token.name for token in gap if token.kind != "mark"] for gap in gaps]
+    last_words_before = [gap[-1:] for gap in words[:-1]]
+    first_words_behind = [gap[:1] for gap in words[1:]]
+    for next_words in (last_words_before, first_words_behind):
+        names = [time or "".join(word) for time, word in zip(times, next_words, strict=True)]
+        if all(_unique(names)) and _CHARGE_UNITS.isdisjoint(names):
+            return names
+    return []
+
+
+def _preceding_names(times: list[str], gaps: list[list[_Token]], counters: Collection[str]) -> list[str]:
+    """Return the names of the numbers. A number without a name has an empty text.
+
+    The name of a number is the last word or key between this number and the previous number or separator, as in
+    `A: 3.5`, `A -> 3.5` and `<A>3.5</A>`. If several numbers have the same name, the word or key before it is the name,
+    as in `{"A": {"pC": 3.5}}`. A name that still occurs several times is removed. These names are removed, too:
+
+    - If no word precedes the first number, but a word follows the last number, the words are units and no names.
+    - If only one of several numbers has a name, the name is a label of the line. This applies if the name is a word or
+      belongs to the first number. Names of counters and clocks are kept.
+
+    Args:
+        times: Name of each number that is a time; empty for the other numbers.
+        gaps: Parts between the numbers.
         counters: Names of counters and clocks.
     """
-    kinds = [token.kind for token in tokens if token.kind in _NUMBER_KINDS]
-    marked_names = [token.name for token in tokens if token.kind == "name"]
-    if marked_names:
-        next_names = iter(marked_names)
-        return [_NAMES_OF_TIMES.get(kind) or next(next_names) for kind in kinds]
+    inner_names = []
+    outer_names = []
+    for time, gap in zip(times, gaps[:-1], strict=True):
+        parts = takewhile(lambda token: token.content not in _SEPARATORS, reversed(gap))
+        inner_name, outer_name, *_ = *(token.name for token in parts if token.kind in ("word", "key")), "", ""
+        inner_names.append(time or inner_name)
+        outer_names.append(outer_name)
+    names = [inner or outer for inner, outer in zip(_unique(inner_names), _unique(outer_names), strict=True)]
 
-    # The last two words before each number, which are empty if there are fewer
-    paths = [
-        ["", "", *(token.name for token in path if token.kind != "quoted")] for path in _paths(tokens, _SEPARATORS)
-    ]
-    inner_names = [_NAMES_OF_TIMES.get(kind, path[-1]) for kind, path in zip(kinds, paths, strict=True)]
-    outer_names = [path[-2] for path in paths]
-    names = [name or outer_name for name, outer_name in zip(_unique(inner_names), _unique(outer_names), strict=True)]
-
-    # Remove the units and the label of the line.
-    words = {token.name for token in tokens if token.kind == "word"}
+    words = {token.name for gap in gaps for token in gap if token.kind == "word"}
+    kinds_behind = [token.kind for token in gaps[-1] if token.kind != "mark"]
     channels = [index for index, name in enumerate(names) if name not in TIMES_US]
-    contents = [token for token in tokens if token.kind != "mark"]
-    if channels and not names[channels[0]] and contents[-1].kind == "word":
+    if channels and not names[channels[0]] and kinds_behind[-1:] == ["word"]:
         names = ["" if name in words else name for name in names]
     named = [index for index in channels if names[index]]
     is_single = len(channels) > 1 and len(named) == 1 and names[named[0]] not in counters
@@ -324,77 +367,27 @@ def _names(tokens: list[_Token], counters: Collection[str]) -> list[str]:
     return names
 
 
-def _with_units(names: list[str], tokens: list[_Token]) -> list[str]:
+def _with_units(names: list[str], gaps: list[list[_Token]]) -> list[str]:
     """Return the names of the numbers with their units of charge or voltage, as `A_nC`.
 
     The unit is directly behind the number, or between the name of the number and the number. The unit pC is not added.
 
     Args:
         names: Name of each number; empty for a number without a name.
-        tokens: Parts of the line.
+        gaps: Parts between the numbers.
     """
-    parts = [token for token in tokens if token.content not in ":="]
-    following_words = [
-        following.content for token, following in pairwise([*parts, _EDGE]) if token.kind in _NUMBER_KINDS
-    ]
+    following_words = [next((token.content for token in gap if token.content not in ":="), "") for gap in gaps[1:]]
     # The word `C` may be the name of an electrode, but a word behind several numbers is not a name.
     known_units = OTHER_CHARGE_UNITS if following_words.count("C") > 1 else _CHARGE_UNITS
     names_with_units = []
-    for number, (name, following_word, path) in enumerate(zip(names, following_words, _paths(tokens), strict=True), 1):
+    for number, (name, following_word, gap) in enumerate(zip(names, following_words, gaps, strict=False), 1):
         # The first word after the previous number is a name, or the unit of the previous number.
-        possible_units = (following_word, *(token.name.strip("[]") for token in path[1:]))
-        unit = next((unit for unit in possible_units if unit in known_units), "")
+        later_words = [token.name.strip("[]") for token in gap if token.kind != "mark"][1:]
+        unit = next((word for word in (following_word, *later_words) if word in known_units), "")
         ending = "coulomb" if unit == "C" else unit  # `A_C` would be an electrode with the name C
         is_added = unit and ending not in names
         names_with_units.append(f"{name or f'ch{number}'}_{ending}" if is_added else name)
     return names_with_units
-
-
-def _with_alternating_names(tokens: list[_Token], *, has_header: bool) -> list[_Token]:
-    """Mark the names in a line in which names and numbers alternate, and return the parts of the line.
-
-    The name of a number is the word that is next to the number, either before each number, as in `C,7,A,3` and
-    `C[7] A[3]`, or behind each number, as in `7 C, 3 A`. All names are different, because words that repeat are units
-    or states. Times have no names. Words of another meaning that alternate with the numbers are taken for names, too.
-
-    A single word and a single number are a name and its value only if a mark separates them and nothing else follows,
-    as in `A,3.5`. Then the word is a name even if the board has sent a header, such as `channel,charge_pC`.
-
-    Args:
-        tokens: Parts of the line.
-        has_header: Whether a header names the numbers.
-    """
-    is_pair = re.fullmatch("[,;]?w[,;|]0w?", _shape(tokens)) is not None  # may begin with a time or end with a unit
-    if has_header and not is_pair:
-        return tokens
-    fewest = 1 if is_pair else 2
-    without_times = [token for token in tokens if token.kind not in _NAMES_OF_TIMES]
-    for ordered_tokens in (without_times, without_times[::-1]):
-        paths = _paths(ordered_tokens)
-        named = [path[-1] for path in paths if path]
-        names = {token.name for token in named}
-        if len(names) == len(paths) >= fewest and _CHARGE_UNITS.isdisjoint(names):
-            return [token._replace(kind="name") if token in named else token for token in tokens]
-    return tokens
-
-
-def _paths(tokens: list[_Token], separators: str = "") -> list[list[_Token]]:
-    """Return the words, keys and texts between each number and the previous number or separator.
-
-    Args:
-        tokens: Parts of the line.
-        separators: Marks that separate columns.
-    """
-    paths = []
-    path: list[_Token] = []
-    for token in tokens:
-        if token.kind in _NUMBER_KINDS:
-            paths.append(path)
-        if token.kind in _NUMBER_KINDS or token.content in separators:
-            path = []
-        elif token.kind != "mark":
-            path.append(token)
-    return paths
 
 
 def _unique(names: list[str]) -> list[str]:
@@ -405,7 +398,7 @@ def _unique(names: list[str]) -> list[str]:
 def skeleton_pattern(line: Line) -> re.Pattern[str]:
     """Return the regular expression of all lines with the skeleton of a line. Each number is a group."""
     patterns = {_CODES[kind]: pattern for kind, pattern in _PATTERNS.items()}
-    return re.compile("".join(patterns.get(part) or re.escape(part) for part in line.skeleton) + _END)
+    return re.compile("".join(patterns.get(part) or re.escape(part) for part in line.skeleton) + r"[\s,;]*+")
 
 
 def line_values(pattern: re.Pattern[str], text: str) -> tuple[float, ...] | None:
@@ -428,8 +421,8 @@ def _value(number: str) -> float:
     """Return the value of a number, which is NaN for `ovf`, or the seconds since midnight of a time of day."""
     if ":" in number:
         hours, minutes, seconds = number.split(":")
-        fraction = re.sub("[.,]", "", seconds[2:])  # two digits are before the fraction
-        return 3600.0 * int(hours) + 60.0 * int(minutes) + float(f"{seconds[:2]}.{fraction}")
+        whole_seconds, *fractions = re.split("[.,]", seconds)
+        return 3600.0 * int(hours) + 60.0 * int(minutes) + float(f"{whole_seconds}.{''.join(fractions)}")
     if "x" in number.lower():
         return float(int(number, 16))
     if number[-3:].lower() == "ovf":
@@ -458,10 +451,9 @@ def header_names(header: str, line: Line) -> tuple[str, ...]:
     line_separator = "\t" if "\t" in line.text else _separator(line.skeleton)
     if separator is None and line_separator is not None:
         return ()
-    columns = [column for column in header.split(separator) if column.strip()]
+    columns = header.rstrip(_IGNORED_AT_END).split(separator)
     if len(columns) != len(starts):  # select the columns of the numbers without names
-        first_column = 0 if line_separator is None else -1  # the part before the first separator is the first column
-        indices = [len(line.text[:start].split(line_separator)) + first_column for start in starts]
+        indices = [len(line.text[: start + 1].split(line_separator)) - 1 for start in starts]
         columns = [columns[index] for index in indices if index < len(columns)]
     # A label with a colon may stand before a name, as in `Data: A, B, C`.
     names = tuple(column.rpartition(":")[2].strip(" \"'") for column in columns)
