@@ -246,6 +246,14 @@ def test_number_does_not_begin_before_the_bytes_that_a_checksum_covers():
     assert section["fields"][0] == {"name": "seq", "type": "u8"}
 
 
+def test_datagrams_are_recognised_even_if_a_line_feed_was_added_to_some():
+    """A UDP socket adds a line feed to a datagram whose bytes are all printable."""
+    datagrams = [struct.pack("<H4h", number, *row) for number, row in enumerate(VALUES[:200].astype(int).tolist())]
+    datagrams[7::20] = [datagram + b"\n" for datagram in datagrams[7::20]]
+    section = recognise(datagrams, 200 / RATE_HZ, are_datagrams=True)
+    assert (section["framing"], section["length"], len(section["fields"])) == ("datagram", 10, 5)
+
+
 @pytest.mark.parametrize(
     ("header", "notation", "rate_Hz", "expected"),
     [

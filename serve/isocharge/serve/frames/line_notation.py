@@ -15,7 +15,7 @@ _COMMANDS = r"(?:\x1b\[[0-9;?]*[A-Za-z])+"
 _COLOURS = rf"\x1b\[[0-9;]*m|^{_COMMANDS}|{_COMMANDS}$"
 """Regular expression of the colours that loggers use, and of commands to a terminal at the ends of a line."""
 
-_SIGNED_NUMBERS = r"[^\w.]?(?:[-+][0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?){2,}[^\w.]?"
+_SIGNED_NUMBERS = r"[^\w.]?(?:[-+]\.?[0-9][0-9.]*(?:[eE][-+]?[0-9]+)?){2,}[^\w.]?"
 """Regular expression of numbers with nothing but their signs between them, such as `<+003.5-003.4+005.8>`."""
 
 _NAMED_NUMBER = r"([A-Za-z]+)([-+]?[0-9]*\.[0-9]+(?:[eE][-+]?[0-9]+(?![.0-9]))?|[-+][0-9]+)[\s,;|]*"

@@ -126,7 +126,7 @@ def possible_parts(rows: Bytes, order: ByteOrder, checksum_start: int, frame_rat
     usual, is_constant = usual_bytes(rows)
     is_zero = is_constant & (usual == 0)
     length = rows.shape[1]
-    byte_step = 1 if order == "little" else -1  # reverses big-endian numbers, so that the lowest byte comes first
+    byte_step = 1 if order == "little" else -1
     parts_at_each_byte: list[list[Part]] = []
     for position in range(length):
         pad_score = Weights.constant if is_constant[position] else Weights.noise
@@ -139,10 +139,10 @@ def possible_parts(rows: Bytes, order: ByteOrder, checksum_start: int, frame_rat
             if is_constant[position:end].all():
                 parts.append(Part(CHANNEL, type_name, end - position, Weights.constant, is_constant=True))
                 continue
-            number_bytes = rows[:, position:end][:, ::byte_step]
-            number_is_constant = is_constant[position:end][::byte_step]
-            number_is_zero = is_zero[position:end][::byte_step]
-            parts += _number_parts(number_bytes, number_is_constant, number_is_zero, type_name, frame_rate_Hz)
+            lowest_first = list(range(position, end)[::byte_step])
+            parts += _number_parts(
+                rows[:, lowest_first], is_constant[lowest_first], is_zero[lowest_first], type_name, frame_rate_Hz
+            )
         parts_at_each_byte.append(parts)
     return parts_at_each_byte
 

@@ -13,7 +13,6 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import product
-from math import gcd
 from typing import NamedTuple
 
 import numpy as np
@@ -105,11 +104,14 @@ def possible_divisions(chunks: Sequence[bytes], *, are_datagrams: bool) -> Itera
     """
     data = b"".join(chunks)[:MAX_EXAMINED_BYTES]
     if are_datagrams:
-        # The length of a frame divides the length of every datagram. It therefore also divides the greatest common
-        # divisor of these lengths.
-        divisible_length = gcd(*map(len, chunks))
-        lengths = range(MIN_FRAME_BYTES, min(divisible_length, MAX_FRAME_BYTES) + 1)
-        yield [_adjacent_frames(DATAGRAM, data, length) for length in lengths if divisible_length % length == 0]
+        # The length of a frame divides the lengths of nearly all datagrams. A line feed may follow the frames of the
+        # others; see `DatagramParser`.
+        divisions = []
+        for length in range(MIN_FRAME_BYTES, MAX_FRAME_BYTES + 1):
+            whole_datagrams = [chunk for chunk in chunks if len(chunk) % length == 0]
+            if len(whole_datagrams) >= INTACT_SHARE * len(chunks):
+                divisions.append(_adjacent_frames(DATAGRAM, b"".join(whole_datagrams)[:MAX_EXAMINED_BYTES], length))
+        yield divisions
     for name, stuffing in STUFFINGS.items():
         yield _stuffed_frames(name, stuffing, data)
     yield _synchronised_frames(data)

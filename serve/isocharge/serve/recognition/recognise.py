@@ -4,6 +4,7 @@ The format is the binary frames of isocharge, lines of text, or frames of fixed 
 """
 
 from collections.abc import Iterator, Sequence
+from itertools import chain, count
 from operator import itemgetter
 from string import printable
 from typing import Any
@@ -56,15 +57,12 @@ def described_frames_section(
         are_datagrams: Whether each chunk is a datagram.
     """
     byte_count = sum(map(len, chunks))
-    examined_share = min(1.0, MAX_EXAMINED_BYTES / max(1, byte_count))  # 1 if there are no bytes
-    examined_seconds = seconds * examined_share
+    examined_seconds = seconds * min(1.0, MAX_EXAMINED_BYTES / max(1, byte_count))
     for divisions in possible_divisions(chunks, are_datagrams=are_datagrams):
-        scored_layouts = [
-            scored_layout for division in divisions for scored_layout in _scored_layouts(division, examined_seconds)
-        ]
-        if scored_layouts:
-            _, best_layout = min(scored_layouts, key=itemgetter(0))
-            section: dict[str, Any] = to_builtins(best_layout)
+        scored_layouts = (_scored_layouts(division, examined_seconds) for division in divisions)
+        best = min(chain.from_iterable(scored_layouts), key=itemgetter(0), default=None)
+        if best is not None:
+            section: dict[str, Any] = to_builtins(best[1])
             return section
     return None
 
@@ -138,13 +136,11 @@ def _fields(parts: Sequence[Part]) -> tuple[Field, ...]:
     because the names of fields must differ. Adjacent padding is joined.
     """
     fields: list[Field] = []
-    names = [""]  # of padding, and of the previous parts
+    channel_numbers = count(1)
     for part in parts:
-        names.append(part.name)
-        if part.name == CHANNEL:
-            fields.append(Field(name=f"ch{names.count(CHANNEL)}", type_name=part.type_name))
-        elif part.name not in names[:-1]:
-            field = Field(name=part.name, type_name=part.type_name)
+        name = f"ch{next(channel_numbers)}" if part.name == CHANNEL else part.name
+        if name and name not in [field.name for field in fields]:
+            field = Field(name=name, type_name=part.type_name)  # a device file states no scale of 1
             fields.append(field if part.scale == 1.0 else structs.replace(field, scale=part.scale))
         else:
             adjacent_padding = fields.pop().count if fields and fields[-1].type_name == PADDING else 0
