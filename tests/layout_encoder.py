@@ -16,11 +16,12 @@ def packed_number(field, value, byte_order):
     if field.type_name in LARGEST_FLOATS:
         largest = LARGEST_FLOATS[field.type_name]
         return min(max(number, -largest), largest)
-    smallest = -field.modulus // 2 if field.is_signed else 0
+    is_signed = field.type_name[0] == "i"
+    smallest = -field.modulus // 2 if is_signed else 0
     if field.name in (SEQ, *TIMES_US):
         number = (round(number) - smallest) % field.modulus + smallest
     whole = round(min(max(number, smallest), smallest + field.modulus - 1))
-    return whole.to_bytes(3, byte_order, signed=field.is_signed) if field.size == 3 else whole
+    return whole.to_bytes(3, byte_order, signed=is_signed) if field.size == 3 else whole
 
 
 def encode_layout(layout, frame):

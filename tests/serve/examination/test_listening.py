@@ -55,3 +55,9 @@ def test_baud_rate_is_found(monkeypatch, silence_s, other_bytes, bauds, tried, g
     assert report.seconds == pytest.approx(2.0)
     assert opened_bauds == tried
     assert good or "another baud rate" in report.missing[0]
+
+
+@pytest.mark.parametrize("jump_s", [-3600.0, 3600.0])
+def test_wall_clock_that_is_set_while_listening_does_not_change_the_time_span(jump_s):
+    chunks = [Chunk(b"1", 1e9 + k + jump_s * (k > 2), 1_000_000_000 * k) for k in range(5)]
+    assert listening.ReceivedData("/dev/ttyUSB9", 9600, chunks=chunks).span_s == pytest.approx(5.0)

@@ -64,7 +64,7 @@ class ReceivedData:
         """
         span_s = self.seconds
         if len(self.chunks) > 1:
-            first_to_last_s = self.chunks[-1].timestamp - self.chunks[0].timestamp
+            first_to_last_s = self.chunks[-1].elapsed_since(self.chunks[0])
             span_s = first_to_last_s * len(self.chunks) / (len(self.chunks) - 1)
         return max(span_s, np.finfo(float).eps)
 

@@ -189,9 +189,9 @@ def examine_received(
     gain_rule = device.rule(GainRule)
     if gain_rule is not None:
         unit = "pC"
-        for column, electrode in enumerate(electrode_at_position.values()):
+        for charge, electrode in zip(charges.T, electrode_at_position.values(), strict=True):
             with np.errstate(over="ignore"):  # an unusable value may become infinite, and is ignored later
-                charges[:, column] = gain_rule.charge_pC(electrode, charges[:, column])
+                charge[:] = gain_rule.charge_pC(electrode, charge)
     channels = tuple(
         measure_channel_health(capture.names[position], charge, times_s[is_rest], capture.rate_Hz)
         for position, charge in zip(electrode_at_position, charges.T, strict=True)

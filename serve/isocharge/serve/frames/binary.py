@@ -41,7 +41,7 @@ def encode_frame(frame: Frame) -> bytes:
     """Encode a frame with COBS, and append the delimiter. A missing counter or clock is encoded as zero.
 
     Raises:
-        struct.error: If a number does not fit its field.
+        struct.error, OverflowError: If a number does not fit its field.
     """
     charge_count = len(frame.values)
     header = HEADER.pack(FRAME_VERSION, frame.seq or 0, frame.t_us or 0, charge_count, frame.bits)

@@ -138,11 +138,6 @@ class Field(Settings, frozen=True, kw_only=True, omit_defaults=True):
         """Number of different values of an integer of this size, at which an unsigned counter wraps to 0."""
         return 1 << 8 * self.size
 
-    @property
-    def is_signed(self) -> bool:
-        """Whether the field contains signed integers."""
-        return self.type_name.startswith("i")
-
 
 SYNC: Final = "sync"
 """Name of the framing in which every frame begins with a sync pattern."""
@@ -290,7 +285,9 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         if self.compute_checksum(data[:checksum_start]) != data[checksum_start:]:
             raise ChecksumError("the checksum is wrong")
         numbers = [  # `struct` unpacks fields of three bytes as bytes
-            int.from_bytes(number, self.byte_order, signed=field.is_signed) if isinstance(number, bytes) else number
+            int.from_bytes(number, self.byte_order, signed=field.type_name == "i24")
+            if isinstance(number, bytes)
+            else number
             for field, number in zip(self.fields, self.body.unpack_from(data, len(self.sync)), strict=True)
         ]
         return self.columns.frame(numbers)

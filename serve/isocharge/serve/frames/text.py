@@ -199,15 +199,17 @@ class TextParser(DelimitedParser):
         if any(header_names(header, line_below_header) for header in self._headers):
             line = line_below_header
         layout = self.layout
+        has_numbers = bool(line.names)
         self.unread_line = text
-        if line.names:  # the line contains numbers
-            return self._recognise_layout(line, size) if layout is None else self._reject(size)
         if layout is None:
+            if has_numbers:
+                return self._recognise_layout(line, size)
             self._headers.append(text)
             columns = text.replace(",", " ").replace(";", " ").split()
             is_plain_header = all(column[0].isalpha() for column in columns)
             return [] if is_plain_header else self._reject(size)
-        if all(layout.names) or not layout.name_unnamed(self._meant(header_names(text, layout.example))):
+        names = self._meant(header_names(text, layout.example))
+        if has_numbers or all(layout.names) or not layout.name_unnamed(names):
             return self._reject(size)
         self._describe_layout(layout)
         return []

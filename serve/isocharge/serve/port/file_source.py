@@ -151,13 +151,12 @@ class FileSource:
             InputError: If the file is a recording, a table or another file that does not come from a board.
         """
         start_s = time.time()
-        is_first_chunk = True
-        while data := os.read(self._descriptor, HEAD_BYTES):
-            if is_first_chunk:
-                check_bytes(self._name, data)
-            is_first_chunk = False
+        data = os.read(self._descriptor, HEAD_BYTES)
+        check_bytes(self._name, data)
+        while data:
             arrival_s = start_s if self.is_on_disk else time.time()
             yield Chunk(data, arrival_s, time.perf_counter_ns())
+            data = os.read(self._descriptor, HEAD_BYTES)
 
 
 @contextmanager

@@ -346,13 +346,9 @@ class AddedSource:
         """
         with self._errors_named():
             for chunk in self._source:
-                if len(chunk.data) <= MAX_READ_BYTES:
-                    yield chunk
-                    continue
-                outage_s = chunk.outage_s
                 for start in range(0, len(chunk.data), MAX_READ_BYTES):
+                    outage_s = chunk.outage_s if start == 0 else 0.0  # the outage ended with the first part
                     yield chunk._replace(data=chunk.data[start : start + MAX_READ_BYTES], outage_s=outage_s)
-                    outage_s = 0.0  # the outage ended with the first part
 
     @contextlib.contextmanager
     def _errors_named(self) -> Iterator[None]:
