@@ -14,7 +14,7 @@ from msgspec import structs, to_builtins
 
 from isocharge.common.arrays import Booleans
 from isocharge.serve.frames.formats import AutoParser
-from isocharge.serve.frames.frame import SEQ, Frame
+from isocharge.serve.frames.frame import SEQ, TIMES_US, Frame
 from isocharge.serve.frames.frame_layout import PADDING, SYNC, Field, FrameLayout
 from isocharge.serve.frames.text import Layout, TextParser
 from isocharge.serve.recognition.fields import (
@@ -168,21 +168,19 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
     # Use only the frames with as many values as the last frame. Earlier frames have another number of values if a
     # header later names one of the columns as counter or clock.
     frames = [frame for frame in all_frames if len(frame.values) == len(all_frames[-1].values)]
-    is_covered = parser.counts.bytes_dropped <= (1.0 - COVERED_SHARE) * len(data)
-    text_section = None
+    section: dict[str, Any] | None = None
     if len(frames) >= MIN_FRAMES:
-        (recognised_parser,) = parser.candidates
+        section = {"format": "binary"}
+        (recognised_parser,) = parser.candidates  # since the first frame, only one parser is left
         if isinstance(recognised_parser, TextParser) and recognised_parser.layout is not None:
-            frame_rate_Hz = len(frames) / seconds
-            text_section = {"format": "text"} | _text_keys(recognised_parser.layout, frames, frame_rate_Hz)
-        if is_covered:
-            return text_section or {"format": "binary"}
-    if _is_text(data):
-        return text_section
+            frame_rate_Hz = len(all_frames) / seconds
+            section = {"format": "text"} | _text_keys(recognised_parser.layout, frames, frame_rate_Hz)
+    is_covered = parser.counts.bytes_dropped <= (1.0 - COVERED_SHARE) * len(data)
+    if _is_text(data) or (section and is_covered):
+        return section
 
     # If most of the bytes are not lines of one layout, the board may send binary frames that resemble text in places.
-    described_section = described_frames_section(chunks, seconds, are_datagrams=are_datagrams)
-    return described_section or text_section
+    return described_frames_section(chunks, seconds, are_datagrams=are_datagrams) or section
 
 
 def _is_text(data: bytes, min_share: float = 0.85) -> bool:
@@ -218,24 +216,23 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
     names = list(layout.names)
     keys: dict[str, Any] = {}
     unnamed_channels: list[int] = []
-    has_counter = frames[-1].seq is not None
-    has_clock = frames[-1].t_us is not None
     steps = np.diff([frame.values for frame in frames], axis=0)  # shape (n - 1, channels)
     for (column, _), channel_steps in zip(layout.columns.channels, steps.T, strict=True):
         name = names[column]
+        meaning = ""
         is_counter, clock = identify(channel_steps, frame_rate_Hz)
         has_time_name = clock is not None and any(word in name.lower() for word in ("ms", "milli", "time"))
-        if is_counter and not has_counter and not has_time_name:
-            names[column] = SEQ
-            has_counter = True
+        if is_counter and SEQ not in names and not has_time_name:
+            meaning = SEQ
         # A device file for lines of text cannot state another duration of a tick.
-        elif clock is not None and clock[1] == 1.0 and not has_clock:
-            names[column] = clock[0]
-            has_clock = True
+        elif clock is not None and clock[1] == 1.0 and TIMES_US.keys().isdisjoint(names):
+            meaning = clock[0]
         elif not name:
             unnamed_channels.append(column)
-        if column not in layout.unnamed and names[column] != name:
-            keys[names[column]] = name
+        if meaning:
+            names[column] = meaning
+            if column not in layout.unnamed:
+                keys[meaning] = name
 
     # Number the channels without names. Without names from a header, a counter or a clock, the columns need no names.
     if any(names[column] for column in layout.unnamed):
