@@ -275,10 +275,10 @@ class TextParser(DelimitedParser):
             values = line_values(pattern, text)
             if values is None:
                 continue
-            if position != len(self._cycle):
+            if position != len(self._cycle):  # a line of a cycle is lost
                 self._drop_cycle()
-            if position != len(self._cycle):  # the beginning of this cycle is lost
-                return self._reject(size)
+                if position > 0:
+                    return self._reject(size)
             self._cycle.append((values, size))
             if len(self._cycle) < len(layout.patterns):
                 return []
