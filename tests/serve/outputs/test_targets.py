@@ -3,6 +3,7 @@
 import csv
 import re
 from contextlib import nullcontext
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -160,6 +161,13 @@ def test_output_that_fails_ends_a_replay_with_its_name(record):
     outputs = Outputs(["broken"], context()).__enter__()
     with pytest.raises(OutputError, match=r"broken: the output failed \(RuntimeError: not open\)"):
         outputs.write(record())
+
+
+def test_full_disk_below_standard_output_is_an_error_with_the_target(record):
+    with Path("/dev/full").open("wb", buffering=0) as full:
+        outputs = Outputs(["json"], context(write_stdout=lambda text: full.write(text.encode()))).__enter__()
+        with pytest.raises(OutputError, match="json cannot be written: No space left on device"):
+            outputs.write(record())
 
 
 @pytest.mark.usefixtures("failing")

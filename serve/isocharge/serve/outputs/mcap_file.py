@@ -16,7 +16,6 @@ import time
 from pathlib import Path
 
 from isocharge.common.errors import require
-from isocharge.common.files import as_output_errors
 from isocharge.serve.outputs.output import FileOutput
 from isocharge.serve.outputs.ros_messages import (
     DEFINITIONS,
@@ -78,18 +77,17 @@ class McapFile(FileOutput):
         if is_ros2:
             channels[0] = (RECORD_TOPIC, "cdr", STRING, "ros2msg", DEFINITIONS[STRING])
         self._channels: dict[str, int] = {}  # identifier of the channel of each topic
-        with as_output_errors(path):
-            self._writer.start(profile="ros2", library="isocharge")
-            for topic, encoding, schema_name, schema_encoding, schema in channels:
-                schema_id = self._writer.register_schema(schema_name, schema_encoding, schema.encode())
-                self._channels[topic] = self._writer.register_channel(topic, encoding, schema_id)
+        self._writer.start(profile="ros2", library="isocharge")
+        for topic, encoding, schema_name, schema_encoding, schema in channels:
+            schema_id = self._writer.register_schema(schema_name, schema_encoding, schema.encode())
+            self._channels[topic] = self._writer.register_channel(topic, encoding, schema_id)
 
     def write(self, record: PredictionRecord) -> None:
         """Write a record, its wrench if the force is known, and its pose if something touches the film.
 
         Raises:
             InputError: If a time stamp of ROS 2 cannot represent the time of the record.
-            OutputError: If the disk is full or was removed.
+            OSError: If the disk is full or was removed.
         """
         values = with_tracked_contact(record.json_values)
         time_ns = ros_time_ns(values)
@@ -100,22 +98,20 @@ class McapFile(FileOutput):
             POSE_TOPIC: pose_stamped(values, time_ns),
         }
         sequence = self.records % (1 << 32)  # the number in the file has 32 bits
-        with as_output_errors(self.path):
-            for topic, message in messages.items():
-                if message is not None:
-                    channel = self._channels[topic]
-                    self._writer.add_message(channel, time_ns, message, publish_time=time_ns, sequence=sequence)
-            self.records += 1
-            if time.monotonic() - self._flush_time_s >= FLUSH_INTERVAL_S:
-                self._writer.flush()  # type: ignore[no-untyped-call]
-                self._flush_time_s = time.monotonic()
+        for topic, message in messages.items():
+            if message is not None:
+                channel = self._channels[topic]
+                self._writer.add_message(channel, time_ns, message, publish_time=time_ns, sequence=sequence)
+        self.records += 1
+        if time.monotonic() - self._flush_time_s >= FLUSH_INTERVAL_S:
+            self._writer.flush()  # type: ignore[no-untyped-call]
+            self._flush_time_s = time.monotonic()
 
     def close(self) -> None:
         """Write the index of the messages, and close the file. In a replay, also rename it to its final name."""
-        with as_output_errors(self.path):
-            try:
-                self._writer.finish()  # type: ignore[no-untyped-call]
-            except BaseException:
-                self.discard()
-                raise
-            super().close()
+        try:
+            self._writer.finish()  # type: ignore[no-untyped-call]
+        except BaseException:
+            self.discard()
+            raise
+        super().close()

@@ -221,12 +221,14 @@ def output_error(error: Exception, target: str) -> Exception:
     """Return an error of an output as an error that states its cause and the target.
 
     Args:
-        error: The error. An `IsochargeError` or an `OSError` states its cause already.
+        error: The error. An `IsochargeError` states its cause already. A broken pipe is not an error of the output.
         target: Target of the output.
     """
-    if isinstance(error, (IsochargeError, OSError)):
+    if isinstance(error, IsochargeError | BrokenPipeError):
         return error
     output_failure = OutputError(f"{target}: the output failed ({type(error).__name__}: {error})")
+    if isinstance(error, OSError):
+        output_failure = OutputError(f"{target} cannot be written: {error.strerror or error}; choose another output")
     output_failure.__cause__ = error
     return output_failure
 

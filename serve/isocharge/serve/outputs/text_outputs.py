@@ -14,7 +14,6 @@ from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from isocharge.common.errors import InputError, shown
-from isocharge.common.files import as_output_errors
 from isocharge.serve.outputs.output import FileOutput, OutputContext, OutputKind, is_file_with
 from isocharge.serve.record.formats import csv_header, csv_row
 from isocharge.serve.record.record import PredictionRecord, record_fields
@@ -65,7 +64,7 @@ class TextFile(FileOutput):
     """Output that writes one line to a new file for each record.
 
     Attributes:
-        write: Function that writes the line of a record. It raises an `OutputError` if the disk is full.
+        write: Function that writes the line of a record. It raises an `OSError` if the disk is full.
     """
 
     def __init__(self, path: Path, lines: LineFormat, *, is_live: bool) -> None:
@@ -81,11 +80,7 @@ class TextFile(FileOutput):
             OutputError: If the file cannot be created.
         """
         super().__init__(path, is_live=is_live)
-        self.write = TextOutput(self._write_text, lines).write
-
-    def _write_text(self, text: str) -> None:
-        with as_output_errors(self.path):
-            self._file.write(text.encode())
+        self.write = TextOutput(lambda text: self._file.write(text.encode()), lines).write
 
 
 def _text_kinds(name: str, suffix: str, lines: Callable[[OutputContext], LineFormat]) -> tuple[OutputKind, OutputKind]:
