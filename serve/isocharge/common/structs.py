@@ -212,8 +212,7 @@ def _describe_mistake(value: Any, expected_type: Any, error: msgspec.ValidationE
     Args:
         value: Value from TOML or JSON.
         expected_type: Type to which the value cannot be converted.
-        error: Exception of msgspec. If `__post_init__` of a struct has raised an exception, that exception is the
-            cause of `error`.
+        error: Exception of msgspec. If `__post_init__` of a struct has raised a `WrongKey`, it is the cause of `error`.
         path: Names of the keys that lead to the value; empty for the whole content.
     """
     item_types = _item_types(value, expected_type)
@@ -227,13 +226,11 @@ def _describe_mistake(value: Any, expected_type: Any, error: msgspec.ValidationE
             item_path = f"{path}[{key}]" if isinstance(key, int) else _join(path, key)
             return _describe_mistake(item, item_type, item_error, item_path)
 
-    wrong_key = _WRONG_KEY.match(str(error))
     cause = error.__cause__
     if isinstance(cause, WrongKey):
         key_path = _join(path, cause.key)
         return f"{key_path}: {cause}" if str(cause) else f"key {key_path!r} is missing"
-    if cause is not None:
-        return f"{_prefix(path)}{cause}"
+    wrong_key = _WRONG_KEY.match(str(error))
     if wrong_key is None:
         expected = _describe_schema(msgspec.json.schema(expected_type))
         return f"{_prefix(path)}expected {expected}, got {shown(value)}"
@@ -347,8 +344,6 @@ _NOUNS = {
 
 def _noun(schema: Mapping[str, Any]) -> str:
     """Return the noun for the values that a schema allows, such as "number", or "value" if they have several types."""
-    if "contentEncoding" in schema:
-        return "text in base64"
     is_struct = "$ref" in schema or "discriminator" in schema
     return _NOUNS.get("object" if is_struct else schema.get("type", ""), "value")
 
@@ -367,5 +362,4 @@ def _describe_number(noun: str, schema: Mapping[str, Any]) -> str:
         return f"a positive {noun}"
     if not bounds and noun == "number":
         return "a finite number"
-    texts = [f"{word} {bound:g}" if isinstance(bound, float) else f"{word} {bound}" for word, bound in bounds.items()]
-    return " ".join([f"a {noun}", *texts])
+    return " ".join([f"a {noun}", *(f"{word} {bound:.16g}" for word, bound in bounds.items())])
