@@ -83,14 +83,13 @@ class Prediction(Stage):
         A contact is valid within the working area and the forces of this predictor.
         """
         self._predictor = predictor_for(setup.device, setup.model)
-        self._validity = self._predictor.validity
         setup.predictor = self._predictor
 
     def step(self, frame: Frame) -> None:
         """Predict the contact of a frame, unless nothing touches the film or the frame has no charges."""
         if frame.charge_pC is None or not frame.is_contact:
             return
-        frame.set_contact(self._predictor.predict(frame.charge_pC), self._validity)
+        frame.set_contact(self._predictor.predict(frame.charge_pC), self._predictor.validity)
 
 
 STAGES: tuple[type[Stage], ...] = (
@@ -166,8 +165,8 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     if isinstance(frames, Mapping):  # `convert` adds a missing section, and reports an error if it is not a mapping
         complete_table["frames"] = {"format": "auto", **frames}
     sections: Any = convert(complete_table, DeviceSections, where, DeviceError)
-    used_rules = [section for section in structs.asdict(sections).values() if isinstance(section, Rule) and section.on]
-    rules = {type(rule): rule for rule in used_rules}
+    values = structs.asdict(sections).values()
+    rules = {type(value): value for value in values if isinstance(value, Rule) and value.on}
     return Device(sections.name, sections.front_end, sections.frames, sections.channels, rules, table, where)
 
 

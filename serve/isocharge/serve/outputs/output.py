@@ -17,10 +17,9 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, Queue
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 from isocharge.common.errors import IsochargeError, OutputError
 from isocharge.common.files import AtomicWriter, new_file
@@ -49,8 +48,7 @@ class Output(Protocol):
         """
 
 
-@dataclass(frozen=True, kw_only=True)
-class OutputContext:
+class OutputContext(NamedTuple):
     """Properties of a stream of records, which are passed to the outputs.
 
     Attributes:
@@ -67,8 +65,7 @@ class OutputContext:
     write_stdout: Callable[[str], object] = sys.stdout.write
 
 
-@dataclass(frozen=True, kw_only=True)
-class OutputKind:
+class OutputKind(NamedTuple):
     """A kind of output, such as CSV files. The form of a target decides which kind of output is used.
 
     Attributes:

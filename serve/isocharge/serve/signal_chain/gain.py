@@ -70,11 +70,10 @@ class Gain(Stage):
 
     def step(self, frame: Frame) -> None:
         """Convert the values of a frame to charges, and mark the frame if a value cannot be a charge."""
-        magnitude = math.hypot(*frame.sent.tolist())  # at least the largest absolute value; NaN if a value is NaN
-        is_valid = magnitude <= self.largest  # false for NaN
         with np.errstate(over="ignore"):  # a value may be so large that its conversion overflows
             frame.raw_pC = (frame.sent - self.zero) * self.gain_pC
-        if not is_valid:
+        magnitude = math.hypot(*frame.sent.tolist())  # at least the largest absolute value; NaN if a value is NaN
+        if not magnitude <= self.largest:  # the condition is negated, so that it is true for NaN
             self._skipped_s += frame.dt_s
             self._skipped_intervals += frame.intervals
             frame.is_valid = False

@@ -113,7 +113,7 @@ class Tare(Stage):
         if frame.charge_pC is None:
             return
         if self._tare_pC is None:
-            self._search(frame)
+            self._search(frame, frame.charge_pC)
             frame.charge_pC = None
             frame.flags.append(TARE)
             return
@@ -150,20 +150,23 @@ class Tare(Stage):
         difference_pC = frame.charge_pC.clip(-rule.noise_limit_pC, rule.noise_limit_pC)
         return difference_pC * -math.expm1(-frame.dt_s / rule.relax_s)
 
-    def _search(self, frame: Frame) -> None:
+    def _search(self, frame: Frame, charge_pC: Array) -> None:
         """Add a frame to the latest frames, and measure the tare if these frames are enough and quiet.
 
         If the tare is switched off, the tare is 0.
+
+        Args:
+            frame: The frame.
+            charge_pC: Charges of the frame, shape (n_electrode,), pC.
 
         Raises:
             TareError: If the frames are not quiet, and the search has lasted for `TareRule.patience` frames.
         """
         rule = self._rule
-        assert frame.charge_pC is not None
         if rule is None:
             self._tare_pC = np.zeros(len(self._electrodes))
             return
-        stored_pC = np.vstack([self._latest_pC, frame.charge_pC])
+        stored_pC = np.vstack([self._latest_pC, charge_pC])
         self._latest_pC = stored_pC[-rule.frames :]  # at most as many frames as a tare needs
         self._remaining_frames -= 1
         if len(self._latest_pC) < rule.frames:

@@ -35,9 +35,6 @@ VELOCITY = slice(3, 5)
 IS_MOVING = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0], [1.0, 1.0, 1.0]])
 """Whether x, y and ln F change (1) or are held (0) in each of the four modes."""
 
-_CHANGE_COUNT = np.array([[0, 1, 1, 2], [1, 0, 2, 1], [1, 2, 0, 1], [2, 1, 1, 0]])
-"""Number of changes between two modes: the position starts or stops, and the force starts or stops to change."""
-
 MEAN_MODE_TIME_s = 0.7
 """Mean time after which a position or a force that is held starts to change, or the reverse, s."""
 
@@ -217,10 +214,12 @@ class MotionFilter:
         Args:
             dt_s: Time until the next frame, s, not negative.
         """
-        # Joint probability of each new mode (row) and each previous mode (column)
+        # Probability that a value is held or moves (row) after it was held or moved (column). Position and force change
+        # independently.
         change = min(dt_s / MEAN_MODE_TIME_s, 0.5)
-        by_count = np.array([(1.0 - change) ** 2, change * (1.0 - change), change**2])
-        joint = by_count[_CHANGE_COUNT] * self.probability
+        of_value = np.array([[1.0 - change, change], [change, 1.0 - change]])
+        of_mode = (of_value[:, None, :, None] * of_value[:, None]).reshape(4, 4)
+        joint = of_mode * self.probability  # of each new mode (row) and each previous mode (column)
         self.probability = joint.sum(axis=1)
         mean, covariance = mixture_moments(joint / self.probability[:, None], self.mean, self.covariance)
 
