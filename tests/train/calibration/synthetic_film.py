@@ -57,11 +57,10 @@ class SyntheticFilm:
 
     def linearised(self, values, contact):
         terms = np.column_stack([np.ones(len(contact)), with_log_force(contact)])
-        charge = np.exp(terms @ self.coefficients(values))
-        return charge, charge[:, :, None] * np.einsum("nf,fke->nek", terms, self.effects)
+        coefficients = self.coefficients(values)
+        charge = np.exp(terms @ coefficients)
+        contact_slopes = charge[:, :, None] * coefficients[1:].T
+        return charge, contact_slopes, charge[:, :, None] * np.einsum("nf,fke->nek", terms, self.effects)
 
     def charges(self, values, contact):
         return self.linearised(values, contact)[0]
-
-    def contact_slopes(self, values, contact):
-        return self.charges(values, contact)[:, :, None] * self.coefficients(values)[1:].T

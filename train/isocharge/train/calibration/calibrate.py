@@ -212,7 +212,7 @@ def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
         return False
     if solved.sensor.film.shear != wanted.sensor.film.shear:
         return False
-    charge, jacobian = charges.linearised(values, contact)
+    charge, _, jacobian = charges.linearised(values, contact)
     # The effects of the imperfections that do not change the stress are exact.
     is_missing = charges.prior.is_imperfection & charges.prior.changes_stress
     missing = np.where(is_missing, values - charges.values, 0.0)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from isocharge.common.arrays import Array
+from isocharge.serve.model.robust_estimate import ModelValues
 from isocharge.simulate import Circle, Domain, FilmPrior, FilmSlopes, ForwardMap, Probe, Sensor, SolveSettings
 from isocharge.simulate.forward.derivative_maps import few_nodes
 from isocharge.simulate.forward.family import nearest_to_clamp
@@ -80,23 +81,23 @@ class FilmCharges:
 
     def charges(self, values: Array, contact: Array) -> Array:
         """Compute the charges of presses on a film with given properties, shape (n, n_electrode), pC."""
-        solved_charge, stress_derivatives = self._solved_charges(self._electrodes(values), contact)
+        solved_charge, _, stress_derivatives = self._solved_charges(self._electrodes(values), contact)
         charge, _ = self._changed(values, solved_charge, stress_derivatives)
         return charge
 
-    def linearised(self, values: Array, contact: Array) -> tuple[Array, Array]:
-        """Compute the charges of presses on a film, and their derivatives with respect to the properties.
+    def linearised(self, values: Array, contact: Array) -> ModelValues:
+        """Compute the charges of presses on a film, and their derivatives.
 
         Args:
             values: Properties of the film, shape (n_property,).
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Charges, shape (n, n_electrode), pC, and their derivatives, shape (n, n_electrode, n_property), pC per unit
-            of the property.
+            Charges and their derivatives. The derivatives with respect to the contact are those of the solved film, and
+            the state consists of the properties, shape (n_property,).
         """
         sensor = self._electrodes(values)
-        solved_charge, stress_derivatives = self._solved_charges(sensor, contact)
+        solved_charge, contact_slopes, stress_derivatives = self._solved_charges(sensor, contact)
         charge, factor = self._changed(values, solved_charge, stress_derivatives)
 
         derivatives = {**stress_derivatives, "crosstalk": solved_charge.sum(axis=1, keepdims=True) - solved_charge}
@@ -110,7 +111,7 @@ class FilmCharges:
             derivatives[one.name] if one.name in derivatives else self._read_difference(sensor, one, contact)
             for one in self.prior.properties
         ]
-        return charge, factor[:, :, None] * np.stack(columns, axis=2)
+        return ModelValues(charge, contact_slopes, factor[:, :, None] * np.stack(columns, axis=2))
 
     def _changed(
         self, values: Array, solved_charge: Array, stress_derivatives: dict[str, Array]
@@ -137,15 +138,6 @@ class FilmCharges:
         charge = np.where(is_logarithmic, solved_charge * factor, solved_charge + charge_change)
         return charge, factor
 
-    def contact_slopes(self, values: Array, contact: Array) -> Array:
-        """Compute the derivatives of the charges with respect to (x, y, ln F), shape (n, n_electrode, 3).
-
-        Args:
-            values: Properties of the film, shape (n_property,).
-            contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        """
-        return _read(self.film, self._electrodes(values)).derivatives(contact)
-
     def _electrodes(self, values: Array) -> Sensor:
         """Return a sensor with the electrodes and the piezoelectric coefficients of given properties.
 
@@ -166,8 +158,8 @@ class FilmCharges:
             value[name] = described_MPa + value[name] * value[PRETENSION.name]
         return value
 
-    def _solved_charges(self, sensor: Sensor, contact: Array) -> tuple[Array, dict[str, Array]]:
-        """Compute the charges of the solved film, and their derivatives with respect to properties.
+    def _solved_charges(self, sensor: Sensor, contact: Array) -> tuple[Array, Array, dict[str, Array]]:
+        """Compute the charges of the solved film, and their derivatives with respect to the contact and to properties.
 
         The properties are those that change the stress. The derivatives with respect to the uneven parts of the
         pretension are those per MPa.
@@ -180,14 +172,14 @@ class FilmCharges:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Charges, shape (n, n_electrode), pC, and derivatives by the name of the property, each of shape (n,
-            n_electrode), pC per unit.
+            Charges, shape (n, n_electrode), pC. Derivatives with respect to (x, y, ln F), shape (n, n_electrode, 3).
+            Derivatives by the name of the property, each of shape (n, n_electrode), pC per unit.
         """
         solved_film = _read(self.film, sensor)
-        charge = solved_film.charges(contact)
+        charge, contact_slopes = solved_film.linearised(contact)
         film, fields = _read(self.slopes.film, sensor), _read(self.slopes.fields, sensor)
         derivatives = replace(self.slopes, film=film, fields=fields).jacobian(contact)
-        force_slope = solved_film.derivatives(contact)[:, :, 2]
+        force_slope = contact_slopes[:, :, 2]
         derivatives["thickness"] = -force_slope
         mechanics = self._mechanics(self.values)
         tension_terms = (mechanics[name] * derivatives[name] for name in (PRETENSION.name, *UNEVEN_TENSIONS))
@@ -197,7 +189,7 @@ class FilmCharges:
             derivatives[PROBE_RADIUS] = (
                 _read(self.larger_probe, sensor).charges(contact) - film.charges(contact)
             ) / step
-        return charge, derivatives
+        return charge, contact_slopes, derivatives
 
     def _read_difference(self, sensor: Sensor, one: FilmProperty, contact: Array) -> Array:
         """Compute the derivative with respect to a property that does not change the stress, by central differences."""

@@ -215,7 +215,7 @@ def _directions(charges: FilmCharges, film: FilmEstimate, contact: Array, charge
         Changes by one standard deviation of each direction, shape (n, n_direction, n_electrode), pC.
     """
     layout = film.layout
-    _, film_jacobian = charges.linearised(film.film_values, contact)
+    *_, film_jacobian = charges.linearised(film.film_values, contact)
     jacobian = np.concatenate([film_jacobian, discrepancy_jacobian(charge, contact, charges.domain)], axis=2)
 
     # Square root of the covariance of the film's properties and of the coefficients

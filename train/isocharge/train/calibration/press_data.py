@@ -166,18 +166,13 @@ def model_values(charges: FilmCharges, layout: Layout, data: PressData, unknowns
         contact: Contacts (x, y, ln F), shape (n, 3).
     """
     metric_contact = in_domain(contact, charges.domain)
-    film_values = unknowns[layout.film]
-    charge, film_jacobian = charges.linearised(film_values, metric_contact)
+    charge, contact_slopes, film_jacobian = charges.linearised(unknowns[layout.film], metric_contact)
     session_jacobian = np.stack([one.effect(data.time, charge) for one in SESSION], axis=2)
 
     coefficient_jacobian = discrepancy_jacobian(charge, metric_contact, charges.domain)
     jacobian = np.concatenate([film_jacobian, session_jacobian, coefficient_jacobian], axis=2)
     beyond_film = slice(layout.film.stop, None)
-    return ModelValues(
-        charge_pC=charge + jacobian[:, :, beyond_film] @ unknowns[beyond_film],
-        by_contact=charges.contact_slopes(film_values, metric_contact),
-        by_state=jacobian,
-    )
+    return ModelValues(charge + jacobian[:, :, beyond_film] @ unknowns[beyond_film], contact_slopes, jacobian)
 
 
 def in_domain(contact: Array, domain: Domain) -> Array:
