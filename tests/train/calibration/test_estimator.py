@@ -34,7 +34,7 @@ ONE = Hypothesis(
 def _one_hypothesis(monkeypatch):
     """Estimate a film under one hypothesis, with nearly normal weights of the presses."""
     monkeypatch.setattr(estimator, "hypotheses", lambda *_: [ONE])
-    monkeypatch.setattr(estimator, "TYPICAL", ONE)
+    monkeypatch.setattr(estimator, "TYPICAL", ONE.sizes)
     monkeypatch.setattr(RobustProblem, "estimate", partialmethod(RobustProblem.estimate, tolerance=1e-4))
     monkeypatch.setattr(estimator, "RobustProblem", partial(RobustProblem, freedom=1e9))
 
@@ -42,7 +42,7 @@ def _one_hypothesis(monkeypatch):
 def draw_unknowns(problem, hypothesis, rng):
     """Draw all unknowns of a film under a hypothesis, within the bounds of the properties."""
     prior = problem.prior
-    unknowns = rng.multivariate_normal(prior.mean, prior.covariance(hypothesis))
+    unknowns = rng.multivariate_normal(prior.mean, prior.covariance(hypothesis.sizes))
     low, high = prior.layout.prior.bounds
     unknowns[prior.layout.film] = np.clip(unknowns[prior.layout.film], low, high)
     return unknowns
@@ -89,7 +89,7 @@ def test_estimate_minimises_the_sum_of_squares_of_all_unknowns_and_contacts(prob
     found = estimate(synthetic, data, problem.prior)
 
     prior, n_unknown = problem.prior, len(unknowns)
-    whitening = np.linalg.inv(np.linalg.cholesky(prior.covariance(ONE)))
+    whitening = np.linalg.inv(np.linalg.cholesky(prior.covariance(ONE.sizes)))
 
     def residuals(parameters):
         values, contact = prior.mean + parameters[:n_unknown], parameters[n_unknown:].reshape(-1, 3)

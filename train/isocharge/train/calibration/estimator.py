@@ -14,7 +14,7 @@ evidence.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
+from itertools import compress, product
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -23,7 +23,7 @@ from scipy.special import chdtrc, chdtri, softmax
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.contact_domain import with_log_force
 from isocharge.serve.model.robust_estimate import ModelValues, RobustPoint, RobustProblem
-from isocharge.simulate import NoiseModel, noise_model
+from isocharge.simulate import NoiseModel
 from isocharge.simulate.sensor.film_properties import UNEVEN_TENSIONS
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, Layout, unit_covariance
@@ -92,9 +92,9 @@ class Hypothesis:
     probability: float
 
     @property
-    def variances(self) -> Array:
-        """Factors of the parts of the prior covariance, shape (4 + n_session,); see `Prior.parts`."""
-        return np.array([1.0, *self.imperfections, self.discrepancy, *self.session_std]) ** 2
+    def sizes(self) -> Array:
+        """Sizes of the parts of the prior covariance, shape (4 + n_session,); see `Prior.covariance`."""
+        return np.array([1.0, *self.imperfections, self.discrepancy, *self.session_std])
 
 
 def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
@@ -114,13 +114,11 @@ def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
         yield Hypothesis(imperfections, discrepancy, tuple(session_std), errors, float(np.prod(probabilities)))
 
 
-TYPICAL = Hypothesis(
-    (1.0, 1.0), 0.01, tuple(one.stds[-1][0] for one in SESSION), PressErrors(noise_model("reference")), 1.0
-)
-"""Hypothesis with which the most probable unknowns are searched, so that all unknowns can differ from zero."""
+TYPICAL = np.array([1.0, 1.0, 1.0, 0.01, *(one.stds[-1][0] for one in SESSION)])
+"""Sizes with which the most probable unknowns are searched, so that all unknowns can differ from zero."""
 
-PLANNED = Hypothesis((0.5, 0.5), 0.01, tuple(one.stds[0][0] for one in SESSION), TYPICAL.errors, 1.0)
-"""Hypothesis with which presses are planned before the first press."""
+PLANNED = np.array([1.0, 0.5, 0.5, 0.01, *(one.stds[0][0] for one in SESSION)])
+"""Sizes with which presses are planned before the first press."""
 
 
 @dataclass(frozen=True)
@@ -158,8 +156,8 @@ class Prior:
 
         The first part is the covariance that is the same under all hypotheses. The other parts are the covariances of
         the uneven tension, of the other imperfections, of the discrepancy, and of each unknown of the session. A
-        hypothesis multiplies each of them by a factor. After an earlier calibration, the first part is the covariance
-        of its result, which contains the imperfections, and the discrepancy is only its change since then.
+        hypothesis multiplies each of them by the square of a size. After an earlier calibration, the first part is the
+        covariance of its result, which contains the imperfections, and the discrepancy is only its change since then.
         """
         layout = self.layout
         parts = np.zeros((4 + len(SESSION), *(layout.coefficients.stop,) * 2))
@@ -183,9 +181,13 @@ class Prior:
             part[layout.film, layout.film] = np.diag(is_part * layout.prior.std**2)
         return parts
 
-    def covariance(self, hypothesis: Hypothesis) -> Array:
-        """Return the covariance of the unknowns, shape (n_unknown, n_unknown)."""
-        return np.tensordot(hypothesis.variances, self.parts, 1)
+    def covariance(self, sizes: Array) -> Array:
+        """Return the covariance of the unknowns, shape (n_unknown, n_unknown).
+
+        Args:
+            sizes: Sizes by whose squares the parts are multiplied, shape (4 + n_session,).
+        """
+        return np.tensordot(sizes**2, self.parts, 1)
 
 
 @dataclass(frozen=True)
@@ -295,12 +297,11 @@ def _estimate_with_errors(
             errors: _Evidence.of(model, stated[is_used].with_errors(errors), used_contact, unknowns, prior)
             for errors in {one.errors for one in probable}
         }
-        all_fits = [evidence[one.errors].fit(one) for one in probable]
-        all_weights = softmax([fit.log_evidence for fit in all_fits])
-        weight = all_weights[all_weights >= MIN_WEIGHT]
-        fits = [fit for fit, one_weight in zip(all_fits, all_weights, strict=True) if one_weight >= MIN_WEIGHT]
-        probable = [fit.hypothesis for fit in fits]
-        means, covariances = zip(*(fit.posterior() for fit in fits), strict=True)
+        all_weights = softmax([evidence[one.errors].log_evidence(one) for one in probable])
+        is_probable = all_weights >= MIN_WEIGHT
+        weight = all_weights[is_probable]
+        probable = list(compress(probable, is_probable))
+        means, covariances = zip(*(evidence[one.errors].posterior(one) for one in probable), strict=True)
         mean = np.average(means, axis=0, weights=weight)
         covariance = np.average(covariances, axis=0, weights=weight)
         # The means of the hypotheses differ, which adds to the covariance of the average.
@@ -308,7 +309,8 @@ def _estimate_with_errors(
         used_contact = used_contact + Linearised.of(model, used_data, used_contact).contact_change(mean - unknowns)
         unknowns = np.clip(mean, *prior.bounds)
 
-    best = fits[int(weight.argmax())]
+    best = probable[int(weight.argmax())]
+    *_, best_chi2 = evidence[best.errors].solve(best)
     log_contact = point.contacts.copy()
     log_contact[is_used] = used_contact
     final_model = model_values(charges, prior.layout, data, unknowns, log_contact)
@@ -322,9 +324,9 @@ def _estimate_with_errors(
         contact=in_domain(log_contact, charges.domain),
         is_bad=is_bad,
         press_chi2=np.divide(final_chi2, redundancy, out=np.full(len(data), np.nan), where=redundancy > 0),
-        chi2=best.chi2,
+        chi2=best_chi2,
         redundancy=float(redundancy[is_used].sum()),
-        hypothesis=best.hypothesis,
+        hypothesis=best,
     )
 
 
@@ -353,34 +355,6 @@ def _most_probable_point(
     if previous is not None:
         unknowns, log_contact = previous.film.values, with_log_force(previous.contact)
     return problem.estimate(unknowns, log_contact, state_bounds=prior.bounds)
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """Estimate of the unknowns under one hypothesis: residuals at the prior means, compared with their covariance.
-
-    Attributes:
-        evidence: The linearised problem.
-        hypothesis: The hypothesis.
-        factor: Cholesky factor of the covariance S of the residuals, as `cho_factor` returns it.
-        weighted: S^-1 r, shape (m,).
-        log_evidence: Logarithm of the evidence.
-        chi2: Sum of the squared residuals of the presses and of the prior distribution after the fit.
-    """
-
-    evidence: "_Evidence"
-    hypothesis: Hypothesis
-    factor: tuple[Array, bool]
-    weighted: Array
-    log_evidence: float
-    chi2: float
-
-    def posterior(self) -> tuple[Array, Array]:
-        """Return the mean, shape (n_unknown,), and the covariance of the unknowns, shape (n_unknown, n_unknown)."""
-        prior = self.evidence.prior
-        prior_covariance = prior.covariance(self.hypothesis)
-        gain = self.evidence.jacobian @ prior_covariance
-        return prior.mean - gain.T @ self.weighted, prior_covariance - gain.T @ cho_solve(self.factor, gain)
 
 
 @dataclass(frozen=True)
@@ -440,12 +414,27 @@ class _Evidence:
             log_volume=float(log_contact_volume + log_density),
         )
 
-    def fit(self, hypothesis: Hypothesis) -> _Fit:
-        """Compute the evidence of a hypothesis."""
-        covariance = np.eye(self.residual.size) + np.tensordot(hypothesis.variances, self.parts, 1)
+    def solve(self, hypothesis: Hypothesis) -> tuple[tuple[Array, bool], Array, float]:
+        """Compare the residuals with their covariance S under a hypothesis.
+
+        Returns:
+            Cholesky factor of S, as `cho_factor` returns it. S^-1 r, shape (m,). Sum of the squared residuals of the
+            presses and of the prior distribution after the fit.
+        """
+        covariance = np.eye(self.residual.size) + np.tensordot(hypothesis.sizes**2, self.parts, 1)
         factor = cho_factor(covariance, lower=True, check_finite=False)
         weighted = cho_solve(factor, self.residual, check_finite=False)
-        chi2 = self.other_chi2 + float(self.residual @ weighted)
-        log_determinant = 2.0 * np.log(np.diag(factor[0])).sum()
-        log_evidence = self.log_volume - 0.5 * (chi2 + log_determinant) + np.log(hypothesis.probability)
-        return _Fit(self, hypothesis, factor, weighted, float(log_evidence), chi2)
+        return factor, weighted, self.other_chi2 + float(self.residual @ weighted)
+
+    def log_evidence(self, hypothesis: Hypothesis) -> float:
+        """Compute the logarithm of the evidence of a hypothesis."""
+        (factor, _), _, chi2 = self.solve(hypothesis)
+        log_determinant = 2.0 * np.log(np.diag(factor)).sum()
+        return float(self.log_volume - 0.5 * (chi2 + log_determinant) + np.log(hypothesis.probability))
+
+    def posterior(self, hypothesis: Hypothesis) -> tuple[Array, Array]:
+        """Return the mean, shape (n_unknown,), and the covariance of the unknowns, shape (n_unknown, n_unknown)."""
+        factor, weighted, _ = self.solve(hypothesis)
+        prior_covariance = self.prior.covariance(hypothesis.sizes)
+        gain = self.jacobian @ prior_covariance
+        return self.prior.mean - gain.T @ weighted, prior_covariance - gain.T @ cho_solve(factor, gain)

@@ -74,17 +74,17 @@ def compact_charges(
     discrepancy = discrepancy_jacobian(film_charge, contact, charges.domain) @ film.values[film.layout.coefficients]
     charge = film_charge + discrepancy  # most probable charges without offset, shape (n, n_electrode)
     names = charges.prior.sensor.electrode_names
-    node_MPa = _nodes(film) if len(names) > len(CONTACT) else np.zeros(1)  # three charges only determine the contact
-    factors = _tension_factors(charges, film, contact, node_MPa, executor)
-    series = _fit_followable_nodes(domain, names, contact, charge[:, None] * factors, node_MPa)
+    node_MPa = np.zeros(1)
+    node_charge = charge[:, None]
+    if len(names) > len(CONTACT):  # three charges only determine the contact
+        node_MPa = _nodes(film)
+        node_charge = node_charge * _tension_factors(charges, film, contact, node_MPa, executor)
+    series = _fit_followable_nodes(domain, names, contact, node_charge, node_MPa)
     few_contacts = slice(DIRECTION_CONTACTS)
     changes = _directions(charges, film, contact[few_contacts], charge[few_contacts])
-    directions = series.directions  # none
-    if changes.size > 0:
-        directions = _fit_directions(series, contact[few_contacts], charge[few_contacts], changes)
     return replace(
         series,
-        directions=directions,
+        directions=_fit_directions(series, contact[few_contacts], charge[few_contacts], changes),
         # A film is at most as well described as its charges can be measured.
         charge_std=max(series.charge_std, film.noise.gain),
         offset_pC=film.value("offset"),
@@ -192,14 +192,9 @@ def _tension_factors(
         similar_films = FilmCharges(prior, prior.even(values), even_map, slopes, larger_probe=None)
         return similar_films.charges(values, contact)
 
-    factors = np.ones((len(contact), node_MPa.size, len(prior.sensor.electrodes)))
-    changed_nodes = np.flatnonzero(node_MPa)
-    if changed_nodes.size > 0:
-        before = charges_after(0.0)
-    for node in changed_nodes:
-        after = charges_after(node_MPa[node])
-        np.divide(after, before, out=factors[:, node], where=before * after > 0.0)
-    return factors
+    charge = np.stack([charges_after(change_MPa) for change_MPa in node_MPa], axis=1)
+    charge_before = charge[:, node_MPa == 0.0]
+    return np.divide(charge, charge_before, out=np.ones_like(charge), where=charge_before * charge > 0.0)
 
 
 def _directions(charges: FilmCharges, film: FilmEstimate, contact: Array, charge: Array) -> Array:

@@ -226,5 +226,5 @@ def fit_series(unit_contact: Array, target: Array, degree: int, force_degree: in
     # The series also has entries for terms above the total degree, whose coefficients remain zero.
     solution = cho_solve(cho_factor(normal_matrix), right_side)
     series = np.zeros((degree + 1, degree + 1, force_degree + 1, target.shape[1]))
-    series[position_degrees(degree)] = solution.reshape(-1, force_degree + 1, target.shape[1])
+    series[position_degrees(degree)] = solution.reshape(n_term // (force_degree + 1), force_degree + 1, -1)
     return series
