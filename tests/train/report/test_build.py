@@ -68,11 +68,12 @@ def test_every_method_is_in_the_table_with_its_error_near_the_cramer_rao_limit(r
 
 def test_model_is_tested_on_positions_and_with_the_noise_of_its_own_training(dataset):
     metadata = load_model(find_model(NAME)).metadata
-    for sha256, hold_out, share in (("other", 0.02, 0.1), (dataset.sha256, 0.02, 0.02), (dataset.sha256, 0.5, 0.1)):
+    own = dataset.sha256
+    for sha256, hold_out, share in (("other", 0.02, 0.1), (own, 0.02, 0.02), (own, 0.5, 0.1), (own, None, 0.1)):
         trained = structs.replace(
             metadata,
             dataset_sha256=sha256,
-            made_with={"config": {"training": {"hold_out": hold_out}}},
+            made_with={"config": {"training": {"hold_out": hold_out}}} if hold_out else {},
             noise=ModelNoise(name="bench", white_pC=3.0, gain=0.01),
         )
         presses, held_out = evaluation.split_presses(dataset, find_model(NAME), trained)

@@ -303,6 +303,7 @@ def test_presses_of_one_force_or_without_forces_train_x_and_y(force_N, stated_N,
     folder = release(fitted, tmp_path / "pad").folder
     stated = f"every answer is {stated_N:g} N with a standard deviation of {100.0 * stated_std:g} %"
     assert f"| forces | not estimated: {stated}" in (folder / "card.md").read_text()
+    np.testing.assert_array_equal(read_presses(folder / "presses.csv").contact, presses.contact)
     assert np.isfinite(Predictor(folder).predict(presses.charge_pC[0])[:7]).all()
     assert Predictor(folder).flags(Predictor(folder).predict(presses.charge_pC[0])) == ()
 

@@ -316,7 +316,7 @@ def split_presses(
     """
     if not is_measured(dataset):
         hold_out = TrainingConfig().hold_out
-        if model.dataset_sha256 == dataset.sha256:
+        if model.dataset_sha256 == dataset.sha256 and "config" in model.made_with:  # not of a network made elsewhere
             hold_out = min(hold_out, model.made_with["config"]["training"]["hold_out"])
         return split_by_position(presses_of(dataset), hold_out)
 

@@ -177,7 +177,8 @@ def fit_presses(
         test=labelled,
         sha256=presses_sha256(usable),
         made_with=made_with,
-        files={PRESSES_FILE: csv_text(usable.columns).encode()},
+        # As they were measured: without merged places, and without assumed forces.
+        files={PRESSES_FILE: csv_text(presses[np.isin(presses.lines, usable.lines)].columns).encode()},
         cross_validated=cross_validated,
     )
 
