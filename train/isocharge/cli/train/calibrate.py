@@ -116,11 +116,17 @@ def calibrate_command(
             held_out_presses = usable_held_out(held_out_presses, presses, problem)  # before anything is solved
         if earlier is not None:
             problem = replace(problem, earlier=read_earlier(earlier, problem))
-        if presses is not None:
+        if presses is None:
+            # The presses are chosen for the mean film.
+            charges = solve_even(problem, executor)
+            film = problem.film_before
+        else:
             say(f"fitting the film to {len(presses)} presses")
             result = calibrate(presses, problem, executor=executor)
             for caution in result.cautions:
                 say(f"caution: {caution}")
+            charges = result.charges
+            film = result.film
         if result is not None and output is not None:
             say("training the network of this film")
             version = write_calibration(result, output, this_command(), held_out=held_out_presses, executor=executor)
@@ -128,9 +134,6 @@ def calibrate_command(
             if held_out_presses is not None:
                 std_factor = StdFactor(**load_model(version).metadata.made_with["std_factor"])
         if next_count:
-            # The next presses are chosen for the calibrated film, or for the mean film if nothing was calibrated.
-            charges = solve_even(problem, executor) if result is None else result.charges
-            film = None if result is None else result.film
             proposed_presses = next_presses(
                 problem, charges, next_count, film, position_std_mm=position_std_mm, force_std=force_std
             )

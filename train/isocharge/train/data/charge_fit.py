@@ -111,8 +111,6 @@ def fit_charge_series(
         force_degree = determined_degree(unit_contact[:, 2], largest_force_degree)
         fewest = FEWEST_PER_TERM * series_term_count(degree, force_degree)
         if fewest > len(presses):
-            if best_series is None:
-                raise TrainingError(f"expected at least {fewest} presses to fit the charges by, got {len(presses)}")
             break
         coefficients = fit_series(unit_contact, target, degree, force_degree)[None]
         series = ChargeSeries(domain=domain, electrodes=electrodes, coefficients=coefficients, log_size=log_size)
@@ -121,7 +119,8 @@ def fit_charge_series(
             best_series = replace(series, charge_std=error)
         if error < GOOD_ENOUGH:
             break
-    assert best_series is not None  # the first degrees were fitted, or an error was raised
+    if best_series is None:
+        raise TrainingError(f"expected at least {fewest} presses to fit the charges by, got {len(presses)}")
     return best_series
 
 

@@ -8,5 +8,5 @@
     arduino/                 a sketch with copies of what it needs
 
 The folder `sources/` contains templates of the files above. Each `$name` in a template is replaced by a value of a
-model or of a board. The C source of the layers of a network is generated without a template.
+model or of a board.
 """

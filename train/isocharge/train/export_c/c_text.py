@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def source_text(name: str, **values: object) -> str:
+def source_text(name: str, /, **values: object) -> str:
     """Read a file in `sources/`, and replace each `$name` by its value."""
     file = resources.files(__package__) / "sources" / name
     template = Template(file.read_text("utf-8"))

@@ -122,7 +122,7 @@ def export_c(model: Path, output: Path, device: Device = ANY_BOARD, *, command: 
     return output
 
 
-def c_files(model: Path, device: Device = ANY_BOARD, command: str = "") -> dict[str, str]:
+def c_files(model: Path, device: Device, command: str) -> dict[str, str]:
     """Return the texts of all files of an export, by their paths in the folder of the export.
 
     Args:

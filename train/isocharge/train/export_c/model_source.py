@@ -85,20 +85,16 @@ def layer_source(name: str, weight: Array, bias: Array | None = None, *, is_hidd
     if is_hidden:
         result = f"tanh_of({result})"
 
-    # The function: set the sums to zero, add the products, and compute the outputs.
-    lines = [
-        f"/* {n_input} numbers x to {n_output} numbers y */",
-        f"static void {name}(const float *restrict x, const float *restrict c, float *restrict y)",
-        "{",
-        f"    for (int j = 0; j < {n_output}; ++j)",
-        "        y[j] = 0.0f;",
-        *_product_lines(f"{name}_weights", values),
-        f"    for (int j = 0; j < {n_output}; ++j)",
-        f"        y[j] = {result};",
-        "}",
-        "",
-    ]
-    return "\n".join([*arrays, *lines])
+    # The function sets the sums to zero, adds the products, and computes the outputs.
+    function = source_text(
+        "layer.c",
+        name=name,
+        n_input=n_input,
+        n_output=n_output,
+        products=_product_source(name, values),
+        result=result,
+    )
+    return "\n".join([*arrays, function])
 
 
 def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
@@ -121,39 +117,37 @@ def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
     return values, None
 
 
-def _product_lines(name: str, values: NDArray[Any]) -> list[str]:
-    """Return C lines that multiply the inputs x by weights, and add the products to the outputs y.
+def _product_source(name: str, values: NDArray[Any]) -> str:
+    """Return C loops that multiply the inputs x by weights, and add the products to the outputs y.
 
     Each loop over the outputs adds the products of up to `N_ROWS` inputs, so that y is read and written less often.
 
     Args:
-        name: Name of the array with the weights.
+        name: Name of the layer.
         values: Weights, shape (inputs, outputs), float32 or int8.
     """
-    n_row, n_column = values.shape
+    n_input, n_output = values.shape
     is_int8 = values.dtype == np.int8
-    number_type = "signed char" if is_int8 else "float"
     cast = "(float)" if is_int8 else ""
 
     # Full groups of N_ROWS rows come first. The remaining rows form one smaller group.
-    n_grouped = n_row - n_row % N_ROWS
-    lines = []
-    for begin, end in ((0, n_grouped), (n_grouped, n_row)):
-        group_size = min(N_ROWS, end - begin)
-        if group_size == 0:
-            continue
-        inputs = ", ".join(f"x{row} = x[{row} + i]" for row in range(group_size))
-        products = " + ".join(f"x{row} * {cast}w[{row * n_column} + j]" for row in range(group_size))
-        lines += [
-            f"    for (int i = {begin}; i < {end}; i += {group_size}) {{",
-            f"        const {number_type} *w = {name} + {n_column} * i;",
-            f"        const float {inputs};",
-            "",
-            f"        for (int j = 0; j < {n_column}; ++j)",
-            f"            y[j] += {products};",
-            "    }",
-        ]
-    return lines
+    n_grouped = n_input - n_input % N_ROWS
+    loops = ""
+    for begin, end in ((0, n_grouped), (n_grouped, n_input)):
+        rows = range(min(N_ROWS, end - begin))
+        if rows:
+            loops += source_text(
+                "products.c",
+                name=name,
+                begin=begin,
+                end=end,
+                n_row=len(rows),
+                n_output=n_output,
+                number_type="signed char" if is_int8 else "float",
+                inputs=", ".join(f"x{row} = x[{row} + i]" for row in rows),
+                products=" + ".join(f"x{row} * {cast}w[{row * n_output} + j]" for row in rows),
+            )
+    return loops
 
 
 FLAG_BITS = {OUTSIDE: 0x100, BEYOND: 0x200, MISFIT: 0x400, STRESS: 0x800}

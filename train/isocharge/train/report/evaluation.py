@@ -102,13 +102,11 @@ def least_squares(task: FittingTask) -> Method:
 
     The residuals are divided by the standard deviation of the noise. The contact is restricted to the domain.
     """
-
-    def estimate(charge: Array) -> Array:
-        """Estimate contacts (x, y, F), shape (n, 3), mm and N."""
-        contact, _ = search(task.charge_map, charge, task.noise.sigma(charge), candidates=N_CANDIDATES)
-        return contact
-
-    return Method("least squares, Gauss-Newton", "NumPy", estimate)
+    return Method(
+        "least squares, Gauss-Newton",
+        "NumPy",
+        lambda charge: search(task.charge_map, charge, task.noise.sigma(charge), candidates=N_CANDIDATES)[0],
+    )
 
 
 METHOD_BUILDERS: tuple[Callable[[FittingTask], Method], ...] = (triangulation, least_squares)
@@ -118,16 +116,17 @@ METHOD_BUILDERS: tuple[Callable[[FittingTask], Method], ...] = (triangulation, l
 def model_method(predictor: Predictor) -> Method:
     """Return a model as a method."""
 
-    def estimate(charge: Array) -> Array:
-        """Estimate contacts (x, y, F), shape (n, 3), mm and N."""
-        return np.asarray(predictor.predict_batch(charge), float)[:, COLUMNS["contact"]]
-
     def single_call(charge: Array) -> Callable[[], object]:
         """Return a function that computes the complete answer to one press."""
         answer = np.zeros(len(Contact._fields), np.float32)  # overwritten by every call
         return partial(predictor.predict_into, charge.astype(np.float32), answer)
 
-    return Method(f"network `{predictor.metadata.label}`", "Predictor", estimate, single_call)
+    return Method(
+        f"network `{predictor.metadata.label}`",
+        "Predictor",
+        lambda charge: np.asarray(predictor.predict_batch(charge), float)[:, COLUMNS["contact"]],
+        single_call,
+    )
 
 
 SEED = 0

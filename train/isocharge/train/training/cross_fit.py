@@ -45,10 +45,10 @@ from isocharge.train.training.config import MANY_ELECTRODE_SIZES, FitConfig, Tra
 from isocharge.train.training.contact_training import contact_stage
 from isocharge.train.training.descent import TrainingStage
 from isocharge.train.training.fit import Answers, Fitted, threads_and_seed, train_perceptron
+from isocharge.train.training.folded_network import LOG_STD, MEAN
 from isocharge.train.training.misfit_training import draw_charges, misfit_stage
 from isocharge.train.training.network import (
     InverseNetwork,
-    Posterior,
     as_tensor,
     fold_network,
     signed_features,
@@ -147,7 +147,7 @@ def fit_presses(
         examples = _misfit_examples(labelled.charge, unit_contact, noise, training)
         train_perceptron(misfit_stage(network, examples, training), settings)
 
-    folded_network = fold_network(network.eval())
+    folded_network = fold_network(network)
     # The network adds an error to the misfit. Three charges fit a contact exactly, so this error is then the misfit.
     *_, network_misfit = folded_network.outputs(labelled.charge)
     misfit = np.maximum(misfit, network_misfit)
@@ -400,20 +400,17 @@ def _distillation_stage(
     charge = as_tensor(np.concatenate(copies))
     # The targets are the means of the outputs over the fold networks.
     with torch.no_grad():
-        outputs = [fold_network.posterior(charge) for fold_network in fold_networks]
-    targets = Posterior(*(torch.stack(values).mean(dim=0) for values in zip(*outputs, strict=True)))
+        outputs = [torch.cat(fold_network.posterior(charge), dim=1) for fold_network in fold_networks]
+    target = torch.stack(outputs).mean(dim=0)
+    # The differences of the means are divided by the standard deviations, and their squares are halved.
+    weight = torch.ones_like(target)
+    weight[:, MEAN] = 0.5 * torch.exp(-2.0 * target[:, LOG_STD])
 
     def loss(random: torch.Generator) -> Tensor:
-        """Return the squared differences from the targets, summed over the outputs and averaged over a random batch.
-
-        The differences of the means are divided by the standard deviations, and their squares are halved.
-        """
+        """Return the squared differences from the targets, summed over the outputs and averaged over a random batch."""
         rows = torch.randint(len(charge), (config.batch,), generator=random)
-        target = Posterior(*(values[rows] for values in targets))
-        mean, log_std, turn = network.posterior(charge[rows])
-        mean_difference = (mean - target.mean) * torch.exp(-target.log_std)
-        squares = 0.5 * mean_difference**2 + (log_std - target.log_std) ** 2 + (turn - target.turn) ** 2
-        return squares.sum(dim=1).mean()
+        difference = torch.cat(network.posterior(charge[rows]), dim=1) - target[rows]
+        return (weight[rows] * difference**2).sum(dim=1).mean()
 
     steps = config.sizes(network.features.n_electrode).steps
     return TrainingStage("contact", network.contact, loss, steps, config.learning_rate, config.seed)
