@@ -51,6 +51,7 @@ class Board(Settings, frozen=True):
     gain: Positive | dict[str, Positive] = 1.0
     order: Literal["little", "big"] = "little"
     parts: tuple[Part, ...] = ()
+    pair: Annotated[tuple[Positive, ...], Meta(min_length=2, max_length=2)] = (1.0, 1.0)
     on: bool = True
     low: int = 0
     high: int = 1
@@ -92,6 +93,7 @@ def test_a_value_that_fits_is_taken():
         ({"frames": {"format": "morse"}}, "board.frames.format: expected one of auto, binary, got 'morse'"),
         ({"parts": [{"name": "a"}, {"name": ""}]}, "board.parts[1].name: expected a text of 1 to 1000 characters"),
         ({"parts": [{"name": "a", "at": [1]}]}, "board.parts[0].at: expected [x, y] in mm, got [1]"),
+        ({"pair": [1, 2, 3]}, "board.pair: expected a list of 2 numbers, got [1, 2, 3]"),
         ({"parts": [3]}, "board.parts[0]: expected a table, got 3"),
         ({"radus": 1}, "unknown key 'board.radus'; did you mean 'radius'? Known are radius, share"),
         ({"zzz": 1}, "unknown key 'board.zzz'; known are radius"),

@@ -319,11 +319,12 @@ def _describe_schema(schema: Mapping[str, Any]) -> str:
 
     noun = _noun(schema)
     minimum_length = schema.get("minItems", 0)
-    if "prefixItems" in schema:  # all items have the same type
-        return f"a list of {minimum_length} {_noun(schema['prefixItems'][0])}s"
-    if "items" in schema:
-        list_description = f"a list of {_noun(schema['items'])}s"
-        return f"{list_description}, {minimum_length} or more" if minimum_length else list_description
+    item, *_ = schema.get("prefixItems", [schema.get("items")])  # all items have the same type
+    if item is not None:
+        items = f"{_noun(item)}s"
+        if minimum_length == schema.get("maxItems"):
+            return f"a list of {minimum_length} {items}"
+        return f"a list of {items}, {minimum_length} or more" if minimum_length else f"a list of {items}"
     if "maxLength" in schema:
         return f"a text of 1 to {schema['maxLength']} characters"
     if noun in ("number", "whole number"):
@@ -355,7 +356,7 @@ def _describe_number(noun: str, schema: Mapping[str, Any]) -> str:
         noun: Noun for the numbers: "number" or "whole number".
         schema: JSON schema that contains the bounds.
     """
-    words = {"exclusiveMinimum": "above", "minimum": "from", "maximum": "to"}
+    words = {"exclusiveMinimum": "above", "minimum": "from", "maximum": "to", "exclusiveMaximum": "to below"}
     # The bounds +-`MAX_FLOAT` exclude only infinity, and are not mentioned.
     bounds = {word: schema[key] for key, word in words.items() if abs(schema.get(key, MAX_FLOAT)) != MAX_FLOAT}
     if bounds == {"above": 0}:

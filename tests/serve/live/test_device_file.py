@@ -117,6 +117,7 @@ WRONG = [
     ("[gane]\n", r"unknown key 'gane'; did you mean 'gain'\? Known are name, front_end, frames, channels, gain"),
     ("[tare]\nframe = 50\n", r"unknown key 'tare.frame'; did you mean 'frames'\? Known are on, frames, noise_limit_pC"),
     ("[tare]\nframes = 50.5\n", r"tare\.frames: expected a whole number from 1 to 1000000000, got 50\.5"),
+    ("[track]\nlasting = 1\n", r"track\.lasting: expected a number from 0 to below 1, got 1"),
     ("[tare]\nframes = 0\n", r"tare\.frames: expected a whole number from 1 to 1000000000, got 0"),
     ("[tare]\nframes = 3000\n", r"tare\.patience: expected at least the 3000 frames of a tare, or 0 .*, got 2000"),
     ("[tare]\non = 1\n", r"tare\.on: expected true or false, got 1"),

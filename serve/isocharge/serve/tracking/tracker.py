@@ -94,8 +94,8 @@ class TrackRule(Rule, frozen=True, kw_only=True):
 
     Attributes:
         lasting: Standard deviation of the errors that are the same in every frame of a held contact, divided by the
-            standard deviation that the model states, 0 to 1. The default of 0.12 was measured for the approximation
-            errors of a model. If the gains are known to only a few percent, set this to about 1.
+            standard deviation that the model states, 0 to below 1. The default of 0.12 was measured for the
+            approximation errors of a model. If the gains are known to only a few percent, set this to 0.99.
     """
 
     lasting: Share = 0.12
