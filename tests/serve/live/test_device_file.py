@@ -210,6 +210,7 @@ def test_channel_of_each_electrode(names, channels, picked):
             (",".join(name + unit for name in "ABC"), {}, f"A{unit}' is in {unit.strip('_')}: convert it to pC")
             for unit in ("_nC", "nC", "_coulomb")
         ),
+        ("", {"A": "ch2"}, "two electrodes the same channel"),
         ("x,y,z", {"A": "zz"}, r'^board\.toml: \[channels\] A = "zz": no channel .* have x, y, z, or 1 to'),
         *(
             ("", {"A": name}, "no channel is called that; the frames have 1, 2, 3, or 1 to 3")

@@ -72,8 +72,9 @@ class Channels(Stage):
         their names, and otherwise by their order.
 
         Raises:
-            ChargeError: If the frame lacks a channel that the device file names, if the channels cannot be assigned by
-                their names or by their order, or if they have different units and the same gain.
+            ChargeError: If the frame lacks a channel that the device file names, if two electrodes have the same one, if
+                the channels cannot be assigned by their names or by their order, or if they have different units and
+                the same gain.
         """
         if self._channels:
             indices = tuple(self._assigned_index(electrode, frame) for electrode in self._electrodes)
@@ -81,6 +82,8 @@ class Channels(Stage):
             indices = self.indices_by_name_or_order(frame) or ()
         if not indices:
             raise self._assignment_error(frame)
+        if len(set(indices)) < len(indices):
+            raise self._assignment_error(frame, "; [channels] gives two electrodes the same channel")
         units = {stated_unit(channel_names(frame)[index]) or "pC" for index in indices}
         if len(units) > 1 and not self._has_gains:
             raise self._assignment_error(frame, "; their units differ: state pC_per_unit of each electrode in [gain]")
