@@ -127,11 +127,10 @@ class AtomicWriter:
 
         Raises:
             OutputExists: If the file exists already.
-            OutputError: If the file cannot be created.
+            OSError: If the file cannot be created.
         """
         refuse_existing(path)
-        with as_output_errors(path):
-            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         self._size = 0  # number of bytes that complete calls of `write` have written
 
     def write(self, data: bytes) -> int:

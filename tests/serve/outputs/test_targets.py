@@ -99,6 +99,14 @@ def test_file_that_exists_is_not_overwritten_and_nothing_else_is_left(tmp_path, 
     assert not (tmp_path / "a.jsonl").exists()
 
 
+@live_and_replayed
+def test_folder_that_is_missing_is_an_error_with_the_target(tmp_path, is_live):
+    path = tmp_path / "no" / "a.csv"
+    message = f"{path} cannot be written: No such file or directory"
+    with pytest.raises(OutputError, match=message), Outputs([str(path)], context(is_live=is_live)):
+        pass
+
+
 def raise_error(*_):
     raise RuntimeError("not open")
 

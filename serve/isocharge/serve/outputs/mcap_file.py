@@ -61,7 +61,7 @@ class McapFile(FileOutput):
 
         Raises:
             OutputExists: If the file exists already.
-            OutputError: If the file cannot be created.
+            OSError: If the file cannot be created.
         """
         super().__init__(path, is_live=is_live)
         self.records = 0

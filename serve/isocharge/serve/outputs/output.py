@@ -196,7 +196,7 @@ class FileOutput:
 
         Raises:
             OutputExists: If the file exists already.
-            OutputError: If the file cannot be created.
+            OSError: If the file cannot be created.
         """
         self.path = path
         # When the stack is closed, it closes the file and, in a replay, gives the file its final name.

@@ -77,7 +77,7 @@ class TextFile(FileOutput):
 
         Raises:
             OutputExists: If the file exists already.
-            OutputError: If the file cannot be created.
+            OSError: If the file cannot be created.
         """
         super().__init__(path, is_live=is_live)
         self.write = TextOutput(lambda text: self._file.write(text.encode()), lines).write

@@ -25,7 +25,7 @@ from msgspec import Meta, Struct, field
 from msgspec.json import encode
 
 from isocharge.common.errors import RecordingError, cut, is_printable
-from isocharge.common.files import AtomicWriter, bounded_lines
+from isocharge.common.files import AtomicWriter, as_output_errors, bounded_lines
 from isocharge.common.progress import report
 from isocharge.common.structs import WrongKey, parse_json
 from isocharge.serve.model.metadata import ModelLabel
@@ -98,7 +98,8 @@ class Recorder:
             OutputExists: If the file exists already.
             OutputError: If the file cannot be created.
         """
-        self._file = AtomicWriter(self.path)
+        with as_output_errors(self.path):
+            self._file = AtomicWriter(self.path)
         self._write(json.dumps(self._header))
 
     def __enter__(self) -> Self:

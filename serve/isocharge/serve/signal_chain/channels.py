@@ -72,9 +72,9 @@ class Channels(Stage):
         their names, and otherwise by their order.
 
         Raises:
-            ChargeError: If the frame lacks a channel that the device file names, if two electrodes have the same one, if
-                the channels cannot be assigned by their names or by their order, or if they have different units and
-                the same gain.
+            ChargeError: If the frame lacks a channel that the device file names, if two electrodes have the same
+                channel, if the channels cannot be assigned by their names or by their order, or if they have different
+                units and the same gain.
         """
         if self._channels:
             indices = tuple(self._assigned_index(electrode, frame) for electrode in self._electrodes)
