@@ -300,8 +300,10 @@ def test_live_demo_streams_a_virtual_sensor_to_its_model(monkeypatch):
     board = SimpleNamespace(url="socket://127.0.0.1:1")
     monkeypatch.setattr(live_film, "ForwardMap", SimpleNamespace(build=lambda sensor, *_, **__: sensor.name))
     monkeypatch.setattr(live_film, "virtual_sensor", lambda played: nullcontext(calls.append(played) or board))
-    monkeypatch.setattr(live_film, "stream_command", lambda *words, **options: calls.append((words, options["live"])))
+    monkeypatch.setattr(
+        live_film, "stream_command", lambda *words, **options: calls.append((words, options["live"], options["token"]))
+    )
     with pytest.raises(InputError, match="--live: expected PORT"):
         demo_command(live="here")
-    demo_command(live="8081")
-    assert calls == [SENSOR, ((SENSOR, board.url), "8081")]
+    demo_command(live="8081", token="sesame")
+    assert calls == [SENSOR, ((SENSOR, board.url), "8081", "sesame")]

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from isocharge.cli.shared.live_page import LiveOption
+from isocharge.cli.shared.live_page import LiveOption, TokenOption
 from isocharge.cli.shared.terminal import say
 from isocharge.common.errors import InputError, require
 from isocharge.common.files import refuse_existing, write_whole
@@ -22,6 +22,7 @@ def demo_command(
         ),
     ] = None,
     live: LiveOption = None,
+    token: TokenOption = None,
     playground: Annotated[
         Path | None,
         typer.Option(
@@ -60,4 +61,4 @@ def demo_command(
     with require("simulate", "http"):
         from isocharge.cli.demo.live_film import show_live_film
 
-        show_live_film(live)
+        show_live_film(live, token)

@@ -11,11 +11,12 @@ DEMO_SENSOR = "three-25um-biaxial"
 """Name of the sensor of the demos, and of its released model."""
 
 
-def show_live_film(live: str) -> None:
+def show_live_film(live: str, token: str | None) -> None:
     """Play a virtual sensor, estimate its contacts with a released model, and show the contacts on the live page.
 
     Args:
         live: Value of `--live`: address at which the page listens.
+        token: Value of `--token`.
 
     Raises:
         InputError: If the address has another form than PORT or HOST:PORT.
@@ -28,4 +29,4 @@ def show_live_film(live: str) -> None:
             )
         with virtual_sensor(forward_map) as board:
             say("Ctrl-C stops")
-            stream_command(DEMO_SENSOR, board.url, output=["none"], live=live)
+            stream_command(DEMO_SENSOR, board.url, output=["none"], live=live, token=token)
