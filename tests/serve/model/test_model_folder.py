@@ -64,6 +64,7 @@ def wrong_arguments(film):
         "no graph": {"onnx": b"not a graph"},
         "no metadata": {"onnx": film.onnx({})},
         "other metadata": {"metadata": film.metadata(probes=("circle:2.0",))},
+        "more metadata": {"metadata": film.metadata(yield_force_N=0.8)},
         "other output": {"onnx": film.onnx(props, renamed={"misfit": "m"})},
         "golden too narrow": {"golden": film.golden_pC()[:, :2]},
         "no answer": {"golden": np.zeros((1, 3))},
@@ -76,7 +77,8 @@ def wrong_arguments(film):
     [
         ("no graph", ModelError, "cannot read these 11 bytes"),
         ("no metadata", ModelError, "key 'name' is missing"),
-        ("other metadata", ModelError, "disagree on 'probes'"),
+        ("other metadata", ModelError, "disagree with the stated ones: .*'probes'"),
+        ("more metadata", ModelError, "disagree with the stated ones: .*'yield_force_N'"),
         ("other output", ModelError, "expected the tensors .*misfit"),
         ("golden too narrow", ChargeError, "'A', 'B', 'C'"),
         ("no answer", ModelError, "contact: expected finite outputs, got .*nan"),

@@ -350,17 +350,14 @@ def write_model(
 
     # Write the version under a temporary name. `new_folder` renames it to `target` after the check has succeeded.
     with new_folder(target) as draft:
-        write_whole(draft / "model.onnx", onnx_model)
-        write_whole(draft / "golden.json", golden.to_json())
-        write_whole(draft / "card.md", card.encode())
-        for name, content in companion_files.items():
+        files = {GRAPH_FILE: onnx_model, "golden.json": golden.to_json(), "card.md": card.encode(), **companion_files}
+        for name, content in files.items():
             write_whole(draft / name, content)
         # Make all checks that are made when a model is read. The metadata in the graph must also be the expected ones.
         model = load_model(draft)
-        actual = model.metadata.to_props()
-        for key, value in metadata.to_props().items():
-            if actual[key] != value:
-                raise ModelError(f"the graph's metadata disagree on {key!r}: expected {value}, got {actual[key]}")
+        differences = metadata.to_props().items() ^ model.metadata.to_props().items()
+        if differences:
+            raise ModelError(f"the graph's metadata disagree with the stated ones: {shown(sorted(differences))}")
         check_golden(model)
     write_whole(folder / "config.pbtxt", triton_config(metadata.name, len(metadata.electrodes)).encode())
     return target

@@ -48,7 +48,7 @@ class Address:
             resource.setrlimit(resource.RLIMIT_NOFILE, (max_open_files, max_open_files))
         try:
             if self.uds is not None:
-                _remove_stale_socket(self.uds)
+                self.release()
                 return _listen_unix(self.uds, backlog)
             # create_server sets SO_REUSEADDR. The port of an earlier server can therefore be used again at once.
             family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
@@ -61,12 +61,17 @@ class Address:
             raise ListenError(f"cannot listen on {place}: {error}; choose another address or port") from error
 
     def release(self) -> None:
-        """Remove the file of the closed Unix socket, unless another server listens on the same path.
+        """Remove the file of the Unix socket if no server listens on the socket any more.
 
-        If the address is not a Unix socket, the function does nothing.
+        If the address is not a Unix socket, or the file is not a socket or does not exist, the function does nothing.
         """
-        if self.uds:
-            _remove_stale_socket(self.uds)
+        if self.uds is None or not self.uds.is_socket():
+            return
+        with socket.socket(socket.AF_UNIX) as client:
+            client.setblocking(False)  # a server that hangs does not accept the connection
+            error_number = client.connect_ex(str(self.uds))  # 0 if a server accepts the connection
+        if error_number == errno.ECONNREFUSED:  # the system refuses a connection only if no server listens
+            self.uds.unlink(missing_ok=True)
 
     def url(self, listening: socket.socket, *, secure: bool) -> str:
         """Return the URL that clients use, or `unix:PATH` if the address is a Unix socket.
@@ -196,17 +201,3 @@ def _listen_unix(path: Path, backlog: int) -> socket.socket:
         listening.close()
         raise
     return listening
-
-
-def _remove_stale_socket(path: Path) -> None:
-    """Remove the file of a Unix socket if no server listens on the socket any more.
-
-    If the file does not exist or is not a socket, the function does nothing.
-    """
-    if not path.is_socket():
-        return
-    with socket.socket(socket.AF_UNIX) as client:
-        client.setblocking(False)  # a server that hangs does not accept the connection
-        error_number = client.connect_ex(str(path))  # 0 if a server accepts the connection
-    if error_number == errno.ECONNREFUSED:  # the system refuses a connection only if no server listens
-        path.unlink(missing_ok=True)

@@ -206,9 +206,8 @@ class CsvTable:
 
     def _has_fraction(self, cells: list[str]) -> bool:
         """Return whether a cell of any column has a fraction such as 0.5, whose mark does not separate thousands."""
-        texts = (cell.strip().lstrip("+-") for cell in cells)
-        fractions = [text for text in texts if text.startswith(f"0{self._mark}") and _NUMBER.fullmatch(text)]
-        return self._mark != "" and bool(fractions)
+        texts = (cell.strip().lstrip("+-") for cell in cells if self._mark)
+        return any(text.startswith(f"0{self._mark}") and _NUMBER.fullmatch(text) for text in texts)
 
     def _number(self, text: str) -> float | None:
         """Return the number in a cell: NaN for an empty cell, and None for a cell without a finite number.
