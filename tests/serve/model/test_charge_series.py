@@ -8,7 +8,7 @@ import pytest
 from drawn_contacts import draw_contacts
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError
-from isocharge.serve.model.charge_file import charge_map_bytes, charge_map_from_bytes, read_charge_map
+from isocharge.serve.model.charge_file import FILE, charge_map_bytes, read_charge_map
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.simulate.forward.charge_map import differences
 
@@ -96,9 +96,10 @@ def test_charges_beyond_the_domain_continue_linearly_in_position_and_as_a_power_
 
 
 @pytest.mark.parametrize("is_signed", [False, True])
-def test_file_is_read_as_it_was_written(is_signed):
+def test_file_is_read_as_it_was_written(is_signed, tmp_path):
     written = random_series(is_signed=is_signed)
-    read = charge_map_from_bytes(charge_map_bytes(written), ELECTRODES)
+    (tmp_path / FILE).write_bytes(charge_map_bytes(written))
+    read = read_charge_map(tmp_path, ELECTRODES)
     state = np.array([0.1, 1.0, -1.0])
     np.testing.assert_array_equal(read.in_state(CONTACTS, state).charge_pC, written.in_state(CONTACTS, state).charge_pC)
     for name in ("domain", "electrodes", "is_folded", "charge_std", "offset_pC", "pretension_MPa", "tension_std_MPa"):
@@ -113,12 +114,11 @@ def test_file_is_read_as_it_was_written(is_signed):
         ("", ("A", "B", "C"), r"series: expected charges of \('A', 'B', 'C'\), got .*4\)"),
     ],
 )
-def test_file_of_another_format_or_model_is_refused(left_out, electrodes, reason):
+def test_file_of_another_format_or_model_is_refused(left_out, electrodes, reason, tmp_path):
     arrays = np.load(io.BytesIO(charge_map_bytes(random_series())))
-    file = io.BytesIO()
-    np.savez_compressed(file, **{name: array for name, array in arrays.items() if name != left_out})
+    np.savez_compressed(tmp_path / FILE, **{name: array for name, array in arrays.items() if name != left_out})
     with pytest.raises(ModelError, match=rf"charges\.npz: .*{reason}.*train again"):
-        charge_map_from_bytes(file.getvalue(), electrodes)
+        read_charge_map(tmp_path, electrodes)
 
 
 def test_model_without_the_file_has_no_map(tmp_path):

@@ -5,7 +5,7 @@ import pytest
 from tests.train.short_training import short_training
 
 from isocharge.common.errors import DatasetError, TrainingError
-from isocharge.serve.model.charge_file import charge_map_from_bytes
+from isocharge.serve.model.charge_file import read_charge_map
 from isocharge.simulate import Domain, noise_model
 from isocharge.simulate.identifiability.nearest_contact import search
 from isocharge.train import fit, release
@@ -159,12 +159,12 @@ def test_charge_series_of_the_whole_domain_and_a_caution_are_released_if_the_dom
     presses = draw_presses(lambda contact: 1000.0 * charges(contact))
     data = TrainingData(sensor=sensor, probes=("circle:1.0",), domain=DOMAIN, presses=presses, sha256="0" * 64)
     fitted = fit(data, short_training(8, 8, 5, 5, 1_000))
-    series = charge_map_from_bytes(fitted.files["charges.npz"], ("A", "B", "C"))
-    assert np.allclose(series.charges(presses.contact), presses.charge, rtol=2e-3)
-    assert fitted.domain.radius < 5.2 < series.domain.radius
     assert split.folded_charges is None
 
     model = release(fitted, tmp_path / "models" / "folded")
+    series = read_charge_map(model.folder, ("A", "B", "C"))
+    assert np.allclose(series.charges(presses.contact), presses.charge, rtol=2e-3)
+    assert fitted.domain.radius < 5.2 < series.domain.radius
     [caution] = caplog.messages
     assert "'serve stream --track' follows contacts to 8 mm" in caution
     assert model.metadata.made_with["cautions"] == [caution]

@@ -65,33 +65,20 @@ def charge_map_bytes(series: ChargeSeries) -> bytes:
 def read_charge_map(version_folder: Path, electrodes: tuple[str, ...]) -> ChargeSeries | None:
     """Read the charge map in the file `charges.npz` of a model. Return None if the model has no such file.
 
+    The numbers are not checked. When a model is loaded, the file is compared with its checksum in `golden.json`.
+
     Args:
         version_folder: Folder of the model, which contains `model.onnx`.
         electrodes: Names of the electrodes of the model.
 
     Raises:
-        ModelError: If the file cannot be read, or `charge_map_from_bytes` refuses its content.
+        ModelError: If the file cannot be read, is not an npz file, has another format, or belongs to a model with other
+            electrodes.
     """
     path = version_folder / FILE
     if not path.exists():
         return None
-    return charge_map_from_bytes(read_needed(path, ModelError, ADVICE), electrodes, str(path))
-
-
-def charge_map_from_bytes(data: bytes, electrodes: tuple[str, ...], where: str = FILE) -> ChargeSeries:
-    """Create the charge map from the content of a file `charges.npz`.
-
-    The numbers are not checked. When a model is loaded, the file is compared with its checksum in `golden.json`.
-
-    Args:
-        data: Content of the file.
-        electrodes: Names of the electrodes of the model.
-        where: Path of the file, for the error message.
-
-    Raises:
-        ModelError: If the content is not that of an npz file, has another format, or belongs to a model with other
-            electrodes.
-    """
+    data = read_needed(path, ModelError, ADVICE)
     try:
         arrays = npz_arrays(data)
         file_format = arrays.get("format", 1)
@@ -111,4 +98,4 @@ def charge_map_from_bytes(data: bytes, electrodes: tuple[str, ...], where: str =
             **{name: float(arrays[name]) for name in NUMBERS},
         )
     except (ValueError, KeyError) as error:
-        raise ModelError(f"{where}: {cut(str(error))}; {ADVICE}") from error
+        raise ModelError(f"{path}: {cut(str(error))}; {ADVICE}") from error
