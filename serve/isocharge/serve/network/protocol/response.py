@@ -27,9 +27,6 @@ _STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
 For a given error, the first row with a matching class is used.
 """
 
-INTERNAL_MESSAGE = "internal error; the server's log says more"
-"""Message to the client for an error that is not an IsochargeError."""
-
 
 def refusal(error: Exception) -> tuple[int, str, str]:
     """Return the HTTP status, the name of the gRPC status and the message that report an error to the client.
@@ -40,7 +37,7 @@ def refusal(error: Exception) -> tuple[int, str, str]:
     message = str(error)
     if not isinstance(error, errors.IsochargeError):
         log.exception("a request failed", exc_info=error)
-        message = INTERNAL_MESSAGE
+        message = "internal error; the server's log says more"
     return next(
         (http_status, grpc_status, message)
         for error_class, http_status, grpc_status in _STATUSES
