@@ -112,7 +112,9 @@ class AccessCheck:
     def _check_site(self, method: str, headers: Mapping[bytes, bytes]) -> None:
         """Raise an error if a page of another site has sent a request."""
         host = headers.get(b"host", b"")
-        if not (self._any_host or self._is_served(host)):
+        name = _name_in(host.decode("latin-1"))
+        is_served = self._any_host or name in self._host_names or ip_address(name) is not None
+        if host and not is_served:  # HTTP/1.0 does not require the header, but browsers always send it
             raise OriginError(
                 f"Host: expected an IP address or one of {', '.join(sorted(self._host_names))}, got {_quoted(host)}; "
                 "use the server's address, or name the host by --allow-host"
@@ -136,16 +138,6 @@ class AccessCheck:
                 f"Sec-Fetch-Site: expected a request by a page of this server, got {_quoted(fetch_site)}; open the "
                 f"page of {_quoted(host)}"
             )
-
-    def _is_served(self, host: bytes) -> bool:
-        """Return whether the header `Host` contains an IP address or a name of this server.
-
-        A missing header is accepted.
-        """
-        if not host:  # HTTP/1.0 does not require the header, but browsers always send it
-            return True
-        name = _name_in(host.decode("latin-1"))
-        return ip_address(name) is not None or name in self._host_names
 
     def _is_own_page(self, origin: bytes, host: bytes) -> bool:
         """Return whether the page that has sent a request belongs to this server.

@@ -301,11 +301,8 @@ def _verdict(
         return "fits: noise explains the errors"
 
     # State the part of the errors that noise and rig do not explain, which is the attribute `beyond`.
-    unexplained = []
-    if position is not None:
-        unexplained.append(f"{position.beyond:.2g} mm")
-    if force is not None:
-        unexplained.append(f"{force.beyond:.2g} %")
+    summaries = {"mm": position, "%": force}
+    unexplained = [f"{summary.beyond:.2g} {unit}" for unit, summary in summaries.items() if summary is not None]
     verdict = f"does not fit: {' and '.join(unexplained)} beyond noise"
     if misfit_text:
         return f"{verdict}; {misfit_text}"

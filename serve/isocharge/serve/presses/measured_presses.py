@@ -220,7 +220,6 @@ def read_presses(
         PressError: If the file cannot be used. The message names the file, the line and the column, and states what was
             expected, what was given and what the user can do.
     """
-    path = Path(path)
     default_stds = {"position_std_mm": position_std_mm, "force_std": force_std}
     for name, std in default_stds.items():
         is_allowed = 0.0 < std <= PRESS_RULES[name].maximum  # false for NaN
@@ -293,7 +292,6 @@ def read_press_list(path: Path) -> Array:
     Raises:
         PressError: If the file cannot be read, or a row is not a press. The message names the line and the column.
     """
-    path = Path(path)
     with open_table(path, CONTACT, PressError, f"a header with {', '.join(CONTACT)}") as table:
         columns = _read_rows(table, {name: PRESS_RULES[name] for name in CONTACT}, {})
     with error_prefix(f"{path}, ", PressError):

@@ -32,9 +32,6 @@ from isocharge.serve.presses.number_columns import ColumnRule, NumberColumns
 
 log = logging.getLogger(__name__)
 
-STDIN = Path("-")
-"""Path that stands for standard input, from which CSV text is read."""
-
 MAX_COLUMNS = 1_000
 """Largest number of columns of a file."""
 
@@ -398,7 +395,7 @@ def open_table(path: Path, names: Collection[str], error_class: type[InputError]
     Raises:
         error_class: If the file cannot be read, either when it is opened or when the block reads the columns.
     """
-    is_stdin = path == STDIN
+    is_stdin = str(path) == "-"
     where = "stdin" if is_stdin else str(path)
     file_or_descriptor = STDIN_FILENO if is_stdin else path
     try:
