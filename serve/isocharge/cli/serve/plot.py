@@ -82,8 +82,8 @@ def recording_picture(samples: Samples, title: str) -> Figure:
         values = samples[f"{quantity}_{unit}"]
         two_std = 2.0 * samples[f"{quantity}_std_{unit}"]
         (points,) = axes.plot(time_s, values, ".", ms=2.0, label=quantity)
-        for limit in (values - two_std, values + two_std):
-            axes.plot(time_s, limit, ".", ms=1.0, alpha=0.3, color=points.get_color())
+        limits = np.column_stack([values - two_std, values + two_std])
+        axes.plot(time_s, limits, ".", ms=1.0, alpha=0.3, color=points.get_color())
     for row, flag_time_s in enumerate(flags.values()):
         flag_axes.plot(flag_time_s, np.full(len(flag_time_s), row), "|", color=INK)
 

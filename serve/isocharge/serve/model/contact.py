@@ -69,7 +69,7 @@ class Contact(NamedTuple):
 
 
 CLOSE_DISTANCE_mm = 0.3
-"""Largest difference of x or of y between two close contacts, mm."""
+"""Largest distance between two close contacts, mm."""
 
 CLOSE_FORCE_RATIO = 0.05
 """Largest difference of the force between two close contacts, relative to the force of the reference contact."""
@@ -87,10 +87,9 @@ def is_close(contact: Contact, reference: Contact | None) -> bool:
     """
     if reference is None:
         return False
-    is_x_close = abs(contact.x_mm - reference.x_mm) <= CLOSE_DISTANCE_mm
-    is_y_close = abs(contact.y_mm - reference.y_mm) <= CLOSE_DISTANCE_mm
+    is_position_close = math.dist(contact[:2], reference[:2]) <= CLOSE_DISTANCE_mm
     is_force_close = abs(contact.force_N - reference.force_N) <= CLOSE_FORCE_RATIO * reference.force_N
-    return is_x_close and is_y_close and is_force_close
+    return is_position_close and is_force_close
 
 
 class Contacts(NamedTuple):
