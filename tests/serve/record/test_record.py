@@ -4,6 +4,7 @@ import json
 import re
 
 import jsonschema_rs
+import numpy as np
 import pytest
 from msgspec import structs
 
@@ -27,6 +28,10 @@ def test_json_has_the_fields_of_tracking_and_film_after_the_others(contract, rec
     assert (written["tracked"], written["event"]) == (structs.asdict(TRACKED), "slide")
     assert written["other"] == structs.asdict(other)
     assert written["film"] == {"pretension_MPa": 0.712346, "pretension_std_MPa": 0.05, "touches": 12}
+
+
+def test_numpy_numbers_are_written_as_numbers(record):
+    assert record(timestamp=np.float64(1.25)).to_json().startswith('{"timestamp": 1.25, ')
 
 
 def test_record_that_is_not_a_number_has_no_json(record):

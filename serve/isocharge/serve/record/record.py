@@ -167,11 +167,10 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
         json_values: dict[str, Any] = {}
         for field in record_fields(self.sections):
             value = getattr(self, field.name)
-            value_class = value.__class__  # comparing the class is faster than a call of `isinstance`
-            if value_class is float:
+            if isinstance(value, float):
                 value = round(value, DECIMALS)
-            elif value_class not in _UNCHANGED:  # the charges by electrode, or a struct of numbers
-                numbers = value if value_class is dict else structs.asdict(value)
+            elif isinstance(value, (dict, Struct)):  # the charges by electrode, or a struct of numbers
+                numbers = value if isinstance(value, dict) else structs.asdict(value)
                 value = {key: None if number is None else round(number, DECIMALS) for key, number in numbers.items()}
             json_values[field.name] = value
         return json_values
@@ -209,8 +208,5 @@ def record_fields(sections: tuple[str, ...] = ()) -> tuple[Field, ...]:
     """
     return tuple(field for field in RECORD_FIELDS if field.section in ("", *sections))
 
-
-_UNCHANGED = frozenset({str, int, bool, tuple, type(None)})
-"""Classes of values that are written to JSON without a change."""
 
 _ENCODE = json.JSONEncoder(allow_nan=False).encode
