@@ -68,7 +68,7 @@ class File(Settings, frozen=True):
 
 def test_a_value_that_fits_is_taken():
     text = 'board = {radius = 2, gain = {A = 1.5, B = 2}, frames = {format = "binary", length = 3}}'
-    board = parse_toml(text.encode(), "mine.toml", SensorError, File).board
+    board = parse_toml(text.encode("utf-8-sig"), "mine.toml", SensorError, File).board
     assert (board.radius, board.gain, board.frames, board.share) == (2.0, {"A": 1.5, "B": 2.0}, Binary(length=3), 0.0)
     assert parse_json(msgspec.json.encode(File(board=board)), "", SensorError, File).board == board
 

@@ -126,7 +126,7 @@ def parse_toml(data: bytes, where: str, error_class: type[InputError], target_ty
         error_class: If the text is not TOML, or its content is wrong.
     """
     try:
-        text = data.decode()
+        text = data.decode("utf-8-sig")  # some editors begin a file with a byte order mark
         if _DEEP_KEY.search(text):  # parsing such a key needs much memory
             raise ValueError("a key of more than 32 parts")
         content = tomllib.loads(text)
