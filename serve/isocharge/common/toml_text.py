@@ -39,9 +39,7 @@ def to_toml(tables: Mapping[str, Any], comment: Iterable[str] = ()) -> str:
 
     for name, table in tables.items():
         if isinstance(table, Mapping):
-            lines.append("")
-            lines.append(f"[{_key(name)}]")
-            lines += [_pair(key, value) for key, value in table.items()]
+            lines += ["", f"[{_key(name)}]", *(_pair(key, value) for key, value in table.items())]
     content = "\n".join(lines).lstrip("\n")  # remove the blank line if the file begins with a section
     return content + "\n"
 

@@ -109,9 +109,5 @@ class McapFile(FileOutput):
 
     def close(self) -> None:
         """Write the index of the messages, and close the file. In a replay, also rename it to its final name."""
-        try:
+        with self._stack:  # in a replay, it removes the file after an error
             self._writer.finish()  # type: ignore[no-untyped-call]
-        except BaseException:
-            self.discard()
-            raise
-        super().close()

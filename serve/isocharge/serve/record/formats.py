@@ -133,16 +133,11 @@ def _property(field: Field, electrodes: Sequence[str], *, allows_null: bool) -> 
             object. If not, the schema declares only the type of known values.
     """
     json_type = field.json_type
-    number_in_object: dict[str, Any] = {"type": "number"}  # schema of a number in an object
-    if allows_null:
-        number_in_object = {"type": ["number", "null"]}
-
-    schema: dict[str, Any] = {"type": json_type}
-    if allows_null and field.may_be_null:
-        schema["type"] = [json_type, "null"]
+    schema: dict[str, Any] = {"type": [json_type, "null"] if allows_null and field.may_be_null else json_type}
     if json_type == "array":  # a list of texts
         schema["items"] = {"type": "string"}
     if json_type == "object":  # its parts are all numbers
-        schema["properties"] = dict.fromkeys(_part_names(field, electrodes), number_in_object)
+        number = {"type": ["number", "null"] if allows_null else "number"}
+        schema["properties"] = dict.fromkeys(_part_names(field, electrodes), number)
     schema["description"] = field.meaning
     return schema

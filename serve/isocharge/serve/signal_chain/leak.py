@@ -121,7 +121,6 @@ class Inflow:
         self.learned_s += dt_s
         averaging_s = max(min(rule.settle_s, self.learned_s), dt_s)
         self.pC_per_s = self.pC_per_s + clipped_surplus_pC / averaging_s
-        self.hold_s = 0.0
 
         # Replace the trusted inflow and the candidate if the candidate is old enough.
         self._candidate_age_s += dt_s
