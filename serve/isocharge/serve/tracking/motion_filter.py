@@ -334,14 +334,11 @@ def _measured_values(contact: Contact) -> tuple[Array, Array]:
     """Return x, y and ln F of a contact, shape (3,), and their covariance, shape (3, 3).
 
     The standard deviations are limited, and the correlations are made slightly smaller, so that the covariance has only
-    positive eigenvalues. Correlations of NaN count as 0.
+    positive eigenvalues.
     """
     smallest_force_N = float(np.finfo(np.float32).tiny)  # ln F would be infinite if the force were zero
     force_N = max(smallest_force_N, contact.force_N)
     std = np.minimum([contact.x_std_mm, contact.y_std_mm, contact.force_std_N / force_N], LARGEST_STD)
     xy, xF, yF = contact.xy_correlation, contact.xF_correlation, contact.yF_correlation
-    correlation = np.array([[1.0, xy, xF], [xy, 1.0, yF], [xF, yF, 1.0]])
-    if math.isnan(xy):
-        correlation = _IDENTITY
-    correlation = correlation + CORRELATION_RIDGE * _IDENTITY
+    correlation = np.array([[1.0, xy, xF], [xy, 1.0, yF], [xF, yF, 1.0]]) + CORRELATION_RIDGE * _IDENTITY
     return np.array([contact.x_mm, contact.y_mm, math.log(force_N)]), correlation * np.outer(std, std)
