@@ -19,7 +19,7 @@ line, except units of charge and voltage. Quotes around a number have no meaning
 
 import math
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Container
 from itertools import pairwise, takewhile
 from typing import NamedTuple
 
@@ -56,9 +56,6 @@ _PATTERNS = {
     "optional blanks": r"\s*+",
 }
 """Regular expressions of the parts of a line that may change from line to line. Numbers are in groups."""
-
-_CODES = {kind: chr(code) for code, kind in enumerate(_PATTERNS)}
-"""Control characters that stand for these parts in a skeleton. A line with control characters is not parsed."""
 
 _IGNORED_AT_END = ",; \t"
 """Marks without a meaning at the end of a line."""
@@ -133,8 +130,8 @@ class Line(NamedTuple):
 
     Attributes:
         text: The line.
-        skeleton: The parts of the line that are the same in each line of a layout, with one control character for each
-            number, each other part that may change, and optional blanks.
+        skeleton: Regular expressions of the parts and of the blanks between them. A part that is the same in each line
+            of a layout has a regular expression that matches only this part.
         names: Name of each number; empty for a number without a name.
         starts: Position in the line at which each number begins.
         is_prose: Whether the line resembles a message; see `_is_prose`.
@@ -142,7 +139,7 @@ class Line(NamedTuple):
     """
 
     text: str
-    skeleton: str
+    skeleton: tuple[str, ...]
     names: tuple[str, ...]
     starts: tuple[int, ...]
     is_prose: bool
@@ -178,7 +175,7 @@ def parse_line(text: str, *, has_header: bool = False, counters: Collection[str]
     return Line(text, skeleton, tuple(_with_units(names, gaps)), starts, _is_prose(tokens), words)
 
 
-def _skeleton(tokens: list[_Token], names: list[str], number_kind: str) -> str:
+def _skeleton(tokens: list[_Token], names: list[str], number_kind: str) -> tuple[str, ...]:
     """Return the skeleton of a line; see `Line`.
 
     Args:
@@ -187,17 +184,17 @@ def _skeleton(tokens: list[_Token], names: list[str], number_kind: str) -> str:
         number_kind: Kind of the numbers in the line, a key of `_TOKENS`.
     """
     fixed_words = {*names, *_ALL_CHARGE_UNITS}  # a line with another unit has another layout
-    skeleton = ""
+    patterns = []
     for previous, token in pairwise([_EDGE, *tokens]):
         if "mark" in (previous.kind, token.kind):
-            skeleton += _CODES["optional blanks"]
+            patterns.append(_PATTERNS["optional blanks"])
         elif token.is_after_blank:
-            skeleton += _CODES["blanks"]
+            patterns.append(_PATTERNS["blanks"])
         if token.kind in ("key", "mark") or (token.name in fixed_words and not token.is_number):
-            skeleton += token.content
+            patterns.append(re.escape(token.content))
         else:
-            skeleton += _CODES[number_kind if token.kind == "number" else token.kind]
-    return skeleton
+            patterns.append(_PATTERNS[number_kind if token.kind == "number" else token.kind])
+    return tuple(patterns)
 
 
 def _is_prose(tokens: list[_Token]) -> bool:
@@ -397,8 +394,7 @@ def _unique(names: list[str]) -> list[str]:
 
 def skeleton_pattern(line: Line) -> re.Pattern[str]:
     """Return the regular expression of all lines with the skeleton of a line. Each number is a group."""
-    patterns = {_CODES[kind]: pattern for kind, pattern in _PATTERNS.items()}
-    return re.compile("".join(patterns.get(part) or re.escape(part) for part in line.skeleton) + r"[\s,;]*+")
+    return re.compile("".join(line.skeleton) + r"[\s,;]*+")
 
 
 def line_values(pattern: re.Pattern[str], text: str) -> tuple[float, ...] | None:
@@ -430,8 +426,8 @@ def _value(number: str) -> float:
     return float(number.replace(",", "."))
 
 
-def _separator(text: str) -> str | None:
-    """Return the mark that separates the columns of a text; None if only blanks separate them."""
+def _separator(text: Container[str]) -> str | None:
+    """Return the mark that separates the columns of a text or a skeleton; None if only blanks separate them."""
     return next((mark for mark in "\t;," if mark in text), None)
 
 
