@@ -9,7 +9,7 @@ is determined later.
 All checksums with a name are tried for every possible position of the first byte that they cover.
 """
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import product
@@ -180,29 +180,28 @@ def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDiv
         data: Bytes of the stream.
         max_lengths: Largest number of divisions.
     """
-    # Positions of each byte and each pair of bytes after which it occurs again, by the distance to the next occurrence
-    starts_by_distance: defaultdict[tuple[int, bytes, int], list[int]] = defaultdict(list)
-    for size in (2, 1):
-        latest_position: dict[bytes, int] = {}
-        for position in range(len(data) - size + 1):
-            code = data[position : position + size]
-            distance = position - latest_position.get(code, position)
-            if MIN_FRAME_BYTES <= distance <= MAX_FRAME_BYTES:
-                starts_by_distance[-size, code, distance].append(position - distance)
-            latest_position[code] = position
+    stream = np.frombuffer(data, np.uint8)
+    single_bytes = stream.astype(int)
+    pairs = 256 * single_bytes[:-1] + single_bytes[1:]
 
-    # For each length of a frame, the largest number of positions at which frames of this length begin
-    best_starts: dict[int, list[int]] = {}
-    for (*_code, length), starts in sorted(starts_by_distance.items()):  # the first of equal counts: a pair of bytes
-        is_frequent = len(starts) * length > COVERED_SHARE * len(data)
-        is_best = len(starts) > len(best_starts.get(length, ()))
-        if is_frequent and is_best:
-            best_starts[length] = starts
+    # For each length of a frame, the positions at which frames of this length begin, as many as possible. Of equal
+    # numbers of positions, those of a pair of bytes are chosen.
+    best_starts: dict[int, NDArray[np.int64]] = {}
+    for codes in (pairs, single_bytes):
+        positions = np.argsort(codes, kind="stable")  # first all positions of the smallest code
+        distances = np.diff(positions) * (np.diff(codes[positions]) == 0)  # 0 behind the last position of a code
+        for length in range(MIN_FRAME_BYTES, MAX_FRAME_BYTES + 1):
+            starts = positions[:-1][distances == length]
+            best_code = np.bincount(codes[starts], minlength=1).argmax()
+            starts = starts[codes[starts] == best_code]
+            is_frequent = len(starts) * length > COVERED_SHARE * len(data)
+            if is_frequent and len(starts) > len(best_starts.get(length, ())):
+                best_starts[length] = starts
 
     # The shares are rounded to 0.1, so that of two lengths with about equal shares the shorter length comes first.
     shares = {length: round(len(starts) * length / len(data), 1) for length, starts in best_starts.items()}
     for length in sorted(shares, key=lambda length: (-shares[length], length))[:max_lengths]:
-        yield FrameDivision(SYNC, np.frombuffer(data, np.uint8), np.array(best_starts[length]), length)
+        yield FrameDivision(SYNC, stream, best_starts[length], length)
 
 
 ORDERS: tuple[ByteOrder, ...] = ("little", "big")
