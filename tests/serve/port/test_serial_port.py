@@ -424,6 +424,7 @@ def test_installed_package_adds_a_source(monkeypatch):
     monkeypatch.setattr("isocharge.serve.port.source.entry_points", entry_points)
     with open_source("can://vcan0") as source:
         assert [received.data for received in source] == [chunk.data, b"can://vcan0"]
+    assert isinstance(open_source("can"), Port)  # a path
     with open_source("large://x") as source:
         chunks = list(source)
     assert b"".join(part.data for part in chunks) == large_chunk.data

@@ -139,17 +139,16 @@ class Port:
             InputError: If the port is a file.
         """
         is_path = "://" not in self.url
+        path = Path(self.url)
         with _permission_errors_converted(self.url):
-            exists = not is_path or Path(self.url).exists()
-            is_file = is_path and Path(self.url).is_file()
-        if not exists:
-            raise PortError(f"{self.url}: there is no such port: plug the board in, check the name, or wait for it")
-        if is_file:
-            with open_file(Path(self.url)):  # raises another error for a file that does not come from a board
-                raise InputError(
-                    f"{self.url}: expected a port, got a file; only `isocharge serve stream` reads the bytes of a "
-                    "board from a file"
-                )
+            if is_path and not path.exists():
+                raise PortError(f"{self.url}: there is no such port: plug the board in, check the name, or wait for it")
+            if is_path and path.is_file():
+                with open_file(path):  # raises another error for a file that does not come from a board
+                    raise InputError(
+                        f"{self.url}: expected a port, got a file; only `isocharge serve stream` reads the bytes of a "
+                        "board from a file"
+                    )
         try:
             if self.url.startswith(UDP_SCHEME):
                 self._line = UdpSocket(self.url)
@@ -385,12 +384,12 @@ def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> context
     if url == STDIN:
         return contextlib.nullcontext(FileSource(sys.stdin.fileno(), STDIN))
 
-    scheme, _, _address = url.partition("://")
-    for entry_point in entry_points(group=ENTRY_POINTS, name=scheme):
+    scheme, separator, _address = url.partition("://")
+    is_path = not separator
+    for entry_point in () if is_path else entry_points(group=ENTRY_POINTS, name=scheme):
         return AddedSource(url, entry_point)
 
     # Wait until the path exists, because the type of a missing path (a file or a port) is unknown.
-    is_path = "://" not in url
     path = Path(url)
     deadline_s = time.monotonic() + wait
     with _permission_errors_converted(url):
