@@ -63,6 +63,13 @@ _IGNORED_AT_END = ",; \t"
 _UNCLEAR_SIGN = r"(?:^|[\s;])[-+]?[0-9.]+(?:(?:\s*[fnpuµμm]?[CV])?\s+-\s+[.0-9]|-(?:[\s,;]|$))"
 """Regular expression of a minus after a number, as in `3.5 - 2.5` and `3.5-`, which may be a sign or a separator."""
 
+_SEPARATING_COMMA = (
+    r"[0-9]\.[0-9]|[0-9],[0-9]+,[0-9]"  # a number with a decimal point or two commas
+    r"|[0-9],[-+.]|[0-9]\s*,\s+[-+.0-9]|[0-9]\s+,"  # before a sign or beside a blank
+    r"|,[0-9]+\s*[:=]|,0[xX]"  # before a name or a hexadecimal number
+)
+"""Regular expression of a text that shows that the commas of a line are separators."""
+
 _NUMBER_KINDS = ("time", "uptime", "hexadecimal", "number")
 
 _NAMES_OF_TIMES = {"time": "t_s", "uptime": "t_ms"}
@@ -224,17 +231,16 @@ def _has_decimal_commas(text: str) -> bool:
     or before a name, if nothing else separates two numbers, or if the line has brackets and a colon or an equals sign
     does not stand before each number. In `A:4,3`, the comma is a decimal comma, because a name belongs to one number.
     """
-    runs = re.findall(r"[0-9]+(?:[.,][0-9]+)*", re.sub(_TIME, "", text))
-    are_decimal = all("." not in run and run.count(",") <= 1 for run in runs)
-    named_runs = re.findall(r"[:=]\s*[-+]?[0-9]+,", text)
-    are_named = 1 < sum("," in run for run in runs) == len(named_runs)
+    text = re.sub(_TIME, "", text)
+    numbers = re.findall("[0-9]+(?:,[0-9]+)?", text)
+    commas = sum("," in number for number in numbers)
+    are_named = 1 < commas == len(re.findall(r"[:=]\s*[-+]?[0-9]+,", text))
     has_one_name = re.fullmatch(r"[^:=]+[:=]\s*[-+]?[0-9]+,[0-9]+\D*", text) is not None
     return (
-        are_decimal
-        and (len(runs) > 1 or has_one_name)
-        and any("," in run for run in runs)
+        commas > 0
+        and (len(numbers) > 1 or has_one_name)
         and (are_named or re.search(r"[\[({]", text) is None)
-        and re.search(r"[0-9],[-+.]|,[0-9]+\s*[:=]|,0[xX]|[0-9]\s*,\s+[-+.0-9]|[0-9]\s+,", text) is None
+        and re.search(_SEPARATING_COMMA, text) is None
     )
 
 
