@@ -311,14 +311,14 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
             parser = DatagramParser(self)
         else:
             stuffing = STUFFINGS[self.framing]
-
-            def decode_stuffed(stuffed_frame: bytes) -> Frame:
-                """Remove the byte stuffing from a frame, and decode the frame."""
-                return self.decode(stuffing.decode(stuffed_frame))
-
             # SLIP and HDLC at most double the length. COBS adds 1 byte, and 1 more for every 254 bytes. The limit is
             # not exact, because it only prevents that an endless piece without a delimiter is stored.
-            parser = StuffedParser(self.description, stuffing.delimiter, 2 * self.length + 2, decode_stuffed)
+            parser = StuffedParser(
+                self.description,
+                stuffing.delimiter,
+                2 * self.length + 2,
+                lambda stuffed_frame: self.decode(stuffing.decode(stuffed_frame)),
+            )
         parser.seq_modulus = self.fields[self.columns.seq_column or 0].modulus  # ignored without a counter
         parser.t_us_modulus = self.t_us_modulus
         return parser

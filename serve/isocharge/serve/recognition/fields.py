@@ -9,6 +9,7 @@ channels are adjacent and have the same type. The weights were fitted to random 
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -250,21 +251,16 @@ def split_frame(
         """
         if position == len(parts_at_each_byte):
             return 0.0, ()
-        best_score = np.inf
-        best_parts: tuple[Part, ...] = ()
+        divisions = []
         for part in parts_at_each_byte[position]:
             channel_type = part.type_name if part.name == CHANNEL else ""
             begins_group = channel_type not in ("", previous_channel_type)
             if begins_group and part.is_constant:
                 continue
             rest_score, rest_parts = best_division(position + part.size, channel_type)
-            score = part.score + rest_score
-            if begins_group:
-                score += Weights.channel_group
-            if score < best_score:
-                best_score = score
-                best_parts = (part, *rest_parts)
-        return best_score, best_parts
+            group_score = Weights.channel_group if begins_group else 0.0
+            divisions.append((part.score + rest_score + group_score, (part, *rest_parts)))
+        return min(divisions, key=itemgetter(0))  # of equal scores, the first division
 
     # Of equal scores, `min` returns the one with the shortest pattern.
     lowest_score, best_sync_length = min((best_division(length, "")[0], length) for length in sync_lengths)
