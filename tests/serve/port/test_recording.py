@@ -38,11 +38,12 @@ def test_unfinished_line_is_ignored(recorded, cut):
     assert [*Recording(recorded).events()] == [*events, expected]
 
 
-def test_recorder_refuses_a_file_that_exists_and_a_missing_folder(tmp_path):
+def test_recorder_refuses_a_file_that_exists_a_missing_folder_and_a_name_that_could_not_be_read(tmp_path):
     path = tmp_path / "touch.rec"
     path.write_text("mine")
-    for refused_path, error in ((path, OutputExists), (tmp_path / "no" / "x", OutputError)):
-        with pytest.raises(error), Recorder(refused_path, "m/1", {}):
+    refused = ((path, "a", OutputExists), (tmp_path / "no" / "x", "a", OutputError), (tmp_path, "a\n", RecordingError))
+    for refused_path, name, error in refused:
+        with pytest.raises(error), Recorder(refused_path, "m/1", {}, name):
             pass
     assert path.read_text() == "mine"
 

@@ -81,13 +81,16 @@ class Recorder:
             model: Label of the model, `name/version`.
             device: Content of the device file.
             name: Name of the film in the records; None for the name of the sensor of the model.
+
+        Raises:
+            RecordingError: If the first line of the recording could not be read.
         """
         self.path = path
         self.model_label = model
         self.failed = False
-        self._header = {KIND: VERSION, "model": model, "device": dict(device)}
-        if name:
-            self._header["name"] = name
+        header = {KIND: VERSION, "model": model, "device": dict(device)} | ({"name": name} if name else {})
+        self._first_line = json.dumps(header)
+        parse_json(self._first_line, "recording", RecordingError, _Header)
         self._last_chunk: Chunk | None = None  # chunk of the latest call of `chunk`
         self._size_before_last_chunk = 0  # size of the file before the last chunk was written, bytes
 
@@ -100,7 +103,7 @@ class Recorder:
         """
         with as_output_errors(self.path):
             self._file = AtomicWriter(self.path)
-        self._write(json.dumps(self._header))
+        self._write(self._first_line)
 
     def __enter__(self) -> Self:
         """Create the file, and return the recorder; see `open`."""
@@ -181,9 +184,7 @@ class Event(Struct):
         Raises:
             WrongKey: If a record lacks its time or its latency, or if the line has no known key.
         """
-        has_time = self.timestamp is not None
-        has_latency = self.latency_us is not None
-        if has_time != has_latency:  # a record has both keys, and an event has neither
+        if (self.timestamp is None) != (self.latency_us is None):  # a record has both keys, and an event has neither
             raise WrongKey("latency_us")
         known_keys = (self.timestamp, self.tare, self.use, self.marker, self.chunk)
         if all(key is None for key in known_keys):
