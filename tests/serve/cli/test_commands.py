@@ -87,8 +87,8 @@ def test_check_of_many_presses_shows_the_worst(measured, models, command):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("check linear measured.csv --force-std 0", "force_std: expected a positive share"),
-        ("check linear measured.csv --position-std nan", "position_std_mm: expected"),
+        ("check linear measured.csv --force-std 0", "Invalid value for '--force-std'"),
+        ("check linear measured.csv --position-std nan", "Invalid value for '--position-std'"),
         ("stream linear --port frames.csv --device leak.toml", "expected a column t_ms, t_us or t_s"),
         ("stream linear --port frames.csv --track", "expected a column t_ms, t_us or t_s"),
         ("stream linear --port frames.csv --device currents.toml", "expected a column t_ms, t_us or t_s"),

@@ -114,6 +114,7 @@ PositionStdOption = Annotated[
     typer.Option(
         "--position-std",
         metavar="MM",
+        min=1e-6,
         help="Standard deviation of known x and y, mm, of presses for which the file states no position_std_mm.",
     ),
 ]
@@ -122,6 +123,8 @@ ForceStdOption = Annotated[
     float,
     typer.Option(
         metavar="SHARE",
+        min=1e-6,
+        max=1.0,
         help="Standard deviation of known forces, a share of the force, of presses for which the file states no "
         "force_std.",
     ),

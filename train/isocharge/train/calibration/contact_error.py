@@ -15,20 +15,21 @@ chosen before any charge is measured. Several presses are chosen one after the o
 Pukelsheim 1993).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import with_log_force
-from isocharge.serve.presses.measured_presses import CONTACT, FORCE_STD, POSITION_STD_MM
+from isocharge.serve.presses.measured_presses import FORCE_STD, POSITION_STD_MM
 from isocharge.simulate import Domain, Sweep
 from isocharge.simulate.identifiability.cramer_rao import CramerRao
 from isocharge.simulate.numerics.disk import log_spaced_forces, sunflower
 from isocharge.simulate.solver.stress_limit import force_within_stress
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import FilmEstimate
-from isocharge.train.calibration.press_data import Linearised, PressData, model_values
+from isocharge.train.calibration.press_data import UNKNOWN_STD, Linearised, PressData, model_values
 from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.data.contact_errors import rms
 
@@ -86,15 +87,13 @@ class ContactSensitivity:
             domain: The working area.
         """
         linearised = _linearise_at(film, charges, spread_contacts(domain))
-        charge_rows = slice(-len(CONTACT))  # the last rows are those of measured coordinates
-        slopes = linearised.contact_jacobian[:, charge_rows]
-        film_slopes = linearised.jacobian[:, charge_rows]
+        slopes = linearised.contact_jacobian
         # The error of a contact is (S' S + P)^-1 S' (noise + R e), where e is the error of the unknowns, and P is the
         # precision of the prior. S and R are the derivatives of the charges with respect to the contact and to the
         # unknowns. A uniform distribution from -1 to 1 has the variance 1/3.
         domain_precision = np.diag(3.0 / domain.scale**2)
         noise_covariance = np.linalg.inv(slopes.swapaxes(1, 2) @ slopes + domain_precision)
-        film_gain = noise_covariance @ slopes.swapaxes(1, 2) @ film_slopes
+        film_gain = noise_covariance @ slopes.swapaxes(1, 2) @ linearised.jacobian
         return cls(film_gain, np.asarray(noise_covariance))
 
     @property
@@ -204,7 +203,7 @@ def _candidates(problem: CalibrationProblem) -> Array:
 
 
 def _linearise_at(
-    film: FilmEstimate, charges: FilmCharges, contact: Array, contact_std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    film: FilmEstimate, charges: FilmCharges, contact: Array, contact_std: Sequence[float] = (UNKNOWN_STD,) * 3
 ) -> Linearised:
     """Compute the derivatives of the residuals of presses without noise on a film.
 
@@ -212,8 +211,7 @@ def _linearise_at(
         film: The film and the noise of the charges.
         charges: Charges of a film and of similar films.
         contact: Contacts (x, y, F) of the presses, shape (n, 3), mm and N.
-        contact_std: Standard deviations of x and y, mm, and of ln F. The default is for callers that do not use the
-            residuals of the contact, which are the last three of each press.
+        contact_std: Standard deviations of x and y, mm, and of ln F. By default, the contacts are not measured.
     """
     charge = charges.charges(film.film_values, contact)
     log_contact = with_log_force(contact)

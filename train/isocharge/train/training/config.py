@@ -79,11 +79,9 @@ class NetworkConfig(Settings, frozen=True):
         If the widths of both networks are given, both networks must have the same number of hidden layers, because they
         are folded into one perceptron.
         """
-        if self.hidden is not None and self.misfit_hidden is not None:
-            layer_count = len(self.hidden)
-            if len(self.misfit_hidden) != layer_count:
-                expected = f"as many layers as network.hidden ({layer_count}; they run side by side)"
-                raise WrongKey("misfit_hidden", expected, list(self.misfit_hidden))
+        if self.hidden and self.misfit_hidden and len(self.misfit_hidden) != len(self.hidden):
+            expected = f"as many layers as network.hidden ({len(self.hidden)}; they run side by side)"
+            raise WrongKey("misfit_hidden", expected, list(self.misfit_hidden))
 
     def widths(self, n_electrode: int) -> tuple[Widths, Widths]:
         """Return the widths of the hidden layers of the contact network and of the misfit network.

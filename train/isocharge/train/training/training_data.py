@@ -193,9 +193,9 @@ class Split:
         """
         # Fit the field, and determine the domain without folds.
         presses = data.presses
-        electrode_names = data.sensor.electrode_names
-        field_train, field_validation = split_by_position(presses, training.hold_out)
-        whole_field = data.field or fit_charge_series(data.domain, electrode_names, field_train, field_validation)
+        whole_field = data.field or fit_charge_series(
+            data.domain, data.sensor.electrode_names, *split_by_position(presses, training.hold_out)
+        )
         domain, cautions = invertible_domain(whole_field, presses, misfit_noise(training.noise_model))
         is_folded = domain != data.domain  # `invertible_domain` reduces the domain only if the map folds
         used_presses = presses.within(domain.radius) if is_folded else presses
