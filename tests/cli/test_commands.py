@@ -295,6 +295,11 @@ def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
     np.testing.assert_allclose(felt.get_xydata(), pressed.get_xydata(), atol=0.5)
 
 
+def test_playground_that_cannot_be_written_is_reported(refused, tmp_path):
+    (tmp_path / "file").touch()
+    refused("demo", "--playground", tmp_path / "file/a.html", message="file/a.html cannot be written", code=1)
+
+
 def test_live_demo_streams_a_virtual_sensor_to_its_model(monkeypatch):
     calls = []
     board = SimpleNamespace(url="socket://127.0.0.1:1")

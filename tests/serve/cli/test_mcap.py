@@ -44,8 +44,10 @@ def figures(monkeypatch):
     return figures
 
 
-def test_plot_draws_a_recording(command, recorded, tmp_path, figures):
+def test_plot_draws_a_recording(command, refused, recorded, tmp_path, figures):
     picture, (path, _) = tmp_path / "touch.png", recorded
+    refused("serve", "plot", path, "-o", tmp_path / "no/a.png", message="no/a.png cannot be written", code=1)
+    figures.clear()
     file = shutil.copy(path, tmp_path / r"a$\frac$.rec")  # matplotlib reads formulas between dollars
     code, out, err = command("serve", "plot", file, "-o", picture)
     assert (code, out, f"drawn in {picture}: 300 records" in err) == (0, "", True), err

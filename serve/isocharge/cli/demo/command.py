@@ -8,7 +8,7 @@ import typer
 from isocharge.cli.shared.live_page import LiveOption, TokenOption
 from isocharge.cli.shared.terminal import say
 from isocharge.common.errors import InputError, require
-from isocharge.common.files import refuse_existing, write_whole
+from isocharge.common.files import as_output_errors, refuse_existing, write_whole
 
 
 def demo_command(
@@ -47,8 +47,9 @@ def demo_command(
         from isocharge.serve.viewer.playground_page import playground_html  # imported late, because the import is slow
 
         refuse_existing(playground)
-        playground.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(playground, playground_html().encode())
+        with as_output_errors(playground):
+            playground.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(playground, playground_html().encode())
         say(f"wrote {playground}; open it in a browser")
         return
 

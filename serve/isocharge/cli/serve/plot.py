@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from isocharge.cli.shared.options import RecordingArgument
 from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.common.errors import RecordingError
+from isocharge.common.files import as_output_errors
 from isocharge.serve import PredictionRecord, Recording
 from isocharge.serve.viewer.tape import FLAG_BITS, Samples, sample_type, sample_values
 from isocharge.simulate.plots.figure import INK, check_picture, new_figure, save_picture
@@ -33,7 +34,8 @@ def plot_command(
     recording = Recording(file)
     with shown_progress():
         samples = recorded_samples(recording, str(file))
-    save_picture(recording_picture(samples, f"{file.name}, {recording.model}"), output)
+    with as_output_errors(output):
+        save_picture(recording_picture(samples, f"{file.name}, {recording.model}"), output)
     say(f"drawn in {output}: {len(samples)} records")
 
 
