@@ -98,7 +98,7 @@ def test_a_model_in_another_ones_folder_is_refused(film, tmp_path):
 
 
 def test_folder_that_cannot_be_listed_affects_no_other_model(film, tmp_path, monkeypatch):
-    """The errors of the operating system are simulated, because the superuser may list every folder."""
+    """The error of the operating system is simulated, because the superuser may list every folder."""
     film.write(tmp_path)
     film.write(tmp_path, name="secret")
     list_folder = Path.iterdir
@@ -110,7 +110,6 @@ def test_folder_that_cannot_be_listed_affects_no_other_model(film, tmp_path, mon
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "iterdir", refuse)
-        patch.setattr(os, "access", lambda folder, _: folder.name != "secret")
         store = ModelStore(tmp_path)
         assert states(store) == [("linear", "1", "READY"), ("secret", "", "UNAVAILABLE")]
         with pytest.raises(ModelError, match="secret: cannot be listed"):

@@ -104,12 +104,18 @@ def model_names(root: Path) -> list[str]:
     """Return the names of the models in a repository, which is a folder of models, in alphabetical order.
 
     A folder whose name cannot be that of a model is skipped. An example is `lost+found` on a mounted volume, which only
-    the superuser may list. Any other folder that must not be listed is assumed to be a model.
+    the superuser may list. Any other folder that cannot be listed is assumed to be a model.
     """
     folders = [folder for folder in _subfolders(root) if NAME.fullmatch(folder.name)]
-    return sorted(
-        folder.name for folder in folders if not os.access(folder, os.R_OK | os.X_OK) or version_folders(folder)
-    )
+    return sorted(folder.name for folder in folders if _may_be_model(folder))
+
+
+def _may_be_model(folder: Path) -> bool:
+    """Return whether a folder contains versions, or cannot be listed."""
+    try:
+        return bool(version_folders(folder))
+    except ModelError:
+        return True
 
 
 def _released_models() -> Path:
