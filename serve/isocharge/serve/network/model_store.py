@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.serve.model.contact import Validity
-from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.model_folder import Model, load_checked_model, model_names, repositories, version_folders
 from isocharge.serve.network.metrics import ModelMetrics, Statistics
 
@@ -27,21 +26,14 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class LoadedVersion:
+class LoadedVersion(Model):
     """Version of a model that is loaded and available for requests.
 
     Attributes:
-        model: The model, which contains its session of onnxruntime.
         statistics: Counters of the requests to this version.
     """
 
-    model: Model
     statistics: Statistics
-
-    @property
-    def metadata(self) -> ModelMetadata:
-        """Metadata of the model."""
-        return self.model.metadata
 
     @cached_property
     def version(self) -> str:
@@ -244,7 +236,7 @@ class ModelStore:
         statistics.ready.set_function(lambda: len(self.versions_of(name, str(number))))
         model = load_checked_model(folder)
         statistics.description.info({"sensor": model.metadata.frame_id, "sha256": model.golden.sha256})
-        return LoadedVersion(model, statistics)
+        return LoadedVersion(**vars(model), statistics=statistics)
 
     def _replace(self, name: str, rows: list[Version]) -> None:
         """Replace all versions of a model, and remove the metrics of the versions that are no longer listed."""

@@ -34,12 +34,6 @@ Headers = Iterable[tuple[bytes, bytes]]
 Message = MutableMapping[str, Any]
 """Message or scope of ASGI."""
 
-Receive = Callable[[], Awaitable[Message]]
-"""Type of the function that returns the next part of a request."""
-
-Send = Callable[[Message], Awaitable[None]]
-"""Type of the function that sends a part of a response."""
-
 
 class Application(ABC):
     """ASGI application: the handler of models or the live page. It can be mounted under any path of another program.
@@ -55,7 +49,9 @@ class Application(ABC):
     traffic: Traffic
     blocking_paths: tuple[str, ...] = ()
 
-    async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
+    async def __call__(
+        self, scope: Message, receive: Callable[[], Awaitable[Message]], send: Callable[[Message], Awaitable[None]]
+    ) -> None:
         """Answer one HTTP request. If the client disconnects before its request is complete, nothing is sent.
 
         Args:

@@ -213,7 +213,7 @@ def infer(
     """
     requested_outputs = _requested_outputs(body)
     charge_pC = _read_charges(body.inputs[0], binary, loaded.metadata.electrodes, max_presses)
-    outputs = dict[str, Rows](run(loaded.model.session, charge_pC))
+    outputs = dict[str, Rows](run(loaded.session, charge_pC))
     if FLAGS in requested_outputs:
         outputs[FLAGS] = _flags(loaded, outputs)
     content: dict[str, Any] = {"model_name": loaded.metadata.name, "model_version": loaded.version}
