@@ -21,17 +21,16 @@ from isocharge.common.structs import Finite, NotNegative, Positive, Settings, Te
 FORMAT_VERSION = 1
 """Version of the format of the metadata."""
 
-NAME_PATTERN = r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}"
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 """Regular expression of the name of a model: characters that are safe in paths, URLs, web pages and `config.pbtxt`."""
 
-VERSION_PATTERN = "[1-9][0-9]{0,17}"
+VERSION = re.compile("[1-9][0-9]{0,17}")
 """Regular expression of the version of a model: a whole number of at most 63 bits."""
 
-NAME = re.compile(NAME_PATTERN)
-VERSION = re.compile(VERSION_PATTERN)
-LABEL = re.compile(f"{NAME_PATTERN}/{VERSION_PATTERN}")
+LABEL = re.compile(f"{NAME.pattern}/{VERSION.pattern}")
+"""Regular expression of the label of a model, `NAME/VERSION`."""
 
-ModelName = Annotated[str, Meta(pattern=rf"\A{NAME_PATTERN}\Z", description="letters, digits, '-', '_' and '.'")]
+ModelName = Annotated[str, Meta(pattern=rf"\A{NAME.pattern}\Z", description="letters, digits, '-', '_' and '.'")]
 
 ModelLabel = Annotated[str, Meta(pattern=rf"\A{LABEL.pattern}\Z", description="the label NAME/VERSION of a model")]
 
