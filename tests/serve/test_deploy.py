@@ -106,6 +106,9 @@ def test_triton_is_started_with_the_backend_for_onnx_beside_its_own(monkeypatch,
     }
     libraries, packages = (environment[name].split(":")[0] for name in ("LD_LIBRARY_PATH", "PYTHONPATH"))
     assert (libraries, packages) == (str(tmp_path / "nvidia_pytriton.libs"), str(tmp_path))
+    shutil.rmtree(server / "python_backend_stubs")
+    with pytest.raises(SystemExit, match="does not support Python"):
+        runpy.run_path(str(DEPLOY / "triton/start.py"), run_name="__main__")
 
 
 # systemd

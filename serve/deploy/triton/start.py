@@ -26,12 +26,14 @@ def create_backends_folder(pytriton: Path) -> Path:
     Args:
         pytriton: Folder of the installed package `pytriton`.
     """
+    python_version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    stub = pytriton / "tritonserver/python_backend_stubs" / python_version / "triton_python_backend_stub"
+    if not stub.is_file():
+        sys.exit(f"{stub}: missing; this version of pytriton does not support Python {python_version}, use another one")
     folder = Path(sys.prefix) / "triton-backends"
     shutil.rmtree(folder, ignore_errors=True)
     # The files are copied, because Triton does not follow symbolic links.
     shutil.copytree(pytriton / "tritonserver/backends/python", folder / "python")
-    python_version = f"{sys.version_info.major}.{sys.version_info.minor}"
-    stub = pytriton / "tritonserver/python_backend_stubs" / python_version / "triton_python_backend_stub"
     shutil.copy2(stub, folder / "python")
     shutil.copytree(HERE / "onnxruntime", folder / "onnxruntime")
     return folder
