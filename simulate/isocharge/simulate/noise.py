@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import InputError
+from isocharge.common.errors import InputError, SceneError
 
 
 class GaussianNoise:
@@ -103,6 +103,18 @@ class NoiseModel(GaussianNoise):
         """
         variance = self.variance(charge)
         return (1.0 + 2.0 * (self.gain**2 * np.asarray(charge)) ** 2 / variance) / variance
+
+    def check_white(self) -> None:
+        """Raise an error if there is no white noise.
+
+        Raises:
+            SceneError: If the white noise is zero.
+        """
+        if self.white == 0.0:
+            raise SceneError(
+                f"noise: expected white noise above 0 pC, got that of {self.name!r}: without noise the errors have no "
+                "lower limit"
+            )
 
     def to_dict(self) -> dict[str, float | str]:
         """Return the name and the parameters of the noise as a dictionary for the metadata of a model."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from function_map import FOLD_X, FunctionMap, folded_map, shaped_charges
+from isocharge.common.errors import SceneError
 from isocharge.simulate import (
     ChargeSpline,
     Circle,
@@ -174,6 +175,11 @@ def test_fold_line_bounds_the_working_area():
     working = working_area(folded_map(), REFERENCE, error=np.inf)
     assert (working.bound, working.fold_radius) == ("fold", pytest.approx(FOLD_X, abs=0.06))
     assert working.radius == working.unambiguous_radius == pytest.approx(2.9, abs=0.11)
+
+
+def test_working_area_without_white_noise_raises_scene_error():
+    with pytest.raises(SceneError, match="white noise above 0 pC, got that of 'clean'"):
+        working_area(folded_map(), noise_model("clean"))
 
 
 def test_allowed_error_bounds_the_working_area():

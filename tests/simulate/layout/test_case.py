@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import InputError
-from isocharge.simulate import Calibration, Electrode, NoiseModel
+from isocharge.simulate import Calibration, Electrode, Finger, NoiseModel
 from isocharge.simulate.layout.case import DesignCase, Nuisances
 from isocharge.simulate.layout.design import _solve_forward_map, design
 
@@ -47,7 +47,8 @@ def test_new_squares_are_named_anticlockwise_with_unused_letters(sensor):
         ({"keep": ("A", "A")}, "expected different names"),
         ({"keep": ("A", "B", "C", "D")}, "nothing to place"),
         ({"keep": ("Q",)}, "no electrode 'Q'"),
-        ({"side": 0.0}, "side: expected at least 0.01 mm, got 0 mm"),
+        ({"side": 0.015}, "side: expected at least 0.02 mm, got 0.015 mm"),
+        ({"probe": Finger(3.0)}, "expected circle:RADIUS, .* got finger:3.0"),
         ({"noise": NoiseModel("mine", 0.0, 1e-3)}, "expected white noise above 0"),
         ({"goal": "best"}, "goal: expected worst or rms, got 'best'"),
         ({"sensor": {"calibration": Calibration(rotation=0.1)}, "keep": ("A",)}, "is calibrated"),

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Ellipse, Finger, GrowingFinger, Polygon, Probe, parse_probe
 
-SIZES = st.floats(0.05, 1e6)
+SIZES = st.floats(0.02, 1e6)
 COMMON = settings(derandomize=True)
 HOUSE = np.array([(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (1.0, 2.0), (0.0, 1.0)])
 
@@ -96,7 +96,7 @@ def test_thousands_of_corners_are_refused_at_once(end):
     [
         *((Circle, size, f"radius: expected at least 0.02 mm, got {size:g} mm") for size in (0.0, np.nan, np.inf)),
         (Circle, 1e-3, r"radius: expected at least 0\.02 mm, got 0\.001 mm; 0\.001 m are 1 mm"),
-        (parse_probe, "polygon:0,0;.01,0;0,.01", r"reach: expected at least 0\.02 mm, got 0\.007"),
+        (parse_probe, "polygon:0,0;.01,0;0,.01", r"diameter: expected at least 0\.02 mm, got 0\.0149"),
         (Polygon.of, HOUSE[::-1], r"convex polygon with its corners anticlockwise, got \[\["),
         (Polygon.of, np.array([(0, 0), (2, 0), (0.5, 0.5), (0, 2)]), "convex polygon"),
         (Polygon.of, np.array([(0, 0), (1, 0), (2, 0), (0, 1)]), "convex polygon"),

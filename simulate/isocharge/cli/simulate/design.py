@@ -14,9 +14,8 @@ from isocharge.cli.shared.options import (
     WorkersOption,
 )
 from isocharge.cli.shared.terminal import say, show_result, shown_progress
-from isocharge.common.errors import InputError
 from isocharge.common.files import refuse_existing
-from isocharge.simulate import Circle, load_sensor, noise_model, parse_probe
+from isocharge.simulate import load_sensor, noise_model, parse_probe
 from isocharge.simulate.artwork import write_design
 from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase, Goal, Nuisances
 from isocharge.simulate.layout.design import design
@@ -66,8 +65,6 @@ def design_command(
     # Check the options, and describe the search.
     refuse_existing(output)
     footprint = parse_probe(probe)
-    if not isinstance(footprint, Circle):
-        raise InputError(f"--probe: expected circle:RADIUS, for which layouts are designed, got {probe}")
     case = DesignCase(
         load_sensor(sensor),
         electrodes,

@@ -235,11 +235,7 @@ def identify(
             f"got {smallest_force:g} N twice"
         )
     noise = noise or noise_model("reference")
-    if noise.white <= 0.0:
-        raise SceneError(
-            f"noise: expected white noise above 0 pC, got that of {noise.name!r}: without noise the errors have no "
-            "lower limit"
-        )
+    noise.check_white()
     if radius is None:
         forward_map = map_to_search(sensor, probe, force_range, executor)
     else:

@@ -62,13 +62,13 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
 
     def precision(position: Array) -> Array:
         """Return the inverse of the position error, which is zero at a fold, shape of the positions without (2,)."""
-        return np.asarray(1.0 / limits_at(charge_map, contacts(position), noise).position).reshape(position.shape[:-1])
+        return (1.0 / limits_at(charge_map, contacts(position), noise).position).reshape(position.shape[:-1])
 
     # Refine the minima of the precision. In each round, the step is halved, and each position moves to the best of 25
     # points: itself and the 24 points that are up to two steps away along x and y.
     position, step = _starting_points(rings, precision(rings.position))
     neighbours = np.stack(np.meshgrid(range(-2, 3), range(-2, 3)), axis=-1).reshape(-1, 2)
-    while len(position) and step.max() > 0.05 * FOLD_WIDTH:
+    while step.max() > 0.05 * FOLD_WIDTH:
         step *= 0.5
         trial = position[:, None] + step[:, None, None] * neighbours
         trial = onto_disk(trial.reshape(-1, 2), radius).reshape(trial.shape)
@@ -320,9 +320,10 @@ def working_area(
         search_pairs: Whether to search for pairs of distant contacts with the same charges.
 
     Raises:
-        SceneError: If the map has fewer than three electrodes.
+        SceneError: If the map has fewer than three electrodes, or if there is no white noise.
     """
     check_electrode_count(len(charge_map.electrodes))
+    noise.check_white()
     search_radius = charge_map.domain.radius
     min_force, max_force = charge_map.domain.force_range
     middle_force = float(np.sqrt(min_force * max_force))

@@ -13,8 +13,9 @@ from isocharge.simulate.identifiability.cramer_rao import cramer_rao
 from isocharge.simulate.noise import NOISE_LEVELS, NoiseModel
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.sensor.film import check_range
+from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.probe import Circle
-from isocharge.simulate.sensor.sensor import Calibration, Electrode, Sensor, electrode_index
+from isocharge.simulate.sensor.sensor import MIN_EXTENT, Calibration, Electrode, Sensor, electrode_index
 
 MIN_ELECTRODES = 3
 """Smallest number of electrodes of a design."""
@@ -101,7 +102,7 @@ class DesignCase:
     radius: float
     goal: Goal = "worst"
     keep: tuple[str, ...] = ()
-    probe: Circle = DEFAULT_PROBE
+    probe: Probe = DEFAULT_PROBE
     force: float = 1.0
     noise: NoiseModel = NOISE_LEVELS["reference"]
     nuisances: Nuisances = Nuisances()
@@ -123,13 +124,13 @@ class DesignCase:
                 f"electrodes: expected {MIN_ELECTRODES} to {MAX_ELECTRODES}, got {self.electrodes}; x, y and the force "
                 "of a press are three unknowns"
             )
-        check_family(self.sensor.film, self.probe, Domain(self.radius, (self.force, self.force)))
-        check_range("side", self.square_side, (1e-2, np.inf), "mm", InputError)
-        if not self.noise.white > 0.0:
+        if not isinstance(self.probe, Circle):
             raise InputError(
-                f"noise {self.noise.name!r}: expected white noise above 0, because errors have no lower limit "
-                "without noise"
+                f"probe: expected circle:RADIUS, for which layouts are designed, got {self.probe.notation}"
             )
+        check_family(self.sensor.film, self.probe, Domain(self.radius, (self.force, self.force)))
+        check_range("side", self.square_side, (MIN_EXTENT, np.inf), "mm", InputError)
+        self.noise.check_white()
         if self.goal not in get_args(Goal):
             raise InputError(f"goal: expected {' or '.join(get_args(Goal))}, got {self.goal!r}")
         self._check_kept_electrodes()

@@ -20,6 +20,7 @@ from isocharge.simulate.forward.readout import ElectrodePieces, PressedFilm
 from isocharge.simulate.mechanics.theory import rotate_stress
 from isocharge.simulate.numerics.polygon import to_complex, to_corners
 from isocharge.simulate.sensor.film import Surface
+from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Electrode, Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress, touch_stress
@@ -52,7 +53,7 @@ PRESS_CHUNK = 256
 
 
 def solve_fields(
-    sensor: Sensor, probe: Circle, force: float, radius: float, executor: Executor | None = None
+    sensor: Sensor, probe: Probe, force: float, radius: float, executor: Executor | None = None
 ) -> ForwardMap:
     """Solve presses at a few distances from the centre, and compute one stress field for each of the `COLUMNS`.
 

@@ -22,7 +22,7 @@ from isocharge.simulate.numerics.polygon import to_corners
 from isocharge.simulate.sensor.film import check_range
 
 MIN_LENGTH = 0.02
-"""Smallest accepted radius, side, axis or reach of a footprint, mm. A smaller value was probably given in metres."""
+"""Smallest accepted radius, side, axis or diameter of a footprint, mm. A smaller one was probably given in metres."""
 
 CORE_SHARE = 0.45 * math.sqrt(2.0)
 """Ratio of two distances from the centroid in the same direction, dimensionless.
@@ -252,7 +252,7 @@ def check_length(what: str, length: float) -> None:
 
     Args:
         what: Name of the length in the error message.
-        length: Radius, side, axis or reach of the footprint, mm.
+        length: Radius, side, axis or diameter of the footprint, mm.
 
     Raises:
         SceneError: If `length` is below `MIN_LENGTH` or infinite.

@@ -260,7 +260,7 @@ class Polygon(Probe):
         if np.linalg.norm(centroid) > 1e-9 * self.reach:
             relative_corners = (corners - centroid).tolist()
             object.__setattr__(self, "corners", tuple(map(tuple, relative_corners)))  # the dataclass is frozen
-        check_length("probe reach", self.reach)
+        check_length("probe diameter", 2.0 * self.reach)
 
     @classmethod
     def of(cls, corners: Array, angle: float = 0.0, shape: str = "") -> "Polygon":
