@@ -280,15 +280,13 @@ class Measurement:
         """
         limit = self.amplifier.limit
         bits = self.amplifier.bits
-        clipped_output = np.clip(output, -limit, limit)
         if not bits:
-            return clipped_output
+            return np.clip(output, -limit, limit)
 
         # The converter has 2^bits codes for the range from -limit to limit.
-        charge_per_code = 2.0 * limit / 2**bits
-        lowest_code = -(2 ** (bits - 1))
-        highest_code = 2 ** (bits - 1) - 1
-        codes = np.clip(np.round(clipped_output / charge_per_code), lowest_code, highest_code)
+        half_count = 2 ** (bits - 1)
+        charge_per_code = limit / half_count
+        codes = np.clip(np.round(output / charge_per_code), -half_count, half_count - 1)
         return np.asarray(codes * charge_per_code)
 
 

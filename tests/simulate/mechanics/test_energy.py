@@ -59,7 +59,7 @@ def random_field(mesh, seed: int) -> np.ndarray:
 @pytest.fixture(params=GROUPS.values(), ids=GROUPS)
 def elastic(request, mesh) -> ElasticFilm:
     *groups, poisson = request.param
-    return ElasticFilm(mesh, DimensionlessGroups(*groups, isotropic(poisson)))
+    return ElasticFilm(mesh, DimensionlessGroups(*groups, isotropic(poisson), np.zeros(3), (0.0, 0.0), 0.0, 0.0, 0.0))
 
 
 def condensed(template, matrices: np.ndarray) -> np.ndarray:

@@ -141,7 +141,6 @@ class ForwardMap:
         # the charges of the check presses, which are solved directly. If the error is very large, the next number of
         # nodes would not suffice either and is skipped.
         check_charges: list[Array] = []  # solved in the first pass of the loop
-        error = np.inf
         remaining_counts = list(node_counts(sensor.film))
         while remaining_counts:
             count = remaining_counts.pop(0)

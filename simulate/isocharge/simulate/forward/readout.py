@@ -238,7 +238,7 @@ def contact_charges(sensor: Sensor, probe: Probe, contact: Array, orientation: A
     rotation = np.broadcast_to(orientation, len(contact))
     largest_reach = probe.under(float(force.max())).reach
     for electrode_index, electrode in enumerate(sensor.electrodes):
-        for part in electrode.parts:
+        for part in electrode.collecting_polygons:
             corners = sensor.calibration.place(part)
             centre = corners.mean(axis=0)
             part_radius = np.linalg.norm(corners - centre, axis=1).max()

@@ -121,7 +121,6 @@ class Triangulation:
         Returns:
             Contacts (x, y, F), shape (n, 3), mm and N, and their spreads, shape (n,), mm.
         """
-        distance = np.empty_like(charge)
         for _ in range(ROUNDS):
             _, derivatives = self.charge_map.linearised(contact)
             gradient_length = np.linalg.norm(derivatives[..., :2], axis=2)

@@ -23,8 +23,7 @@ bending (`error_estimate.modelling_error`), and the amplitude determines whether
 Saint-Venant-Kirchhoff elasticity (`load_case.check_press`).
 """
 
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -201,11 +200,11 @@ class DimensionlessGroups:
     tension: float
     bending: float
     elasticity: Array
-    uneven_tension: Array = field(default_factory=partial(np.zeros, 3))
-    side_load: tuple[float, float] = (0.0, 0.0)
-    static_pressure: float = 0.0
-    ambient_pressure: float = 0.0
-    compression: float = 0.0
+    uneven_tension: Array
+    side_load: tuple[float, float]
+    static_pressure: float
+    ambient_pressure: float
+    compression: float
 
     @classmethod
     def of(
@@ -230,12 +229,13 @@ class DimensionlessGroups:
         """
         # The unit of the force is E h a A^3, and the unit of the pressure is E h A^3 / a.
         squared_amplitude = float(amplitude_squared(film, force))
-        force_unit = film.young * film.thickness * film.radius * squared_amplitude**1.5
-        pressure_unit = film.young * film.thickness * squared_amplitude**1.5 / film.radius
+        side_unit = side_force_unit(film, squared_amplitude)
+        force_unit = side_unit * squared_amplitude**0.5
+        pressure_unit = force_unit / film.radius**2
 
         # Rotate the side force, as a complex number Fx + i Fy, into the axes of the press.
         rotation = complex(np.cos(angle), -np.sin(angle))
-        side_load = complex(*side_force) * rotation / side_force_unit(film, squared_amplitude)
+        side_load = complex(*side_force) * rotation / side_unit
 
         # The pretension (T11, T22, T12) minus its mean, MPa, refers to the axes x and y. The angle from the direction
         # of the press to the x axis is `-angle`.

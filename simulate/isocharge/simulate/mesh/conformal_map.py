@@ -74,7 +74,7 @@ def distance_coordinate(distance: Array | float) -> Any:
     return np.arctanh(distance)
 
 
-def enclosing_circle(outline: Complexes, centroid: Array, bisection_steps: int = 40) -> tuple[Array, Array]:
+def enclosing_circle(outline: Complexes, centroid: Array) -> tuple[Array, Array]:
     """Compute for each footprint a circle on the film that encloses the footprint with a gap.
 
     The centre of the circle is the centroid of the footprint if the circle keeps a minimum distance from the rim. If
@@ -84,7 +84,6 @@ def enclosing_circle(outline: Complexes, centroid: Array, bisection_steps: int =
     Args:
         outline: Points x + iy along the boundary of each footprint, shape (..., n), in film radii.
         centroid: Position of the centroid of each footprint on the x axis, shape (...), in film radii.
-        bisection_steps: Number of bisection steps for the centre of the enclosing circle.
 
     Returns:
         Position of the centre of each circle on the x axis, and radius of each circle, each of shape (...), in film
@@ -100,7 +99,7 @@ def enclosing_circle(outline: Complexes, centroid: Array, bisection_steps: int =
     # Bisection for the centre with the largest x coordinate at which the circle fits
     lower_bound = np.zeros(centroid.shape)
     upper_bound = centroid.copy()
-    for _ in range(bisection_steps):
+    for _ in range(40):
         middle = 0.5 * (lower_bound + upper_bound)
         middle_fits = middle + _enclosing_radius(outline, middle, rim_gap) <= max_extent
         lower_bound = np.where(middle_fits, middle, lower_bound)
@@ -190,7 +189,7 @@ def _intersections_with_circle(origin: Complexes, ray: Complexes, radius: Array)
     return np.asarray(origin + ray * length)
 
 
-def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array, max_turn: float = 0.2) -> Array:
+def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) -> Array:
     """Compute the directions of the rays that extend from the centroid of the footprint to the sides of the sectors.
 
     The last layer of elements inside the innermost circle connects the circle to an inner boundary. Each of the given
@@ -203,8 +202,6 @@ def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array, ma
             each corner of the core polygon, and one point half-way between each two corners.
         radius_ratio: Radius of the innermost circle divided by the largest distance of the inner boundary from the
             centre of the circle, shape (...).
-        max_turn: Largest angle between the side of a sector and the ray through its corner, rad. With larger angles,
-            elements at corners that lie close together would fold.
 
     Returns:
         Angles, shape (..., n_sector + 1), rad.
@@ -216,16 +213,17 @@ def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array, ma
     even_angle = angle_from_first + mean_difference[..., None]
 
     # Rotate the direction of each inner point towards the even angle. The rotation is small if the circle is close to
-    # the inner points. The function `tanh` limits the rotation to `max_turn`.
+    # the inner points. The function `tanh` limits the rotation to 0.2 rad. With larger angles, elements at corners that
+    # lie close together would fold.
     share = 0.5 * np.minimum((radius_ratio - 1.0) / CLEARANCE, 1.0)[..., None]  # of the difference, from 0 to 0.5
-    rotation = max_turn * np.tanh(share * (even_angle - inner_angle) / max_turn)
+    rotation = 0.2 * np.tanh(share * (even_angle - inner_angle) / 0.2)
     mixed_angle = inner_angle + rotation
 
     # Add the rays between the rays of the inner points.
     return divide_intervals(mixed_angle, blocks.n_half_edge)
 
 
-def rim_angles(angle: Array, map_parameter: Array, template_radius: Array, grading: float = 0.65) -> Array:
+def rim_angles(angle: Array, map_parameter: Array, template_radius: Array) -> Array:
     """Compute the angles at which the sides of the sectors meet the rim.
 
     The conformal map compresses the far side of the film, which lies at the angle pi. Therefore the sides of the
@@ -235,14 +233,14 @@ def rim_angles(angle: Array, map_parameter: Array, template_radius: Array, gradi
         angle: Angles on the innermost circle in the template plane, shape (..., n_sector + 1), rad.
         map_parameter: Parameter c of the conformal map, shape (...).
         template_radius: Radius of the innermost circle in the template plane, shape (...).
-        grading: Share of the stretching of the conformal map along the rim that the sectors compensate, from 0 to 1.
 
     Returns:
         Angles in the template plane, shape (..., n_sector + 1), rad.
     """
-    # A factor above 1 shifts angles towards pi. A factor below 1 would shift them back, so the factor is at least 1.
-    rim_stretch = map_stretch(map_parameter, 1.0) ** grading
+    # The sectors compensate a share of 0.65 of the stretching of the conformal map along the rim.
+    rim_stretch = map_stretch(map_parameter, 1.0) ** 0.65
     remaining_stretch = rim_stretch / map_stretch(map_parameter, template_radius)
+    # A factor above 1 shifts angles towards pi. A factor below 1 would shift them back, so the factor is at least 1.
     return stretch_angles(angle, np.maximum(remaining_stretch, 1.0))
 
 

@@ -43,7 +43,7 @@ def to_oval(points: Complexes, oval: complex | Complexes) -> Complexes:
     return points * (1.0 + _displacement_ratio(radius) * rim_displacement)
 
 
-def from_oval(points: Complexes, oval: complex | Complexes, newton_steps: int = 8) -> Complexes:
+def from_oval(points: Complexes, oval: complex | Complexes) -> Complexes:
     """Convert points of an oval film into points of a circular film. This function is the inverse of `to_oval`.
 
     The radius of each point on the circular film is computed by Newton's method with an approximate slope.
@@ -51,8 +51,6 @@ def from_oval(points: Complexes, oval: complex | Complexes, newton_steps: int = 
     Args:
         points: Points x + iy of the oval film, any shape, in film radii.
         oval: Shape e exp(2 i alpha) of the clamp, a number or an array that broadcasts with the points.
-        newton_steps: Number of Newton steps. After this number of steps, the error is of the order of
-            rounding errors for oval parameters up to e = 0.05.
 
     Returns:
         Points x + iy of the circular film, same shape, in film radii.
@@ -62,7 +60,7 @@ def from_oval(points: Complexes, oval: complex | Complexes, newton_steps: int = 
     oval_radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)
     rim_displacement = (np.conj(oval) * (points / oval_radius) ** 2).real  # e cos(2 (angle - alpha))
     radius = oval_radius
-    for _ in range(newton_steps):
+    for _ in range(8):  # the error is then of the order of rounding errors for oval parameters up to e = 0.05
         displacement_ratio = _displacement_ratio(radius)
         residual = radius * (1.0 + displacement_ratio * rim_displacement) - oval_radius
         # If d(r) is the displacement ratio at the radius r, the derivative of r d(r) is d + r d', which is 7 d at the

@@ -90,8 +90,6 @@ class Placement:
         # Corners of the core polygon on the circular film, followed by the centroid of the footprint. The centroid is a
         # real number, because the press lies on the x axis.
         centroid = from_oval(np.asarray(distance / film_radius, dtype=complex), oval).real
-        if probe.is_axisymmetric:
-            rotation = 0.0
         rotation_factor: Complexes = np.exp(1j * np.broadcast_to(rotation, centroid.shape))
         core_corners = centroid[..., None] + probe.core(film_radius) * rotation_factor[..., None]
         corners = np.concatenate([core_corners, centroid[..., None]], axis=-1)
@@ -111,7 +109,7 @@ class Placement:
             centre, radius = enclosing_circle(inner_boundary, centroid)
             if isinstance(probe, CurvedProbe) and probe.topology.is_curved:
                 boundary = probe.boundary(blocks.boundary_parameter[:: blocks.n_half_edge])
-                inner_points = np.asarray(centroid[..., None] + boundary / film_radius * rotation_factor[..., None])
+                inner_points = centroid[..., None] + boundary / film_radius * rotation_factor[..., None]
 
         inner_extent = np.abs(inner_boundary - centre[..., None]).max(axis=-1)
 
@@ -127,7 +125,7 @@ class Placement:
             circle_angles=circle_angles,
             rim_angles=rim_angles(circle_angles, map_parameter, template_radius),
             ring_depths=ring_edges(blocks.resolution, template_radius, template_thin_ring_width),
-            rotation_and_scale=np.asarray(rotation_factor / film_radius),
+            rotation_and_scale=rotation_factor / film_radius,
             probe=probe,
             oval=np.asarray(oval),
         )
@@ -246,7 +244,7 @@ class Placement:
             boundary = self.boundary(first_parameter + angular * (last_parameter - first_parameter))
             outer[in_first_layer] = boundary[in_first_layer]
             inner[in_last_layer] = boundary[in_last_layer]
-        return np.asarray(inner), np.asarray(outer)
+        return inner, outer
 
     def _ring_element_points(self, blocks: Blocks) -> Complexes:
         """Compute the film points of the nodes of the elements between the innermost circle and the rim.

@@ -177,7 +177,7 @@ def _locate_in_intervals(edges: Array, values: Array) -> tuple[Integers, Array]:
 
 
 def _locate_inside(
-    placement: Placement, blocks: Blocks, points: Complexes, corners: Complexes, tolerance: float = 1e-9
+    placement: Placement, blocks: Blocks, points: Complexes, corners: Complexes
 ) -> tuple[Integers, Array]:
     """Find the elements that contain points inside the innermost circle.
 
@@ -192,7 +192,6 @@ def _locate_inside(
         blocks: The elements.
         points: Film points x + iy, shape (n,), in film radii.
         corners: Corners of all elements for each point, shape (n, n_inner, 4); see `_inner_corners`.
-        tolerance: Distance of a local coordinate from the range from 0 to 1 above which another element is tried.
 
     Returns:
         Index of the element, shape (n,). Radial and angular coordinate in the element from 0 to 1, shape (2, n).
@@ -206,7 +205,7 @@ def _locate_inside(
     coordinates = np.full((2, points.size), np.inf)
     for candidate in candidates.T:
         # Select the points whose element has not been found yet.
-        selected = np.flatnonzero(_overshoot(coordinates) > tolerance)
+        selected = np.flatnonzero(_overshoot(coordinates) > 1e-9)
         if selected.size == 0:
             break
         tried = candidate[selected]
@@ -240,9 +239,6 @@ def _local_coordinates(
     blocks: Blocks,
     points: Complexes,
     element: Integers,
-    max_steps: int = 20,
-    negligible_step: float = 1e-13,
-    max_overshoot: float = 0.1,
     difference_step: float = 1e-5,
 ) -> Array:
     """Compute the local coordinates of points in given elements inside the innermost circle by Newton's method.
@@ -255,10 +251,6 @@ def _local_coordinates(
         blocks: The elements.
         points: Film points x + iy, shape (n,), in film radii.
         element: Index of the element that contains each point, shape (n,).
-        max_steps: Largest number of Newton steps with which a point inside the innermost circle is located.
-        negligible_step: Change of the local coordinates below which Newton's method ends, dimensionless.
-        max_overshoot: Largest distance of the local coordinates of a point from the range from 0 to 1 in Newton's
-            method.
         difference_step: Step of the angular coordinate for the derivative of the sides of an element by central
             differences.
 
@@ -266,7 +258,7 @@ def _local_coordinates(
         Radial coordinate and angular coordinate, shape (2, n). They are between 0 and 1 for points inside the element.
     """
     coordinates = np.full((2, points.size), 0.5)
-    for _ in range(max_steps):
+    for _ in range(20):
         # Evaluate the sides at the angular coordinate, and before and after it for the central differences.
         radial, angular = coordinates
         shifted_angular = angular[:, None] + np.array([0.0, -difference_step, difference_step])
@@ -283,10 +275,10 @@ def _local_coordinates(
         radial_numerator = (np.conj(residual) * angular_derivative).imag
         angular_numerator = (np.conj(radial_derivative) * residual).imag
         step = -np.stack([radial_numerator, angular_numerator]) / determinant
-        new_coordinates = np.clip(coordinates + step, -max_overshoot, 1.0 + max_overshoot)
+        new_coordinates = np.clip(coordinates + step, -0.1, 1.1)  # the point may leave the element a little
         largest_step = np.abs(new_coordinates - coordinates).max()
         coordinates = new_coordinates
-        if largest_step < negligible_step:
+        if largest_step < 1e-13:
             break
     return coordinates
 

@@ -8,8 +8,9 @@ from matplotlib.patches import Circle as Disk
 from matplotlib.patches import Polygon as Patch
 from matplotlib.patheffects import withStroke
 
-from isocharge.common.arrays import Array, Complexes
+from isocharge.common.arrays import Complexes
 from isocharge.simulate.forward.charge_map import ChargeMap
+from isocharge.simulate.numerics.disk import contacts_at
 from isocharge.simulate.numerics.polygon import to_corners
 from isocharge.simulate.plots.figure import FELT, INK
 from isocharge.simulate.sensor.film import Film
@@ -116,11 +117,11 @@ def draw_charge_map(axes: Any, charge_map: ChargeMap, electrode: int) -> None:
         electrode: Index of the electrode in the order of the charges.
     """
     edge = charge_map.domain.radius * np.exp(2j * np.pi * np.linspace(0.0, 1.0, 81))
-    x, y = _polar_grid(edge, rings=40)
-    contact = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
-    charge = charge_map.charges(contact)[:, electrode].reshape(x.shape)
-    axes.contourf(x, y, charge, levels=30, cmap="YlGnBu")
-    contour_lines = axes.contour(x, y, charge, levels=12, colors=INK, linewidths=0.8)
+    points = _polar_grid(edge, rings=40)
+    contact = contacts_at(to_corners(points.ravel()), 1.0)
+    charge = charge_map.charges(contact)[:, electrode].reshape(points.shape)
+    axes.contourf(points.real, points.imag, charge, levels=30, cmap="YlGnBu")
+    contour_lines = axes.contour(points.real, points.imag, charge, levels=12, colors=INK, linewidths=0.8)
     axes.clabel(contour_lines, fmt="%.0f", fontsize=7)
 
 
@@ -131,10 +132,9 @@ def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
         axes: Axes of matplotlib.
         equilibrium: Equilibrium of the film under a press.
     """
-    x, y = _polar_grid(equilibrium.film.rim, rings=240)
-    points = np.stack([x.ravel(), y.ravel()], axis=1)
-    depth = deflection(equilibrium, points).reshape(x.shape)
-    shades = axes.contourf(x, y, depth, levels=24, cmap="viridis_r")
+    points = _polar_grid(equilibrium.film.rim, rings=240)
+    depth = deflection(equilibrium, to_corners(points.ravel())).reshape(points.shape)
+    shades = axes.contourf(points.real, points.imag, depth, levels=24, cmap="viridis_r")
     axes.figure.colorbar(shades, ax=axes, shrink=0.8, label="deflection, mm")
     draw_rim(axes, equilibrium.film, color=INK)
     axes.set(title=f"the film under {equilibrium.force:g} N", xlabel="x, mm", ylabel="y, mm", aspect="equal")
@@ -171,7 +171,7 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
     )
 
 
-def _polar_grid(outermost_ring: Complexes, rings: int) -> tuple[Array, Array]:
+def _polar_grid(outermost_ring: Complexes, rings: int) -> Complexes:
     """Return the points of a polar grid. The areas between neighbouring rings are equal.
 
     Args:
@@ -179,8 +179,7 @@ def _polar_grid(outermost_ring: Complexes, rings: int) -> tuple[Array, Array]:
         rings: Number of rings, including the centre.
 
     Returns:
-        Coordinates x and y, each of shape (rings, n_angle), mm.
+        Points x + iy, shape (rings, n_angle), mm.
     """
     share_of_outermost_ring = np.sqrt(np.linspace(0.0, 1.0, rings))
-    points = np.outer(share_of_outermost_ring, outermost_ring)
-    return points.real, points.imag
+    return np.outer(share_of_outermost_ring, outermost_ring)

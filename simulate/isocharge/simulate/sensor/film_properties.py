@@ -212,8 +212,8 @@ class FilmPrior:
     @cached_property
     def _rim_gap(self) -> float:
         """Smallest distance between an electrode and the rim of the described film, mm."""
-        parts = [part for electrode in self.sensor.electrodes for part in electrode.parts]
-        return self.sensor.film.inner_radius - outermost_corner(self.sensor, parts)
+        polygons = [polygon for electrode in self.sensor.electrodes for polygon in electrode.collecting_polygons]
+        return self.sensor.film.inner_radius - outermost_corner(self.sensor, polygons)
 
     @cached_property
     def properties(self) -> tuple[FilmProperty, ...]:

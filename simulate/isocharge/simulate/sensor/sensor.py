@@ -192,17 +192,6 @@ class Electrode:
         # whole back is metal.
         return tuple(union_triangles(self.front, self.back))
 
-    @cached_property
-    def parts(self) -> tuple[Array, ...]:
-        """Convex parts that do not overlap and together form the collecting area of the electrode.
-
-        A convex electrode has one part. All other electrodes are divided into triangles, whose sides along the outline
-        are at most `MAX_PART_SIDE` long. The corners (x, y) of a part are an array of shape (n, 2), mm.
-        """
-        if self._is_convex:
-            return self.collecting_polygons
-        return tuple(union_triangles(self.front, self.back, MAX_PART_SIDE))
-
     @property
     def _is_convex(self) -> bool:
         """Whether the pad is convex and the collecting area is the whole pad."""
@@ -211,13 +200,18 @@ class Electrode:
     @property
     def area(self) -> float:
         """Size of the collecting area, mm^2."""
-        return sum(area_of(part) for part in self.parts)
+        return sum(area_of(polygon) for polygon in self.collecting_polygons)
 
     @cached_property
     def metal(self) -> tuple[Array, ...]:
-        """Convex parts of all metal on the front, including metal that collects no charge; see `parts`."""
-        # Without polygons on the back, the whole back is metal, and all metal on the front collects charge.
-        return replace(self, back=()).parts
+        """Convex parts of all metal on the front, including metal that collects no charge.
+
+        A convex pad without further metal is one part. All other metal is divided into triangles, whose sides along the
+        outline are at most `MAX_PART_SIDE` long. The corners (x, y) of a part are an array of shape (n, 2), mm.
+        """
+        if replace(self, back=())._is_convex:
+            return (np.array(self.corners),)
+        return tuple(union_triangles(self.front, max_side=MAX_PART_SIDE))
 
     @cached_property
     def region(self) -> shapely.Geometry:
@@ -466,11 +460,7 @@ def check_polygon(where: str, polygon: Corners) -> None:
     corners = np.array(polygon)
     if corners.shape[1:] != (2,) or not 3 <= len(corners) <= MAX_CORNERS:
         raise SensorError(f"{where}: expected 3 to {MAX_CORNERS} corners (x, y), got {shown(corners.tolist())}")
-
-    # A convex polygon does not cross itself. This case is tested first, because the test is faster and most polygons
-    # are convex.
-    is_finite = np.isfinite(corners).all()
-    if not (is_finite and (is_convex(corners) or is_simple(corners))):
+    if not (np.isfinite(corners).all() and is_simple(corners)):
         raise SensorError(
             f"{where}: expected a polygon that does not cross itself, with its corners anticlockwise, got "
             f"{shown(corners.tolist())} mm"

@@ -69,10 +69,8 @@ class Assembly:
         self.free = _free_unknowns(mesh, unknowns_per_node, odd)
 
         # Compute the local indices of the unknowns on the sides of an element and in its interior. Within an element,
-        # the unknowns are numbered component by component. The nodes of an element form a square grid.
-        grid_index = np.arange(mesh.resolution.order + 1)
-        is_end = (grid_index == grid_index[0]) | (grid_index == grid_index[-1])
-        is_on_side = (is_end[:, None] | is_end[None, :]).ravel()
+        # the unknowns are numbered component by component.
+        is_on_side = np.maximum(np.abs(mesh.xi), np.abs(mesh.eta)) == 1.0
         component = np.arange(unknowns_per_node)[:, None]
         n_local = is_on_side.size
         self._side_indices = (component * n_local + np.flatnonzero(is_on_side)).ravel()

@@ -155,7 +155,7 @@ PATCH_RING_RADII = (0.0, 0.1, 0.22, 0.4, 0.6, 0.8)
 """Radii of the rings on which square patches are placed to compare the charges of two meshes, in film radii."""
 
 
-def relative_difference(one: Equilibrium, other: Equilibrium, patches_per_ring: int = 12) -> float:
+def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
     """Compute the largest relative difference between two equilibria of the same press.
 
     The function compares the deflections at the probe, and the charges that square patches of the film would collect.
@@ -166,14 +166,13 @@ def relative_difference(one: Equilibrium, other: Equilibrium, patches_per_ring: 
     Args:
         one: First equilibrium.
         other: Second equilibrium. The differences are relative to its deflection and its charges.
-        patches_per_ring: Number of patches on each ring.
 
     Returns:
         Relative difference, dimensionless.
     """
-    # Centres x + iy of the patches, shape (n_ring, patches_per_ring), mm
+    # Centres x + iy of the patches, shape (n_ring, 12), mm
     film_radius = one.film.radius
-    unit_circle = np.exp(2j * np.pi * np.arange(patches_per_ring) / patches_per_ring)
+    unit_circle = np.exp(2j * np.pi * np.arange(12) / 12)
     rings_around_centre = film_radius * np.array(PATCH_RING_RADII)[:, None] * unit_circle
     ring_around_footprint = complex(*one.at) + one.probe.reach * unit_circle
     patch_centres = np.concatenate([rings_around_centre, ring_around_footprint[None]])
@@ -191,16 +190,14 @@ def relative_difference(one: Equilibrium, other: Equilibrium, patches_per_ring: 
     return max(charge_difference, deflection_difference)
 
 
-def _patch_charges(
-    equilibrium: Equilibrium, centres: Complexes, relative_side: float = 1.0 / 15.0, points_per_side: int = 6
-) -> Array:
+def _patch_charges(equilibrium: Equilibrium, centres: Complexes) -> Array:
     """Compute the charge per area of each square patch, for a biaxial film and for a uniaxial film.
+
+    The side of a patch is a fifteenth of the film radius.
 
     Args:
         equilibrium: The solved press.
         centres: Centres x + iy of the patches, shape (n_ring, n_patch), mm.
-        relative_side: Side of the patches, in film radii.
-        points_per_side: Number of Gauss points along the side of a patch.
 
     Returns:
         Charges per area in arbitrary units, shape (n_ring, n_patch, 2). The last axis is the kind of film. The part of
@@ -208,8 +205,8 @@ def _patch_charges(
     """
     # Integration points of all patches. The coordinates xi and eta range from -1 to 1.
     film_radius = equilibrium.film.radius
-    xi, eta, weights = gauss_reference_square(points_per_side)
-    half_side = 0.5 * relative_side * film_radius
+    xi, eta, weights = gauss_reference_square(6)
+    half_side = film_radius / 30.0
     complex_points = (centres[:, :, None] + half_side * (xi + 1j * eta)).ravel()
     points = to_corners(complex_points)
 

@@ -219,8 +219,6 @@ def _take_full_step(iterate: _Iterate, step: Array) -> _Iterate | None:
         iterate: Present iterate.
         step: Newton step, shape (n_node, 3).
     """
-    if not np.isfinite(step).all():
-        return None
     next_iterate = iterate.after(step)
     halves_residual = next_iterate.relative_residual < 0.5 * iterate.relative_residual
     return next_iterate if halves_residual else None
@@ -231,60 +229,52 @@ def _chord_steps(
     solve: SolveTangent,
     previous_residual: float,
     tolerance: float,
-    max_first_ratio: float = 0.15,
-    max_ratio: float = 0.3,
 ) -> _Iterate:
     """Take further steps with the factorised tangent of the last Newton step, as long as they reduce the residual.
 
     This is the chord method. A step with a reused tangent takes about a seventh of the time of a Newton step. If the
     last step multiplied the residual by a factor s, the next step with the same tangent multiplies the residual by
-    about 2 s (Kelley 1995).
+    about 2 s (Kelley 1995). The tangent is reused if s is at most 0.15, and as long as each step multiplies the
+    residual by less than 0.3.
 
     Args:
         iterate: Iterate after the Newton step.
         solve: Function that solves linear systems with the tangent of the last Newton step.
         previous_residual: Relative residual before the Newton step.
         tolerance: Relative residual at which the solve has converged.
-        max_first_ratio: Largest ratio of the residual after a Newton step to the residual before the step at which the
-            tangent is reused.
-        max_ratio: Largest ratio of the residual after a step with a reused tangent to the residual before the step. If
-            the ratio is larger, the tangent is not reused again.
 
     Returns:
         The last iterate whose step reduced the residual sufficiently.
     """
-    if iterate.relative_residual > max_first_ratio * previous_residual:
+    if iterate.relative_residual > 0.15 * previous_residual:
         return iterate
     while iterate.relative_residual > tolerance:
         next_iterate = iterate.after(solve(-iterate.residual))
         # The condition is negated, so that a residual that is NaN ends the loop.
-        if not next_iterate.relative_residual < max_ratio * iterate.relative_residual:
+        if not next_iterate.relative_residual < 0.3 * iterate.relative_residual:
             break
         iterate = next_iterate
     return iterate
 
 
-def _descent_step(iterate: _Iterate, step: Array, max_trials: int = 12, first_tension: float = 0.05) -> Array:
+def _descent_step(iterate: _Iterate, step: Array) -> Array:
     """Return the Newton step if it is a descent direction of the energy, and a modified step otherwise.
 
     The residual is the gradient of the energy. A step is therefore a descent direction if its scalar product with the
     residual is negative. The modified step is computed with a tension that is added to the tangent. The tension is
-    doubled until the modified step is a descent direction, or until `max_trials` tensions were tried.
+    doubled until the modified step is a descent direction, or until twelve tensions were tried.
 
     Args:
         iterate: Present iterate.
         step: Newton step, shape (n_node, 3).
-        max_trials: Largest number of tensions that are tried to obtain a descent direction. Each tension is twice the
-            previous tension.
-        first_tension: Smallest tension that is added to the tangent to obtain a descent direction. The unit is the
-            stabilising tension at a relative residual of one.
 
     Returns:
         The step, shape (n_node, 3). If no tension is sufficient, the step may not be a descent direction.
     """
     elastic = iterate.elastic
-    added_tension = first_tension * STABILISING_TENSION * elastic.groups.induced_tension
-    for _ in range(max_trials):
+    # The first tension is a twentieth of the stabilising tension at a relative residual of one.
+    added_tension = 0.05 * STABILISING_TENSION * elastic.groups.induced_tension
+    for _ in range(12):
         energy_slope = float(np.sum(step * iterate.residual))
         is_descent_direction = np.isfinite(step).all() and energy_slope < 0.0
         if is_descent_direction:
@@ -295,22 +285,16 @@ def _descent_step(iterate: _Iterate, step: Array, max_trials: int = 12, first_te
     return step
 
 
-def _line_search(
-    iterate: _Iterate, step: Array, max_halvings: int = 30, armijo_share: float = 1e-4, energy_round_off: float = 1e-12
-) -> _Iterate | None:
+def _line_search(iterate: _Iterate, step: Array) -> _Iterate | None:
     """Halve a step until it lowers the energy sufficiently.
 
-    According to Armijo's condition, the energy must decrease by at least `armijo_share` times the decrease that the
-    slope of the energy along the step predicts. If the change of the energy may be caused by rounding errors, the step
+    According to Armijo's condition, the energy must decrease by at least 1e-4 times the decrease that the slope of the
+    energy along the step predicts. If the change of the energy may be caused by rounding errors, the step
     must lower the residual instead.
 
     Args:
         iterate: Present iterate.
         step: Full step, shape (n_node, 3).
-        max_halvings: Largest number of step lengths that the line search tries.
-        armijo_share: Smallest accepted ratio of the decrease of the energy to the decrease that the slope predicts,
-            dimensionless.
-        energy_round_off: Relative change of the energy that may be caused by rounding errors only.
 
     Returns:
         The iterate after the accepted step. None if no step length is accepted.
@@ -320,11 +304,11 @@ def _line_search(
     energy_slope = float(np.sum(step * iterate.residual))  # derivative of the energy with respect to the step length
     residual_norm = np.linalg.norm(iterate.residual[iterate.free])
     step_length = 1.0
-    for _ in range(max_halvings):
+    for _ in range(30):
         next_iterate = iterate.after(step_length * step)
         energy_change = elastic.energy(next_iterate.field) - energy
-        lowers_energy = energy_change <= armijo_share * step_length * energy_slope
-        is_round_off = abs(energy_change) <= energy_round_off * abs(energy)
+        lowers_energy = energy_change <= 1e-4 * step_length * energy_slope
+        is_round_off = abs(energy_change) <= 1e-12 * abs(energy)
         if lowers_energy or is_round_off:
             lowers_residual = np.linalg.norm(next_iterate.residual[iterate.free]) < residual_norm
             if lowers_energy or lowers_residual:

@@ -264,10 +264,10 @@ def _solve_by_load_steps(
     case: LoadCase,
     failed: NewtonResult,
     full_load: ElasticFilm,
-    first_load_share: float = 0.0625,
-    max_load_steps: int = 12,
 ) -> NewtonResult:
     """Solve a press for increasing forces, because the solve with the full force has failed.
+
+    The first force is a sixteenth of the full force. At most twelve forces are tried.
 
     Each solve starts from the field under the largest force for which an equilibrium was found. After each successful
     solve, the force is multiplied by a factor, which is two at the beginning. After each failed solve, the factor is
@@ -278,8 +278,6 @@ def _solve_by_load_steps(
         case: The press.
         failed: Result of the failed solve with the full force.
         full_load: Discrete model of the film under the full force.
-        first_load_share: Share of the full load in the first load step.
-        max_load_steps: Largest number of load steps.
 
     Returns:
         Result of a successful solve with the full force. If there is none, `failed` with the total number of
@@ -289,8 +287,8 @@ def _solve_by_load_steps(
     force_factor = 2.0  # ratio of the next force to `solved_force`
     iterations = failed.iterations
     field = first_iterate(full_load)
-    force = first_load_share * case.force
-    for _ in range(max_load_steps):
+    force = case.force / 16.0
+    for _ in range(12):
         # An equilibrium with a smaller force is close to the solution, so full Newton steps are allowed at once.
         full_steps_below = np.inf if solved_force else UNSTABILISED_BELOW
         elastic = _elastic_film(case, full_load.mesh, force)
@@ -334,12 +332,10 @@ def _first_field(start: Equilibrium | None, elastic: ElasticFilm) -> Array:
     has_same_resolution_except_order = resolution_with_same_order == template.resolution
     if not (has_same_blocks and has_same_resolution_except_order):
         return first_iterate(elastic)
-    if start_template.resolution.order == template.resolution.order:
-        return start.field
 
-    # Interpolate to the nodes of the elements with the new order. The weights of the nodes of an element have the shape
-    # (n_local, n_start_local). A node of several elements is assigned several times. The field is continuous, so the
-    # values are equal.
+    # Interpolate to the nodes of the elements, which may have a new order. The weights of the nodes of an element have
+    # the shape (n_local, n_start_local). A node of several elements is assigned several times. The field is continuous,
+    # so the values are equal.
     weights = tensor_values(start_template.resolution.order, template.xi, template.eta)
     field = np.empty((template.n_node, 3))
     field[template.nodes] = weights @ start.field[start_template.nodes]
