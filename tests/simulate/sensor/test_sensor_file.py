@@ -126,6 +126,7 @@ def test_error_message_names_the_key_of_the_wrong_type(path):
         (("piezo", "d32"), -2e-4, r"piezo d32: expected pC/N, got -0\.0002 pC/N"),
         (("film", "thickness_um"), -25.0, r"film\.thickness_um: expected a number above 0.*, got -25\.0"),
         (("film", "thickness_um"), 0.025, r"film\.thickness_um: expected at least 0\.1 um, .* 0\.025 mm are 25 um"),
+        (("film", "young_GPa"), [3.0] * 3, "film.young_GPa: expected a positive number or a list of two, got"),
         (("film", "young_GPa"), [3.0, 0.2], r"film\.young_GPa, E1 / E2: expected 0\.1 to 10, got 15"),
         (("electrodes", "side_mm"), 0.0, "electrodes.side_mm: expected a number above 0"),
         (("calibration", "gain"), {"A": 0.0}, "calibration.gain.A: expected a positive number, got 0.0"),

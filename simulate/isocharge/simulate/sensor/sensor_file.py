@@ -47,22 +47,25 @@ Point = Annotated[tuple[Coordinate, Coordinate], Meta(description=f"[x, y] in mm
 
 Length = Annotated[float, Meta(gt=0.0, le=MAX_COORDINATE_mm)]
 
+Pair = Meta(min_length=2, max_length=2, description="a list of two")
+Triple = Meta(min_length=3, max_length=3, description="a list of three")
+
 
 class FilmTable(Settings, frozen=True):
     """Content of the section `film` of a sensor file, with the mechanical properties of the film."""
 
     radius_mm: Length
     thickness_um: Length
-    young_GPa: Positive | Annotated[list[Positive], Meta(min_length=2, max_length=2)]
+    young_GPa: Positive | Annotated[list[Positive], Pair]
     poisson: Finite
-    pretension_MPa: Finite | Annotated[list[Finite], Meta(min_length=3, max_length=3)] = 0.0
+    pretension_MPa: Finite | Annotated[list[Finite], Triple] = 0.0
     shear_GPa: Positive | None = None
     axis_deg: Finite = 0.0
     oval: Finite = 0.0
     oval_axis_deg: Finite = 0.0
     back_volume_mm3: Positive | None = None
     static_pressure_Pa: Finite = 0.0
-    expansion_ppm_per_K: Finite | Annotated[list[Finite], Meta(min_length=2, max_length=2)] | None = None
+    expansion_ppm_per_K: Finite | Annotated[list[Finite], Pair] | None = None
     ring_expansion_ppm_per_K: Finite = 1e6 * ALUMINIUM_EXPANSION
 
 
