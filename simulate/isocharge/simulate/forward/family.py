@@ -273,10 +273,7 @@ class Family:
             Scaled stress, shape (n_distance * n_force * n_turn, n_element * n_local * 3), dimensionless. The rows have
             the order of the columns of `weights`.
         """
-        n_value = solved.shape[-1]
         symmetry_order = self.turns.symmetry_order
-        if symmetry_order == 1:
-            return solved.reshape(-1, n_value)
         solved_period = solved.reshape(*solved.shape[:-1], mesh.n_element, -1, 3)
         stress_of_periods = []
         for period_index in range(symmetry_order):
@@ -286,7 +283,7 @@ class Family:
             # The stress itself does not change, but its components refer to a frame that was rotated by `angle`.
             stress_of_periods.append(rotate_stress(reordered_stress, -angle))
         all_turns = np.concatenate(stress_of_periods, axis=2)
-        return all_turns.reshape(-1, n_value)
+        return all_turns.reshape(-1, solved.shape[-1])
 
 
 def node_counts(film: Film) -> tuple[NodeCount, ...]:

@@ -171,8 +171,7 @@ class DesignCase:
         """
         if self.side is not None:
             return float(self.side)
-        pads = (replace(electrode, more=(), back=()) for electrode in self.sensor.electrodes)  # without traces
-        sides = (pad.side for pad in pads)
+        sides = (replace(electrode, more=(), back=()).side for electrode in self.sensor.electrodes)  # without traces
         return next((side for side in sides if side is not None), DEFAULT_SIDE)
 
     @property

@@ -36,8 +36,6 @@ def to_oval(points: Complexes, oval: complex | Complexes) -> Complexes:
     Returns:
         Points x + iy of the oval film, same shape, in film radii.
     """
-    if not np.any(oval):
-        return points
     radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)  # the displacement ratio is zero at `UNDEFORMED_RADIUS`
     rim_displacement = (np.conj(oval) * (points / radius) ** 2).real  # e cos(2 (angle - alpha))
     return points * (1.0 + _displacement_ratio(radius) * rim_displacement)

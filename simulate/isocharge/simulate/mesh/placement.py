@@ -91,7 +91,7 @@ class Placement:
         # real number, because the press lies on the x axis.
         centroid = from_oval(np.asarray(distance / film_radius, dtype=complex), oval).real
         rotation_factor: Complexes = np.exp(1j * np.broadcast_to(rotation, centroid.shape))
-        core_corners = centroid[..., None] + probe.core(film_radius) * rotation_factor[..., None]
+        core_corners = centroid[..., None] + probe.core() / film_radius * rotation_factor[..., None]
         corners = np.concatenate([core_corners, centroid[..., None]], axis=-1)
 
         # The innermost circle is the boundary of a circular footprint, or encloses the footprint with a gap. The last

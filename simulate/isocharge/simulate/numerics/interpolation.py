@@ -21,12 +21,13 @@ def lobatto_nodes(order: int) -> Array:
     given order has an extremum.
 
     Args:
-        order: Order of the Legendre polynomial. Polynomials of this order are determined by their values at the nodes.
+        order: Order of the Legendre polynomial, at least 2. Polynomials of this order are determined by their values at
+            the nodes.
 
     Returns:
         Nodes in ascending order, shape (order + 1,).
     """
-    interior = roots_jacobi(order - 1, 1.0, 1.0)[0] if order > 1 else np.empty(0)
+    interior, _ = roots_jacobi(order - 1, 1.0, 1.0)
     return _read_only(np.concatenate([[-1.0], interior, [1.0]]))
 
 

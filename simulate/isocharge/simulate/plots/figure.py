@@ -7,7 +7,6 @@ from io import BytesIO
 from pathlib import Path
 
 from matplotlib import rc_context
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from isocharge.common.errors import InputError
@@ -39,9 +38,7 @@ def new_figure(width: float, height: float) -> Figure:
         width: Width of the figure, inches.
         height: Height of the figure, inches.
     """
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure(figsize=(width, height), layout="constrained")
 
 
 def check_picture(path: Path) -> None:

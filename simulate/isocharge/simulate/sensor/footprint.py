@@ -119,17 +119,11 @@ class Probe(ABC):
         """
 
     @abstractmethod
-    def core(self, unit: float) -> Complexes:
-        """Return the corners x + iy of the core polygon, anticlockwise.
+    def core(self) -> Complexes:
+        """Return the corners x + iy of the core polygon, anticlockwise, shape (topology.n_corner,), mm.
 
         The corners of the core polygon of a curved footprint are evenly spaced in the boundary parameter. The parameter
         of the first corner is half of the spacing.
-
-        Args:
-            unit: Unit of the returned corners, mm.
-
-        Returns:
-            Corners, shape (topology.n_corner,), in multiples of `unit`.
         """
 
     def rotated(self, angle: float) -> Self:
@@ -227,11 +221,11 @@ class CurvedProbe(Probe):
         """Points x + iy of the boundary at evenly spaced parameters, shape (OUTLINE_POINTS,), mm."""
         return self.boundary(2.0 * np.pi * np.arange(OUTLINE_POINTS) / OUTLINE_POINTS)
 
-    def core(self, unit: float) -> Complexes:
-        """Return the corners x + iy of the core polygon in multiples of `unit` (mm), shape (n_corner,)."""
+    def core(self) -> Complexes:
+        """Return the corners x + iy of the core polygon, shape (n_corner,), mm."""
         n_corner = self.topology.n_corner
         parameter = 2.0 * np.pi * (np.arange(n_corner) + 0.5) / n_corner
-        return CORE_SHARE * self.boundary(parameter) / unit
+        return CORE_SHARE * self.boundary(parameter)
 
 
 def check_angle(angle: float) -> None:

@@ -344,9 +344,9 @@ class Polygon(Probe):
         """Corners x + iy of the rotated polygon relative to its centroid, anticlockwise, shape (n_corner,), mm."""
         return np.asarray(to_complex(np.array(self.corners)) * np.exp(1j * self.angle))
 
-    def core(self, unit: float) -> Complexes:
-        """Return the corners x + iy of the rotated polygon in multiples of `unit` (mm), shape (n_corner,)."""
-        return self.outline / unit
+    def core(self) -> Complexes:
+        """Return the corners x + iy of the rotated polygon, shape (n_corner,), mm."""
+        return self.outline
 
 
 NUMBER_PATTERN = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"

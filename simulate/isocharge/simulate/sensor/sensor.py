@@ -177,9 +177,10 @@ class Electrode:
         Raises:
             SensorError: If a polygon crosses itself, or there are too few or too many corners.
         """
-        for polygon in (*self.front, *self.back):
+        polygons = (*self.front, *self.back)
+        for polygon in polygons:
             check_polygon(f"electrode {self.name!r}", polygon)
-        count = sum(len(polygon) for polygon in (*self.front, *self.back))
+        count = sum(map(len, polygons))
         if count > MAX_ELECTRODE_CORNERS:
             raise SensorError(
                 f"electrode {self.name!r}: expected at most {MAX_ELECTRODE_CORNERS} corners of all polygons, got "

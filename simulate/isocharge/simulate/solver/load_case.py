@@ -168,8 +168,6 @@ def farthest_distance(film: Film, probe: Probe, at: tuple[float, float]) -> floa
         probe: The probe.
         at: Centroid (x, y) of the footprint, mm.
     """
-    if not film.oval:
-        return probe.farthest_distance(at)
     centroid = film.radius * from_oval(np.array(complex(*at) / film.radius), film_oval(film, direction=0.0))
     return probe.farthest_distance((float(centroid.real), float(centroid.imag)))
 
@@ -269,8 +267,7 @@ def needs_second_mesh(case: LoadCase) -> bool:
     radius = case.film.radius
     is_large = not case.probe.topology.fills_circle and case.probe.reach > RELIABLE_REACH * radius
     is_near_rim = farthest_distance(case.film, case.probe, case.at) > RELIABLE_RADIUS * radius
-    has_back_pressure = case.film.has_back_pressure
-    return is_large or is_near_rim or has_back_pressure or case.settings.accuracy < ACCURACY
+    return is_large or is_near_rim or case.film.has_back_pressure or case.settings.accuracy < ACCURACY
 
 
 def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:

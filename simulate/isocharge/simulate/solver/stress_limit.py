@@ -92,16 +92,13 @@ def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tup
     if largest_stress(film, probe, max_force) <= limit:
         return max_force
 
-    def log_stress_ratio(log_force: float) -> float:
-        """Compute ln(stress / limit), which is zero at the limit.
-
-        Args:
-            log_force: Logarithm of the force in N.
-        """
-        stress = largest_stress(film, probe, float(np.exp(log_force)))
-        return float(np.log(stress / limit))
-
-    return float(np.exp(scipy.optimize.brentq(log_stress_ratio, np.log(min_force), np.log(max_force), xtol=1e-3)))
+    log_force = scipy.optimize.brentq(
+        lambda log_force: np.log(largest_stress(film, probe, float(np.exp(log_force))) / limit),
+        np.log(min_force),
+        np.log(max_force),
+        xtol=1e-3,
+    )
+    return float(np.exp(log_force))
 
 
 def yield_force(film: Film, probes: Sequence[Probe], force_range: tuple[float, float]) -> float | None:
