@@ -9,7 +9,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, field
-from operator import add
+from operator import add, sub
 from typing import Any, TypeVar
 
 from isocharge.common.arrays import Array
@@ -170,6 +170,10 @@ class FrameCounts:
     def __add__(self, other: "FrameCounts") -> "FrameCounts":
         """Return the sum of each counter."""
         return FrameCounts(*map(add, astuple(self), astuple(other)))
+
+    def __sub__(self, other: "FrameCounts") -> "FrameCounts":
+        """Return the difference of each counter."""
+        return FrameCounts(*map(sub, astuple(self), astuple(other)))
 
     def count_rejected(self, size: int, *, wrong_checksum: bool = False) -> None:
         """Count bytes that the parser expected to be one frame, but has rejected.

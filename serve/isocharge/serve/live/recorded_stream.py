@@ -181,12 +181,13 @@ class RecordedStream:
         self._is_recording_new = False
         if not self._preamble:
             return chunk
-        had_frames = self._stream.totals().frames > 0
+        totals = self._stream.totals()
         preamble = chunk._replace(data=self._preamble, outage_s=0.0)
         deque(self._stream.feed(preamble), maxlen=0)
+        self._stream.counts_before_restart = totals - self._stream.parser.counts  # these bytes were counted before
         if self.recorder is not None:  # the recording may have been ended before this chunk
             self.recorder.chunk(preamble, [])
-        return chunk._replace(outage_s=max(chunk.outage_s, RESTART_OUTAGE_s)) if had_frames else chunk
+        return chunk._replace(outage_s=max(chunk.outage_s, RESTART_OUTAGE_s)) if totals.frames > 0 else chunk
 
     def _end_recording(self) -> None:
         """End the present recording, and close its recorder unless the caller has opened the recorder."""

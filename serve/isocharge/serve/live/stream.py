@@ -54,6 +54,7 @@ class ReadingStream:
     Attributes:
         parser: Parser that finds the frames in the bytes and counts them.
         clock: Clock of the device.
+        counts_before_restart: Counts of the time before the latest `restart`. `totals` adds the counts of the parser.
     """
 
     def __init__(
@@ -79,7 +80,7 @@ class ReadingStream:
         """
         self._device = device
         self._setup = Setup(electrodes, device, predictor, reader, has_any_sign=has_any_sign)
-        self._before_restart = FrameCounts()  # counts of the time before the latest `restart`
+        self.counts_before_restart = FrameCounts()
         self._begin()
 
     def _begin(self) -> None:
@@ -100,12 +101,12 @@ class ReadingStream:
 
         Only the counts that `totals` returns include the time before the restart.
         """
-        self._before_restart = self.totals()  # `totals` adds these counts to the counts of the new parser
+        self.counts_before_restart = self.totals()
         self._begin()
 
     def totals(self) -> FrameCounts:
         """Return the counts of the stream since it began, including the counts before its latest restart."""
-        return self._before_restart + self.parser.counts
+        return self.counts_before_restart + self.parser.counts
 
     def frames(self, chunk: Chunk) -> Iterator[Frame]:
         """Process a chunk, pass each frame whose last byte it contains through all stages, and yield the frame.
