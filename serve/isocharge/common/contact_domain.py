@@ -116,7 +116,7 @@ class Domain:
         contact = as_contacts(contact, source)
         is_inside = self.contains(contact)
         if not is_inside.all():
-            first_outside = int(np.argmin(is_inside))  # index of the first False
+            first_outside = np.argmin(is_inside)  # index of the first False
             x, y, force = contact[first_outside]
             low, high = self.force_range
             raise SceneError(

@@ -241,7 +241,7 @@ class PressWatch:
 
         # The line is fitted by least squares. Its value at the mean time of the frames is the mean charge.
         centred_s = times_s - times_s.mean()
-        square_sum_s2 = max(float(centred_s @ centred_s), 1e-30)  # avoids a division by 0 if all times are equal
+        square_sum_s2 = max(centred_s @ centred_s, 1e-30)  # avoids a division by 0 if all times are equal
         slope_pC_per_s = centred_s @ charge_pC / square_sum_s2
         mean_pC = charge_pC.mean(axis=0)
         scatter_pC = (charge_pC - mean_pC - np.outer(centred_s, slope_pC_per_s)).std(axis=0)
@@ -271,7 +271,7 @@ class PressWatch:
         """
         mean_magnitude_pC = np.abs(charge_pC).mean()
         max_scatter_pC = self.MAX_SCATTER_SIGMAS * np.hypot(noise_pC, self.RELATIVE_NOISE * mean_magnitude_pC)
-        worst = int((scatter_pC / max_scatter_pC).argmax())
+        worst = (scatter_pC / max_scatter_pC).argmax()
         if scatter_pC[worst] > max_scatter_pC[worst]:
             return f"the charge of {self._electrodes[worst]} shakes by {scatter_pC[worst]:.2g} pC"
 
@@ -281,7 +281,7 @@ class PressWatch:
         reference_pC = np.maximum(np.abs(charge_pC), mean_magnitude_pC)
         max_drift_pC = self.MAX_RELATIVE_DRIFT * reference_pC + self.DRIFT_SIGMAS * drift_std_pC
         drift_pC = np.abs(slope_pC_per_s) * window_s
-        worst = int((drift_pC / max_drift_pC).argmax())
+        worst = (drift_pC / max_drift_pC).argmax()
         if drift_pC[worst] <= max_drift_pC[worst]:
             return ""
         return (

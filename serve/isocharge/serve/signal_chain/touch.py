@@ -164,7 +164,7 @@ class Touch(Stage):
         self._peak = max(self._peak, min(size, _norm(self._previous)))  # a spike of a single frame is not a peak
         release_size = max((rule.release_share or 0.0) * self._peak, 0.5)
         reference = self._previous if self._setup.has_any_sign else self._rest_direction
-        is_reversed = float(charge @ reference) < 0.0
+        is_reversed = charge @ reference < 0.0
         if size < release_size or is_reversed:
             self._is_contact = False
             self._base = charge
@@ -188,13 +188,13 @@ class Touch(Stage):
         """
         # After a touch, the base is the charge that remains of it. While the finger leaves the film, the charge at rest
         # is held, and the base must not decay, because the finger still causes this charge.
-        is_remainder = float(self._base @ direction) > 0.0
+        is_remainder = self._base @ direction > 0.0
         if not (frame.is_base_held and is_remainder):
             self._base = self._base * math.exp(-frame.dt_s / frame.base_relax_s)
         size = _norm(charge)
         change = charge - self._base
         change_size = _norm(change)
-        if float(change @ direction) < OPPOSING_COSINE * change_size * _norm(direction):
+        if change @ direction < OPPOSING_COSINE * change_size * _norm(direction):
             self._base = charge  # a release or a drift
         elif change_size > 1.0:  # a touch begins
             self._is_contact = True
@@ -206,7 +206,7 @@ class Touch(Stage):
             self._base = charge  # the charge that remains of the latest touch becomes smaller
 
         self._mean = charge + math.exp(-frame.dt_s / RISE_S) * (self._mean - charge)
-        if size > 1.0 and float(charge @ direction) < 0.0:
+        if size > 1.0 and charge @ direction < 0.0:
             frame.flags.append(NEGATIVE)
         self._rest_s = 0.0 if size > 1.0 else self._rest_s + frame.dt_s
         if self._rest_s >= RISE_S - SUM_TOLERANCE_s:
@@ -222,4 +222,4 @@ class Touch(Stage):
 
 def _norm(vector: Array) -> float:
     """Return the length of a vector."""
-    return math.sqrt(float(vector @ vector))
+    return math.sqrt(vector @ vector)

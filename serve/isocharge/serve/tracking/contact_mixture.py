@@ -103,7 +103,7 @@ class ContactHypothesis(NamedTuple):
         The probability is the result of a chi-squared test with two degrees of freedom.
         """
         velocity = self.mean[VELOCITY]
-        squared_distance = float(velocity @ np.linalg.solve(self.covariance[VELOCITY, VELOCITY], velocity))
+        squared_distance = velocity @ np.linalg.solve(self.covariance[VELOCITY, VELOCITY], velocity)
         return -math.expm1(-0.5 * squared_distance)
 
 
@@ -220,7 +220,7 @@ def prune_components(components: Components, max_count: int = 8, merge_distance:
             break
         is_similar = (np.abs(motion[kept] - motion[row]) < merge_distance * std[row]).all(axis=1)
         if is_similar.any():
-            first = kept[int(is_similar.argmax())]
+            first = kept[is_similar.argmax()]
             log_weight[first] = np.logaddexp(log_weight[first], log_weight[row])  # add the weights
         else:
             kept.append(row)
@@ -363,7 +363,7 @@ class ContactMixture:
         distance_mm = np.hypot(*components.mean[:, POSITION].T)
         is_outside = distance_mm > MAX_RELATIVE_RADIUS * self.charges.domain.radius
         log_weight = np.where(is_outside, -np.inf, components.log_weight)
-        best = int(log_weight.argmax())
+        best = log_weight.argmax()
         if is_outside[best] or updated.squared_distance[best] > SQUARED_GATE:
             return
         components = prune_components(components._replace(log_weight=log_weight))  # the most probable is now the first
@@ -430,7 +430,7 @@ def _hypotheses_of(components: Components, is_across_fold: Booleans, misfit: flo
     remaining = np.ones(len(probability), dtype=bool)
     hypotheses = []
     while remaining.any():
-        first = int(remaining.argmax())
+        first = remaining.argmax()
         difference_mm = np.abs(components.mean - components.mean[first])[:, POSITION]
         is_near = (difference_mm < CLEAR_DISTANCE * np.sqrt(variance + variance[first])).all(axis=1)
         is_same = remaining & is_near & ~is_across_fold[first]

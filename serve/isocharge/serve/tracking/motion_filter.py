@@ -174,7 +174,7 @@ class NoiseEstimate:
         share = (middle[-1] - first[-1]) / (last[-1] - first[-1])
         deviation = (middle - (1.0 - share) * first - share * last)[:-1]
         variance_factor = (1.0 + (1.0 - share) ** 2 + share**2) * deviation.size
-        relative_square = float(deviation @ np.linalg.solve(covariance, deviation)) / variance_factor
+        relative_square = deviation @ np.linalg.solve(covariance, deviation) / variance_factor
         self._frames += 1
         limited_square = min(relative_square, 3.0**2 * self.relative_variance)
         self.relative_variance += (limited_square - self.relative_variance) / self._frames
