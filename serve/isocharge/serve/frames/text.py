@@ -205,9 +205,7 @@ class TextParser(DelimitedParser):
             if has_numbers:
                 return self._recognise_layout(line, size)
             self._headers.append(text)
-            columns = text.replace(",", " ").replace(";", " ").split()
-            is_plain_header = all(column[0].isalpha() for column in columns)
-            return [] if is_plain_header else self._reject(size)
+            return []
         names = self._meant(header_names(text, layout.example))
         if has_numbers or all(layout.names) or not layout.name_unnamed(names):
             return self._reject(size)
