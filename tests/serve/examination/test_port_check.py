@@ -217,6 +217,11 @@ def test_channels_are_proposed_by_their_names(names, channels, message):
     assert message in missing(report)
 
 
+def test_channels_with_different_units_are_not_taken_for_voltages_because_their_noise_is_small():
+    rng = np.random.default_rng(0)
+    assert examined(lambda _: "A_nC:{:.4f},B_pC:{:.4f}\n".format(*rng.normal(0, 0.01, 2)).encode()).unit == "pC"
+
+
 def test_channels_without_names_beside_others_are_proposed_by_their_numbers():
     report = examined(lambda k: b"left: %d 2, right: 3 4\n" % (3 * k % 5), electrodes=FOUR)
     assert report.device["channels"] == {"A": "left", "B": "2", "C": "right", "D": "4"}

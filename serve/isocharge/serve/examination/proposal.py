@@ -71,6 +71,7 @@ def unit_of(capture: Capture, max_noise_V: float = 0.02) -> str:
     The unit is guessed from the names and the values of the channels. The first rule that applies determines the unit.
 
     - If all names of channels state the same unit, this is the unit, such as nC for `A_nC`.
+    - If some names state different units, the unit is assumed to be pC. The report requests the gains.
     - The unit is pC for binary frames of isocharge.
     - The unit is counts if all values are whole numbers.
     - The unit is volts if all names end in `V`, or if there is noise, but at most `max_noise_V` on each channel.
@@ -83,7 +84,7 @@ def unit_of(capture: Capture, max_noise_V: float = 0.02) -> str:
     units = {stated_unit(name) for name in capture.names}
     if len(units) == 1 and units != {""}:
         return units.pop()
-    if not capture.frames or capture.parser.format == BINARY:
+    if len(units - {""}) > 1 or not capture.frames or capture.parser.format == BINARY:
         return "pC"
     values, _times_s = capture.values()  # shape (frames, channels)
     finite_values = values[np.isfinite(values)]

@@ -73,7 +73,7 @@ class Layout:
     """Arrangement of the values of a frame in one line, or in a cycle of several lines.
 
     Attributes:
-        example: The first line, with which headers are compared.
+        first_line: The first line, with which headers are compared.
         patterns: Regular expression of each line of a frame, in which the numbers are groups.
         names: Names of all values; empty for a value without a name.
         unnamed: Indices of the values that have no names in the lines. A header or a device file may name them.
@@ -82,7 +82,7 @@ class Layout:
 
     def __init__(self, lines: Sequence[Line]) -> None:
         """Determine the layout from the lines of one frame."""
-        self.example = lines[0]
+        self.first_line = lines[0]
         self.patterns = [skeleton_pattern(line) for line in lines]
         names = [name for line in lines for name in line.names]
         self._words = tuple(word for line in lines for word in line.words)
@@ -172,7 +172,7 @@ class TextParser(DelimitedParser):
         except ValueError:
             return self._reject(size)
 
-    def _meant(self, names: Sequence[str]) -> tuple[str, ...]:
+    def _with_meanings(self, names: Sequence[str]) -> tuple[str, ...]:
         """Replace the names that the device uses for its counter and its clock by their meanings."""
         return tuple(self._meanings.get(name, name) for name in names)
 
@@ -206,7 +206,7 @@ class TextParser(DelimitedParser):
                 return self._recognise_layout(line, size)
             self._headers.append(text)
             return []
-        names = self._meant(header_names(text, layout.example))
+        names = self._with_meanings(header_names(text, layout.first_line))
         if has_numbers or all(layout.names) or not layout.name_unnamed(names):
             return self._reject(size)
         self._describe_layout(layout)
@@ -231,7 +231,7 @@ class TextParser(DelimitedParser):
         Returns:
             The frames in the collected lines; an empty list if no layout is recognised yet.
         """
-        self._collected_lines.append((line._replace(names=self._meant(line.names)), size))
+        self._collected_lines.append((line._replace(names=self._with_meanings(line.names)), size))
         repeats = MESSAGE_REPEATS if line.is_prose else RECOGNITION_REPEATS
         lines = [line for line, _ in self._collected_lines]
         frame_lines = _frame_lines(lines, repeats)
@@ -251,9 +251,9 @@ class TextParser(DelimitedParser):
     def _named_layout(self, frame_lines: Sequence[Line]) -> Layout:
         """Return the layout of the lines of a frame, with names from the device file or from the latest header."""
         layout = Layout(frame_lines)
-        is_named = layout.name_unnamed(self._meant(self._columns))
+        is_named = layout.name_unnamed(self._with_meanings(self._columns))
         for header in reversed(self._headers):
-            is_named = is_named or layout.name_unnamed(self._meant(header_names(header, layout.example)))
+            is_named = is_named or layout.name_unnamed(self._with_meanings(header_names(header, layout.first_line)))
         return layout
 
     def _read_line(self, text: str, size: int) -> list[Frame]:
