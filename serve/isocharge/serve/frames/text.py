@@ -95,8 +95,8 @@ class Layout:
         self.columns = Columns(names, (1.0,) * len(names), words=self._words)  # values in text have no scale
 
     def name_unnamed(self, names: Sequence[str]) -> bool:
-        """Give names to the values that have none in the lines, and return whether the number of names fits."""
-        if not names or len(names) != len(self.unnamed):
+        """Give names to the values without a name, and return whether there are such values and as many names."""
+        if all(self.names) or len(names) != len(self.unnamed):
             return False
         new_names = dict(zip(self.unnamed, names, strict=True))
         self.set_names([new_names.get(index, name) for index, name in enumerate(self.names)])
@@ -207,7 +207,7 @@ class TextParser(DelimitedParser):
             self._headers.append(text)
             return []
         names = self._with_meanings(header_names(text, layout.first_line))
-        if has_numbers or all(layout.names) or not layout.name_unnamed(names):
+        if has_numbers or not layout.name_unnamed(names):
             return self._reject(size)
         self._describe_layout(layout)
         return []
@@ -251,9 +251,9 @@ class TextParser(DelimitedParser):
     def _named_layout(self, frame_lines: Sequence[Line]) -> Layout:
         """Return the layout of the lines of a frame, with names from the device file or from the latest header."""
         layout = Layout(frame_lines)
-        is_named = layout.name_unnamed(self._with_meanings(self._columns))
-        for header in reversed(self._headers):
-            is_named = is_named or layout.name_unnamed(self._with_meanings(header_names(header, layout.first_line)))
+        names_in_headers = [header_names(header, layout.first_line) for header in reversed(self._headers)]
+        for names in (self._columns, *names_in_headers):
+            layout.name_unnamed(self._with_meanings(names))
         return layout
 
     def _read_line(self, text: str, size: int) -> list[Frame]:
