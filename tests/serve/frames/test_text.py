@@ -380,7 +380,7 @@ def test_unrecognised_lines_use_bounded_memory():
 
 @pytest.mark.parametrize(
     ("first_line", "frame_count", "malformed_count"),
-    [("", 9, 1), ("A,B\n", 10, 0), ("# board\n", 10, 0), ("\n", 10, 0)],
+    [("", 9, 1), ("A,B\n", 10, 0), ("\ufeffA,B\n", 10, 0), ("# board\n", 10, 0), ("\n", 10, 0)],
 )
 def test_first_line_of_a_pipe_or_file_is_malformed_only_without_a_header_comment_or_blank_line(
     first_line, frame_count, malformed_count

@@ -3,9 +3,9 @@
 A board writes each frame as one line, or as a cycle of lines that together contain all values of the frame. The module
 `isocharge.serve.frames.text_lines` reads the numbers of each line. Lines with the same text between their numbers
 have the same layout. The parser recognises a layout as soon as the same kind of line, or the same cycle of lines, has
-occurred three times in succession. Lines that resemble a message, such as `Channel 3 is ready`, must occur ten times,
-because a board that starts often sends several similar messages. After the recognition, lines with another layout are
-dropped and counted.
+occurred three times in succession. Lines that resemble a message, such as `Channel 3 is ready` or `load:0x3FCD6100`,
+must occur ten times, because a board that starts often sends several similar messages. After the recognition, lines
+with another layout are dropped and counted.
 
 If a column contains the number of the channel, each line contains the charge of one channel, as in `1000,0,3.2` and
 `1000,1,4.1`. Such lines are not recognised, because they could be mistaken for frames with three values. A frame
@@ -307,11 +307,13 @@ class TextParser(DelimitedParser):
 def _decoded(line: bytes) -> str:
     """Decode a line in UTF-8, or else in Latin-1, in which some instruments write the signs of micro and degree.
 
+    A byte order mark, with which some editors begin a file, is removed.
+
     Raises:
         UnicodeDecodeError: If the line is not in UTF-8, and contains other signs of Latin-1.
     """
     try:
-        return line.decode()
+        return line.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = line.decode("latin-1")
         if not text.replace("µ", "").replace("°", "").isascii():

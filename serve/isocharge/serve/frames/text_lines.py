@@ -216,12 +216,11 @@ def _is_prose(tokens: list[_Token]) -> bool:
     """
     number_kinds = [token.kind for token in tokens if token.is_number]
     word_kinds = ("word", "key") if len(number_kinds) > 1 else ("word",)
-    words = [
-        token
+    word_count = sum(
+        token.kind in word_kinds and previous.kind != "mark" and token.content not in _ALL_CHARGE_UNITS
         for previous, token in pairwise([_EDGE, *tokens])
-        if token.kind in word_kinds and previous.kind != "mark" and token.content not in _ALL_CHARGE_UNITS
-    ]
-    return "hexadecimal" in number_kinds or len(words) >= len(number_kinds)
+    )
+    return "hexadecimal" in number_kinds or word_count >= len(number_kinds)
 
 
 def _has_decimal_commas(text: str) -> bool:
