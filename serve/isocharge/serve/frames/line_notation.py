@@ -39,7 +39,8 @@ def clean_text(text: str) -> str:
     if "\x1b" in text:
         text = re.sub(_COLOURS, "", text)
     if not text.isascii():
-        text = re.sub(r"[^\S\t]", " ", text)  # some programs write blanks of fixed width
+        # Some programs write blanks of fixed width, and a byte order mark at the beginning of a file.
+        text = re.sub("[^\\S\t]|\ufeff", " ", text)
     text = re.sub("[\u2010-\u2015\u2212]", "-", text.strip())  # dashes, and the minus sign of some locales
     text = re.sub(r"(^|[:=,;(\[] *)([-+]) +(?=[.0-9])", r"\1\2", text)  # a sign apart from its number, as in `A: - 3.5`
     if re.fullmatch(_SIGNED_NUMBERS, text):

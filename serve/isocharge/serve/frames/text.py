@@ -307,13 +307,11 @@ class TextParser(DelimitedParser):
 def _decoded(line: bytes) -> str:
     """Decode a line in UTF-8, or else in Latin-1, in which some instruments write the signs of micro and degree.
 
-    A byte order mark, with which some editors begin a file, is removed.
-
     Raises:
         UnicodeDecodeError: If the line is not in UTF-8, and contains other signs of Latin-1.
     """
     try:
-        return line.decode("utf-8-sig")
+        return line.decode()
     except UnicodeDecodeError:
         text = line.decode("latin-1")
         if not text.replace("µ", "").replace("°", "").isascii():
