@@ -7,7 +7,7 @@ import time
 import pytest
 
 from isocharge.common.errors import InputError
-from isocharge.serve.viewer.live_page import Marker, Record, Tare
+from isocharge.serve.viewer.live_page import CONTENT_TYPES, Marker, Record, Tare
 from isocharge.serve.viewer.tape import LIVE_SAMPLES, MAX_DRAWN_SAMPLES
 
 
@@ -130,6 +130,11 @@ def test_description_and_samples_need_the_token(start_page):
 def test_unknown_path_wrong_method_and_page_of_another_site_are_refused(client, method, path, status):
     assert client.send(method, path)[0] == status
     assert client.send(method, path, Host="evil.example:8001", Origin="http://evil.example:8001")[0] == 403
+
+
+def test_file_of_an_unknown_type_in_the_folder_of_the_page_is_not_served(start_page, monkeypatch):
+    monkeypatch.delitem(CONTENT_TYPES, ".svg")
+    assert start_page().send("GET", "/icon.svg")[0] == 404
 
 
 def test_files_of_the_page_are_served(client):

@@ -246,12 +246,12 @@ class PressWatch:
         mean_pC = charge_pC.mean(axis=0)
         scatter_pC = (charge_pC - mean_pC - np.outer(centred_s, slope_pC_per_s)).std(axis=0)
 
-        reason = self._unsteady(mean_pC, scatter_pC, slope_pC_per_s, float(times_s[-1] - times_s[0]), noise_pC)
+        reason = self._unsteady(mean_pC, scatter_pC, slope_pC_per_s, times_s[-1] - times_s[0], noise_pC)
         if not reason:
             flags = dict.fromkeys(flag for frame in self._frames for flag in frame.flags)  # each flag once
             return SteadyPress(mean_pC, self._end_s - self._begin_s, tuple(flags))
         if scatter_pC.max() <= self._min_scatter_pC:
-            self._min_scatter_pC = float(scatter_pC.max())
+            self._min_scatter_pC = scatter_pC.max()
             self._reason = reason
         return None
 

@@ -58,13 +58,13 @@ class TareRule(Rule, frozen=True, kw_only=True):
             mean_pC: Mean charge of each electrode in the frames, shape (n_electrode,), pC.
             noise_pC: Standard deviation of each charge, shape (n_electrode,), pC.
         """
-        largest_noise_pC = float(noise_pC.max())
+        largest_noise_pC = noise_pC.max()
         if largest_noise_pC > self.noise_limit_pC:
             return (
                 f"the charge of an electrode varies by {largest_noise_pC:.3g} pC rms, expected at most "
                 f"{self.noise_limit_pC:g} pC; leave the film alone and start again"
             )
-        largest_offset_pC = float(np.abs(mean_pC).max())
+        largest_offset_pC = np.abs(mean_pC).max()
         if largest_offset_pC > self.offset_limit_pC:
             return (
                 f"an electrode rests at {largest_offset_pC:.4g} pC, expected at most {self.offset_limit_pC:g} pC; take "

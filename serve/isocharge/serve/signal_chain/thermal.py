@@ -150,7 +150,7 @@ class Warming(Stage):
 
         # The measured change is the minimum of the parabola, limited to the range of the trial values.
         minimum_pC = -slope / (2.0 * curvature)
-        change_pC = min(max(minimum_pC, float(TRIED_PC[0])), float(TRIED_PC[-1]))
+        change_pC = min(max(minimum_pC, TRIED_PC[0]), TRIED_PC[-1])
 
         # Kalman update of the estimate and of its variance
         gain = self._variance_pC2 / (self._variance_pC2 + estimate_variance_pC2)

@@ -265,7 +265,7 @@ def _page_files() -> dict[str, Response]:
     folder = Path(__file__).with_name("page")
     responses = {}
     for path in folder.rglob("*"):
-        if path.is_file():
+        if path.suffix in CONTENT_TYPES:  # other files belong to the operating system, such as .DS_Store
             response = response_of(200, CONTENT_TYPES[path.suffix], path.read_bytes())
             response.headers.extend(PAGE_HEADERS)
             responses[f"/{path.relative_to(folder).as_posix()}"] = response

@@ -204,7 +204,7 @@ def corrupt(data: bytes, fraction: float, rng: np.random.Generator) -> bytes:
     """
     damaged = bytearray(data)
     for index in reversed(np.flatnonzero(rng.random(len(data)) < fraction).tolist()):  # later indices do not change
-        flipped = data[index] ^ (1 << int(rng.integers(8)))
+        flipped = data[index] ^ (1 << rng.integers(8))
         replacements = (bytes([flipped]), b"", bytes([data[index], flipped]))
         damaged[index : index + 1] = replacements[rng.integers(3)]
     return bytes(damaged)

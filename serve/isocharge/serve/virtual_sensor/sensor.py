@@ -304,7 +304,7 @@ def _clean_charges(forward: Charges, script: Script) -> Array:
         SceneError: If the forward map returns charges of another shape, or charges that are not finite.
     """
     is_touch = script.touching
-    touch_count = int(is_touch.sum())
+    touch_count = is_touch.sum()
     touch_pC = forward(script.contact[is_touch])
     if touch_pC.ndim != 2 or len(touch_pC) != touch_count or not np.isfinite(touch_pC).all():
         raise SceneError(
