@@ -39,17 +39,17 @@ def to_toml(tables: Mapping[str, Any], comment: Iterable[str] = ()) -> str:
 
     for name, table in tables.items():
         if isinstance(table, Mapping):
-            lines += ["", f"[{_key(name)}]", *(_pair(key, value) for key, value in table.items())]
+            lines += ["", f"[{toml_key(name)}]", *(_pair(key, value) for key, value in table.items())]
     content = "\n".join(lines).lstrip("\n")  # remove the blank line if the file begins with a section
     return content + "\n"
 
 
 def _pair(key: str, value: object) -> str:
     """Return a key and its value in the notation of TOML."""
-    return f"{_key(key)} = {_value(value)}"
+    return f"{toml_key(key)} = {_value(value)}"
 
 
-def _key(key: str) -> str:
+def toml_key(key: str) -> str:
     """Return a key in the notation of TOML, with quotation marks if they are necessary."""
     return key if _BARE_KEY.fullmatch(key) else _json(key)
 

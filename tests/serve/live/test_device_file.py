@@ -232,9 +232,11 @@ def test_advice_for_the_channels_is_a_valid_device_file():
 
 
 def test_tare_error_states_the_offset_for_the_device_file():
-    stream = ReadingStream(ELECTRODES, device_from_table({"tare": {"frames": 5, "patience": 10}}, "board.toml"))
+    stream = ReadingStream(
+        ("A", "Pad 1", "C"), device_from_table({"tare": {"frames": 5, "patience": 10}}, "board.toml")
+    )
     data = b"".join(encoded_frames([(2048.0, 2050.5, 2047.0)] * 20))
-    with pytest.raises(TareError, match=r"\[gain\] offset = \{A = 2048, B = 2050.5, C = 2047\}"):
+    with pytest.raises(TareError, match=r'\[gain\] offset = \{A = 2048, "Pad 1" = 2050.5, C = 2047\}'):
         list(stream.frames(Chunk(data, 1e9, 0)))
 
 

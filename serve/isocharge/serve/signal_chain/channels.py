@@ -9,6 +9,7 @@ from os.path import commonprefix
 import numpy as np
 
 from isocharge.common.errors import ChargeError, cut, shown
+from isocharge.common.toml_text import toml_key
 from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, Frame
 from isocharge.serve.signal_chain.gain import GainRule
 from isocharge.serve.signal_chain.stage import Setup, Stage
@@ -144,8 +145,7 @@ class Channels(Stage):
             advice: Part of a sentence about a channel, which begins with a semicolon; empty without advice.
         """
         number = "a frame" if frame.seq is None else f"frame {frame.seq}"
-        keys = (name if re.fullmatch("[A-Za-z0-9_-]+", name) else dumps(name) for name in self._electrodes)
-        example_keys = ", ".join(f'{key} = "..."' for key in keys)
+        example_keys = ", ".join(f'{toml_key(name)} = "..."' for name in self._electrodes)
         return ChargeError(
             f"{self._setup.reader} expects {len(self._electrodes)} charges {self._electrodes}, {number} has "
             f"{len(frame.values)} {channel_names(frame)}{advice}; choose the "

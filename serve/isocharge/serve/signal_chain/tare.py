@@ -13,6 +13,7 @@ from msgspec import Meta, structs
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DeviceError, TareError
 from isocharge.common.structs import WrongKey
+from isocharge.common.toml_text import toml_key
 from isocharge.serve.flags import TARE
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.signal_chain.leak import LeakRule
@@ -192,7 +193,7 @@ class Tare(Stage):
             frame: The last frame.
         """
         value_of_electrode = zip(self._electrodes, frame.sent.tolist(), strict=True)
-        offsets = ", ".join(f"{name} = {value:.10g}" for name, value in value_of_electrode)
+        offsets = ", ".join(f"{toml_key(name)} = {value:.10g}" for name, value in value_of_electrode)
         setting = "[gain] offset = {" + offsets + "}"
         return TareError(
             f"cannot tare on the last {len(self._latest_pC)} frames: {reason}; if the board rests there without a "
