@@ -162,10 +162,15 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     sections: tuple[str, ...] = ()
 
     @property
+    def fields(self) -> tuple[Field, ...]:
+        """The fields that this record has, in their order."""
+        return record_fields(self.sections)
+
+    @property
     def json_values(self) -> dict[str, Any]:
         """Values of the fields by name, as JSON contains them. Numbers are rounded to six decimals."""
         json_values: dict[str, Any] = {}
-        for field in record_fields(self.sections):
+        for field in self.fields:
             value = getattr(self, field.name)
             if isinstance(value, float):
                 value = round(value, DECIMALS)
