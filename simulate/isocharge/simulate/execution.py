@@ -263,7 +263,7 @@ def dask_workers(address: str) -> Iterator[Executor]:
             ) from error
         with client:
             # With `pure=False`, Dask does not compute the keys of the tasks from their arguments, which are large.
-            executor: Executor = client.get_executor(pure=False)
+            executor = client.get_executor(pure=False)
             try:
                 yield executor
             finally:

@@ -20,7 +20,7 @@ A TOML file can describe a further measuring chain. The function `load_amplifier
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Literal, get_type_hints
 
 import numpy as np
 import scipy  # loads each of its subpackages on first use
@@ -394,7 +394,7 @@ def load_amplifier(level: str) -> Amplifier:
     if not level.endswith(".toml"):
         raise InputError(f"noise level: expected one of {', '.join(AMPLIFIER_LEVELS)}, or a TOML file, got {level!r}")
     file = read_toml(Path(level), "the description of noise", InputError, AmplifierFile)
-    changes: dict[str, Any] = {name: value for name, value in structs.asdict(file).items() if value is not None}
+    changes = {name: value for name, value in structs.asdict(file).items() if value is not None}
 
     # Remove the level and the parameters of the noise, because the remaining keys must be attributes of the amplifier.
     similar_amplifier = AMPLIFIER_LEVELS[changes.pop("like")]

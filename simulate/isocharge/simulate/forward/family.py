@@ -250,7 +250,7 @@ class Family:
         film = sensor.film.rotated(rotation - direction)
         rotated_probe = probe.rotated(rotation)
         values_of_forces = []
-        equilibrium: Equilibrium | None = None
+        equilibrium = None
         for force in self.force.tolist():
             # The equilibrium under the previous force is a good start for the iterations of the solver.
             equilibrium = press(film, rotated_probe, (distance, 0.0), force, settings, start=equilibrium)

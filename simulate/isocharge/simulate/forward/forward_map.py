@@ -347,7 +347,7 @@ class ForwardMap:
         Returns:
             Charges, shape (n, n_electrode), pC.
         """
-        charge: Array = self.field_charges(contact, EVEN_FIELD, orientation)[..., 0]
+        charge = self.field_charges(contact, EVEN_FIELD, orientation)[..., 0]
         charge += contact_charges(self.sensor, self.probe, contact, orientation)
         return self.sensor.calibration.read(charge)
 

@@ -93,8 +93,8 @@ def bounded_step(point: Array, residual: Array, slopes: Array, damping: Array) -
         Points after the step, shape (n, 3).
     """
     # Damped normal equations. The addition to the trace avoids a singular matrix if all derivatives are zero.
-    matrix: Array = slopes @ slopes.swapaxes(1, 2)  # J'J, shape (n, 3, 3)
-    gradient: Array = (slopes @ residual[..., None])[..., 0]  # J'r, shape (n, 3)
+    matrix = slopes @ slopes.swapaxes(1, 2)  # J'J, shape (n, 3, 3)
+    gradient = (slopes @ residual[..., None])[..., 0]  # J'r, shape (n, 3)
     trace = np.trace(matrix, axis1=1, axis2=2)[:, None, None] + 1e-12
     matrix = matrix + damping[:, None, None] * trace * np.eye(3) / 3.0
 
@@ -130,7 +130,7 @@ def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -
     matrix = matrix + outward[:, 0, None, None] * tangent[:, :, None] * tangent[:, None, :]
 
     # Remove the components across the active edges. The trace makes the matrix regular in these directions.
-    across: Array = np.einsum("nbi,nbj->nij", normals, normals)
+    across = np.einsum("nbi,nbj->nij", normals, normals)
     along = np.eye(3) - across
     return along @ matrix @ along + trace * across, (along @ gradient[..., None])[..., 0]
 

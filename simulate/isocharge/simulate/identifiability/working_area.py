@@ -57,8 +57,7 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
 
     def contacts(position: Array) -> Array:
         """Return contacts at positions of shape (..., 2), moved onto the disk of the map, shape (n, 3)."""
-        inside = onto_disk(position.reshape(-1, 2), radius)
-        return contacts_at(inside, force)
+        return contacts_at(onto_disk(position, radius).reshape(-1, 2), force)
 
     def precision(position: Array) -> Array:
         """Return the inverse of the position error, which is zero at a fold, shape of the positions without (2,)."""
@@ -70,8 +69,7 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
     neighbours = np.stack(np.meshgrid(range(-2, 3), range(-2, 3)), axis=-1).reshape(-1, 2)
     while step.max() > 0.05 * FOLD_WIDTH:
         step *= 0.5
-        trial = position[:, None] + step[:, None, None] * neighbours
-        trial = onto_disk(trial.reshape(-1, 2), radius).reshape(trial.shape)
+        trial = onto_disk(position[:, None] + step[:, None, None] * neighbours, radius)
         position = trial[np.arange(len(trial)), precision(trial).argmin(axis=1)]
 
     # A position is on a fold if the charge map reverses its orientation between two opposite points of a circle around

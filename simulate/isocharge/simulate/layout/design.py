@@ -361,7 +361,7 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     # Check the layouts in the order of their errors, up to the first layout that is not ambiguous. A layout cannot be
     # checked if there is no accurate forward map.
     forward_map = _solve_forward_map(case, executor)
-    summaries: list[str] = []
+    summaries = []
     sensors = [case.layout(np.round(layout.positions, DECIMALS)) for layout in refined_layouts]
     for sensor in track(sensors, "looking for folds and ambiguous pairs"):
         summary = NOT_SEARCHED

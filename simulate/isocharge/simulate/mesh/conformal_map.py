@@ -158,8 +158,8 @@ def sector_angles(
     """
     origin = centroid[..., None] + 0j  # common origin of all rays
     ray_angle = _ray_angles(blocks, inner_points - origin, radius / inner_extent)
-    ray: Complexes = np.exp(1j * ray_angle)  # unit vectors x + iy, shape (..., n_sector + 1)
-    origin_from_centre: Complexes = np.asarray(origin - centre[..., None], dtype=complex)
+    ray = np.exp(1j * ray_angle)  # unit vectors x + iy, shape (..., n_sector + 1)
+    origin_from_centre = np.asarray(origin - centre[..., None], dtype=complex)
     intersection = _intersections_with_circle(origin_from_centre, ray, radius[..., None])
 
     # Angles of the intersections around the centre of the circle. Each angle is larger than the previous angle, also

@@ -171,7 +171,7 @@ def _locate_in_intervals(edges: Array, values: Array) -> tuple[Integers, Array]:
         (k, n).
     """
     # The index of the interval is the number of inner edges that do not exceed the value.
-    index: Integers = np.sum(edges[1:-1] <= values, axis=0)
+    index = np.sum(edges[1:-1] <= values, axis=0)
     start, end = np.take_along_axis(edges, np.stack([index, index + 1]), axis=0)
     return index, (values - start) / (end - start)
 

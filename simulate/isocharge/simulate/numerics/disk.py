@@ -93,15 +93,14 @@ def onto_disk(position: Array, radius: float) -> Array:
     """Replace each position outside a disk by the nearest point on the edge of the disk.
 
     Args:
-        position: Positions (x, y), shape (n, 2), in the unit of the radius.
+        position: Positions (x, y), shape (..., 2), in the unit of the radius.
         radius: Radius of the disk, whose centre is the origin.
 
     Returns:
-        Positions within the disk or on its edge, shape (n, 2). Positions that were inside are unchanged.
+        Positions within the disk or on its edge, same shape. Positions that were inside are unchanged.
     """
-    x, y = position.T
-    relative_distance = np.hypot(x, y) / radius
-    return np.asarray(position / np.maximum(1.0, relative_distance)[:, None])
+    relative_distance = np.linalg.norm(position, axis=-1, keepdims=True) / radius
+    return np.asarray(position / np.maximum(1.0, relative_distance))
 
 
 def contacts_at(position: Array, force: float) -> Array:

@@ -1,6 +1,5 @@
 """Interpolation by polynomials and by a Fourier series of two angles, and Gauss quadrature rules."""
 
-import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -323,11 +322,11 @@ def _lattice(harmonics: Integers, symmetry_order: int) -> tuple[int, int]:
     Returns:
         Number of turns, which is a multiple of the symmetry order, and step.
     """
-    min_period_count = math.ceil(len(harmonics) / symmetry_order)
-    for period_count in itertools.count(min_period_count):
+    period_count = math.ceil(len(harmonics) / symmetry_order)
+    while True:  # a lattice with more turns than pairs of angles separates all harmonics
         n_turn = symmetry_order * period_count
         for step in range(2 % symmetry_order, n_turn, symmetry_order):
             remainders = (harmonics @ (step, 1)) % n_turn
             if len(set(remainders.tolist())) == len(harmonics):
                 return n_turn, step
-    raise AssertionError("a lattice with more turns than pairs of angles separates all harmonics")
+        period_count += 1

@@ -66,7 +66,7 @@ def picture_bytes(figure: Figure, file_format: str = "png") -> bytes:
         file_format: Format of the file: "png", "svg" or "pdf".
     """
     # The value None removes the present date, which matplotlib would write into SVG and PDF files.
-    date_metadata: dict[str, dict[str, None]] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
+    date_metadata = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
     buffer = BytesIO()
 
     # With a fixed salt, the identifiers of SVG elements are not random. Text is stored as text, not as outlines.

@@ -113,7 +113,7 @@ class Electrode:
         """
         directions = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
         corners = np.array(centre) + 0.5 * side * directions
-        return cls(name, _as_tuples(corners.tolist()))
+        return cls(name, corners.tolist())
 
     def with_trace(self, path: Corners, width: float) -> "Electrode":
         """Return a copy of the electrode whose metal on the front includes a trace.
@@ -146,7 +146,7 @@ class Electrode:
                 f"{where}: expected a path that does not cross itself and whose bends are farther apart than the "
                 f"width of {width:g} mm, got {shown(path)} mm"
             )
-        return replace(self, more=(*self.more, _as_tuples(corners.tolist())))
+        return replace(self, more=(*self.more, corners.tolist()))
 
     @cached_property
     def side(self) -> float | None:

@@ -269,7 +269,7 @@ def film_to_dict(film: Film) -> dict[str, Any]:
     # If E is the geometric mean of the moduli and r^2 = E1 / E2, the moduli are E1 = E r and E2 = E / r.
     root_of_ratio = math.sqrt(film.young_ratio)
     moduli = (film.young * root_of_ratio, film.young / root_of_ratio)
-    values: dict[str, Any] = {
+    values = {
         **vars(film),
         "young": film.young if film.young_ratio == 1.0 else moduli,
         "pretension": tension if any(film.deviator) else film.pretension,
@@ -375,14 +375,14 @@ def _film(table: FilmTable) -> Film:
         SensorError: If a property is outside its accepted range.
     """
     # Young's moduli along both axes, and their geometric mean. The mean of equal values has no rounding error.
-    values: dict[str, Any] = msgspec.structs.asdict(table)
+    values = msgspec.structs.asdict(table)
     young_1, young_2 = _along_axes(table.young_GPa)
     values["young_GPa"] = math.sqrt(young_1 * young_2)
 
     # Components of the pretension, and the mean of the components along x and y
     tension_11, tension_22, tension_12, *_ = [*_along_axes(table.pretension_MPa), 0.0]
     values["pretension_MPa"] = 0.5 * (tension_11 + tension_22)
-    numbers: dict[str, Any] = {
+    numbers = {
         attribute: values[number.key] / number.factor
         for attribute, number in FILM_NUMBERS.items()
         if isinstance(values.get(number.key), float)
