@@ -307,7 +307,7 @@ class Validity:
         Returns:
             Whether each press is a touch, shape (n,).
         """
-        limit_pC = TOUCH_LIMIT * np.asarray(self.white_pC)
+        limit_pC = np.multiply(TOUCH_LIMIT, self.white_pC)
         return np.asarray((np.abs(charge_pC) > limit_pC).any(axis=1))
 
     @cached_property

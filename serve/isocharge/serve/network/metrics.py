@@ -41,7 +41,7 @@ class ModelMetrics:
 
     def __init__(self) -> None:
         """Create the metrics, which have no values before `of` is called."""
-        registry = self.registry = CollectorRegistry(auto_describe=False)
+        registry = self.registry = CollectorRegistry()
         ProcessCollector(registry=registry)
         versions = Info("isocharge", "Versions of the server.", registry=registry)
         versions.info({"version": package_version(), "onnxruntime": ort.__version__})
@@ -207,7 +207,7 @@ class Traffic:
     def __init__(self, log: RequestLog | None = None) -> None:
         """Create the metrics of a server that has not received any request."""
         self.log = log
-        self.registry = CollectorRegistry(auto_describe=False)
+        self.registry = CollectorRegistry()
         self._requests = Counter(
             "isocharge_requests",
             "Requests that were answered or refused.",

@@ -303,8 +303,8 @@ def chi_squared_deviate(statistic: ArrayLike, degrees: ArrayLike) -> Array:
         statistic: The chi-squared variables, shape (n,), not negative.
         degrees: Their degrees of freedom, shape (n,), 1 or more.
     """
-    variance = 2.0 / (9.0 * np.asarray(degrees))
-    cube_root = np.cbrt(statistic / np.asarray(degrees))
+    variance = 2.0 / np.multiply(9.0, degrees)
+    cube_root = np.cbrt(np.divide(statistic, degrees))
     return (cube_root - (1.0 - variance)) / np.sqrt(variance)
 
 
