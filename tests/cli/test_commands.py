@@ -310,5 +310,7 @@ def test_live_demo_streams_a_virtual_sensor_to_its_model(monkeypatch):
     )
     with pytest.raises(InputError, match="--live: expected PORT"):
         demo_command(live="here")
+    with pytest.raises(InputError, match="expected only one of --output, --live and --playground"):
+        demo_command(live="8081", output=Path("demo"))
     demo_command(live="8081", token="sesame")
     assert calls == [SENSOR, ((SENSOR, board.url), "8081", "sesame")]

@@ -41,9 +41,9 @@ def demo_command(
 
     Example: isocharge demo -o first-light
     """
+    if [output, live, playground].count(None) < 2:
+        raise InputError("expected only one of --output, --live and --playground, got several")
     if playground is not None:
-        if output is not None or live is not None:
-            raise InputError("expected --playground without another option, got another option with it")
         from isocharge.serve.viewer.playground_page import playground_html  # imported late, because the import is slow
 
         refuse_existing(playground)
