@@ -124,8 +124,8 @@ def assign_channels(changes: Array, electrodes: Sequence[str], min_advantage: fl
     # The channel of each electrode is the column with the largest change in its row. Check that the choice is clear.
     columns = [int(column) for column in np.argmax(normalised, axis=1)]
     for row, column in enumerate(columns):
-        other_changes = np.delete(normalised[row], column)  # empty if there is only one channel
-        if other_changes.size and normalised[row, column] < min_advantage * other_changes.max():
+        largest_other_change = np.delete(normalised[row], column).max(initial=0.0)  # 0 if there is only one channel
+        if normalised[row, column] < min_advantage * largest_other_change:
             raise PressCheckError(
                 f"the press near electrode {electrodes[row]} changes two channels by almost the same amount; press "
                 "closer to the electrode, with a thinner probe, and try again"

@@ -257,9 +257,8 @@ def electrodes_by_position(capture: Capture, device: Device, electrodes: tuple[s
             if (position := channel_index(channel, last_frame)) is not None
         }
     rule = device.rule(GainRule)
-    gain_numbers = [] if rule is None else [rule.offset, rule.pC_per_unit]
-    numbers_by_electrode = [numbers for numbers in gain_numbers if isinstance(numbers, dict)]
-    names = electrodes or tuple(next(iter(numbers_by_electrode), ()))
+    gain_settings = () if rule is None else (rule.offset, rule.pC_per_unit)
+    names = electrodes or next((tuple(numbers) for numbers in gain_settings if isinstance(numbers, dict)), ())
     positions = None
     with suppress(ChargeError):  # a stream reports this error when it begins
         positions = Channels(Setup(names), any_unit=True).indices_by_name_or_order(last_frame)

@@ -4,7 +4,7 @@ The format is the binary frames of isocharge, lines of text, or frames of fixed 
 """
 
 from collections.abc import Iterator, Sequence
-from itertools import chain, count
+from itertools import chain, count, product
 from operator import itemgetter
 from string import printable
 from typing import Any
@@ -88,35 +88,35 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
     has_sync = division.framing == SYNC
     distances = np.flatnonzero(_may_be_sync(division.rows()))[:MAX_CONSTANT_BYTES].tolist() if has_sync else [0]
     possible_rows = [division.rows(distance) for distance in distances]
-    rows_and_checks = [(rows, check) for rows in possible_rows for check in find_checks(rows)]
+    checked_rows = [(rows, check) for rows in possible_rows for check in find_checks(rows)]
+    unchecked_rows = [(rows, Check(0, "little")) for rows in possible_rows]
 
     # For each byte order and each pair, find the division of the frame into parts with the lowest score.
     stream_bytes = len(division.stream)
     covered_share = min(1.0, len(division.starts) * length / stream_bytes)  # share of the bytes inside frames
     frame_rate_Hz = stream_bytes / length / seconds  # as if all bytes of the stream belonged to frames
-    for order in ORDERS:
-        for rows, check in rows_and_checks or [(rows, Check(0, order)) for rows in possible_rows]:
-            rows_before_check = rows[:, : length - check.size]
-            parts_at_each_byte = possible_parts(rows_before_check, order, check.start, frame_rate_Hz)
-            # The first byte belongs to the pattern: it is constant in the unshifted rows. In the shifted rows, of which
-            # there may be one less, a damaged frame may hide this.
-            sync_lengths = range(1, max(1, count_leading(_may_be_sync(rows))) + 1) if has_sync else [0]
-            score, sync_length, parts = split_frame(parts_at_each_byte, sync_lengths)
-            has_channel = any(part.name == CHANNEL for part in parts)
-            if has_channel:
-                sync = usual_bytes(rows)[0][:sync_length].tobytes()
-                layout = FrameLayout(
-                    framing=division.framing,
-                    sync_bytes=sync.hex(" ").upper() or None,
-                    length=length,
-                    byte_order=order,
-                    checksum=check.name,
-                    checksum_from=check.start,
-                    checksum_order=check.order if check.order != order and check.size > 1 else None,
-                    fields_and_padding=_fields(parts),
-                )
-                # Each byte outside of all frames contributes `Weights.noise` bits.
-                yield covered_share * score / length + (1.0 - covered_share) * Weights.noise, layout
+    for order, (rows, check) in product(ORDERS, checked_rows or unchecked_rows):
+        rows_before_check = rows[:, : length - check.size]
+        parts_at_each_byte = possible_parts(rows_before_check, order, check.start, frame_rate_Hz)
+        # The first byte belongs to the pattern: it is constant in the unshifted rows. In the shifted rows, of which
+        # there may be one less, a damaged frame may hide this.
+        sync_lengths = range(1, max(1, count_leading(_may_be_sync(rows))) + 1) if has_sync else [0]
+        score, sync_length, parts = split_frame(parts_at_each_byte, sync_lengths)
+        if all(part.name != CHANNEL for part in parts):
+            continue
+        sync = usual_bytes(rows)[0][:sync_length].tobytes()
+        layout = FrameLayout(
+            framing=division.framing,
+            sync_bytes=sync.hex(" ").upper() or None,
+            length=length,
+            byte_order=order,
+            checksum=check.name,
+            checksum_from=check.start,
+            checksum_order=check.order if check.order != order and check.size > 1 else None,
+            fields_and_padding=_fields(parts),
+        )
+        # Each byte outside of all frames contributes `Weights.noise` bits.
+        yield covered_share * score / length + (1.0 - covered_share) * Weights.noise, layout
 
 
 def _may_be_sync(rows: Bytes) -> Booleans:
