@@ -195,22 +195,21 @@ class TextParser(DelimitedParser):
             ValueError: If the line cannot be parsed.
         """
         line = parse_line(text, counters=self._counters)
-        line_below_header = parse_line(text, has_header=True, counters=self._counters)
-        if any(header_names(header, line_below_header) for header in self._headers):
-            line = line_below_header
-        layout = self.layout
-        has_numbers = bool(line.names)
         self.unread_line = text
-        if layout is None:
-            if has_numbers:
-                return self._recognise_layout(line, size)
+        layout = self.layout
+        if layout is not None:
+            names = self._with_meanings(header_names(text, layout.first_line))
+            if line.names or not layout.name_unnamed(names):  # it contains numbers, or is no header
+                return self._reject(size)
+            self._describe_layout(layout)
+            return []
+
+        if not line.names:  # it contains no numbers
             self._headers.append(text)
             return []
-        names = self._with_meanings(header_names(text, layout.first_line))
-        if has_numbers or not layout.name_unnamed(names):
-            return self._reject(size)
-        self._describe_layout(layout)
-        return []
+        line_below_header = parse_line(text, has_header=True, counters=self._counters)
+        has_header = any(header_names(header, line_below_header) for header in self._headers)
+        return self._recognise_layout(line_below_header if has_header else line, size)
 
     def _describe_layout(self, layout: Layout) -> None:
         """Describe the recognised layout in the attribute `format`."""
