@@ -317,6 +317,7 @@ def test_time_of_day_is_the_clock_which_wraps_at_midnight():
     frames = feed(*(f"23:59:59.{ms:03d} -> 1,2" for ms in range(900, 1000, 20)), "00:00:00.000 -> 1,2", parser=parser)
     assert [frame.t_us for frame in frames[-2:]] == [86_399_980_000, 0]
     assert parser.t_us_modulus == 86_400_000_000
+    assert parser.format == "text: t_s, 2 columns without names"
 
 
 def test_values_that_are_not_numbers_or_out_of_range_are_not_finite():

@@ -216,9 +216,10 @@ class TextParser(DelimitedParser):
         unit_us = round(layout.columns.clock_unit_us)
         is_time_of_day = unit_us == TIMES_US["t_s"]  # a day has 86400 s
         self.t_us_modulus = (86_400 if is_time_of_day else T_US_MODULUS) * unit_us
-        is_unnamed = not any(layout.names)
-        names = f"{len(layout.names)} columns without names" if is_unnamed else ", ".join(layout.names)
-        self.format = f"text: {printable(names)}"
+        names = [name for name in layout.names if name]
+        if len(names) < len(layout.names):
+            names.append(f"{len(layout.names) - len(names)} columns without names")
+        self.format = f"text: {printable(', '.join(names))}"
 
     def _recognise_layout(self, line: Line, size: int) -> list[Frame]:
         """Add a line to the collected lines. If their layout can now be recognised, return their frames.
