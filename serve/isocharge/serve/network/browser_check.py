@@ -82,7 +82,34 @@ class AccessCheck:
             OriginError: If a page of another site has sent the request, or if `Host` is not a name of this server.
             TokenError: If the token is missing or wrong.
         """
-        self._check_site(method, headers)
+        host = headers.get(b"host", b"")
+        name = _name_in(host.decode("latin-1"))
+        is_served = self._any_host or name in self._host_names or ip_address(name) is not None
+        if host and not is_served:  # HTTP/1.0 does not require the header, but browsers always send it
+            raise OriginError(
+                f"Host: expected an IP address or one of {', '.join(sorted(self._host_names))}, got {_quoted(host)}; "
+                "use the server's address, or name the host by --allow-host"
+            )
+
+        # Browsers send `same-origin` if a page of this server sends the request, and `none` if the user has typed the
+        # address. Other programs do not send the header. A link on another site may open a page of this server, because
+        # the other site cannot read the response.
+        origin = headers.get(b"origin")
+        fetch_site = headers.get(b"sec-fetch-site", b"none")
+        is_navigation = headers.get(b"sec-fetch-mode") == b"navigate" and headers.get(b"sec-fetch-dest") == b"document"
+        is_link = is_navigation and method in ("GET", "HEAD")
+        if origin is not None:
+            if not self._is_own_page(origin, host):
+                raise OriginError(
+                    f"Origin: expected a page of this server, got a page of {_quoted(origin)}; open {_quoted(host)} "
+                    "itself, or name the page's host by --allow-host"
+                )
+        elif fetch_site.lower() not in (b"same-origin", b"none") and not is_link:
+            raise OriginError(
+                f"Sec-Fetch-Site: expected a request by a page of this server, got {_quoted(fetch_site)}; open the "
+                f"page of {_quoted(host)}"
+            )
+
         if needs_token:
             self.check_token(headers.get(b"authorization", b""))
 
@@ -107,36 +134,6 @@ class AccessCheck:
             raise TokenError(
                 "expected `Authorization: Bearer TOKEN` with this server's token, in a header or in the metadata of "
                 f"gRPC, got {received}"
-            )
-
-    def _check_site(self, method: str, headers: Mapping[bytes, bytes]) -> None:
-        """Raise an error if a page of another site has sent a request."""
-        host = headers.get(b"host", b"")
-        name = _name_in(host.decode("latin-1"))
-        is_served = self._any_host or name in self._host_names or ip_address(name) is not None
-        if host and not is_served:  # HTTP/1.0 does not require the header, but browsers always send it
-            raise OriginError(
-                f"Host: expected an IP address or one of {', '.join(sorted(self._host_names))}, got {_quoted(host)}; "
-                "use the server's address, or name the host by --allow-host"
-            )
-        origin = headers.get(b"origin")
-        if origin is not None:
-            if not self._is_own_page(origin, host):
-                raise OriginError(
-                    f"Origin: expected a page of this server, got a page of {_quoted(origin)}; open {_quoted(host)} "
-                    "itself, or name the page's host by --allow-host"
-                )
-            return
-        # Browsers send `same-origin` if a page of this server sends the request, and `none` if the user has typed the
-        # address. Other programs do not send the header. A link on another site may open a page of this server, because
-        # the other site cannot read the response.
-        fetch_site = headers.get(b"sec-fetch-site", b"none")
-        is_navigation = headers.get(b"sec-fetch-mode") == b"navigate" and headers.get(b"sec-fetch-dest") == b"document"
-        is_link = is_navigation and method in ("GET", "HEAD")
-        if fetch_site.lower() not in (b"same-origin", b"none") and not is_link:
-            raise OriginError(
-                f"Sec-Fetch-Site: expected a request by a page of this server, got {_quoted(fetch_site)}; open the "
-                f"page of {_quoted(host)}"
             )
 
     def _is_own_page(self, origin: bytes, host: bytes) -> bool:
