@@ -68,6 +68,10 @@ class DeviceClock:
         self._device_us = 0  # clock of the latest reading after the wraps were removed
         self._chunk_arrival_s: float | None = None  # arrival of the latest chunk
 
+        # Whether the present chunk arrived at another time than the previous chunk. All chunks of a file have the same
+        # arrival time, which contains no information. After the first chunk, it is not known whether this is a file.
+        self._is_new_arrival = False
+
         # According to the fit, the host time was `_fitted_host_s` when the clock of the device was `_fitted_us`. If
         # `_fitted_us` is None, there is no fit.
         self._fitted_us: int | None = None
@@ -92,6 +96,7 @@ class DeviceClock:
             return
         is_first_chunk = self._chunk_arrival_s is None
         elapsed_s = self._enter_chunk(chunk)
+        self._is_new_arrival = self._chunk_arrival_s not in (None, chunk.timestamp)
         share_s = 0.0 if is_first_chunk else elapsed_s / len(frames)
         for n_later, frame in zip(reversed(range(len(frames))), frames, strict=True):
             if frame.t_us is None:
@@ -137,12 +142,10 @@ class DeviceClock:
         predicted_s = self._predict(self._device_us)
 
         # A reading is taken before it arrives. If the predicted time is much later than the arrival, the clock of the
-        # host or of the device was set, and the fit is wrong. Two cases are not examined. All chunks of a file have the
-        # same arrival time, which contains no information. The times of a provisional fit may be wrong by the length of
-        # a chunk.
-        is_new_arrival = self._chunk_arrival_s not in (None, arrival_s)
+        # host or of the device was set, and the fit is wrong. A provisional fit is not examined, because its times may
+        # be wrong by the length of a chunk.
         has_fit = self._fitted_us is not None and not self._is_fit_provisional
-        if has_fit and is_new_arrival and predicted_s - arrival_s > MAX_LEAD_s:
+        if has_fit and self._is_new_arrival and predicted_s - arrival_s > MAX_LEAD_s:
             self._fitted_us = None  # discards the fit
             self._device_us -= step_us  # the time of the device goes on from the previous reading
             step_us = 0  # the time since the previous reading is unknown
@@ -164,17 +167,11 @@ class DeviceClock:
     def _end_chunk(self, arrival_s: float) -> None:
         """Fit the clock of the device to the arrival time of a chunk, whose readings have been processed.
 
-        If the readings come from a file, all chunks have the same arrival time, which contains no information about the
-        clock. An arrival time is therefore used only if it differs from the previous arrival time.
-
         Args:
             arrival_s: Arrival of the chunk, unix seconds.
         """
-        previous_arrival_s = self._chunk_arrival_s
         self._chunk_arrival_s = arrival_s
-        # All chunks of a file arrive at the same time. After the first arrival, it is not known whether this is a file.
-        is_new_arrival = previous_arrival_s not in (None, arrival_s)
-        if self._fitted_us is None or not is_new_arrival:
+        if self._fitted_us is None or not self._is_new_arrival:
             return  # the provisional fit of `stamp` remains
 
         delay_s = arrival_s - self._predict(self._device_us)  # positive if the chunk arrived later than predicted
