@@ -11,6 +11,7 @@ _QUOTED_NUMBER = r"""(?<!\w)(["'])([-+]?\.?[0-9][0-9.,]*(?:[eE][-+]?[0-9]+)?(?:\
 """Regular expression of a number in quotes, with or without its unit."""
 
 _COMMANDS = r"(?:\x1b\[[0-9;?]*[A-Za-z])+"
+"""Regular expression of commands to a terminal, such as those that clear the screen."""
 
 _COLOURS = rf"\x1b\[[0-9;]*m|^{_COMMANDS}|{_COMMANDS}$"
 """Regular expression of the colours that loggers use, and of commands to a terminal at the ends of a line."""
@@ -39,16 +40,21 @@ def clean_text(text: str) -> str:
     if "\x1b" in text:
         text = re.sub(_COLOURS, "", text)
     if not text.isascii():
-        # Some programs write blanks of fixed width, and a byte order mark at the beginning of a file.
+        # Some programs write blanks of fixed width, a byte order mark at the beginning of a file, or dashes as minus.
         text = re.sub("[^\\S\t]|\ufeff", " ", text)
-    text = re.sub("[\u2010-\u2015\u2212]", "-", text.strip())  # dashes, and the minus sign of some locales
-    text = re.sub(r"(^|[:=,;(\[] *)([-+]) +(?=[.0-9])", r"\1\2", text)  # a sign apart from its number, as in `A: - 3.5`
+        text = re.sub("[\u2010-\u2015\u2212]", "-", text)
+
+    # Join each sign with its number, as in `A: - 3.5`.
+    text = re.sub(r"(^|[:=,;(\[] *)([-+]) +(?=[.0-9])", r"\1\2", text.strip())
+
+    # Separate numbers from each other, or names from numbers, if nothing is between them.
     if re.fullmatch(_SIGNED_NUMBERS, text):
         text = re.sub(r"(?<=[0-9])(?=[-+])", " ", text)
     if re.fullmatch(f"(?:{_NAMED_NUMBER}){{2,}}", text):
         named_numbers = re.findall(_NAMED_NUMBER, text)
         if len(dict(named_numbers)) == len(named_numbers):  # not a header such as `ch-1, ch-2`
             text = " ".join(f"{name}={number}" for name, number in named_numbers)
+
     if '"' in text or "'" in text:
         text = re.sub(_QUOTED_NUMBER, r"\2", text)
     if text[:1] == ">":
