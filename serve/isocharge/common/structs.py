@@ -257,12 +257,12 @@ def _item_types(value: Any, expected_type: Any) -> dict[str | int, Any]:
     types: dict[str | int, Any] = {}
     if isinstance(value, Mapping):
         structs = [member for member in members if isinstance(member, type) and issubclass(member, Struct)]
-        tags = [struct.__struct_config__.tag for struct in structs]
-        for struct, tag in zip(structs, tags, strict=True):
-            tag_key = struct.__struct_config__.tag_field  # all structs of a union have the same tag key
-            if tag_key is not None:
-                types[tag_key] = Literal[tuple(tags)]
-            if value.get(tag_key) == tag:  # both are None if the struct has no tag
+        tags = tuple(struct.__struct_config__.tag for struct in structs)
+        for struct in structs:
+            config = struct.__struct_config__  # all structs of a union have the same tag key
+            if config.tag_field is not None:
+                types[config.tag_field] = Literal[tags]
+            if value.get(config.tag_field) == config.tag:  # both are None if the struct has no tag
                 types |= {field.encode_name: field.type for field in msgspec.structs.fields(struct)}
     for member in members:
         arguments = get_args(member)

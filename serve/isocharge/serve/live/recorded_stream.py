@@ -201,8 +201,9 @@ class RecordedStream:
 
     def _begin_loading(self, load: Load) -> None:
         """Load a model in another thread, so that the stream does not have to wait, and then request its use."""
-        loading = self._loader.submit(load)
-        loading.add_done_callback(lambda loaded: self._requests.append(partial(self._use_loaded_model, loaded)))
+        self._loader.submit(load).add_done_callback(
+            lambda loaded: self._requests.append(partial(self._use_loaded_model, loaded))
+        )
 
     def _use_loaded_model(self, loading_result: "Future[Predictor]") -> None:
         """Use a newly loaded model for all later chunks, and write its label to the recording.

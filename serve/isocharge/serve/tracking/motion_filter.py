@@ -119,8 +119,8 @@ def process_noise(velocity_mm_per_s: Array, force_density: float, dt_s: float, i
     density[:, POSITION] = (ACCELERATION_DENSITY + SPEED_CHANGE_RATE * squared_speed)[:, None]
     # Covariance of a value and its rate for a unit density
     unit_covariance = np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
-    blocks = np.einsum("ab,nk,kl->nakbl", unit_covariance, is_moving * density, _IDENTITY)
-    return np.asarray(blocks.reshape(-1, 6, 6))
+    blocks: Array = np.einsum("ab,nk,kl->nakbl", unit_covariance, is_moving * density, _IDENTITY)
+    return blocks.reshape(-1, 6, 6)
 
 
 def mixture_moments(weight: Array, mean: Array, covariance: Array) -> tuple[Array, Array]:

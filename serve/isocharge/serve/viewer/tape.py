@@ -167,8 +167,7 @@ class Tape:
 
         If all stored samples are earlier, the result is the number of the next sample that will be appended.
         """
-        numbers = range(self.total)
-        return bisect_right(numbers, time_s, lo=self.oldest, key=self.timestamp)
+        return bisect_right(range(self.total), time_s, lo=self.oldest, key=self.timestamp)
 
     def span(self) -> tuple[float, float]:
         """Return the Unix times of the oldest and the latest stored sample, s. Without samples, return two zeros."""
