@@ -25,6 +25,12 @@ PROBE = Circle(1.0)
 MEMBRANE = Theory(bending=False)
 
 
+@pytest.mark.parametrize("accuracy", [0.0, np.nan])
+def test_accuracy_without_a_mesh_raises_scene_error(film, accuracy):
+    with pytest.raises(SceneError, match="accuracy: expected 1e-06 to 1, got"):
+        press(film, PROBE, (0.0, 0.0), 1.0, SolveSettings(accuracy=accuracy))
+
+
 @pytest.mark.parametrize(
     ("changes", "probe", "at", "force", "message"),
     [

@@ -15,7 +15,7 @@ from isocharge.simulate.mesh.conformal_map import CLEARANCE, map_stretch
 from isocharge.simulate.mesh.oval import film_oval, from_oval
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, place
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.sensor.film import Film, check_range
 from isocharge.simulate.sensor.footprint import Probe
 
 TOLERANCE = 1e-7
@@ -92,7 +92,7 @@ class SolveSettings:
     """Settings of a solve.
 
     Attributes:
-        accuracy: Largest allowed relative error of a charge.
+        accuracy: Largest allowed relative error of a charge, from 1e-6 to 1.
         theory: Terms of the film theory.
         resolution: Fineness of the mesh; "auto" for the coarsest mesh that reaches the accuracy.
         layer: Total width of the thin rings at the rim, in film radii; "auto" for six bending lengths.
@@ -211,9 +211,10 @@ class LoadCase:
         """Check the press and its side force.
 
         Raises:
-            SceneError: If the press cannot exist, or if the side force is not finite or exceeds `MAX_SIDE_SHARE` times
-                the force of the press.
+            SceneError: If the press cannot exist, if the required accuracy is out of range, or if the side force is not
+                finite or exceeds `MAX_SIDE_SHARE` times the force of the press.
         """
+        check_range("accuracy", self.settings.accuracy, (1e-6, 1.0), "", SceneError)
         check_press(self.film, self.probe, self.at, self.force)
         side_force = np.hypot(*self.side_force)
         if not side_force <= MAX_SIDE_SHARE * self.force:  # the condition is negated, so that NaN raises the error
