@@ -362,10 +362,9 @@ def _read_shard(folder: Path, entry: _Shard, sensor: Sensor) -> Samples:
         raise DatasetError(f"{path}: the manifest lists this shard, but the file is missing; make the dataset again")
     data = read_needed(path, DatasetError, "make the dataset again", MAX_SHARD_BYTES)
     checksum = sha256_of(data)
-    expected = entry.sha256
-    if checksum != expected:
+    if checksum != entry.sha256:
         raise DatasetError(
-            f"{path} is damaged: expected sha256 {expected[:12]}..., got {checksum[:12]}...; make the dataset again"
+            f"{path} is damaged: expected sha256 {entry.sha256[:12]}..., got {checksum[:12]}...; make the dataset again"
         )
     # The file is not trusted. `npz_arrays` does not execute code that the file may contain.
     try:

@@ -327,10 +327,9 @@ def _first_field(start: Equilibrium | None, elastic: ElasticFilm) -> Array:
     # Compare the blocks, and the resolution except for the order.
     template = elastic.mesh.template
     start_template = start.mesh.template
-    has_same_blocks = start_template.topology == template.topology and start_template.half == template.half
-    resolution_with_same_order = replace(start_template.resolution, order=template.resolution.order)
-    has_same_resolution_except_order = resolution_with_same_order == template.resolution
-    if not (has_same_blocks and has_same_resolution_except_order):
+    start_resolution = replace(start_template.resolution, order=template.resolution.order)
+    start_blocks = (start_template.topology, start_template.half, start_resolution)
+    if start_blocks != (template.topology, template.half, template.resolution):
         return first_iterate(elastic)
 
     # Interpolate to the nodes of the elements, which may have a new order. The weights of the nodes of an element have
