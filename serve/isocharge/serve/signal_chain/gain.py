@@ -64,7 +64,7 @@ class Gain(Stage):
         rule = setup.device.rule(GainRule) or GainRule(pC_per_unit=1.0)
         self.gain_pC = setup.for_each_electrode("gain.pC_per_unit", rule.pC_per_unit)
         self.zero = setup.for_each_electrode("gain.offset", rule.offset)
-        self.largest = LARGEST / float(np.abs(self.gain_pC).max())
+        self.largest = LARGEST / float(np.abs(self.gain_pC).max(initial=np.finfo(float).tiny))
         self._skipped_s = 0.0  # duration of the invalid frames since the last valid frame
         self._skipped_intervals = 0
 
