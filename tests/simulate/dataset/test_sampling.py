@@ -40,17 +40,6 @@ def test_presses_are_uniform_in_the_logarithm_of_the_force():
     assert stats.kstest(np.log(force), "uniform", args=(np.log(0.05), np.log(40.0))).pvalue > 0.05
 
 
-def test_sobol_presses_have_a_smaller_discrepancy_than_random_presses():
-    """For every probe, the squared distance and the angle are uniform, more evenly than independent draws."""
-    probes = 3
-    presses = Sweep(samples=1024 * probes, seed=4).over(PROBES[:probes])
-    chance = np.random.default_rng(4).random((1024, 2))
-    for number in range(probes):
-        x, y, _ = presses.contact[presses.probe == number].T
-        unit = np.stack([(x**2 + y**2) / 64.0, np.mod(np.arctan2(y, x) / (2 * np.pi), 1.0)], axis=1)
-        assert stats.qmc.discrepancy(unit) < 0.1 * stats.qmc.discrepancy(chance)
-
-
 def test_presses_depend_on_seed_and_probe():
     first, other = (Sweep(samples=100, seed=seed).contacts() for seed in (5, 6))
     assert np.all(first != other)

@@ -273,25 +273,6 @@ def test_taut_film_with_a_ratio_of_three_between_its_pretensions_is_interpolated
     assert ForwardMap.build(taut, PROBE, 8.0, (0.05, 0.05)).error <= INTERPOLATION_ERROR
 
 
-def test_derivatives_of_a_small_sensor_are_those_of_a_large_one_in_other_units(near_map):
-    """The equations have no length of their own, so a sensor of a tenth of the size has a hundredth of the charges."""
-    large = near_map.sensor
-    electrodes = tuple(Electrode(one.name, 0.1 * np.array(one.corners)) for one in large.electrodes)
-    film = replace(large.film, radius=0.1 * large.film.radius, thickness=0.1 * large.film.thickness)
-    small = replace(large, film=film, electrodes=electrodes)
-    low, high = near_map.domain.force_range
-    radius = 0.1 * near_map.domain.radius
-    small_map = ForwardMap.build(
-        small, Circle(0.1 * near_map.probe.radius), radius, (0.01 * low, 0.01 * high), near_map.settings
-    )
-    contact, _ = draw(near_map, 20, seed=5)
-    contact[:, :2] *= 0.9
-    expected = near_map.derivatives(contact) * [0.1, 0.1, 0.01]
-    slope = small_map.derivatives(contact * [0.1, 0.1, 0.01])
-    largest = np.abs(expected).max(axis=(0, 1))
-    np.testing.assert_allclose(slope / largest, expected / largest, atol=1e-6)
-
-
 @pytest.mark.slow
 def test_derivatives_under_a_narrow_probe_are_those_of_direct_solves():
     """The electrode has more integration points in a direct solve, so its differences allow short steps."""

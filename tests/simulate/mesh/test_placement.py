@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Ellipse, Film, Polygon, Probe, SolveSettings
-from isocharge.simulate.mesh import template
 from isocharge.simulate.mesh.placed_mesh import place
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template, locate_points, template_for
@@ -117,10 +116,3 @@ def test_no_element_is_folded_and_the_footprint_has_the_area_centroid_and_load_o
     assert mean.real == pytest.approx(distance, abs=exact * probe.reach / RADIUS)
     if not mesh.half:
         assert mean.imag == pytest.approx(0.0, abs=exact * probe.reach / RADIUS)
-
-
-def test_distance_from_a_line_is_positive_on_its_left():
-    """The triangle (-1, -3), (2, 1), (-1, 2) has the area 7.5, and its first side has the length 5."""
-    start, end, point = np.array([-1.0 - 3.0j]), np.array([2.0 + 1.0j]), np.array([-1.0 + 2.0j])
-    assert template._distance_to_left(start, end, point) == pytest.approx([3.0])
-    assert template._distance_to_left(end, start, point) == pytest.approx([-3.0])

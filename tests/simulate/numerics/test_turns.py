@@ -5,36 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from isocharge.simulate import Circle, Ellipse, Film, Polygon, load_sensor
+from isocharge.simulate import Circle, Ellipse, Polygon, load_sensor
 from isocharge.simulate.forward.family import DEFAULT_HARMONICS
 from isocharge.simulate.numerics.interpolation import Turns
 
 EVEN = load_sensor("three-25um-biaxial").film
 UNEVEN = replace(EVEN, pretension=1.0, deviator=(0.3, 0.1))
 IRREGULAR = Polygon.of(np.array([(0.0, 0.0), (3.0, 0.0), (1.0, 2.0)]))
-
-
-@pytest.mark.parametrize("film", [EVEN, UNEVEN], ids=["even", "uneven"])
-@pytest.mark.parametrize(
-    "probe", [Circle(1.0), IRREGULAR, Ellipse(4.0, 2.0), Polygon.triangle(4.0), Polygon.rectangle(3.0, 3.0)]
-)
-@pytest.mark.parametrize("largest", [DEFAULT_HARMONICS, (7, 5, 3, 2, 1)])
-def test_fourier_series_is_interpolated_exactly(film: Film, probe, largest):
-    """The expected values are those of the series itself, with the terms of which the docstring speaks."""
-    turns = Turns.spread(largest, probe.period, has_directions=not film.is_axisymmetric)
-    rng = np.random.default_rng(3)
-    terms = [
-        (m, k, rng.normal(), rng.uniform(0.0, 2.0 * np.pi))
-        for m in range(1 if film.is_axisymmetric else len(largest))
-        for k in (range(-largest[m], largest[m] + 1) if not probe.is_axisymmetric else [0])
-    ]
-
-    def series(direction: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-        return sum(size * np.cos(2.0 * m * direction + k * rotation + phase) for m, k, size, phase in terms)
-
-    direction, rotation = rng.uniform(-np.pi, np.pi, (2, 20))
-    found = turns.weights(direction, rotation) @ series(turns.direction, turns.rotation)
-    np.testing.assert_allclose(found, series(direction, rotation), atol=1e-12)
 
 
 @pytest.mark.parametrize(

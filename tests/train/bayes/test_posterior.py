@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 from bayes.posterior import Posterior
-from scipy import stats
 
 from function_map import FunctionMap
 from isocharge.simulate import Domain, NoiseModel
-from isocharge.train.data.presses import draw_contacts
 
 ONE_FORCE = Domain(1.0, (1.0, 1.0 + 1e-9))
 """Disk with a radius of 1 mm and practically one force."""
@@ -25,19 +23,3 @@ def test_the_posterior_of_linear_charges_with_white_noise_is_a_gaussian(seed):
     expected, *_ = np.linalg.lstsq(slopes.T, (noisy - 100.0)[0], rcond=None)
     assert (np.abs(mean[0, :2] - expected) < 0.05 * std[0, :2]).all()
     assert std[0, :2] == pytest.approx(np.sqrt(np.diag(covariance)), rel=0.04)
-
-
-@pytest.mark.parametrize("contact", [(5.0, 3.0, 0.06), (1.0, 2.0, 0.4), (0.1, 0.0, 1.9)])
-def test_posterior_means_are_weighted_means_of_the_prior(spline, contact):
-    """With loud noise, the prior ends within the posterior, and the factor 1 / sigma shifts the mean."""
-    noise = NoiseModel("loud", 5.0, 0.1)
-    charge = spline.charges(np.array([contact]))
-    (mean,), (std,) = Posterior(spline, noise, spline.domain.radius, population=4_000).mean_and_std(charge)
-    drawn = draw_contacts(np.random.default_rng(0), spline.domain, 400_000)
-    expected = spline.charges(drawn)
-    weight = stats.norm.pdf(charge, expected, noise.sigma(expected)).prod(axis=1)
-    weight /= weight.sum()
-    drawn_mean = weight @ drawn
-    assert std == pytest.approx(np.sqrt(weight @ (drawn - drawn_mean) ** 2), rel=0.1)  # drawn contacts are correlated
-    drawn_mean[2] = (weight @ (1.0 / drawn[:, 2])) / (weight @ drawn[:, 2] ** -2.0)
-    assert (np.abs(mean - drawn_mean) < 0.15 * std).all()
