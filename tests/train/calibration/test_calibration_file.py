@@ -73,8 +73,9 @@ def test_sensor_file_of_the_earlier_calibration_is_required(tmp_path):
     film = random_film(1)
     path.write_text(json_text(film_table(PROBLEM, film)))
     sensor, _ = PROBLEM.prior.layout.prior.film(film.film_values)
-    with pytest.raises(PressError, match=r"another film, piezo, calibration; give that file, not the calibrated"):
-        read_film(path, replace(PROBLEM, sensor=sensor))
+    for other, words in ((sensor, "film, piezo, calibration"), (load_sensor("three-25um-biaxial"), "name, electrodes")):
+        with pytest.raises(PressError, match=f"another {words}; give that file, not the calibrated"):
+            read_film(path, replace(PROBLEM, sensor=other))
 
 
 @pytest.mark.parametrize(("key", "value", "message"), FAULTS.values(), ids=FAULTS)

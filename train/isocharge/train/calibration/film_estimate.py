@@ -6,9 +6,10 @@ effects (Kennedy and O'Hagan 2001). The relative change of the charge of the ele
 
     sum c_eijm T_i(x / r) T_j(y / r) T_m(l),    i + j + m <= DEGREE, m <= FORCE_DEGREE,
 
-with Chebyshev polynomials T, the radius r of the domain, and the logarithm l of the force, scaled to [-1, 1]. The prior
-standard deviation of c_eijm is s FADING^(i + j + m), where s is the size of the discrepancy. A part of the coefficients
-is the same for all electrodes, because all charges are smaller where a film is stiffer than its properties imply.
+with Chebyshev polynomials T, the radius r of the domain, and the logarithm l of the force, scaled to [-1, 1]. Each
+coefficient c_eijm is the sum of two parts with the prior standard deviation s FADING^(i + j + m), where s is the size
+of the discrepancy. One part is the same for all electrodes, because all charges are smaller where a film is stiffer
+than its properties imply.
 """
 
 from collections.abc import Callable, Sequence

@@ -147,6 +147,15 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
 
 def _check_same_problem(path: Path, content: _CalibrationFile, problem: CalibrationProblem) -> None:
     """Raise PressError if a file belongs to another calibration problem."""
+    # The properties are deviations from the sensor file, so that they would be wrong with another one.
+    described = plain_values(sensor_to_dict(problem.sensor))
+    differences = [key for key in described if described[key] != content.described_sensor.get(key)]
+    if differences:
+        raise PressError(
+            f"{path}: expected the sensor file from which this calibration began, got one with another "
+            f"{', '.join(differences)}; give that file, not the calibrated {SENSOR}, or calibrate without the earlier "
+            "calibration"
+        )
     layout = problem.prior.layout
     for key, expected, got in (
         ("probe", problem.probe.rotated_notation, content.probe),
@@ -159,15 +168,6 @@ def _check_same_problem(path: Path, content: _CalibrationFile, problem: Calibrat
                 f"{path}: {key}: expected {cut(str(expected))}, as in this calibration, got {cut(str(got))}; calibrate "
                 "without the earlier calibration"
             )
-    # The properties are deviations from the sensor file, so that they would be wrong with another one.
-    described = plain_values(sensor_to_dict(problem.sensor))
-    differences = [key for key in described if described[key] != content.described_sensor.get(key)]
-    if differences:
-        raise PressError(
-            f"{path}: expected the sensor file from which this calibration began, got one with another "
-            f"{', '.join(differences)}; give that file, not the calibrated {SENSOR}, or calibrate without the earlier "
-            "calibration"
-        )
 
 
 def _correlations(path: Path, rows: list[list[float]], count: int) -> Array:

@@ -324,6 +324,4 @@ def _convert_to_differences(weight: Array) -> Array:
     Returns:
         Weights of the first logarithm and of the logarithms of the ratios, same shape.
     """
-    new_weight = np.array(weight)
-    new_weight[0] = weight.sum(axis=0)
-    return new_weight
+    return np.vstack([weight.sum(axis=0), weight[1:]])
