@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -23,7 +23,7 @@ from isocharge.serve.model.model_folder import load_model
 from isocharge.serve.presses.measured_presses import read_presses
 from isocharge.serve.presses.std_factor import StdFactor
 from isocharge.simulate import load_sensor, parse_probe
-from isocharge.train import CalibrationProblem, CalibrationResult, ProposedPress, calibrate, next_presses
+from isocharge.train import CalibrationProblem, calibrate, next_presses
 from isocharge.train.calibration.calibrate import solve_even
 from isocharge.train.calibration.folder import (
     check_calibration_folder,
@@ -99,9 +99,9 @@ def calibrate_command(
     problem = CalibrationProblem(load_sensor(sensor), parse_probe(probe), radius=radius, stress_limit=stress_limit)
     if output is not None:
         check_calibration_folder(output, problem.electrodes)
-    result: CalibrationResult | None = None  # None if only presses are proposed
-    std_factor: StdFactor | None = None  # None without held-out presses
-    proposed_presses: list[ProposedPress] = []
+    fields: dict[str, Any] = {}  # of the JSON object
+    sentences: list[str] = []
+    rows: list[dict[str, Any]] = []  # proposed presses, each with the errors that would remain after it
     with (
         shown_progress(),
         executor_for() as executor,
@@ -127,28 +127,28 @@ def calibrate_command(
                 say(f"caution: {caution}")
             charges = result.charges
             film = result.film
-        if result is not None and output is not None:
-            say("training the network of this film")
-            version = write_calibration(result, output, this_command(), held_out=held_out_presses, executor=executor)
-            say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
-            if held_out_presses is not None:
-                std_factor = StdFactor(**load_model(version).metadata.made_with["std_factor"])
+            fields |= result_table(result)
+            sentences += result.summary
+            if output is not None:
+                say("training the network of this film")
+                version = write_calibration(
+                    result, output, this_command(), held_out=held_out_presses, executor=executor
+                )
+                say(f"{version}: sensor.toml, calibration.json, card.md, model.onnx")
+                if held_out_presses is not None:
+                    std_factor = StdFactor(**load_model(version).metadata.made_with["std_factor"])
+                    fields["std_factor"] = std_factor.factor
+                    sentences.append(f"Held-out presses: {std_factor.statement}.")
         if next_count:
             proposed_presses = next_presses(
                 problem, charges, next_count, film, position_std_mm=position_std_mm, force_std=force_std
             )
+            rows += map(vars, proposed_presses)
 
-    # For each proposed press, print the errors that would remain after this press.
-    rows = [vars(press) for press in proposed_presses]
     if json:
-        result_fields = {} if result is None else result_table(result)
-        if std_factor is not None:
-            result_fields["std_factor"] = std_factor.factor
-        show_json(result_fields | {"next": rows})
+        show_json(fields | {"next": rows})
         return
-    if result is not None:
-        show("\n".join(result.summary))
-    if std_factor is not None:
-        show(f"Held-out presses: {std_factor.statement}.")
+    if sentences:
+        show("\n".join(sentences))
     if rows:
         show_result({"next": rows}, json=False)

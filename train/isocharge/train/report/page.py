@@ -151,12 +151,10 @@ def draw_speed(sections: Sequence[Section]) -> Figure:
         answered = [record for record in section.methods if record.errors]
         for record in answered:
             is_evaluated = record is section.methods[0]
-            style: dict[str, Any] = (
-                {"color": FELT, "marker": "*", "ms": 14} if is_evaluated else {"marker": "o", "ms": 7}
-            )
+            colour, marker, size = (FELT, "*", 14) if is_evaluated else (None, "o", 7)
             error_mm = _position_error(record)
             label = f"{record.name.replace('`', '')}, {error_mm:.3g} mm"
-            axes.plot(record.single_press_us, error_mm, ls="", label=label, **style)
+            axes.plot(record.single_press_us, error_mm, ls="", label=label, color=colour, marker=marker, ms=size)
         if section.limits:
             limit_mm = section.limits["position_rms_mm"]
             axes.axhline(limit_mm, color=INK, ls=":", label=f"Cramér-Rao limit, unbiased, {limit_mm:.3g} mm")
