@@ -74,7 +74,8 @@ def unit_of(capture: Capture, max_noise_V: float = 0.02) -> str:
     - If some names state different units, the unit is assumed to be pC. The report requests the gains.
     - The unit is pC for binary frames of isocharge.
     - The unit is counts if all values are whole numbers.
-    - The unit is volts if all names end in `V`, or if there is noise, but at most `max_noise_V` on each channel.
+    - The unit is volts if all names end in `V`. It is volts, too, if there is noise on some channel, and on no channel
+      more than `max_noise_V`.
     - The unit of all other values is assumed to be pC.
 
     Args:

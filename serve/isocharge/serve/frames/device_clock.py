@@ -178,7 +178,7 @@ class DeviceClock:
         was_clock_set = abs(delay_s) > MAX_DELAY_s
         if was_clock_set and not self._is_fit_provisional:
             self._latest_host_s = -math.inf  # allows the host time of the next reading to be earlier
-        # If a board has stored readings before the connection, a provisional fit may have moved far ahead.
+        # Readings that a board stored before the connection may have moved the host time far ahead of the arrival.
         self._latest_host_s = min(self._latest_host_s, arrival_s + MAX_LEAD_s)
         # A provisional fit relies on the arrival of only one chunk. A fit that begins at this arrival replaces it.
         if was_clock_set or self._is_fit_provisional:

@@ -212,9 +212,11 @@ class TextParser(DelimitedParser):
         return self._recognise_layout(line_below_header if has_header else line, size)
 
     def _describe_layout(self, layout: Layout) -> None:
-        """Describe the recognised layout in the attribute `format`."""
+        """Set the attribute `format`, which describes the recognised layout, and the modulus of the clock."""
         unit_us = round(layout.columns.clock_unit_us)
-        is_time_of_day = unit_us == TIMES_US["t_s"]  # a day has 86400 s
+        is_time_of_day = (
+            unit_us == TIMES_US["t_s"]
+        )  # a day has 86400 s; other clocks count ms or us
         self.t_us_modulus = (86_400 if is_time_of_day else T_US_MODULUS) * unit_us
         names = [name for name in layout.names if name]
         if len(names) < len(layout.names):

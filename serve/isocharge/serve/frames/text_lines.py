@@ -207,9 +207,9 @@ def _skeleton(tokens: list[_Token], names: list[str], number_kind: str) -> tuple
 def _is_prose(tokens: list[_Token]) -> bool:
     """Return whether a line resembles a message of a board instead of a frame.
 
-    A message has at least as many words as numbers, as in `Channel 3 is ready`. Words after a comma or another mark,
-    units of charge, and the key of a single number are not counted. A line with a hexadecimal number may be a message,
-    too. For example, boards print the address and the size of each part of their program when they start.
+    A message has at least as many words as numbers, as in `Channel 3 is ready`. Units of charge, words that follow a
+    comma or another mark, and the key of a single number are not counted. A line with a hexadecimal number may be a
+    message, too. For example, boards print the address and the size of each part of their program when they start.
 
     Args:
         tokens: Parts of the line.
@@ -279,7 +279,7 @@ def _index_positions(tokens: list[_Token]) -> list[int]:
     numbers = [position for position, token in enumerate(tokens) if _SHAPES.get(token.kind) == "0"]
 
     def first_numbers(pair: str) -> list[int]:
-        """Return the positions of the first numbers of all pairs at the end that have a given shape."""
+        """Return the position of the first number of each pair, for the pairs of a given shape that end the line."""
         pairs = re.search(rf"(?:[^0]*{pair})+[^0]*$", shape)
         return [] if pairs is None else numbers[-pairs[0].count("0") :: 2]
 
@@ -296,7 +296,7 @@ def _index_positions(tokens: list[_Token]) -> list[int]:
 
 
 def _shape(tokens: list[_Token]) -> str:
-    """Return one character for each part of a line."""
+    """Return one character for each part of a line, as in `k=0,k=0`: 0 for a number, w for a word, k for a key."""
     return "".join(_SHAPES.get(token.kind, token.content) for token in tokens)
 
 
@@ -323,11 +323,11 @@ def _alternating_names(times: list[str], gaps: list[list[_Token]]) -> list[str]:
         gaps: Parts between the numbers.
     """
     words = [[token.name for token in gap if token.kind != "mark"] for gap in gaps]
-    last_words_before = [gap[-1:] for gap in words[:-1]]
-    first_words_behind = [gap[:1] for gap in words[1:]]
-    for next_words in (last_words_before, first_words_behind):
-        names = [time or "".join(word) for time, word in zip(times, next_words, strict=True)]
-        if all(_unique(names)) and _CHARGE_UNITS.isdisjoint(names):
+    words_before = [gap[-1] if gap else "" for gap in words[:-1]]
+    words_behind = [gap[0] if gap else "" for gap in words[1:]]
+    for next_words in (words_before, words_behind):
+        names = [time or word for time, word in zip(times, next_words, strict=True)]
+        if all(_unique(names)) and _CHARGE_UNITS.isdisjoint(names):  # each number has a name of its own
             return names
     return []
 
@@ -337,10 +337,10 @@ def _preceding_names(times: list[str], gaps: list[list[_Token]], counters: Colle
 
     The name of a number is the last word or key between this number and the previous number or separator, as in
     `A: 3.5`, `A -> 3.5` and `<A>3.5</A>`. If several numbers have the same name, the word or key before it is the name,
-    as in `{"A": {"pC": 3.5}}`. A name that still occurs several times is removed. These names are removed, too:
+    as in `{"A": {"pC": 3.5}}`. A name that still occurs several times is removed. In these cases, words are not names:
 
-    - If no word precedes the first number, but a word follows the last number, the words are units and no names.
-    - If only one of several numbers has a name, the name is a label of the line. This applies if the name is a word or
+    - If no word precedes the first number, but a word follows the last number, the words are units.
+    - If only one of several numbers has a name, this name is a label of the line. This applies if the name is a word or
       belongs to the first number. Names of counters and clocks are kept.
 
     Args:
@@ -419,7 +419,7 @@ def line_values(pattern: re.Pattern[str], text: str) -> tuple[float, ...] | None
 
 
 def _value(number: str) -> float:
-    """Return the value of a number, which is NaN for `ovf`, or the seconds since midnight of a time of day."""
+    """Return the value of a number, or the seconds from midnight to a time of day. The value of `ovf` is NaN."""
     if ":" in number:
         hours, minutes, seconds = number.split(":")
         whole_seconds, *fractions = re.split("[.,]", seconds)

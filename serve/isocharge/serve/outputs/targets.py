@@ -223,7 +223,7 @@ class Outputs:
                     output.path.unlink()  # another output could not be opened, so the file has no records
             else:
                 output.close()
-        except KeyboardInterrupt:  # in a replay, the file is then removed
+        except KeyboardInterrupt:  # in a replay, the command then removes the file
             self.not_written[target] = None
             raise
         except Exception as error:

@@ -184,12 +184,12 @@ def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDiv
     single_bytes = stream.astype(int)
     pairs = 256 * single_bytes[:-1] + single_bytes[1:]
 
-    # For each length of a frame, the positions at which frames of this length begin, as many as possible. Of equal
-    # numbers of positions, those of a pair of bytes are chosen.
+    # For each length of a frame, the positions at which frames of this length begin. The byte or pair with the most
+    # positions is chosen, and a pair if a byte has equally many.
     best_starts: dict[int, NDArray[np.int64]] = {}
     for codes in (pairs, single_bytes):
         positions = np.argsort(codes, kind="stable")  # first all positions of the smallest code
-        distances = np.diff(positions) * (np.diff(codes[positions]) == 0)  # 0 behind the last position of a code
+        distances = np.diff(positions) * (np.diff(codes[positions]) == 0)  # 0 between two codes
         for length in range(MIN_FRAME_BYTES, MAX_FRAME_BYTES + 1):
             starts = positions[:-1][distances == length]
             best_code = np.bincount(codes[starts], minlength=1).argmax()

@@ -91,15 +91,15 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
     checked_rows = [(rows, check) for rows in possible_rows for check in find_checks(rows)]
     unchecked_rows = [(rows, Check(0, "little")) for rows in possible_rows]
 
-    # For each byte order and each pair, find the division of the frame into parts with the lowest score.
+    # For each byte order and each checksum, find the division of the frame into parts with the lowest score.
     stream_bytes = len(division.stream)
     covered_share = min(1.0, len(division.starts) * length / stream_bytes)  # share of the bytes inside frames
     frame_rate_Hz = stream_bytes / length / seconds  # as if all bytes of the stream belonged to frames
     for order, (rows, check) in product(ORDERS, checked_rows or unchecked_rows):
         rows_before_check = rows[:, : length - check.size]
         parts_at_each_byte = possible_parts(rows_before_check, order, check.start, frame_rate_Hz)
-        # The first byte belongs to the pattern: it is constant in the unshifted rows. In the shifted rows, of which
-        # there may be one less, a damaged frame may hide this.
+        # The first byte always belongs to the pattern, even if a damaged frame among these rows hides that it is
+        # constant.
         sync_lengths = range(1, max(1, count_leading(_may_be_sync(rows))) + 1) if has_sync else [0]
         score, sync_length, parts = split_frame(parts_at_each_byte, sync_lengths)
         if all(part.name != CHANNEL for part in parts):

@@ -191,7 +191,10 @@ class RecordedTape(Tape):
     """
 
     def append(self, values: tuple[float | None, ...]) -> None:
-        """Append a sample. If the buffer is full, its size is doubled."""
+        """Append a sample. If the buffer is full, its size is doubled.
+
+        The times of the samples never decrease: an earlier time, or none, is replaced by the time of the latest sample.
+        """
         if self.total == len(self._ring):
             self._double()
         time_s, *others = values

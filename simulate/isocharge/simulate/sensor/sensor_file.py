@@ -379,7 +379,7 @@ def _film(table: FilmTable) -> Film:
     young_1, young_2 = _along_axes(table.young_GPa)
     values["young_GPa"] = math.sqrt(young_1 * young_2)
 
-    # Components of the pretension, and the mean of the components along x and y
+    # Components of the pretension, of which T12 may be left out, and the mean of the components along x and y
     tension_11, tension_22, tension_12, *_ = [*_along_axes(table.pretension_MPa), 0.0]
     values["pretension_MPa"] = 0.5 * (tension_11 + tension_22)
     numbers = {

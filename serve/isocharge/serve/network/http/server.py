@@ -136,8 +136,8 @@ class Connection(HttpToolsProtocol):
     def close_if_overdue(self, now: float) -> None:
         """End the connection if a deadline has passed. If a request has begun, the client receives the reason.
 
-        The time between two requests has a deadline, too. Any byte would stop the timer of uvicorn, even an empty line,
-        with which no request begins.
+        The time between two requests has a deadline of its own, which replaces the timer of uvicorn. A client could
+        stop that timer by an empty line, with which no request begins.
 
         Args:
             now: Present time on the clock of the event loop, s.
