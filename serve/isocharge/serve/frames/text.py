@@ -214,9 +214,7 @@ class TextParser(DelimitedParser):
     def _describe_layout(self, layout: Layout) -> None:
         """Set the attribute `format`, which describes the recognised layout, and the modulus of the clock."""
         unit_us = round(layout.columns.clock_unit_us)
-        is_time_of_day = (
-            unit_us == TIMES_US["t_s"]
-        )  # a day has 86400 s; other clocks count ms or us
+        is_time_of_day = unit_us == TIMES_US["t_s"]  # a day has 86400 s; other clocks count ms or us
         self.t_us_modulus = (86_400 if is_time_of_day else T_US_MODULUS) * unit_us
         names = [name for name in layout.names if name]
         if len(names) < len(layout.names):
