@@ -39,9 +39,6 @@ CURVES = """([index, [x, y, force]]) => {
   return charges.map((charge, electrode) => grid.isocharge(electrode, charge, force));
 }"""
 
-MIRROR = """() => isocharge.playground.stage.region.map((polygon) =>
-  [0, 1].map((axis) => polygon.reduce((sum, corner) => sum + corner[axis], 0) / polygon.length))"""
-
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
@@ -140,22 +137,6 @@ def test_the_isocharge_curves_cross_at_the_press(page, press):
         share = np.clip(np.sum((press[:2] - starts) * along, axis=1) / np.sum(along**2, axis=1), 0.0, 1.0)
         nearest = starts + share[:, None] * along
         assert np.linalg.norm(nearest - press[:2], axis=1).min() < 0.1
-
-
-def test_presses_in_the_mirror_region_are_answered_elsewhere_without_a_flag(open_page):
-    page = open_page()
-    centres = np.array(page.evaluate(MIRROR))  # drawn at once, as on the live page
-    places = centres[np.hypot(*centres.T) < 24.0][::10]
-    force = np.geomspace(0.2, 2.0, len(places))[:, None]
-    charges = page.evaluate(CHARGES, [0, np.hstack([places, np.random.default_rng(0).permutation(force)]).tolist()])
-    predictor = Predictor(MODELS[0])
-    is_wrong = []
-    for (x_mm, y_mm), row in zip(places, charges, strict=True):
-        contact = predictor.predict(row)
-        is_unnoticed = not {*predictor.flags(contact)} - {"stress"}
-        is_wrong.append(is_unnoticed and np.hypot(contact.x_mm - x_mm, contact.y_mm - y_mm) > 0.9)
-    assert len(is_wrong) > 50
-    assert np.mean(is_wrong) > 0.9
 
 
 def test_a_press_with_the_mouse_gives_its_place_and_force(open_page):
