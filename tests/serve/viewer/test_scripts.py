@@ -110,22 +110,6 @@ def test_deflection_that_the_page_draws_is_near_that_of_the_solver(changes, larg
         assert np.abs(np.array(got) - expected).max() < largest_error * expected.max()
 
 
-def test_sheet_of_the_page_has_the_deflection_of_its_places():
-    film = film_to_dict(FILM) | {"pretension_MPa": [1.0, 2.0, 0.1]}
-    got = node(
-        f"""import {{ Deflection }} from "{(VIEWER / "page/deflection.js").as_uri()}";
-        const field = new Deflection({json.dumps(film)}, 1.0, 2.0), flat = field.at(1, 1);
-        field.press(-12, 9, 0.4);
-        const nodes = field.rings.map((_, ring) => field.node(ring, 0.3 * ring));
-        console.log(JSON.stringify({{ flat, nodes, at: nodes.map(([x, y]) => field.at(x, y)) }}));"""
-    )
-    nodes = np.array(got["nodes"])
-    assert got["flat"] == 0.0
-    assert got["at"] == pytest.approx(nodes[:, 2], abs=1e-9)
-    assert np.hypot(nodes[:, 0] + 12.0, nodes[:, 1] - 9.0)[0] < 0.1  # the first ring is the centre of the probe
-    assert np.hypot(*nodes[-1, :2]) == pytest.approx(45.0)
-
-
 def test_page_reads_a_token_with_a_percent_sign_as_it_is():
     """A server accepts no such token, so the page then asks for another one."""
     token = node(
