@@ -288,8 +288,8 @@ class Integrator(Leak):
         touch gets the flag `gap` if the error of this assumption may exceed both the noise and 1 % of the charge. A
         copy of the previous frame adds no charge, and neither does a frame that arrives late.
 
-        At rest, the charges decay with the time constant `relax_s`. The sum of independent currents then has the
-        variance of a current times relax_s / (2 dt).
+        At rest, the charges decay with the time constant `relax_s`. The variance of the sum of independent currents is
+        then relax_s / (2 dt) times the variance of one current.
         """
         missing_count = frame.intervals - 1
         if self._previous is None:

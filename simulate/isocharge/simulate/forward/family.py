@@ -219,9 +219,9 @@ class Family:
             `unfold` extends stresses to all rotations.
         """
         turns = self.turns.solved
-        chains = [(float(distance), turn) for distance in self.distance for turn in turns]
+        places = [(float(distance), turn) for distance in self.distance for turn in turns]
         solve = partial(self._solve_chain, sensor, probe, settings, read)
-        solved = np.stack(list(track(in_order(executor, solve, chains), "solving the film", len(chains))))
+        solved = np.stack(list(track(in_order(executor, solve, places), "solving the film", len(places))))
         return solved.reshape(self.distance.size, len(turns), self.force.size, -1).swapaxes(1, 2)
 
     def _solve_chain(
@@ -230,7 +230,7 @@ class Family:
         probe: Probe,
         settings: SolveSettings,
         read: Reading,
-        chain: tuple[float, tuple[float, float]],
+        place: tuple[float, tuple[float, float]],
     ) -> Array:
         """Solve one press for each force, all at one position and rotation, one after the other; see `solve`.
 
@@ -239,14 +239,14 @@ class Family:
             probe: Probe that presses the film.
             settings: Theory, mesh and width of the thin rings at the rim.
             read: Function that computes the returned values from each solved press.
-            chain: Distance from the centre of the film, mm, and the direction and rotation of a turn, rad.
+            place: Distance from the centre of the film, mm, and the angles of a turn, rad: the direction of the press,
+                and the rotation of the probe. The direction contains the rotation; see `Turns`.
 
         Returns:
             Values that `read` computes, shape (n_force, n_value).
         """
         # The film is rotated by the opposite of the angle of the press, so that the press lies on the positive x axis.
-        # The direction of a turn contains the rotation of the probe, which is subtracted here.
-        distance, (direction, rotation) = chain
+        distance, (direction, rotation) = place
         film = sensor.film.rotated(rotation - direction)
         rotated_probe = probe.rotated(rotation)
         values_of_forces = []

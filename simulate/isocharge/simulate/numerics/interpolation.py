@@ -310,10 +310,11 @@ def _symmetric_range(largest: int) -> range:
 def _lattice(harmonics: Integers, symmetry_order: int) -> tuple[int, int]:
     """Find the smallest lattice of turns at which no two harmonics have the same values.
 
-    At the turn j of n, the angle d is pi s j / n and the rotation of the probe is 2 pi j / n, where s is the
+    At the turn j of n, the angles `direction` and `rotation` of `Turns` are pi s j / n and 2 pi j / n, where s is the
     step. The harmonic (m, k) has the phase 2 pi (m s + k) j / n. Two harmonics therefore have the same values at all
-    turns if and only if the remainders of m s + k after the division by n are equal. After one period of the probe,
-    both angles must have increased by the period, so that s - 2 is a multiple of the symmetry order.
+    turns if and only if the remainders of m s + k after the division by n are equal. While the rotation increases by
+    one period of the probe, the direction must increase by the same angle or by half a turn more or less, and so on.
+    The difference s - 2 is therefore a multiple of the symmetry order.
 
     Args:
         harmonics: Pairs (m, k), shape (n_term, 2).
