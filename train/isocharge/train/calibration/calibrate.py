@@ -93,12 +93,13 @@ def calibrate(
     # Presses at the edge may lie outside the working area by their errors.
     is_outside = problem.solved_domain.is_outside(ordered_presses.contact)
     used_presses = ordered_presses[~is_outside]
-    outside_words = (
-        f"{ordered_presses[is_outside].line_words}: a calibration takes presses "
-        f"{domain_words(problem.solved_domain)} (--radius)"
-    )
     cautions = []
+    outside_words = ""
     if is_outside.any():
+        outside_words = (
+            f"{ordered_presses[is_outside].line_words}: a calibration takes presses "
+            f"{domain_words(problem.solved_domain)} (--radius)"
+        )
         if len(ordered_presses) == 1 or _is_uninformative(used_presses):
             raise PressError(outside_words)
         cautions.append(f"{outside_words}; left out")
