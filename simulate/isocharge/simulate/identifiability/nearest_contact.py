@@ -112,8 +112,8 @@ def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -
     """Modify the normal equations of points on an edge of the domain D such that each step does not leave D.
 
     Args:
-        normals: Normals of the circle and of the end of the interval at each point, shape (n, 2, 3); zeros for an edge
-            on which the point does not lie.
+        normals: Outward normals of both edges of D at each point, shape (n, 2, 3): of the circle that bounds x and y,
+            and of the end of the interval that bounds the force; zeros for an edge on which the point does not lie.
         matrix: Damped matrices J'J, shape (n, 3, 3).
         gradient: Gradients J'r, shape (n, 3).
         trace: Traces of the matrices J'J, shape (n, 1, 1).
@@ -125,7 +125,8 @@ def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -
     outward = -np.einsum("nbi,ni->nb", normals, gradient)
     normals = normals * (outward > 0.0)[..., None]
 
-    # The curvature of the circle adds the outward component to the second derivative along the tangent.
+    # A step along the tangent of the circle must also turn with the circle. This adds the outward component to the
+    # second derivative along the tangent.
     tangent = normals[:, 0, [1, 0, 2]] * np.array([-1.0, 1.0, 0.0])
     matrix = matrix + outward[:, 0, None, None] * tangent[:, :, None] * tangent[:, None, :]
 

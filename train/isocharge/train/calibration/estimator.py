@@ -160,7 +160,8 @@ class Prior:
         covariance of its result, which contains the imperfections, and the discrepancy is only its change since then.
         """
         layout = self.layout
-        parts = np.zeros((4 + len(SESSION), *(layout.coefficients.stop,) * 2))
+        n_unknown = layout.coefficients.stop
+        parts = np.zeros((4 + len(SESSION), n_unknown, n_unknown))
         fixed, uneven_tension, others, discrepancy, *session = parts
         discrepancy[layout.coefficients, layout.coefficients] = unit_covariance(
             len(layout.prior.sensor.electrode_names)

@@ -93,8 +93,8 @@ class FilmCharges:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Charges and their derivatives. The derivatives with respect to the contact are those of the solved film, and
-            the state consists of the properties, shape (n_property,).
+            Charges and their derivatives. The derivatives with respect to the contact are those of the solved film. The
+            derivatives with respect to the state are those with respect to the properties.
         """
         sensor = self._electrodes(values)
         solved_charge, contact_slopes, stress_derivatives = self._solved_charges(sensor, contact)

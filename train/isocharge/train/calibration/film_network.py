@@ -159,9 +159,9 @@ def _tension_factors(
 ) -> Array:
     """Compute the factors by which changes of the pretension multiply the charges.
 
-    The tension changes equally in all directions. The factors are those of an axisymmetric film under a circular probe,
-    for an uneven film with first-order changes by the imperfections. A factor is 1 where the charges before and after
-    the change have different signs.
+    The tension changes equally in all directions. For each change, an axisymmetric film under a circular probe is
+    solved, and the imperfections of an uneven film are added as first-order changes. A factor is 1 where the charges
+    before and after the change have different signs.
 
     Args:
         charges: Charges of the solved film and of similar films.

@@ -165,7 +165,7 @@ def model_values(charges: FilmCharges, layout: Layout, data: PressData, unknowns
         unknowns: Values of the unknowns, shape (n_unknown,).
         contact: Contacts (x, y, ln F), shape (n, 3).
     """
-    metric_contact = in_domain(contact, charges.domain)
+    metric_contact = in_domain(contact, charges.domain)  # (x, y, F), mm and N
     charge, contact_slopes, film_jacobian = charges.linearised(unknowns[layout.film], metric_contact)
     session_jacobian = np.stack([one.effect(data.time, charge) for one in SESSION], axis=2)
 

@@ -114,7 +114,7 @@ METHOD_BUILDERS: tuple[Callable[[FittingTask], Method], ...] = (triangulation, l
 
 
 def model_method(predictor: Predictor) -> Method:
-    """Return a model as a method."""
+    """Return the method that estimates contacts with the network of a model."""
 
     def single_call(charge: Array) -> Callable[[], object]:
         """Return a function that computes the complete answer to one press."""
@@ -300,9 +300,9 @@ def split_presses(
     """Split presses into those to which methods are fitted, and those that are held out for the test.
 
     In a simulated dataset, a tenth of the positions is held out. A training on the same dataset also holds these
-    positions out. If the training of the model has held fewer positions out, only those are held out here, too.
-    Measured datasets are smaller. In them, a fifth of the positions is held out, except presses that a calibration of
-    the model has used.
+    positions out, or some of them if its configuration states a smaller share. Only the positions that both hold out
+    are used for the test. Measured datasets are smaller. In them, a fifth of the positions is held out, except presses
+    that a calibration of the model has used.
 
     Args:
         dataset: The presses of a dataset that the model covers.
@@ -315,7 +315,7 @@ def split_presses(
     """
     if not is_measured(dataset):
         hold_out = TrainingConfig().hold_out
-        if model.dataset_sha256 == dataset.sha256 and "config" in model.made_with:  # not of a network made elsewhere
+        if model.dataset_sha256 == dataset.sha256 and "config" in model.made_with:  # not a network of another program
             hold_out = min(hold_out, model.made_with["config"]["training"]["hold_out"])
         return split_by_position(presses_of(dataset), hold_out)
 

@@ -181,7 +181,7 @@ class Split:
 
     @classmethod
     def by_position(cls, data: TrainingData, training: TrainingConfig) -> "Split":
-        """Split presses into two parts for training and for the test, and fit a charge field to them.
+        """Split presses into a part for training and a part for the test, and fit a charge field to all of them.
 
         A charge field is a smooth map from contacts to charges. The map folds where different contacts have the same
         charges. The field is fitted to all presses and determines the largest disk in which the map certainly does not
