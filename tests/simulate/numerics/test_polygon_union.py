@@ -61,6 +61,7 @@ POLYGONS = {
     "corner touches an edge": ([0, 4, 4 + 4j, 2, 4j], True),
     "touches itself along an edge": (SQUARE_WITH_HOLE, True),
     "double corner": ([0, 1, 1, 1 + 1j, 1j], True),
+    "small and far from the origin": (4000.0 + 6000.3j + 0.01 * np.array([0, 2, 2 + 2j, 2j]), True),
     "bow tie": ([0, 1 + 1j, 1, 1j], False),
     "pentagram": (np.exp(4j * np.pi * np.arange(5) / 5), False),
     "clockwise": (SQUARE[::-1], False),

@@ -43,6 +43,8 @@ def test_accuracy_without_a_mesh_raises_scene_error(film, accuracy):
         ),
         ({}, Polygon.rectangle(10.0, 1.0), (39.9, 5.0), 1.0, r"off the film: centre \(39\.9, 5\) mm, .* rectangle"),
         ({}, PROBE, (np.nan, 0.0), 1.0, r"probe off the film: centre \(nan, 0\) mm"),
+        ({}, PROBE, (np.inf, 0.0), 1.0, r"probe off the film: centre \(inf, 0\) mm"),
+        ({"oval": 0.02}, PROBE, (1e300, 0.0), 1.0, r"probe off the film: centre \(1e\+300, 0\) mm"),
         ({}, GrowingFinger(1.0), (0.0, 0.0), 1e-6, r"growing-finger:1\.0 under 1e-06 N: expected a radius of at least"),
         (
             {},

@@ -168,7 +168,8 @@ def farthest_distance(film: Film, probe: Probe, at: tuple[float, float]) -> floa
         probe: The probe.
         at: Centroid (x, y) of the footprint, mm.
     """
-    centroid = film.radius * from_oval(np.array(complex(*at) / film.radius), film_oval(film, direction=0.0))
+    with np.errstate(over="ignore", invalid="ignore"):  # the caller refuses a huge distance or NaN
+        centroid = film.radius * from_oval(np.array(complex(*at) / film.radius), film_oval(film, direction=0.0))
     return probe.farthest_distance((float(centroid.real), float(centroid.imag)))
 
 
