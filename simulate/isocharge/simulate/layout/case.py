@@ -93,7 +93,7 @@ class DesignCase:
 
     Raises:
         InputError: If a number is out of range, or no electrode is left to be placed.
-        SceneError: If a press within the radius cannot exist.
+        SceneError: If a press within the radius cannot exist, or if there is no white noise.
         SensorError: If a kept electrode does not exist.
     """
 
@@ -116,7 +116,7 @@ class DesignCase:
 
         Raises:
             InputError: If a value is not allowed, or the kept electrodes do not satisfy the rules.
-            SceneError: If a press within the radius cannot exist.
+            SceneError: If a press within the radius cannot exist, or if there is no white noise.
             SensorError: If a kept electrode does not exist.
         """
         if not MIN_ELECTRODES <= self.electrodes <= MAX_ELECTRODES:

@@ -204,7 +204,7 @@ def _locate_inside(
     element = candidates[:, 0]
     coordinates = np.full((2, points.size), np.inf)
     for candidate in candidates.T:
-        # Select the points whose element has not been found yet.
+        # Select the points whose element has not been found yet, apart from rounding errors of the coordinates.
         selected = np.flatnonzero(_overshoot(coordinates) > 1e-9)
         if selected.size == 0:
             break
@@ -258,7 +258,7 @@ def _local_coordinates(
         Radial coordinate and angular coordinate, shape (2, n). They are between 0 and 1 for points inside the element.
     """
     coordinates = np.full((2, points.size), 0.5)
-    for _ in range(20):
+    for _ in range(20):  # three to six steps are typical
         # Evaluate the sides at the angular coordinate, and before and after it for the central differences.
         radial, angular = coordinates
         shifted_angular = angular[:, None] + np.array([0.0, -difference_step, difference_step])
@@ -278,7 +278,7 @@ def _local_coordinates(
         new_coordinates = np.clip(coordinates + step, -0.1, 1.1)  # the point may leave the element a little
         largest_step = np.abs(new_coordinates - coordinates).max()
         coordinates = new_coordinates
-        if largest_step < 1e-13:
+        if largest_step < 1e-13:  # the step is a rounding error
             break
     return coordinates
 

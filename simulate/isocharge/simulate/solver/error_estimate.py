@@ -170,9 +170,10 @@ def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
     Returns:
         Relative difference, dimensionless.
     """
-    # Centres x + iy of the patches, shape (n_ring, 12), mm
+    # Centres x + iy of the patches, shape (n_ring, patches_per_ring), mm
+    patches_per_ring = 12
     film_radius = one.film.radius
-    unit_circle = np.exp(2j * np.pi * np.arange(12) / 12)
+    unit_circle = np.exp(2j * np.pi * np.arange(patches_per_ring) / patches_per_ring)
     rings_around_centre = film_radius * np.array(PATCH_RING_RADII)[:, None] * unit_circle
     ring_around_footprint = complex(*one.at) + one.probe.reach * unit_circle
     patch_centres = np.concatenate([rings_around_centre, ring_around_footprint[None]])
@@ -203,7 +204,7 @@ def _patch_charges(equilibrium: Equilibrium, centres: Complexes) -> Array:
         Charges per area in arbitrary units, shape (n_ring, n_patch, 2). The last axis is the kind of film. The part of
         a patch outside the film does not contribute.
     """
-    # Integration points of all patches. The coordinates xi and eta range from -1 to 1.
+    # Integration points of all patches, six along each side. The coordinates xi and eta range from -1 to 1.
     film_radius = equilibrium.film.radius
     xi, eta, weights = gauss_reference_square(6)
     half_side = film_radius / 30.0

@@ -224,12 +224,7 @@ def _take_full_step(iterate: _Iterate, step: Array) -> _Iterate | None:
     return next_iterate if halves_residual else None
 
 
-def _chord_steps(
-    iterate: _Iterate,
-    solve: SolveTangent,
-    previous_residual: float,
-    tolerance: float,
-) -> _Iterate:
+def _chord_steps(iterate: _Iterate, solve: SolveTangent, previous_residual: float, tolerance: float) -> _Iterate:
     """Take further steps with the factorised tangent of the last Newton step, as long as they reduce the residual.
 
     This is the chord method. A step with a reused tangent takes about a seventh of the time of a Newton step. If the
@@ -289,8 +284,8 @@ def _line_search(iterate: _Iterate, step: Array) -> _Iterate | None:
     """Halve a step until it lowers the energy sufficiently.
 
     According to Armijo's condition, the energy must decrease by at least 1e-4 times the decrease that the slope of the
-    energy along the step predicts. If the change of the energy may be caused by rounding errors, the step
-    must lower the residual instead.
+    energy along the step predicts. If the change of the energy may be caused by rounding errors, the step must lower
+    the residual instead. At most thirty step lengths are tried.
 
     Args:
         iterate: Present iterate.

@@ -260,11 +260,7 @@ def _elastic_film(case: LoadCase, mesh: PlacedMesh, force: float) -> ElasticFilm
     return ElasticFilm(mesh, groups)
 
 
-def _solve_by_load_steps(
-    case: LoadCase,
-    failed: NewtonResult,
-    full_load: ElasticFilm,
-) -> NewtonResult:
+def _solve_by_load_steps(case: LoadCase, failed: NewtonResult, full_load: ElasticFilm) -> NewtonResult:
     """Solve a press for increasing forces, because the solve with the full force has failed.
 
     The first force is a sixteenth of the full force. At most twelve forces are tried.
