@@ -122,6 +122,13 @@ def test_layout_is_recognised_from_the_first_good_lines():
     assert (parser.counts.frames, parser.counts.malformed) == (4, 1)
 
 
+def test_lines_without_numbers_are_counted_if_they_are_too_many_for_headers():
+    """Otherwise, a stream of such lines would wait for ever instead of reporting that it contains no frame."""
+    parser = TextParser()
+    feed(*["no sensor"] * 70, parser=parser)
+    assert parser.counts.malformed == 7
+
+
 UNNAMED_NOTATIONS = [
     "{a};{b};{c}",
     "({a}, {b}, {c})",

@@ -185,7 +185,8 @@ class TextParser(DelimitedParser):
         """Examine a line that does not have the recognised layout, and return the frames that become readable.
 
         Until a layout is recognised, lines with numbers are collected, and other lines are stored as possible headers.
-        Later, a line is rejected unless it is a header that names the columns without names.
+        As soon as `MAX_CYCLE_LINES` of these are stored, each next one is also counted as rejected. Later, a line is
+        rejected unless it is a header that names the columns without names.
 
         Args:
             text: The line.
@@ -206,7 +207,7 @@ class TextParser(DelimitedParser):
 
         if not line.names:  # it contains no numbers
             self._headers.append(text)
-            return []
+            return self._reject(size) if len(self._headers) == MAX_CYCLE_LINES else []
         line_below_header = parse_line(text, has_header=True, counters=self._counters)
         has_header = any(header_names(header, line_below_header) for header in self._headers)
         return self._recognise_layout(line_below_header if has_header else line, size)
