@@ -147,6 +147,10 @@ def test_flags_outside_beyond_misfit_and_stress(film, changes, flags):
     assert validity.batch_flags(Contacts(*np.float32([contact]).T)) == [flags]
 
 
+def test_contacts_as_whole_numbers():
+    assert np.asarray(Contacts(*np.full((10, 1), 1.5)), int).tolist() == [[1] * 10]
+
+
 @pytest.mark.parametrize("name", ["three-25um-biaxial", "four-25um-uniaxial"])
 def test_absurd_charges_are_always_flagged(name):
     """Charges of any size and sign: none that no press can give passes as one."""

@@ -116,7 +116,7 @@ class Contacts(NamedTuple):
             dtype: Requested number type; None for float32.
             copy: Ignored, because the result is always a new array.
         """
-        return np.stack(tuple(self), axis=1, dtype=dtype or np.float32)
+        return np.stack(tuple(self), axis=1, dtype=dtype or np.float32, casting="unsafe")
 
 
 def add_covariance(contacts: Singles, covariance: Array) -> Singles:
