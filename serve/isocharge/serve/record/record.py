@@ -174,7 +174,7 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
             value = getattr(self, field.name)
             if isinstance(value, float):
                 value = round(value, DECIMALS)
-            elif isinstance(value, (dict, Struct)):  # the charges by electrode, or a struct of numbers
+            elif value and isinstance(value, (dict, Struct)):  # the charges by electrode, or a struct of numbers
                 numbers = value if isinstance(value, dict) else structs.asdict(value)
                 value = {key: None if number is None else round(number, DECIMALS) for key, number in numbers.items()}
             json_values[field.name] = value
