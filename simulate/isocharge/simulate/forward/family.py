@@ -274,6 +274,8 @@ class Family:
             the order of the columns of `weights`.
         """
         symmetry_order = self.turns.symmetry_order
+        if symmetry_order == 1:  # the copies below would need four times the memory of a large table
+            return solved.reshape(-1, solved.shape[-1])
         solved_period = solved.reshape(*solved.shape[:-1], mesh.n_element, -1, 3)
         stress_of_periods = []
         for period_index in range(symmetry_order):
