@@ -125,7 +125,7 @@ def test_layout_is_recognised_from_the_first_good_lines():
 def test_lines_without_numbers_are_counted_if_they_are_too_many_for_headers():
     """Otherwise, a stream of such lines would wait for ever instead of reporting that it contains no frame."""
     parser = TextParser()
-    feed(*["no sensor"] * 70, parser=parser)
+    feed("\nno sensor" * 70, parser=parser)
     assert parser.counts.malformed == 7
 
 

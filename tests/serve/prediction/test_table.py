@@ -148,7 +148,7 @@ def test_flags_outside_beyond_misfit_and_stress(film, changes, flags):
 
 
 def test_contacts_as_whole_numbers():
-    assert np.asarray(Contacts(*np.full((10, 1), 1.5)), int).tolist() == [[1] * 10]
+    assert np.asarray(Contacts(*[[1.5]] * 10), int).sum() == 10
 
 
 @pytest.mark.parametrize("name", ["three-25um-biaxial", "four-25um-uniaxial"])
