@@ -71,7 +71,8 @@ class OutputKind(NamedTuple):
     Attributes:
         form: Form of the targets, for help and messages, such as `FILE.csv`.
         accepts: Function that returns whether the text of a target has this form.
-        open: Function that opens the output with the given target. It raises an `IsochargeError` if this is impossible.
+        open: Function that opens the output with the given target. It raises an `IsochargeError` or an `OSError` if
+            this is impossible.
         is_standard_output: Whether the output writes to standard output. Only one output of a command may write to
             standard output. The stream ends when standard output is closed.
     """

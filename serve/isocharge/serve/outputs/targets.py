@@ -131,7 +131,8 @@ class Outputs:
         """Open the outputs.
 
         Raises:
-            IsochargeError, OSError: If an output cannot be opened. The outputs that were opened before are discarded.
+            IsochargeError, BrokenPipeError: If an output cannot be opened. The outputs that were opened before are
+                discarded.
         """
         for target, kind in self._kinds.items():
             try:
