@@ -58,7 +58,7 @@ def from_oval(points: Complexes, oval: complex | Complexes) -> Complexes:
     oval_radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)
     rim_displacement = (np.conj(oval) * (points / oval_radius) ** 2).real  # e cos(2 (angle - alpha))
     radius = oval_radius
-    for _ in range(8):  # the error is then of the order of rounding errors for oval parameters up to e = 0.05
+    for _ in range(8):  # the error is then below 1e-10 for all accepted oval parameters
         displacement_ratio = _displacement_ratio(radius)
         residual = radius * (1.0 + displacement_ratio * rim_displacement) - oval_radius
         # If d(r) is the displacement ratio at the radius r, the derivative of r d(r) is d + r d', which is 7 d at the
