@@ -185,6 +185,7 @@ def test_the_series_of_the_package_is_that_of_the_simulator():
     np.testing.assert_allclose(coefficients(stored["outer"]), coefficients(made["outer"]), atol=2e-5)
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize("name", MODELS)
 def test_every_model_of_the_page_is_a_biaxial_film_whose_stress_the_series_describes(name):
     model = load_model(find_model(name))

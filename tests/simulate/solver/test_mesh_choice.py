@@ -120,7 +120,7 @@ def worst_error(film: Film, rough, fine) -> float:
     return max(errors)
 
 
-@pytest.mark.first_cases(3)
+@pytest.mark.first_cases(2)
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
 def test_mesh_error_bounds_the_difference_from_a_finer_mesh(scene):
     """The finer mesh has an order that is higher by two, and more rings."""

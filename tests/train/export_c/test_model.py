@@ -41,6 +41,7 @@ def test_self_test_passes_in_strict_c99(compiler, options, exports, run_self_tes
         assert " golden vectors, 0 wrong numbers" in printed
 
 
+@pytest.mark.first_cases(4)
 @pytest.mark.parametrize("name", model_names(find_model("four-25um-biaxial").parents[1]))
 def test_self_test_of_each_released_model_passes(name, run_self_test, tmp_path):
     code, printed = run_self_test(export_c(find_model(name), tmp_path / "export"))
