@@ -7,9 +7,9 @@ occurred three times in succession. Lines that resemble a message, such as `Chan
 must occur ten times, because a board that starts often sends several similar messages. After the recognition, lines
 with another layout are dropped and counted.
 
-If a column contains the number of the channel, each line contains the charge of one channel, as in `1000,0,3.2` and
-`1000,1,4.1`. Such lines are not recognised, because they could be mistaken for frames with three values. A frame
-counter without a name may look like the number of a channel during the first eight lines.
+In lines such as `1000,0,3.2` and `1000,1,4.1`, the second column is the number of a channel, and the third column is
+its charge. Such lines are not recognised, because they could be mistaken for frames with three values. A frame counter
+without a name may look like the number of a channel during the first eight lines.
 
 Reading may start in the middle of a cycle. A cycle therefore begins with the line whose name is that of the frame
 counter, or else comes first in the order of names.

@@ -301,7 +301,14 @@ def _shape(tokens: list[_Token]) -> str:
 
 
 def _gaps(tokens: list[_Token]) -> list[list[_Token]]:
-    """Return the parts before the first number, between each two numbers, and after the last number."""
+    """Divide a line at its numbers, and return the parts before the first number, after it, after the second, etc.
+
+    Args:
+        tokens: Parts of the line.
+
+    Returns:
+        One list for each number, and a further list with the parts after the last number.
+    """
     gaps: list[list[_Token]] = [[]]
     for token in tokens:
         if token.is_number:
@@ -335,13 +342,15 @@ def _alternating_names(times: list[str], gaps: list[list[_Token]]) -> list[str]:
 def _preceding_names(times: list[str], gaps: list[list[_Token]], counters: Collection[str]) -> list[str]:
     """Return the names of the numbers. A number without a name has an empty text.
 
-    The name of a number is the last word or key between this number and the previous number or separator, as in
-    `A: 3.5`, `A -> 3.5` and `<A>3.5</A>`. If several numbers have the same name, the word or key before it is the name,
-    as in `{"A": {"pC": 3.5}}`. A name that still occurs several times is removed. In these cases, words are not names:
+    The name of a number is the nearest word or key before the number, as in `A: 3.5`, `A -> 3.5` and `<A>3.5</A>`. It
+    must stand behind the previous number and behind the previous separator. If several numbers have the same nearest
+    word, as in `{"A": {"pC": 3.5}, "B": {"pC": 4.1}}`, the word before it is the name. A name that still occurs several
+    times is removed. In these cases, words are not names, either:
 
-    - If no word precedes the first number, but a word follows the last number, the words are units.
-    - If only one of several numbers has a name, this name is a label of the line. This applies if the name is a word or
-      belongs to the first number. Names of counters and clocks are kept.
+    - If no word stands before the first number, but one stands behind the last number, the words are units.
+    - If only one of several numbers would have a name, as in `Data: 3.5, 4.1`, the word is taken for a label of the
+      whole line. This applies if it is no key, or if it stands before the first number. Counters and clocks keep their
+      names.
 
     Args:
         times: Name of each number that is a time; empty for the other numbers.
@@ -370,9 +379,9 @@ def _preceding_names(times: list[str], gaps: list[list[_Token]], counters: Colle
 
 
 def _with_units(names: list[str], gaps: list[list[_Token]]) -> list[str]:
-    """Return the names of the numbers with their units of charge or voltage, as `A_nC`.
+    """Add the unit of charge or voltage of each number to its name, as in `A_nC` for `A = 3.5 nC`.
 
-    The unit is directly behind the number, or between the name of the number and the number. The unit pC is not added.
+    The unit stands directly behind the number, or between the name and the number. The unit pC is not added.
 
     Args:
         names: Name of each number; empty for a number without a name.

@@ -144,14 +144,14 @@ class FileSource:
     def __iter__(self) -> Iterator[Chunk]:
         """Yield chunks until the file ends.
 
-        For a file on a disk, the arrival time of all chunks is the time at which reading began. For a pipe, the arrival
-        time of a chunk is the time at which the chunk was read.
+        All chunks of a file on a disk have the same arrival time, at which reading began. The arrival time of a chunk
+        of a pipe is the time at which the chunk was read.
 
         Raises:
             InputError: If the file is a recording, a table or another file that does not come from a board.
         """
         start_s = time.time()
-        data = os.read(self._descriptor, HEAD_BYTES)
+        data = os.read(self._descriptor, HEAD_BYTES)  # empty at the end of the file
         check_bytes(self._name, data)
         while data:
             arrival_s = start_s if self.is_on_disk else time.time()

@@ -283,10 +283,10 @@ class Integrator(Leak):
     def step(self, frame: Frame) -> None:
         """Replace the currents by the charges, and the noise of the currents by the noise of the charges at rest.
 
-        If frames are missing, each of their currents is assumed to be the mean of the currents before and after the
-        gap. A mean that may be noise counts as 0, because it would be multiplied by the number of missing frames. The
-        touch gets the flag `gap` if the error of this assumption may exceed both the noise and 1 % of the charge. A
-        copy of the previous frame adds no charge, and neither does a frame that arrives late.
+        The current of a missing frame is assumed to be the mean of the currents before and after the gap. A mean that
+        may be noise counts as 0, because it would be multiplied by the number of missing frames. The touch gets the
+        flag `gap` if the error of this assumption may exceed both the noise and 1 % of the charge. A copy of the
+        previous frame adds no charge, and neither does a frame that arrives late.
 
         At rest, the charges decay with the time constant `relax_s`. The variance of the sum of independent currents is
         then relax_s / (2 dt) times the variance of one current.

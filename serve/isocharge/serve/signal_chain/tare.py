@@ -141,15 +141,20 @@ class Tare(Stage):
         self._remaining_frames = math.inf
 
     def _change_pC(self, frame: Frame) -> Array | float:
-        """Return the change of the tare because of a frame, shape (n_electrode,) or one number, pC.
+        """Return by how much the tare changes after a frame, shape (n_electrode,) or one number, pC.
 
-        In contact, the change is the warming. Otherwise, the tare approaches the charge of the frame.
+        While something touches the film, only its warming changes the tare. Otherwise, the charge that the frame has
+        above the tare belongs to the tare, which approaches it with the time constant `relax_s`. A large charge may be
+        the beginning of a touch, and counts only up to `noise_limit_pC`.
+
+        Args:
+            frame: The frame, whose charges no longer contain the tare.
         """
         rule = self._rule
         if frame.is_contact or rule is None or frame.charge_pC is None:
             return frame.warming_pC
-        difference_pC = frame.charge_pC.clip(-rule.noise_limit_pC, rule.noise_limit_pC)
-        return difference_pC * -math.expm1(-frame.dt_s / rule.relax_s)
+        limited_charge_pC = frame.charge_pC.clip(-rule.noise_limit_pC, rule.noise_limit_pC)
+        return limited_charge_pC * -math.expm1(-frame.dt_s / rule.relax_s)
 
     def _search(self, frame: Frame, charge_pC: Array) -> None:
         """Add a frame to the latest frames, and measure the tare if these frames are enough and quiet.

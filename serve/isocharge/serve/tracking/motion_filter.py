@@ -153,11 +153,12 @@ class NoiseEstimate:
         self._latest_s = -math.inf
 
     def update(self, measured: Array, covariance: Array, t_s: float) -> None:
-        """Update the estimate, a mean over all frames, with the deviation of the latest values from a steady motion.
+        """Update the estimate with the values of a frame.
 
-        The value in the middle of three frames is compared with the interpolation between the two others. The frames
-        may have any times. A contact that starts or stops also deviates, although it has no more noise. A deviation of
-        more than three standard deviations therefore counts as three.
+        If the contact moves steadily and there is no noise, the values of the latest three frames lie on a straight
+        line. The deviation of the middle values from the line between the two others therefore shows the noise. The
+        estimate is the mean of its square over all frames. A contact that starts or stops deviates from a line, too. A
+        deviation of more than three standard deviations therefore counts as three.
 
         Args:
             measured: Measured x, y and ln F, shape (3,).

@@ -151,8 +151,8 @@ class VirtualSensor:
             charges: Forward map. It is called once, for the frames in which something touches.
             script: The presses.
             noise: Amplifier. By default, the measured charges are the charges of the film.
-            offset_pC: Constant charge on each electrode, pC, which the reader subtracts as its tare. By default the
-                charges are drawn at random.
+            offset_pC: Charge that is added to every frame, one for each electrode, pC. A reader measures it as its
+                tare. By default, the charges are drawn at random.
             seed: Seed of noise, offset and faults.
             encode: Frame format.
             faults: Faults between the sensor and the reader; none by default.
@@ -171,7 +171,7 @@ class VirtualSensor:
         self._clean_pC = _clean_charges(charges, script)  # touch charges of the script, shape (n, electrodes)
         n_electrode = self._clean_pC.shape[1]
         random_pC = self._rng.uniform(-MAX_RANDOM_OFFSET_pC, MAX_RANDOM_OFFSET_pC, n_electrode)
-        self._offset_pC = random_pC if offset_pC is None else np.broadcast_to(offset_pC, n_electrode)
+        self._offset_pC = random_pC if offset_pC is None else np.reshape(offset_pC, n_electrode)
 
         self._reset_counters()
         self._stop = threading.Event()

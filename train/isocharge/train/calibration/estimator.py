@@ -93,7 +93,7 @@ class Hypothesis:
 
     @property
     def sizes(self) -> Array:
-        """Sizes of the parts of the prior covariance, shape (4 + n_session,); see `Prior.covariance`."""
+        """Size of each part of the prior covariance in the order of `Prior.parts`, shape (4 + n_session,)."""
         return np.array([1.0, *self.imperfections, self.discrepancy, *self.session_std])
 
 
@@ -115,10 +115,13 @@ def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
 
 
 TYPICAL = np.array([1.0, 1.0, 1.0, 0.01, *(one.stds[-1][0] for one in SESSION)])
-"""Sizes with which the most probable unknowns are searched, so that all unknowns can differ from zero."""
+"""Sizes of the parts of the prior covariance with which the most probable unknowns are searched.
+
+No size is zero, so that all unknowns can differ from their means.
+"""
 
 PLANNED = np.array([1.0, 0.5, 0.5, 0.01, *(one.stds[0][0] for one in SESSION)])
-"""Sizes with which presses are planned before the first press."""
+"""Sizes of the parts of the prior covariance with which presses are planned before the first press."""
 
 
 @dataclass(frozen=True)
@@ -156,8 +159,9 @@ class Prior:
 
         The first part is the covariance that is the same under all hypotheses. The other parts are the covariances of
         the uneven tension, of the other imperfections, of the discrepancy, and of each unknown of the session. A
-        hypothesis multiplies each of them by the square of a size. After an earlier calibration, the first part is the
-        covariance of its result, which contains the imperfections, and the discrepancy is only its change since then.
+        hypothesis multiplies each of them by the square of its size; see `Hypothesis.sizes`. After an earlier
+        calibration, the first part is the covariance that it has found, which contains the imperfections. The part of
+        the discrepancy then describes only what the earlier calibration could not show.
         """
         layout = self.layout
         n_unknown = layout.coefficients.stop
@@ -186,7 +190,7 @@ class Prior:
         """Return the covariance of the unknowns, shape (n_unknown, n_unknown).
 
         Args:
-            sizes: Sizes by whose squares the parts are multiplied, shape (4 + n_session,).
+            sizes: Size of each part, by whose square the part is multiplied, shape (4 + n_session,).
         """
         return np.tensordot(sizes**2, self.parts, 1)
 

@@ -160,8 +160,8 @@ def _tension_factors(
     """Compute the factors by which changes of the pretension multiply the charges.
 
     The tension changes equally in all directions. For each change, an axisymmetric film under a circular probe is
-    solved, and the imperfections of an uneven film are added as first-order changes. A factor is 1 where the charges
-    before and after the change have different signs.
+    solved, and the imperfections of an uneven film are added as first-order changes. If a change reverses the sign of a
+    charge, no factor can describe it, and the result is 1.
 
     Args:
         charges: Charges of the solved film and of similar films.

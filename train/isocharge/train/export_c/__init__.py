@@ -7,6 +7,6 @@
     host_example.c           a serial port in, contacts out
     arduino/                 a sketch with copies of what it needs
 
-The folder `sources/` contains templates of the files above. Each `$name` in a template is replaced by a value of a
-model or of a board.
+The folder `sources/` contains templates of C code. Each placeholder, such as `$n_input`, is replaced by a value that
+describes the model or the board.
 """
