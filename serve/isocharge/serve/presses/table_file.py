@@ -56,7 +56,7 @@ _WRONG_BYTE = re.compile("[\0\udc80-\udcff]")
 _THOUSANDS = re.compile(r"[-+]?[1-9][0-9]{0,2}[.,][0-9]{3}")
 """Number whose mark may be a separator of thousands."""
 
-_UNITS_AT_END = {"length": "[µμnmc]?m", "force": "(?:[µμmk]?n|m?k?gf?)", "charge": "[µμfpn]?c"}
+_UNITS_AT_END = {"length": "(?:[uµμnmc]?m|in)", "force": "(?:[uµμmk]?n|m?k?gf?|lbf?)", "charge": "[uµμfpn]?c"}
 """Patterns of units in lower case that may stand at the end of the name of a column, by their quantity."""
 
 
