@@ -1,10 +1,15 @@
 """Commands that read a file of presses: names of columns in messages, and long files."""
 
+from pathlib import Path
+
 import pytest
 
 from isocharge.cli.train import calibrate as calibrate_module
 from isocharge.common.defaults import MAX_BATCH
 from isocharge.serve import Predictor
+from isocharge.simulate import Circle, load_sensor
+from isocharge.train import CalibrationProblem
+from isocharge.train.calibration.folder import film_table, json_text
 
 
 def test_a_missing_column_of_a_training_is_named(refused, tmp_path, monkeypatch):
@@ -42,17 +47,18 @@ def test_a_setting_without_effect_on_measured_presses_is_refused(refused, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("charges", "message"),
+    ("words", "message"),
     [
-        ("500,500,500,400", "at least 22 held-out presses within 8 mm"),
-        ("500,500,500,500", "line 2: expected held-out presses that are not among those of the calibration"),
+        ("calibrate old/presses.csv -o film --held-out old/presses.csv", "held-out presses that are not among those"),
+        ("calibrate old/presses.csv --from old", "presses that are not among those of the earlier calibration old,"),
+        ("press -o old/presses.csv --from old --port none", "presses that are not among those of the earlier"),
     ],
-    ids=["too few", "of the calibration"],
 )
-def test_wrong_held_out_presses_are_refused_before_the_film_is_solved(charges, message, refused, tmp_path, monkeypatch):
+def test_presses_that_would_count_twice_are_refused(words, message, refused, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(calibrate_module, "calibrate", lambda *_, **__: pytest.fail("the film is solved"))
-    for name, row in (("p.csv", "500,500,500,500"), ("h.csv", charges)):
-        (tmp_path / name).write_text(f"x_mm,y_mm,force_N,A,B,C,D\n1,2,1,{row}\n")
-    words = "train", "calibrate", tmp_path / "p.csv", "--sensor", "four-25um-biaxial", "-o", tmp_path / "film"
-    refused(*words, "--held-out", tmp_path / "h.csv", message=message)
-    assert {path.name for path in tmp_path.iterdir()} == {"p.csv", "h.csv"}
+    Path("old").mkdir()
+    Path("old/presses.csv").write_text("x_mm,y_mm,force_N,A,B,C,D\n1,2,1,500,500,500,500\n")
+    problem = CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))
+    Path("old/calibration.json").write_text(json_text(film_table(problem, problem.film_before)))
+    refused("train", *words.split(), "--sensor", "four-25um-biaxial", message=f"line 2: expected {message}")

@@ -115,7 +115,7 @@ def calibrate_command(
         if presses is not None and held_out_presses is not None:
             held_out_presses = usable_held_out(held_out_presses, presses, problem)  # before anything is solved
         if earlier is not None:
-            problem = replace(problem, earlier=read_earlier(earlier, problem))
+            problem = replace(problem, earlier=read_earlier(earlier, problem, presses))
         if presses is None:
             # The presses are chosen for the mean film.
             charges = solve_even(problem, executor)

@@ -89,8 +89,6 @@ def press_command(
     Example: isocharge train press --port /dev/ttyACM0 --sensor four-25um-biaxial -o presses.csv
     """
     problem = CalibrationProblem(load_sensor(sensor), parse_probe(probe), radius=radius, stress_limit=stress_limit)
-    if earlier is not None:
-        problem = replace(problem, earlier=read_earlier(earlier, problem))
 
     # A machine makes the presses of a list. Without a list, a person makes the presses, and is asked about each press.
     contacts = None if press_list is None else read_press_list(press_list)
@@ -111,6 +109,8 @@ def press_command(
         say(f"{output} has {len(presses)} presses; the session continues with them. Delete the file to begin again")
     elif output.exists() or not output.parent.is_dir():
         raise OutputError(f"{output}: expected a file in an existing folder; choose another output")
+    if earlier is not None:
+        problem = replace(problem, earlier=read_earlier(earlier, problem, presses))
     with executor_for() as executor:
         say("solving the film of the sensor file")
         session = PressSession(

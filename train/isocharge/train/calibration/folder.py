@@ -36,7 +36,7 @@ from isocharge.common.structs import Text, plain_values, read_json
 from isocharge.serve.model.charge_file import FILE as CHARGES
 from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.model_folder import check_target, version_folders
-from isocharge.serve.presses.measured_presses import MeasuredPresses
+from isocharge.serve.presses.measured_presses import MeasuredPresses, read_presses
 from isocharge.serve.presses.std_factor import FEWEST_HELD_OUT, StdFactor
 from isocharge.serve.presses.table_file import csv_text
 from isocharge.simulate import NoiseModel
@@ -318,12 +318,7 @@ def usable_held_out(
     """
     domain = problem.domain
     held_out, presses = (one.of_electrodes(problem.electrodes, problem.sensor.name) for one in (held_out, presses))
-    is_learned = have_charges_of(held_out.charge_pC, presses.charge_pC)
-    if is_learned.any():
-        raise PressError(
-            f"{held_out[is_learned].line_words}: expected held-out presses that are not among "
-            "those of the calibration, got the same charges; take them out of one of the files"
-        )
+    _refuse_learned(held_out, presses, "held-out presses that are not among those of the calibration")
     is_known = np.isfinite(held_out.charge_pC).all(axis=1) & np.isfinite(held_out.contact).any(axis=1)
     usable = held_out[is_known & ~domain.is_outside(held_out.contact)]
     if len(usable) < FEWEST_HELD_OUT:
@@ -333,6 +328,24 @@ def usable_held_out(
             "presses"
         )
     return usable
+
+
+def _refuse_learned(presses: MeasuredPresses, learned: MeasuredPresses, expected: str) -> None:
+    """Raise an error if presses have the same charges as presses that are already used.
+
+    Args:
+        presses: The presses.
+        learned: The presses that are already used, with the charges of the same electrodes.
+        expected: Description of the expected presses, for the message.
+
+    Raises:
+        PressError: If a press is already used.
+    """
+    is_learned = have_charges_of(presses.charge_pC, learned.charge_pC)
+    if is_learned.any():
+        raise PressError(
+            f"{presses[is_learned].line_words}: expected {expected}, got the same charges; leave them out of this file"
+        )
 
 
 def with_guarantee(fitted: Fitted, held_out: MeasuredPresses) -> Fitted:
@@ -371,19 +384,26 @@ def result_table(result: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def read_earlier(folder: Path, problem: CalibrationProblem) -> FilmEstimate:
+def read_earlier(folder: Path, problem: CalibrationProblem, presses: MeasuredPresses | None = None) -> FilmEstimate:
     """Read the film of an earlier calibration, and add the possible drift since then to its uncertainty.
 
     Args:
         folder: Folder that `write_calibration` wrote, or one of its version folders.
         problem: Problem of the new calibration.
+        presses: Presses of the new calibration with the electrodes of the problem; None if there are none yet.
 
     Raises:
-        PressError: If the folder contains no calibration, or a calibration of another problem.
+        PressError: If the folder contains no calibration, or a calibration of another problem, or if one of the presses
+            belongs to the earlier calibration. It would count twice, and the standard deviations would be too small.
     """
     calibrated_versions = [version for version in version_folders(folder).values() if (version / RESULT).is_file()]
     *_, version = folder, *calibrated_versions
-    return read_film(version / RESULT, problem).drifted()
+    film = read_film(version / RESULT, problem)
+    learned_path = version / PRESSES
+    if presses is not None and learned_path.is_file():
+        learned = read_presses(learned_path, problem.electrodes)
+        _refuse_learned(presses, learned, f"presses that are not among those of the earlier calibration {version}")
+    return film.drifted()
 
 
 def _film_section(result: CalibrationResult, made_with: Mapping[str, Any]) -> str:
