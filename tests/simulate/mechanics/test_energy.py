@@ -68,10 +68,10 @@ def condensed(template, matrices: np.ndarray) -> np.ndarray:
     The matrix is the sum of those of the elements. The fourth unknown, the Laplacian of W, is eliminated by a Schur
     complement.
     """
-    components = range(matrices.shape[2])
+    components = range(matrices.shape[1])
     whole = np.zeros((template.n_node, len(components)) * 2)
     for nodes, matrix in zip(template.nodes, matrices, strict=True):
-        whole[np.ix_(nodes, components, nodes, components)] += matrix
+        whole[np.ix_(nodes, components, nodes, components)] += matrix.transpose(1, 0, 3, 2)
     size = 3 * template.n_node
     first = whole[:, :3, :, :3].reshape(size, size)
     if len(components) == 3:

@@ -82,17 +82,28 @@ class ElasticFilm:
         Returns:
             Forces along (U1, U2, W), shape (n_node, 3).
         """
-        deflection = field[:, 2]
-        element_forces = self.membrane.forces(field)  # shape (n_element, n_local, 3)
+        return self.out_of_balance(field, self.element_forces(field))
+
+    def element_forces(self, field: Array) -> Array:
+        """Compute the internal forces of the elements, shape (n_element, n_local, 3).
+
+        Args:
+            field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
+        """
+        element_forces = self.membrane.forces(field)
         if self.bending is not None:
-            element_forces[..., 2] += self.bending.forces(deflection)
+            element_forces[..., 2] += self.bending.forces(field[:, 2])
+        return element_forces
+
+    def out_of_balance(self, field: Array, element_forces: Array) -> Array:
+        """Compute the residual from the internal forces of the elements; see `residual`."""
         residual = np.stack([self.mesh.gather(element_forces[..., i]) for i in range(3)], axis=1)
         residual -= self.probe_force
 
         # `back.forces` is the derivative of the energy, which is the negative force of the pressure on the whole film.
         # Therefore the derivative is added.
         if self.back is not None:
-            residual[:, 2] += self.back.forces(deflection)
+            residual[:, 2] += self.back.forces(field[:, 2])
         return residual
 
     @property
@@ -116,13 +127,13 @@ class ElasticFilm:
             added_tension: Tension that is added to the pretension, in units of E_young A^2.
 
         Returns:
-            Element matrices, shape (n_element, n_local, n_unknown, n_local, n_unknown), where
+            Element matrices, shape (n_element, n_unknown, n_local, n_unknown, n_local), where
             n_unknown is `unknowns_per_node`.
         """
-        tangent = self.membrane.tangent(field, added_tension)
-        if self.bending is None:
-            return tangent
-        return self.bending.extend(tangent)
+        tangent = self.membrane.tangent(field, added_tension, self.unknowns_per_node)
+        if self.bending is not None:
+            self.bending.extend(tangent)
+        return tangent
 
 
 EQUAL_TENSION = np.array([1.0, 1.0, 0.0])
@@ -236,17 +247,18 @@ class Membrane:
         transposed_gradient = mesh.stacked_gradient.transpose(0, 2, 1)  # shape (n_element, n_local, n_point * 2)
         return transposed_gradient @ stacked_traction
 
-    def tangent(self, field: Array, added_tension: float = 0.0) -> Array:
+    def tangent(self, field: Array, added_tension: float, unknowns_per_node: int) -> Array:
         """Compute the second derivatives of the stretching energy of each element.
 
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
             added_tension: Tension that is added to the pretension, in units of E_young A^2.
+            unknowns_per_node: Number of unknowns per node. The first three are U1, U2 and W.
 
         Returns:
-            Second derivatives, shape (n_element, n_local, 3, n_local, 3). The second and third axes are the node and
-            the component of the first derivative. The last two axes are the node and the component of the second
-            derivative.
+            Second derivatives, shape (n_element, unknowns_per_node, n_local, unknowns_per_node, n_local). The second
+            and third axes are the component and the node of the first derivative. The last two axes are the component
+            and the node of the second derivative. The derivatives with respect to a fourth unknown are zero.
         """
         mesh = self.mesh
         gradient = mesh.gauss_gradient  # shape (n_element, n_point, 2, n_local)
@@ -265,7 +277,7 @@ class Membrane:
         # are transposed copies of the blocks above the diagonal.
         n_element, _, _, n_local = gradient.shape
         transposed_gradient = np.ascontiguousarray(mesh.stacked_gradient.transpose(0, 2, 1))
-        matrix = np.empty((n_element, 3, n_local, 3, n_local))
+        matrix = np.zeros((n_element, unknowns_per_node, n_local, unknowns_per_node, n_local))
         for i, j in combinations_with_replacement(range(3), 2):
             block = weighted_stiffness[..., i, :, j].copy()
             if i == j:
@@ -273,10 +285,10 @@ class Membrane:
 
             # Compute gradient' block gradient, summed over the quadrature points and the two derivatives at each point.
             stacked_product = (block @ gradient).reshape(n_element, -1, n_local)
-            matrix[:, i, :, j] = transposed_gradient @ stacked_product
+            np.matmul(transposed_gradient, stacked_product, out=matrix[:, i, :, j])
             if i != j:
                 matrix[:, j, :, i] = matrix[:, i, :, j].transpose(0, 2, 1)
-        return matrix.transpose(0, 2, 1, 4, 3)  # the node before the component
+        return matrix
 
     def _material_stiffness(self, deformation: Array) -> Array:
         """Compute the second derivatives of the elastic energy density with respect to all slopes.
@@ -338,6 +350,9 @@ class Bending:
     is 5.78. If the shift lies between 0 and twice the lowest eigenvalue, the first block of the matrix is positive
     definite. The first block is positive definite even if K is zero, as in a thick film without tension. The complete
     matrix is therefore quasi-definite, and can be factorised without pivoting (Vanderbei 1995).
+
+    A node in the interior of an element belongs to no other element, and M is diagonal. The unknowns mu of the interior
+    nodes of each element are therefore eliminated before the matrix is assembled.
     """
 
     def __init__(self, mesh: PlacedMesh, stiffness: float) -> None:
@@ -359,6 +374,17 @@ class Bending:
         self._laplace = mesh.stacked_gradient.transpose(0, 2, 1) @ (weights * mesh.stacked_gradient)
 
         self._mass = mesh.gather(mesh.mass)  # diagonal of M, shape (n_node,)
+
+        # Compute the blocks of the matrix of the linear solves. The unknowns mu of interior nodes are eliminated: their
+        # coupling becomes zero, and their Schur complement is added to the block of W.
+        self._mass_blocks = np.eye(mesh.mass.shape[1]) * mesh.mass[:, None]  # M, shape (n_element, n_local, n_local)
+        self._coupling = np.sqrt(stiffness) * (self._laplace - BENDING_SHIFT * self._mass_blocks)  # symmetric
+        interior = mesh.template.is_interior
+        interior_coupling = self._coupling[:, interior]  # shape (n_element, n_interior, n_local)
+        schur_complement = interior_coupling.transpose(0, 2, 1) @ (interior_coupling / mesh.mass[:, interior, None])
+        shifted_laplace = 2.0 * BENDING_SHIFT * self._laplace - BENDING_SHIFT**2 * self._mass_blocks
+        self._deflection_block = stiffness * shifted_laplace + schur_complement
+        self._coupling[:, interior] = 0.0
 
     def laplacian(self, deflection: Array) -> Array:
         """Compute the Laplacian m = -M^-1 L W of the deflection W.
@@ -400,8 +426,8 @@ class Bending:
         element_laplacian = self.laplacian(deflection)[self.mesh.template.nodes]  # shape (n_element, n_local)
         return -self.stiffness * (self._laplace @ element_laplacian[..., None])[..., 0]
 
-    def extend(self, tangent: Array) -> Array:
-        """Add bending to the element matrices K of the membrane.
+    def extend(self, tangent: Array) -> None:
+        """Add bending to the element matrices K of the membrane, which are changed in place.
 
         The equations for the deflection W and for an auxiliary unknown mu are
 
@@ -410,28 +436,17 @@ class Bending:
 
         where r is the right-hand side for W, beta is the bending stiffness, L is the matrix of the weak Laplacian, and
         M is the diagonal mass matrix. The solution W does not depend on the constant s, which is `BENDING_SHIFT`. With
-        this constant, the matrix can be factorised without pivoting.
+        this constant, the matrix can be factorised without pivoting. The unknowns mu of interior nodes are eliminated.
 
         Args:
-            tangent: Matrices for (U1, U2, W), shape (n_element, n_local, 3, n_local, 3).
-
-        Returns:
-            Matrices for (U1, U2, W, mu), shape (n_element, n_local, 4, n_local, 4).
+            tangent: Matrices for (U1, U2, W, mu), shape (n_element, 4, n_local, 4, n_local). The entries of mu are
+                zero.
         """
-        n_element, n_local = self.mesh.template.nodes.shape
-        mass = np.eye(n_local) * self.mesh.mass[:, None]  # M of each element, shape (n_element, n_local, n_local)
-        coupling = np.sqrt(self.stiffness) * (self._laplace - BENDING_SHIFT * mass)  # symmetric
-
-        # The indices of the unknowns of a node are 0 for U1, 1 for U2, 2 for W and 3 for mu. The array is created with
-        # the unknown before the node and then transposed, so that the values of one unknown at all nodes of an element
-        # lie side by side in memory.
-        matrix = np.zeros((n_element, 4, n_local, 4, n_local)).transpose(0, 2, 1, 4, 3)
-        matrix[:, :, :3, :, :3] = tangent
-        matrix[:, :, 2, :, 2] += self.stiffness * (2.0 * BENDING_SHIFT * self._laplace - BENDING_SHIFT**2 * mass)
-        matrix[:, :, 2, :, 3] = coupling
-        matrix[:, :, 3, :, 2] = coupling
-        matrix[:, :, 3, :, 3] = -mass
-        return matrix
+        # The indices of the unknowns of a node are 0 for U1, 1 for U2, 2 for W and 3 for mu.
+        tangent[:, 2, :, 2] += self._deflection_block
+        tangent[:, 2, :, 3] = self._coupling.transpose(0, 2, 1)
+        tangent[:, 3, :, 2] = self._coupling
+        tangent[:, 3, :, 3] = -self._mass_blocks
 
 
 def _symmetric_matrix(stress: Array) -> Array:

@@ -57,6 +57,7 @@ class Template(Blocks):
         nodes: Number of each node of each element, shape (n_element, (order + 1)^2).
         n_node: Number of nodes.
         first_occurrence: Index of the first occurrence of each node among the nodes of all elements, shape (n_node,).
+        is_interior: Whether each node of an element lies in its interior, shape ((order + 1)^2,).
         on_rim: Whether each node lies on the rim, shape (n_node,).
         on_axis: Whether each node lies on the line of symmetry of a half mesh, shape (n_node,).
     """
@@ -82,6 +83,7 @@ class Template(Blocks):
         _, self.first_occurrence, node_number = np.unique(rounded_points, return_index=True, return_inverse=True)
         self.nodes: Integers = node_number.reshape(element_points.shape)
         self.n_node = self.first_occurrence.size
+        self.is_interior = np.maximum(np.abs(self.xi), np.abs(self.eta)) < 1.0
 
         # Find the nodes on the rim, and the nodes on the line of symmetry of a half mesh.
         node_points = all_points[self.first_occurrence]

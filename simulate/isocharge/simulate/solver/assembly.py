@@ -69,12 +69,12 @@ class Assembly:
         self.free = _free_unknowns(mesh, unknowns_per_node, odd)
 
         # Compute the local indices of the unknowns on the sides of an element and in its interior. Within an element,
-        # the unknowns are numbered component by component.
-        is_on_side = np.maximum(np.abs(mesh.xi), np.abs(mesh.eta)) == 1.0
+        # the unknowns are numbered component by component. `mechanics.energy.Bending` has eliminated the auxiliary
+        # unknown of the interior nodes.
         component = np.arange(unknowns_per_node)[:, None]
-        n_local = is_on_side.size
-        self._side_indices = (component * n_local + np.flatnonzero(is_on_side)).ravel()
-        self._interior_indices = (component * n_local + np.flatnonzero(~is_on_side)).ravel()
+        n_local = mesh.is_interior.size
+        self._side_indices = (component * n_local + np.flatnonzero(~mesh.is_interior)).ravel()
+        self._interior_indices = (component[:3] * n_local + np.flatnonzero(mesh.is_interior)).ravel()
 
         # Compute the global indices of the unknowns of each element. Globally, the unknowns are numbered node by node.
         unknown = (unknowns_per_node * mesh.nodes[:, None] + component).reshape(len(mesh.nodes), -1)
@@ -134,18 +134,16 @@ class Assembly:
         """Factorise the matrix of the mesh.
 
         Args:
-            matrix: Symmetric element matrices, shape (n_element, n_local, unknowns_per_node, n_local,
-                unknowns_per_node).
+            matrix: Symmetric element matrices, shape (n_element, unknowns_per_node, n_local, unknowns_per_node,
+                n_local).
 
         Returns:
             Function that solves the linear system for a right-hand side.
         """
         interior = self._interior_indices
         sides = self._side_indices
-        n_local = matrix.shape[1]
-        n_unknown = n_local * self.unknowns_per_node
-        # Number the unknowns of an element component by component.
-        element_matrix = matrix.transpose(0, 2, 1, 4, 3).reshape(-1, n_unknown, n_unknown)
+        n_element, n_component, n_local, _, _ = matrix.shape
+        element_matrix = matrix.reshape(n_element, n_component * n_local, n_component * n_local)
 
         # Eliminate the interior unknowns of each element by static condensation. With the blocks A (interior), B
         # (coupling) and C (sides), the Schur complement is C - B' A^-1 B.

@@ -156,9 +156,14 @@ class _Iterate:
         return replace(self, field=self.field + step)
 
     @cached_property
+    def element_forces(self) -> Array:
+        """Internal forces of the elements, shape (n_element, n_local, 3)."""
+        return self.elastic.element_forces(self.field)
+
+    @cached_property
     def residual(self) -> Array:
         """Out-of-balance forces at the nodes, shape (n_node, 3)."""
-        return self.elastic.residual(self.field)
+        return self.elastic.out_of_balance(self.field, self.element_forces)
 
     @cached_property
     def relative_residual(self) -> float:
@@ -168,7 +173,7 @@ class _Iterate:
         in-plane forces of the elements.
         """
         free_residual = self.residual * self.free  # without the reactions at fixed nodes
-        in_plane_force = float(np.linalg.norm(self.elastic.membrane.forces(self.field)[..., :2]))
+        in_plane_force = float(np.linalg.norm(self.element_forces[..., :2]))
         transverse_ratio = np.linalg.norm(free_residual[:, 2]) / np.linalg.norm(self.elastic.load)
         in_plane_ratio = np.linalg.norm(free_residual[:, :2]) / max(in_plane_force, 1e-300)  # avoids a division by zero
         return float(max(transverse_ratio, in_plane_ratio))
