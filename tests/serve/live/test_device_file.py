@@ -122,6 +122,7 @@ WRONG = [
     ("[tare]\nframes = 3000\n", r"tare\.patience: expected at least the 3000 frames of a tare, or 0 .*, got 2000"),
     ("[tare]\non = 1\n", r"tare\.on: expected true or false, got 1"),
     ("[touch]\nfloor_pC = -3\n", r"touch\.floor_pC: expected a number from 0 to .*, got -3"),
+    ("[touch]\nrelease_share = 5\n", r"touch\.release_share: expected a number from 0 to below 1, got 5"),
     ("[hum]\nsettle_s = 0\n", r"hum\.settle_s: expected a number from 0\.001 to 1"),
     ("[hum]\nfrequency_Hz = 0\n", r"hum\.frequency_Hz: expected a number from 0\.001 to 1"),
     ("[common_mode]\nnoise = 0\n", r"common_mode\.noise: expected a number from 0\.001 to 1"),
@@ -221,6 +222,13 @@ def test_channel_of_each_electrode(names, channels, picked):
 def test_unknown_channels_are_refused(names, channels, message):
     with pytest.raises(ChargeError, match=message):
         charges_sent(names, channels and {"A": "1", "B": "2", "C": "3"} | channels)
+
+
+def test_key_below_the_channels_that_is_no_electrode_is_refused(device):
+    """TOML counts a line at the end of a file to its last section."""
+    board = device('[channels]\nA = "1"\nfront_end = "current"\n')
+    with pytest.raises(DeviceError, match=r"device\.toml: channels\.front_end: expected one of the electrodes \('A',"):
+        ReadingStream(ELECTRODES, board)
 
 
 def test_advice_for_the_channels_is_a_valid_device_file():

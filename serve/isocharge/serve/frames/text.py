@@ -123,7 +123,7 @@ class TextParser(DelimitedParser):
         self._columns = columns
         self._meanings = dict(meanings or {})
         self._counters = (SEQ, *self._meanings)
-        self._headers: deque[str] = deque(maxlen=MAX_CYCLE_LINES)  # lines without numbers
+        self._headers: deque[str] = deque(maxlen=MAX_CYCLE_LINES)  # lines and comments without numbers
         self.seq_modulus = SEQ_MODULI[0]
         self._last_seq = 0
         self._is_first_line = True  # whether the next line is the first line of a connection
@@ -164,6 +164,7 @@ class TextParser(DelimitedParser):
             text = clean_text(line)
             if not text:
                 self.unread_line = line.strip() or self.unread_line
+                self._store_comment(line.strip())
                 return []
             # The beginning of the first line may be missing. For example, "801.2" may have become the number "1.2".
             if is_first_line and parse_line(text).starts[:1] == (0,):
@@ -171,6 +172,16 @@ class TextParser(DelimitedParser):
             return self._read_line(text, size)
         except ValueError:
             return self._reject(size)
+
+    def _store_comment(self, text: str) -> None:
+        """Store a comment without numbers, such as `# t_ms,A,B,C`, as a possible header, until a layout is recognised.
+
+        Raises:
+            ValueError: If the comment contains characters that are not printable.
+        """
+        content = text.lstrip("# ")
+        if self.layout is None and content != text and not parse_line(content).names:
+            self._headers.append(content)
 
     def _with_meanings(self, names: Sequence[str]) -> tuple[str, ...]:
         """Replace the names that the device uses for its counter and its clock by their meanings."""

@@ -8,7 +8,7 @@ from os.path import commonprefix
 
 import numpy as np
 
-from isocharge.common.errors import ChargeError, cut, shown
+from isocharge.common.errors import ChargeError, DeviceError, cut, shown
 from isocharge.common.toml_text import toml_key
 from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, Frame
 from isocharge.serve.signal_chain.gain import GainRule
@@ -38,12 +38,21 @@ class Channels(Stage):
         Args:
             setup: Settings of all stages.
             any_unit: Whether the names of the channels may contain any unit, even if the gain is not known.
+
+        Raises:
+            DeviceError: If a key of `[channels]` is no electrode.
         """
         gain = setup.device.rule(GainRule)
         self._allows_any_unit = any_unit or gain is not None
         self._has_gains = gain is not None and isinstance(gain.pC_per_unit, dict)  # one for each electrode
         self._electrodes = setup.electrodes
         self._channels = setup.device.channels
+        for key in self._channels:
+            if key not in setup.electrodes:  # TOML adds a key at the end of the file to the last section
+                raise DeviceError(
+                    f"{setup.device.where}: channels.{cut(key)}: expected one of the electrodes {setup.electrodes}; "
+                    "correct or remove the key, or write a key that belongs to no section above the first section"
+                )
         self._setup = setup
         # Names and number of values of the previous frame, and its channel indices. `step` uses the indices again.
         self._previous_layout: tuple[tuple[str, ...], int] | None = None  # None before the first frame

@@ -17,7 +17,7 @@ from msgspec import structs
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import DRIFT, NEGATIVE
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.stage import Rule, Setting, Setup, Stage, SUM_TOLERANCE_s
+from isocharge.serve.signal_chain.stage import Rule, Setting, Setup, Share, Stage, SUM_TOLERANCE_s
 
 
 class TouchRule(Rule, frozen=True, kw_only=True):
@@ -38,7 +38,7 @@ class TouchRule(Rule, frozen=True, kw_only=True):
 
     sigmas: Setting = 6.0
     floor_pC: Setting | None = None
-    release_share: Setting | None = None
+    release_share: Share | None = None
 
     def resolved(self, *, has_currents: bool) -> "TouchRule":
         """Return the settings with the default values for a board that sends charges, or currents."""
