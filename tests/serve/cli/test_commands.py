@@ -162,6 +162,17 @@ def test_stream_writes_a_record_for_each_frame_and_replay_repeats_them_at_their_
     assert time.monotonic() - began > 0.2  # 50 chunks of 10 ms
 
 
+def test_stream_of_a_pipe_that_is_stopped_keeps_its_file(frames, tmp_path, stream):
+    """The bytes of a pipe cannot be read again, unlike those of a file."""
+    os.mkfifo(tmp_path / "pipe")
+    board = os.open(tmp_path / "pipe", os.O_RDWR)  # as a writer that never ends
+    os.write(board, frames.read_bytes())
+    stopped = stream(tmp_path / "pipe", "--output", tmp_path / "touch.csv", "--seconds", 1)
+    os.close(board)
+    assert stopped.exit_code == 0
+    assert (tmp_path / "touch.csv").read_text().count("\n") == 301
+
+
 def test_stream_that_ends_without_a_tare_says_why(tmp_path, stream):
     path = tmp_path / "offset.txt"
     path.write_text("A,B,C\n" + "300.0,1.0,2.0\n" * 150)

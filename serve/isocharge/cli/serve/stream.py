@@ -151,10 +151,8 @@ def say_missing_records(outputs: Outputs, state: str) -> None:
         state: What is printed about an output if the number is unknown.
     """
     for target, missing_records in outputs.not_written.items():
-        if missing_records is not None:
-            say(f"{target}: {missing_records} records not written, the oldest: the output was too slow")
-        else:
-            say(f"{target}: {state}")
+        count = f"{missing_records} records not written, the oldest: the output was too slow"
+        say(f"{target}: {state if missing_records is None else count}")
 
 
 def summary(touch: TouchStream) -> str:
@@ -267,15 +265,16 @@ def stream_command(
             new_recorder = None if recorder else partial(Recorder, device=board.table, name=name)
             writers.append(PageFeed(page, touch, stream, new_recorder).write)
         needs_time = board.has_currents or not {LeakRule, HumRule, ThermalRule, TrackRule}.isdisjoint(board.rules)
-        if needs_time and isinstance(source, FileSource) and source.is_on_disk:
+        is_repeatable = isinstance(source, FileSource) and source.is_on_disk
+        if needs_time and is_repeatable:
             writers.insert(0, _require_time)
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
             with no_frames_advice_added(port, device):
                 write_records(islice(records, count), writers)
         finally:
-            if source.is_live:
-                outputs.close()
+            if not is_repeatable:
+                outputs.close()  # otherwise, their incomplete files are removed
             say(summary(touch))
     if outputs is None:
         say(f"{port}: the command was stopped before the port was open")
@@ -284,7 +283,7 @@ def stream_command(
     if has_no_frames:
         say(f"no frames were recognised; {no_frames_hint(port, device)}")
     say_missing_records(outputs, "incomplete")
-    is_recording_incomplete = recorder is not None and recorder.failed
+    is_recording_incomplete = recorder and recorder.failed
     is_without_result = has_no_frames and has_expired.is_set()
     if is_recording_incomplete or outputs.has_incomplete_file or is_without_result:
         raise typer.Exit(1)
