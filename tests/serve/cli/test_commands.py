@@ -137,11 +137,9 @@ def test_stream_that_waits_for_its_port_can_be_stopped(tmp_path, stream, stop, e
     ctrl_c = threading.Timer(0.3, interrupt)
     if not stop:
         ctrl_c.start()
-    start_s = time.monotonic()
     result = stream(tmp_path / "film", "--output", tmp_path / "x.csv", "--wait", 30, *stop)
     assert result.exit_code == exit_code
     assert f"{tmp_path / 'film'}: the command was stopped before the port was open" in result.stderr
-    assert time.monotonic() - start_s < 10.0
     assert list(tmp_path.iterdir()) == []
 
 
@@ -160,17 +158,6 @@ def test_stream_writes_a_record_for_each_frame_and_replay_repeats_them_at_their_
     began = time.monotonic()
     assert run("replay", path, "--real-time", "--models", models).stdout == streamed.stdout
     assert time.monotonic() - began > 0.2  # 50 chunks of 10 ms
-
-
-def test_stream_of_a_pipe_that_is_stopped_keeps_its_file(frames, tmp_path, stream):
-    """The bytes of a pipe cannot be read again, unlike those of a file."""
-    os.mkfifo(tmp_path / "pipe")
-    board = os.open(tmp_path / "pipe", os.O_RDWR)  # as a writer that never ends
-    os.write(board, frames.read_bytes())
-    stopped = stream(tmp_path / "pipe", "--output", tmp_path / "touch.csv", "--seconds", 1)
-    os.close(board)
-    assert stopped.exit_code == 0
-    assert (tmp_path / "touch.csv").read_text().count("\n") == 301
 
 
 def test_stream_that_ends_without_a_tare_says_why(tmp_path, stream):
@@ -245,13 +232,6 @@ def test_doctor_lists_the_ports_and_what_they_send(resting, run, monkeypatch):
     assert none.startswith("/dev/ttyNone (n/a): /dev/ttyNone: there is no such port")
 
 
-def test_doctor_refuses_a_file_in_a_folder_that_does_not_exist(resting, run):
-    with resting() as sensor:
-        result = run("doctor", "--port", sensor.url, "--seconds", 0.5, "--write", "/proc/none/board.toml")
-    assert result.exit_code == 1
-    assert "OutputError: /proc/none/board.toml cannot be written: No such file" in result.stderr
-
-
 def test_doctor_writes_no_file_of_which_the_unit_is_missing(resting, command, tmp_path):
     """The command that is completed with the unit can then write the file, and the file is valid."""
     path = tmp_path / "board.toml"
@@ -265,7 +245,9 @@ def test_doctor_writes_no_file_of_which_the_unit_is_missing(resting, command, tm
         assert (code, path.exists()) == (1, False)
         assert "--pc-per-unit NUMBER" in out
         assert "is not written, because the charge of one unit is missing" in err
-        assert json.loads(command(*words, "--json")[1])["unit"] == "counts"
+        code, _, err = command(*words[:-1], "/proc/none/board.toml", "--pc-per-unit", ".1")
+        assert code == 1
+        assert "OutputError: /proc/none/board.toml cannot be written: No such file" in err
         code, _, err = command(*words, "--pc-per-unit", ".1")
         assert code == 0, err
     assert load_device(path).rule(GainRule).pC_per_unit == 0.1
@@ -292,15 +274,18 @@ def bash(script, **environment):
         ("stream linear --port {frames} --record {record} >&-", ""),
         ("predict linear {presses} 2>&- | wc -l", "3\n"),
         ("stream linear --port {frames} | (sleep 1; wc -l)", "300\n"),
+        (
+            "stream linear --port - --output {csv} --seconds 1 < <(exec 2>&-; cat {frames}; sleep 9) && wc -l <{csv}",
+            "301\n",
+        ),
     ],
-    ids=["closed stdout", "closed stdout and a recording", "closed stderr", "a slow reader of the records of a file"],
 )
-def test_closed_output_is_the_null_device_and_a_slow_reader_gets_all_of_a_file(
+def test_closed_output_is_the_null_device_a_slow_reader_gets_all_of_a_file_and_a_stopped_pipe_leaves_its_file(
     models, presses, frames, tmp_path, line, printed
 ):
-    """No file that is opened later gets the place of a closed output."""
+    """No file that is opened later gets the place of a closed output. The bytes of a pipe cannot be read again."""
     record = tmp_path / "touch.rec"
-    line = line.format(presses=presses, frames=frames, record=record)
+    line = line.format(presses=presses, frames=frames, record=record, csv=tmp_path / "touch.csv")
     done = bash(f"set -o pipefail; {ISOCHARGE} serve {line}", ISOCHARGE_MODELS=str(models))
     assert (done.returncode, done.stdout) == (0, printed)
     assert not record.exists() or Recording(record).model == "linear/1"

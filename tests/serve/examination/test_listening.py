@@ -19,10 +19,10 @@ REQUEST = Request(b"?", 200.0)
         (0.0, b"\xf8\x80\xfe\xff", (115200, 57600, 9600), [115200, 57600, 57600], 200),
         (0.0, b"\xf8\x80\xfe\xff", (115200, 9600), [115200, 9600, 115200], 0),
         (0.0, b"\xf8\x80\xfe\xff", (57600,), [57600], 200),
+        # an Arduino, which restarts at each opening, and a board that needs requests
         (6.0, b"\xf8\x80\xfe\xff", (115200, 57600, 9600), [115200, 57600, 57600], 200),
         (0.0, b"", (115200, 57600, 9600), [115200, 57600, 57600], 200),
     ],
-    ids=["found", "none is right", "one is not tried", "an Arduino, which restarts at each opening", "requests"],
 )
 def test_baud_rate_is_found(monkeypatch, silence_s, other_bytes, bauds, tried, good):
     """The board sends a line every 10 ms at 57600 bit/s. At other speeds, other bytes arrive. The time is simulated.

@@ -269,24 +269,19 @@ MESSAGES = ["Sensor 1 ready", "Sensor 2 ready", "Sensor 3 ready"] + ["load:0x3fc
 @pytest.mark.parametrize(
     ("lines", "values"),
     [
+        # a header after a reset
         (["A,B", "1,2", "3,4", "5,6", "A,B", "7,8"], [(1, 2), (3, 4), (5, 6), (7, 8)]),
+        # messages of a board that starts
         ([*MESSAGES, "1,2,3", "4,5,6", "7,8,9"], [(1, 2, 3), (4, 5, 6), (7, 8, 9)]),
+        # an echo
         (["READ 1", "0,2", "READ 1", "1,2", "READ 1", "1,2"], [(0, 2), (1, 2), (1, 2)]),
         (["0x7FF0 0x8001", "0x7FF9 0x8011"] * 5, [(0x7FF0, 0x8001), (0x7FF9, 0x8011)] * 5),
+        # two frames, and then a temperature
         (["A 1 B 2", "A 3 B 4", "T 5"] * 12, [(1, 2), (3, 4)] * 12),
         (["5,0x1F", "8,-0x20"] * 5, [(5, 31), (8, -32)] * 5),
         ([f"seq=0x{n:X} A=-{n}" for n in range(12)], [(-n,) for n in range(12)]),
+        # two values behind each name, which are no index and value
         (["x 0 7 y 1 8", "x 0 7 y 2 8", "x 1 7 y 2 8"] * 4, [(0, 7, 1, 8), (0, 7, 2, 8), (1, 7, 2, 8)] * 4),
-    ],
-    ids=[
-        "a header after a reset",
-        "messages of a board that starts",
-        "an echo",
-        "hexadecimal",
-        "two frames, and then a temperature",
-        "mixed",
-        "a hexadecimal counter",
-        "two values behind each name, which are no index and value",
     ],
 )
 def test_lines_that_are_frames(lines, values):

@@ -86,6 +86,13 @@ def test_record_before_the_tare(predictor):
         assert record.charge_raw_pC == {"A": 12.0, "B": -7.0, "C": 3.0}
 
 
+def test_board_that_sends_other_lines_from_now_on_is_reported_once(predictor, caplog):
+    """For example, its program was replaced while the stream runs."""
+    pieces = [b"\n" + b"1,2,3\n" * 9, *[b"A=1 B=2 C=3\n" * 300] * 5]
+    list(stream([Chunk(piece, 1e9, 0) for piece in pieces], predictor))
+    assert caplog.text.count("the latest 10800 bytes, such as 'A=1 B=2 C=3'; expected text: 3 columns") == 1
+
+
 @pytest.mark.parametrize("data", [b"", b"hello, film\n"])
 def test_file_without_a_frame_raises_an_error(predictor, data):
     """An error is raised even if the file is empty, because an empty file does not mean that nothing touches."""

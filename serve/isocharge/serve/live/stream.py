@@ -5,6 +5,7 @@ in the charges and the contact of the frame; see `isocharge.serve.live.device.ST
 on a model of the film, unless warming is estimated.
 """
 
+import logging
 import math
 import time
 from collections.abc import Iterable, Iterator
@@ -23,6 +24,8 @@ from isocharge.serve.signal_chain.stage import Device, Setup
 
 RESTART_OUTAGE_s = 1e-6
 """Outage that a chunk states if a new recording begins after the first frames, s. Every outage of a port is longer."""
+
+log = logging.getLogger(__name__)
 
 
 def stream(chunks: Iterable[Chunk], predictor: Predictor, device: Device = ANY_BOARD) -> Iterator[PredictionRecord]:
@@ -90,6 +93,7 @@ class ReadingStream:
         self._stages = create_stages(self._setup)
         self._pending_flags: list[str] = []  # flags that the next frame gets
         self._previous_values: tuple[float, ...] = ()
+        self._readable_until = 0.0  # number of dropped bytes at the latest frame; infinite after a warning
 
     def tare(self) -> None:
         """Discard the tare and the present touch, and measure the tare again from the next quiet frames."""
@@ -122,6 +126,8 @@ class ReadingStream:
             self._reconnect(chunk.outage_s)
         parser = self.parser
         frames = parser.feed(chunk.data)
+        if frames:
+            self._readable_until = parser.counts.bytes_dropped
         self._check_recognised()
         self.clock.stamp(chunk, frames, parser.t_us_modulus)
         for frame in frames:
@@ -143,18 +149,32 @@ class ReadingStream:
         Raises:
             NoFramesError: If the whole stream has contained no intact frame.
         """
-        self._check_recognised(max_bytes=-1)  # raises an error without a frame, even if no bytes have arrived
+        if self.parser.counts.frames == 0:
+            self._check_recognised(max_bytes=-1)  # raises an error, even if no bytes have arrived
 
     def _check_recognised(self, max_bytes: int = 8192) -> None:
-        """Raise an error if the parser has found no intact frame in more than `max_bytes` bytes.
+        """Report that more than `max_bytes` bytes have arrived since the latest frame, none of them an intact frame.
+
+        After the first frame, this is only a warning, because a disturbance may end.
 
         Raises:
-            NoFramesError: If more than `max_bytes` bytes have arrived, and none of them belonged to an intact frame.
+            NoFramesError: If the stream has contained no frame.
         """
         counts = self.parser.counts
-        if counts.frames or counts.bytes_dropped <= max_bytes:
+        dropped_bytes = counts.bytes_dropped - self._readable_until
+        if dropped_bytes <= max_bytes:
             return
         line = f", such as {shown(self.parser.unread_line)}" if self.parser.unread_line else ""
+        if counts.frames:
+            self._readable_until = math.inf
+            log.warning(
+                "no intact frame among the latest %d bytes%s; expected %s, as before: check the cable, and start again "
+                "if the board sends other frames now",
+                dropped_bytes,
+                line,
+                self.parser.format,
+            )
+            return
         raise NoFramesError(
             f"no intact frame among the first {counts.bytes_dropped} bytes ({counts.crc_errors} with a wrong CRC, "
             f"{counts.malformed} of another form{line}); {self.parser.format}: check baud rate and device; "
