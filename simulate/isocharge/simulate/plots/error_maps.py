@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import ScalarFormatter
+from matplotlib.ticker import LogLocator
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.identifiability.identification import Identification
@@ -77,7 +77,7 @@ def _draw_distance(axes: Any, identification: Identification) -> None:
     largest_error = 20.0 * area.error  # near a fold, the error is infinite
     axes.set(xlabel="distance from the centre, mm", ylabel=ERROR_LABEL, xlim=(0.0, area.search_radius))
     axes.set_ylim(top=min(axes.get_ylim()[1], largest_error))
-    axes.yaxis.set_major_formatter(ScalarFormatter())
+    _label_errors(axes.yaxis)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, loc="lower right")
 
@@ -138,8 +138,14 @@ def _draw_errors(axes: Any, sensor: Sensor, positions: Array, errors: Array, nor
 def _add_colour_bar(figure: Figure, coloured_area: Any, axes: list[Any]) -> None:
     """Add a colour bar for position errors beside axes that have the same colour scale."""
     colour_bar = figure.colorbar(coloured_area, ax=axes, label=ERROR_LABEL, shrink=0.85, extend="max")
-    colour_bar.ax.yaxis.set_major_formatter(ScalarFormatter())
-    colour_bar.ax.yaxis.set_minor_formatter(ScalarFormatter())
+    _label_errors(colour_bar.ax.yaxis)
+
+
+def _label_errors(axis: Any) -> None:
+    """Label a logarithmic axis of errors with a few decimal numbers, which do not overlap."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter("")
 
 
 def mirror_picture(sensor: Sensor, mirror: MirrorRegion) -> Figure:
