@@ -214,6 +214,11 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
     charge_difference = np.linalg.norm(residual, axis=2)
     is_distant = np.linalg.norm((second - first)[..., :2], axis=2) > min_distance[:, None]
     is_ambiguous = is_distant & (charge_difference < INDISTINGUISHABLE_SIGMAS)
+
+    # Several searches of a first contact often find the same second contact, which counts once.
+    separation = np.linalg.norm((second[:, :, None] - second[:, None])[..., :2], axis=3)  # shape (n, STARTS, STARTS)
+    is_same = (separation < position_std[:, None, None]) & is_ambiguous[:, None]
+    is_ambiguous &= ~np.tril(is_same, -1).any(axis=2)
     columns = (first[is_ambiguous], second[is_ambiguous], charge_difference[is_ambiguous])
     order = np.argsort(AmbiguousPairs(*columns).outer_radius, kind="stable")
     return AmbiguousPairs(*(column[order] for column in columns))
