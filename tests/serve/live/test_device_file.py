@@ -91,9 +91,7 @@ def test_device_without_a_file_has_tare_and_touch(device):
     assert isinstance(ANY_BOARD.parser(), AutoParser)
 
 
-@pytest.mark.parametrize(
-    ("offset", "zero"), [("8388608", [8388608] * 3), ("{A = 1, B = 2, C = 3}", [1, 2, 3])], ids=["half range", "each"]
-)
+@pytest.mark.parametrize(("offset", "zero"), [("8388608", [8388608] * 3), ("{A = 1, B = 2, C = 3}", [1, 2, 3])])
 def test_offset_is_subtracted_before_the_gain(device, offset, zero):
     """The offset is one number, such as half of the range of a converter, or one number for each electrode."""
     board = device(f"[gain]\noffset = {offset}\npC_per_unit = {{A = 0.5, B = -0.5, C = 1}}\n")

@@ -85,22 +85,27 @@ def write_records(records: Iterable[PredictionRecord], writers: Iterable[Callabl
     """
     is_tare_new = True
     untared_pC: Mapping[str, float | None] | None = None
-    for record in records:
-        for write in writers:
-            write(record)
-        if TARE in record.flags:  # the tare is being measured
-            is_tare_new = True
-            untared_pC = record.charge_raw_pC
-        elif is_tare_new and record.tare_pC is not None:  # an invalid record has no tare
-            is_tare_new = False
-            untared_pC = None
-            say(f"tared: {_listed(record.tare_pC)}")
-    if untared_pC:
-        say(
-            "caution: no tare, because the stream ended before the film had rested near zero for long enough; the last "
-            f"charges are {_listed(untared_pC)}; leave the film alone longer, or state an offset of the board as "
-            "offset in [gain]"
-        )
+    try:
+        for record in records:
+            for write in writers:
+                write(record)
+            if TARE in record.flags:  # the tare is being measured
+                is_tare_new = True
+                untared_pC = record.charge_raw_pC
+            elif is_tare_new and record.tare_pC is not None:  # an invalid record has no tare
+                is_tare_new = False
+                untared_pC = None
+                say(f"tared: {_listed(record.tare_pC)}")
+    except Exception:
+        untared_pC = None  # the error states why the stream ended
+        raise
+    finally:  # also after Ctrl-C
+        if untared_pC:
+            say(
+                "caution: no tare, because the stream ended before the film had rested near zero for long enough; the "
+                f"last charges are {_listed(untared_pC)}; leave the film alone longer, or state an offset of the board "
+                "as offset in [gain]"
+            )
 
 
 def _require_time(record: PredictionRecord) -> None:
@@ -221,7 +226,7 @@ def stream_command(
     if name is not None and not (name and is_printable(name)):
         raise InputError(f"--name: expected printable characters, got {shown(name)}")
 
-    if record is not None:
+    if record:
         refuse_existing(record)
 
     # The options take precedence over the settings of the device file.
@@ -279,13 +284,12 @@ def stream_command(
     if outputs is None:
         say(f"{port}: the command was stopped before the port was open")
         raise typer.Exit(int(has_expired.is_set()))
-    has_no_frames = touch.totals().frames == 0
+    has_no_frames = not touch.totals().frames
     if has_no_frames:
         say(f"no frames were recognised; {no_frames_hint(port, device)}")
     say_missing_records(outputs, "incomplete")
     is_recording_incomplete = recorder and recorder.failed
-    is_without_result = has_no_frames and has_expired.is_set()
-    if is_recording_incomplete or outputs.has_incomplete_file or is_without_result:
+    if is_recording_incomplete or outputs.has_incomplete_file or (has_no_frames and has_expired.is_set()):
         raise typer.Exit(1)
 
 
