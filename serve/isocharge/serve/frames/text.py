@@ -174,14 +174,13 @@ class TextParser(DelimitedParser):
             return self._reject(size)
 
     def _store_comment(self, text: str) -> None:
-        """Store a comment without numbers, such as `# t_ms,A,B,C`, as a possible header, until a layout is recognised.
+        """Store a comment without numbers, such as `# t_ms,A,B,C`, as a possible header until a layout is recognised.
 
         Raises:
             ValueError: If the comment contains characters that are not printable.
         """
-        content = text.lstrip("# ")
-        if self.layout is None and content != text and not parse_line(content).names:
-            self._headers.append(content)
+        if self.layout is None and text and not parse_line(text).names:
+            self._headers.append(text)
 
     def _with_meanings(self, names: Sequence[str]) -> tuple[str, ...]:
         """Replace the names that the device uses for its counter and its clock by their meanings."""

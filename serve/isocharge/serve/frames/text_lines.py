@@ -449,19 +449,21 @@ def header_names(header: str, line: Line) -> tuple[str, ...]:
     """Return the names that a header states for the numbers without names in a line.
 
     The result is empty if the text is no header of the line. A column of the header is a name, which begins with a
-    letter. Columns of the line that contain a text, and a label before the first column, are ignored. Words with only
-    blanks between them, such as `the tare is done`, are no header of a line with another separator.
+    letter. The mark of a comment, a label before the first column, and columns of the line that contain a text are
+    ignored. Words with only blanks between them, such as `the tare is done`, are no header of a line with another
+    separator.
 
     Args:
         header: A line without numbers.
         line: The line.
     """
     starts = [start for start, name in zip(line.starts, line.names, strict=True) if not name]
+    header = header.lstrip("#%/ ").rstrip(_IGNORED_AT_END)
     separator = _separator(header)  # None: blanks
     line_separator = "\t" if "\t" in line.text else _separator(line.skeleton)
     if separator is None and line_separator is not None:
         return ()
-    columns = header.rstrip(_IGNORED_AT_END).split(separator)
+    columns = header.split(separator)
     if len(columns) != len(starts):  # select the columns of the numbers without names
         indices = [len(line.text[: start + 1].split(line_separator)) - 1 for start in starts]
         columns = [columns[index] for index in indices if index < len(columns)]
