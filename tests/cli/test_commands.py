@@ -172,8 +172,8 @@ def test_a_point_warns_and_adds_a_temperature_step(command, tmp_path):
     assert warm["charge_pC"]["B"] - cold["charge_pC"]["B"] == pytest.approx(-27.0)
     assert "--temperature" not in warm_message
     path.write_text(path.read_text().replace("pyro_uC_per_m2_K = -30.0", ""))
-    _, message_without_pyro = point(command, path, "--temperature", 0.1)
-    assert "caution: --temperature changes no charge" in message_without_pyro
+    without_pyro, _ = point(command, path, "--temperature", 0.1)
+    assert "--temperature changes no charge" in without_pyro["warnings"][-1]
 
 
 @pytest.mark.slow

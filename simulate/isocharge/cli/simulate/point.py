@@ -92,7 +92,6 @@ def point_command(
     if any(applied_side_force):
         report["side_force_N"] = list(applied_side_force)
     warnings = report["warnings"] if json else report.pop("warnings")
-    show_result(report, json=json)
     error = report["estimated_error"]
     if error is None:  # infinite
         warnings.append(f"a {theory} does not describe this film at all; omit --theory")
@@ -103,5 +102,6 @@ def point_command(
             "--temperature changes no charge, because the sensor file has neither pyro_uC_per_m2_K nor "
             "expansion_ppm_per_K"
         )
+    show_result(report, json=json)
     for warning in warnings:
         say(f"caution: {warning}")
