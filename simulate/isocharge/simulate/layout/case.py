@@ -129,7 +129,8 @@ class DesignCase:
                 f"probe: expected circle:RADIUS, for which layouts are designed, got {self.probe.notation}"
             )
         check_family(self.sensor.film, self.probe, Domain(self.radius, (self.force, self.force)))
-        check_range("side", self.square_side, (MIN_EXTENT, np.inf), "mm", InputError)
+        largest_side = 2.0**0.5 * (self.sensor.film.inner_radius - RIM_DISTANCE)  # of a square at the centre
+        check_range("side", self.square_side, (MIN_EXTENT, largest_side), "mm", InputError)
         self.noise.check_white()
         if self.goal not in get_args(Goal):
             raise InputError(f"goal: expected {' or '.join(get_args(Goal))}, got {self.goal!r}")
