@@ -16,7 +16,7 @@ def test_a_missing_column_of_a_training_is_named(refused, tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "p.csv").write_text("force_N,A,B,C,D\n1,100,200,300,400\n")
     refused("train", "fit", "p.csv", "-o", "models/pad", message="add the column 'x_mm', 'y_mm'")
-    assert [path.name for path in tmp_path.iterdir()] == ["p.csv"]
+    assert list(tmp_path.iterdir()) == [tmp_path / "p.csv"]
 
 
 def test_a_long_table_is_predicted_in_pieces(command, tmp_path, monkeypatch):

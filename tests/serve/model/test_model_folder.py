@@ -112,9 +112,11 @@ def test_tolerance_near_zero_is_that_of_a_twentieth_of_the_range(film):
     assert contact_floors(large) == pytest.approx((1.8, 1.8, 0.15))
 
 
-def test_model_in_a_folder_with_another_name_is_refused(film, tmp_path):
+def test_model_in_a_folder_with_another_name_or_other_files_is_refused(film, tmp_path):
     with pytest.raises(ModelError, match="expected a folder named 'linear'"):
         write(film, tmp_path / "other")
+    with pytest.raises(ModelError, match="expected a new folder or the folder of a model, got one with other files"):
+        write(film, film.write(tmp_path))  # the folder of a version
 
 
 def test_version_with_other_electrodes_in_the_same_model_folder_is_refused(film, tmp_path):

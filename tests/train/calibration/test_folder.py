@@ -112,15 +112,14 @@ def test_next_version_has_wider_regions_that_hold_for_held_out_presses(written, 
 
 
 def test_unsuitable_folders_are_refused_and_left_as_they_are(written, problem, tmp_path):
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    (tmp_path / "mine" / "1").mkdir(parents=True)
     with pytest.raises(ModelError, match="expected a new folder or one of an earlier calibration"):
         write_calibration(written.result, tmp_path / "mine")
     other = CalibrationProblem(load_sensor("three-25um-biaxial"), problem.probe)
     with pytest.raises(ModelError):
         check_calibration_folder(written.path, other.electrodes)
-    with pytest.raises(OutputError, match=r"notes\.txt is not a writable folder"):
-        check_calibration_folder(tmp_path / "mine" / "notes.txt" / "film", problem.electrodes)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine"]
+    with pytest.raises(OutputError, match=r"card\.md is not a writable folder"):
+        check_calibration_folder(written.path / "card.md" / "film", problem.electrodes)
+    assert list(tmp_path.iterdir()) == [tmp_path / "mine"]
     with pytest.raises(PressError, match=r"calibration\.json"):
         read_earlier(tmp_path / "mine", problem)

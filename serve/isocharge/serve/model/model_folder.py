@@ -382,8 +382,9 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
     Raises:
         OutputExists: If the version exists already, or a file has the folder's name.
         OutputError: If the folder cannot be written.
-        ModelError: If the name of the folder is not a valid name of a model, or if the folder contains a model with
-            another number of electrodes.
+        ModelError: If the name of the folder is not a valid name of a model, if the folder contains a model with
+            another number of electrodes, or if the folder contains files but no model, as a dataset, a version of a
+            model and a folder of several models do.
     """
     target = folder / str(version)
     refuse_existing(target)
@@ -396,6 +397,12 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
     if not NAME.fullmatch(name):
         raise ModelError(f"model name {name!r}: expected letters, digits, '-', '_' and '.'; rename the folder")
     config_path = folder / "config.pbtxt"
+    is_model_folder = config_path.exists() or version_folders(folder)
+    if any(folder.glob("[!.]*")) and not is_model_folder:
+        raise ModelError(
+            f"{folder}: expected a new folder or the folder of a model, got one with other files; choose another "
+            "output, such as models/NAME"
+        )
     if config_path.exists() and config_path.read_bytes() != triton_config(name, len(electrodes)).encode():
         raise ModelError(
             f"{config_path}: describes a model other than {name!r} with the electrodes {electrodes}; use another model "
