@@ -259,13 +259,17 @@ class TextParser(DelimitedParser):
         self._collected_lines = []
         return [frame for line, line_size in collected_lines for frame in self._read_line(line.text, line_size)]
 
-    def _named_layout(self, frame_lines: Sequence[Line]) -> Layout:
-        """Return the layout of the lines of a frame, with names from the device file or from the latest header."""
+    def _named_layout(self, frame_lines: Sequence[Line]) -> Layout | None:
+        """Return the layout of the lines of a frame, with names from the device file or from the latest header.
+
+        The result is None if the device file names more or fewer columns, and no header names the columns.
+        """
         layout = Layout(frame_lines)
         names_in_headers = [header_names(header, layout.first_line) for header in reversed(self._headers)]
         for names in (self._columns, *names_in_headers):
             layout.name_unnamed(self._with_meanings(names))
-        return layout
+        has_other_columns = self._columns and len(self._columns) != len(layout.unnamed)
+        return None if has_other_columns and "" in layout.names else layout
 
     def _read_line(self, text: str, size: int) -> list[Frame]:
         """Return the frames that a line completes. If a line of a cycle is lost, reject the other lines of the cycle.

@@ -178,7 +178,7 @@ class ReadingStream:
         raise NoFramesError(
             f"no intact frame among the first {counts.bytes_dropped} bytes ({counts.crc_errors} with a wrong CRC, "
             f"{counts.malformed} of another form{line}); {self.parser.format}: check baud rate and device; "
-            "each line of text needs the numbers of all channels"
+            "each line of text needs the numbers of all channels, and of all columns that the device file names"
         )
 
     def _reconnect(self, outage_s: float) -> None:
