@@ -46,7 +46,6 @@ def test_new_squares_are_named_anticlockwise_with_unused_letters(sensor):
         ({"keep": ("A", "A")}, "expected different names"),
         ({"keep": ("A", "B", "C", "D")}, "nothing to place"),
         ({"keep": ("Q",)}, "no electrode 'Q'"),
-        ({"side": 0.015}, "side: expected 0.02 to 62.2254 mm, got 0.015 mm"),
         ({"side": 3000.0}, "side: expected 0.02 to 62.2254 mm, got 3000 mm"),
         ({"probe": Finger(3.0)}, "expected circle:RADIUS, .* got finger:3.0"),
         ({"noise": NoiseModel("mine", 0.0, 1e-3)}, "expected white noise above 0"),
