@@ -76,20 +76,14 @@ def _starting_order(item):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def few_check_presses():
-    """Compare each forward map with four direct solves instead of ten when it is built.
+def few_solves():
+    """Compare each forward map with four direct solves instead of ten when it is built, and solve each film once.
 
-    The tests build many maps. The tests of the forward map compare it with further direct solves.
+    The tests build many maps. The tests of the forward map compare it with further direct solves. The coarse map of a
+    whole film is solved once for all sweeps and all mirror regions of this film.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("isocharge.simulate.forward.forward_map.CHECK_COUNT", 4)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def whole_films_are_solved_once():
-    """Solve the coarse map of a whole film once for all sweeps and all mirror regions of this film."""
-    with pytest.MonkeyPatch.context() as patch:
         for module in ("dataset.sweep", "identifiability.mirror_region"):
             patch.setattr(f"isocharge.simulate.{module}.whole_film_map", whole_film_map_solved_once)
         yield

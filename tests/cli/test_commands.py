@@ -215,6 +215,7 @@ BAD = [
     ("simulate sweep SENSOR --radius all -o OUT", "expected a number of mm or 'auto', got 'all'"),
     ("simulate identify SENSOR --noise clean", "expected white noise above 0 pC, got that of 'clean'"),
     ("simulate identify SENSOR --error 0", "--error"),
+    ("simulate identify SENSOR --force 1 1", "a smaller and a larger force"),
     ("simulate design SENSOR --electrodes 2 --radius 8 -o OUT", "three unknowns"),
     ("simulate design SENSOR --electrodes 3 --probe triangle:3 --radius 8 -o OUT", "expected circle:RADIUS"),
     ("train fit -o OUT", "InputError: expected either a DATASET folder or --sensor SENSOR"),

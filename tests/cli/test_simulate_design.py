@@ -19,7 +19,7 @@ FILES = ["design.json", "design.png", "layout.dxf", "layout.svg", "sensor.toml"]
 @pytest.fixture
 def _rough(monkeypatch):
     """The search is coarse and does not search for folds in a map of its own, because this would take half a minute."""
-    monkeypatch.setattr(case_module, "FINE_PRESSES", 450)
+    monkeypatch.setattr(case_module, "FINE_PRESSES", 150)
     monkeypatch.setattr(case_module, "SEARCH_PRESSES", 50)
     monkeypatch.setattr(design_module, "STARTS", 1)
     monkeypatch.setattr(stress_fields, "NODE_COUNT", NodeCount(distances=2, forces=1))

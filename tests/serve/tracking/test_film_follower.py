@@ -57,7 +57,7 @@ def model_in(folder, series, noise=NOISE):
 
     def predict(charge_pC):
         contact = np.array([0.0, 0.0, np.log(0.5)])
-        for _ in range(6):
+        for _ in range(4):
             place = np.array([[contact[0], contact[1], np.exp(contact[2])]])
             charge, slopes = series.linearised(place)
             weight = 1.0 / NOISE.sigma(charge[0])

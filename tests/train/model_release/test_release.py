@@ -118,12 +118,12 @@ def forward_map(predictor, film):
 def truth(forward_map):
     """Contacts that were not in the training, and their simulated charges."""
     film, radius = forward_map
-    return draw_presses(film, 10_000, 78, radius)
+    return kept(draw_presses, film, radius)
 
 
-def draw_presses(film, count, seed, radius=RADIUS_mm):
+def draw_presses(film, radius):
     """Draw contacts that were not in the training, and simulate their charges."""
-    contact = draw_contacts(np.random.default_rng(seed), Domain(radius, FORCE_RANGE_N), count)
+    contact = draw_contacts(np.random.default_rng(78), Domain(radius, FORCE_RANGE_N), 10_000)
     return LabelledPresses(contact, film.charges(contact))
 
 
