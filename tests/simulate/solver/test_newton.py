@@ -38,7 +38,7 @@ def test_newton_converges_from_the_flat_film_for_every_force(film, changes, theo
 def test_compressed_plate_buckles_into_a_stable_equilibrium(film):
     """Newton's steps alone lead to an unstable equilibrium, in which the plate is nearly flat."""
     plate = replace(film, thickness=0.5, pretension=-1.0)
-    solved = press(plate, Circle(3.0), (0.0, 0.0), 0.01, throw=False)
+    solved = press(plate, Circle(3.0), (0.0, 0.0), 0.003, throw=False)
     assert abs(deflection(solved, np.zeros((1, 2)))[0]) > plate.thickness
 
 
@@ -87,9 +87,9 @@ WRINKLES = r"no equilibrium at .* N, position \(.*\) mm: .* it wrinkles, which h
 
 def test_wrinkling_film_raises_solve_error(film, monkeypatch):
     """The message mentions the compression near the rim, and does not mention it at the centre."""
-    monkeypatch.setattr("isocharge.simulate.solver.newton.MAX_ITERATIONS", 3)
+    monkeypatch.setattr("isocharge.simulate.solver.newton.MAX_ITERATIONS", 2)
     mesh = SolveSettings(theory=FULL, resolution=Resolution(5, 8, 6, 1))
     with pytest.raises(SolveError, match=WRINKLES):
         press(film, CIRCLE, (0.0, 42.0), 5.0, mesh)
-    with pytest.raises(SolveError, match=r"after 6 steps$"):
+    with pytest.raises(SolveError, match=r"after 4 steps$"):
         press(film, CIRCLE, (0.0, 0.0), 5.0, mesh)
