@@ -26,7 +26,7 @@ def random_series(*, is_signed=False):
     if not is_signed:
         coefficients[:, 0, 0, :2] += np.array([[5.0], [1.2]])
     coefficients[:, np.add.outer(range(4), range(4)) > 3] = 0.0
-    directions = 0.05 * rng.normal(size=(2, 2, 1, 2, 4))
+    directions = 0.05 * rng.normal(size=(2, 2, 1, 2, 2, 4))
     directions[1, 1] = 0.0
     return ChargeSeries(
         domain=DOMAIN,
@@ -49,8 +49,8 @@ def polynomial_values(series, contact, state):
     by_node = np.array(node_values)  # shape (n_node, n_electrode, n)
     polynomial = np.polyfit(series.node_MPa, by_node.reshape(len(by_node), -1), len(by_node) - 1)
     value = np.polyval(polynomial, state[0]).reshape(by_node.shape[1:])
-    direction_values = np.polynomial.chebyshev.chebval3d(*unit.T, series.directions)  # shape (K, n_electrode, n)
-    return (value + np.tensordot(state[1:], direction_values, axes=1)).T
+    at_zero, slopes = np.polynomial.chebyshev.chebval3d(*unit.T, series.directions)  # shapes (K, n_electrode, n)
+    return (value + np.tensordot(state[1:], at_zero + state[0] * slopes, axes=1)).T
 
 
 @pytest.mark.parametrize("is_signed", [False, True])
@@ -109,7 +109,7 @@ def test_file_is_read_as_it_was_written(is_signed, tmp_path):
 @pytest.mark.parametrize(
     ("left_out", "electrodes", "reason"),
     [
-        ("format", ELECTRODES, r"format 1 is not supported \(this version reads 2\)"),
+        ("format", ELECTRODES, r"format 1 is not supported \(this version reads 3\)"),
         ("series", ELECTRODES, "'series'"),
         ("", ("A", "B", "C"), r"series: expected charges of \('A', 'B', 'C'\), got .*4\)"),
     ],

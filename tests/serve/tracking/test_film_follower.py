@@ -31,7 +31,7 @@ def series():
     tension = np.zeros_like(base)
     tension[0, 0, 0], tension[0, 0, 1] = [-0.4, -0.35, -0.3, -0.38], 0.1
     tension[1, 0, 0], tension[0, 1, 0] = [-0.1, 0.02, 0.1, 0.0], [0.02, -0.1, 0.0, 0.1]
-    direction = 0.003 * rng.standard_normal((2, 2, 2, 2, 4))
+    direction = 0.003 * rng.standard_normal((2, 2, 2, 2, 2, 4))
     nodes = np.array([-0.7, 0.0, 0.7])
     return ChargeSeries(
         domain=Domain(8.0, (0.05, 2.0)),

@@ -9,7 +9,8 @@ from tests.train.calibration.conftest import rig, uneven_film
 from isocharge.train import calibrate
 from isocharge.train.calibration import film_network
 from isocharge.train.calibration.calibrate import solve_even
-from isocharge.train.calibration.film_network import _nodes, _tension_factors
+from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.calibration.film_network import _ChangedFilm, _nodes, _tension_factors
 from solved_charges import solved_charges, with_film
 
 
@@ -24,10 +25,30 @@ def test_charges_of_an_uneven_film_after_warming_agree_with_full_solves(problem)
     after = solved_charges(later, probe, contact)
 
     charges = solve_even(problem, values=film.film_values)
-    uneven_map = replace(charges.film, sensor=replace(charges.film.sensor, film=sensor.film))
-    factors = _tension_factors(replace(charges, film=uneven_map), film, contact, np.array([0.0, -0.4]), None)
+    calibrated = _ChangedFilm(0.0, charges, film.film_values, np.eye(film.film_values.size))
+    factors = _tension_factors([_ChangedFilm.solve(calibrated, change, None) for change in (0.0, -0.4)], contact)
     np.testing.assert_array_equal(factors[:, 0], 1.0)
     np.testing.assert_allclose(factors[:, 1], after / before, rtol=1e-3)
+
+
+def test_derivatives_of_a_film_after_warming_are_those_with_respect_to_the_calibrated_film(
+    problem, synthetic, monkeypatch
+):
+    """If the calibrated film was tauter or more uneven than estimated, so is the film after warming."""
+    monkeypatch.setattr(FilmCharges, "even", lambda *_: synthetic)
+    contact = np.array([[3.0, 2.0, 0.5], [-5.0, 1.0, 1.5]])
+
+    def charges_after(values):
+        calibrated = _ChangedFilm(0.0, synthetic, values, np.eye(values.size))
+        return _ChangedFilm.solve(calibrated, -0.3, None).linearised(contact)
+
+    values = uneven_film(problem).film_values
+    _, derivatives = charges_after(values)
+    for name in ("pretension", "tension_difference", "young"):
+        index = synthetic.prior.index(name)
+        step = 1e-4 * np.eye(values.size)[index]
+        expected = (charges_after(values + step)[0] - charges_after(values - step)[0]) / 2e-4
+        np.testing.assert_allclose(derivatives[:, :, index], expected, rtol=1e-4)
 
 
 def test_no_node_makes_a_film_slack_in_one_direction(problem):
@@ -40,12 +61,13 @@ def test_no_node_makes_a_film_slack_in_one_direction(problem):
 def test_node_at_which_the_charges_are_unknown_is_left_out(problem, synthetic, monkeypatch, caplog):
     """Otherwise, the fit to its charges would also spoil the charges at the other nodes."""
 
-    def factors(_charges, _film, contact, _node_MPa, _executor):
+    def factors(_films, contact):
         ratio = 0.5 * np.random.default_rng(3).standard_normal((len(contact), 3, 4))
         return 1.0 + ratio * np.array([0.0, 0.0, 1.0])[:, None]
 
     monkeypatch.setattr(film_network, "_nodes", lambda _: np.array([-0.3, 0.0, 0.9]))
     monkeypatch.setattr(film_network, "_tension_factors", factors)
+    monkeypatch.setattr(FilmCharges, "even", lambda *_: synthetic)
     series = film_network.compact_charges(problem.domain, synthetic, uneven_film(problem), None)
     assert series.node_MPa.tolist() == [-0.3, 0.0]
     assert "changes from -0.3 to +0 MPa can be followed" in caplog.text

@@ -6,8 +6,8 @@ The file is in the same folder as `model.onnx`. It contains these arrays, with t
     format           version of the format
     series           coefficients c, shape (n_node, degree + 1, degree + 1, force_degree + 1, n_electrode)
     node_MPa         values of t at the nodes, shape (n_node,), MPa
-    directions       coefficients of d, shape (degree + 1, degree + 1, force_degree + 1, K, n_electrode); may be missing
-                     if K = 0. The degrees may differ from those of `series`
+    directions       coefficients of d and d', shape (degree + 1, degree + 1, force_degree + 1, 2, K, n_electrode); may
+                     be missing if K = 0. The degrees may differ from those of `series`
     log_size         Chebyshev coefficients of ln S as a function of l; missing if all charges are positive
     radius_mm        radius r of the domain, mm
     force_N          smallest and largest force of the domain, N
@@ -33,7 +33,7 @@ from isocharge.serve.model.charge_series import ChargeSeries
 FILE = "charges.npz"
 """Name of the file in a version folder."""
 
-FORMAT = 2
+FORMAT = 3
 """Version of the format of the file. Files of the first version contain no version."""
 
 ADVICE = "copy the model's folder again, or calibrate or train again"
@@ -92,7 +92,7 @@ def read_charge_map(version_folder: Path, electrodes: tuple[str, ...]) -> Charge
             electrodes=electrodes,
             coefficients=coefficients.astype(float),
             node_MPa=arrays["node_MPa"],
-            directions=arrays.get("directions", np.zeros((1, 1, 1, 0, 1))).astype(float),
+            directions=arrays.get("directions", np.zeros((1, 1, 1, 2, 0, 1))).astype(float),
             log_size=arrays.get("log_size"),
             is_folded=bool(arrays["is_folded"]),
             **{name: float(arrays[name]) for name in NUMBERS},

@@ -20,8 +20,9 @@ A calibrated film may change. The map then also depends on the state of the film
   t, which are called nodes. Between the nodes, the coefficients are interpolated by a polynomial (Lagrange). A film
   whose pretension cannot be followed has the single node 0.
 - z_k is the change of the film along direction k, in standard deviations. A direction is a linear combination of
-  properties of the film that remained uncertain after the calibration. A change adds z_k d_ke(x, y, F) to v_e, where
-  d_ke is another Chebyshev series.
+  properties of the film that remained uncertain after the calibration. A change adds z_k (d_ke + t d'_ke) to v_e, where
+  d_ke(x, y, F) and d'_ke(x, y, F) are further Chebyshev series. The second one is needed because some combinations of
+  properties hardly change the charges of the calibrated film, but those of a film with another pretension.
 """
 
 from dataclasses import dataclass, field
@@ -175,8 +176,9 @@ class ChargeSeries:
         coefficients: Coefficients of v at each node, shape (n_node, degree + 1, degree + 1, force_degree + 1,
             n_electrode).
         node_MPa: Changes t of the mean pretension at the nodes, shape (n_node,), MPa, ascending and containing 0.
-        directions: Coefficients of the changes of v by one unit of each direction, shape (degree + 1, degree + 1,
-            force_degree + 1, K, n_electrode). By default, the map has no directions.
+        directions: Coefficients of the changes d of v by one unit of each direction, and of their derivatives d' with
+            respect to t, 1/MPa, shape (degree + 1, degree + 1, force_degree + 1, 2, K, n_electrode). By default, the
+            map has no directions.
         log_size: Chebyshev coefficients of ln S as a function of l; None if all charges are positive.
         is_folded: Whether different contacts of the domain have the same charges. A service then tracks contacts with a
             `ContactMixture`.
@@ -191,7 +193,7 @@ class ChargeSeries:
     electrodes: tuple[str, ...]
     coefficients: Array
     node_MPa: Array = field(default_factory=lambda: np.zeros(1))
-    directions: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 0, 1)))
+    directions: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 2, 0, 1)))
     log_size: Array | None = None
     is_folded: bool = False
     charge_std: float = 0.0
@@ -202,7 +204,7 @@ class ChargeSeries:
     @property
     def direction_count(self) -> int:
         """Number K of directions."""
-        return int(self.directions.shape[3])
+        return int(self.directions.shape[4])
 
     def charges(self, contact: Array) -> Array:
         """Compute the charges of contacts on the calibrated film.
@@ -251,14 +253,21 @@ class ChargeSeries:
         # Evaluate v at the nodes, and the change of v by each direction. An axis of length 4 contains the value and its
         # derivatives with respect to the three coordinates of the contact.
         at_nodes = self._node_series.values_and_derivatives(nearest, excess).reshape(n_contact, 4, -1, n_electrode)
-        by_directions = self._direction_series.values_and_derivatives(nearest, excess)
-        by_directions = by_directions.reshape(n_contact, 4, self.direction_count, n_electrode)
+        at_zero, by_tension = np.moveaxis(
+            self._direction_series.values_and_derivatives(nearest, excess).reshape(
+                n_contact, 4, 2, self.direction_count, n_electrode
+            ),
+            2,
+            0,
+        )
+        by_directions = at_zero + pretension[:, None, None, None] * by_tension
 
         # Interpolate between the nodes (index k), and add the changes by the directions (index d). The other indices
         # are the press (n), the value or one of its derivatives (s) and the electrode (e).
         weights, weight_slopes = interpolation_weights(self.node_MPa, pretension)  # shape (n, n_node)
         value = np.einsum("nk,nske->nse", weights, at_nodes) + np.einsum("nd,nsde->nse", directions, by_directions)
         by_pretension = np.einsum("nk,nke->ne", weight_slopes, at_nodes[:, 0])
+        by_pretension += np.einsum("nd,nde->ne", directions, by_tension[:, 0])
         value_by_state = np.stack([by_pretension, *by_directions[:, 0].swapaxes(0, 1)], axis=2)
 
         charge_pC, charge_per_value, by_contact = self._charges(value, nearest, excess)
@@ -277,7 +286,7 @@ class ChargeSeries:
 
     @cached_property
     def _direction_series(self) -> Series:
-        """Series of the changes of v by all directions. Directions and electrodes share the last axis."""
+        """Series of d and d' of all directions. They, the directions and the electrodes share the last axis."""
         return Series(self.directions.reshape(*self.directions.shape[:3], -1))
 
     def _nearest_in_domain(self, contact: Array) -> tuple[Array, Array]:

@@ -11,8 +11,10 @@ The charges of four electrodes have one degree of freedom more than a contact (x
 changes, for example because the room becomes warmer by 1 K, no contact explains the charges of touches exactly. Each
 touch therefore updates the estimate of the state. An iterated extended Kalman filter finds the most probable state
 together with the contact of the touch. The estimate from the earlier touches is the Gaussian prior of the state, and
-the contact has no prior. Before each touch, the covariance of the state moves a little towards that before the first
-touch. A sudden change of the film is therefore followed within about twenty touches.
+the contact has no prior. Before each touch, the variances of the pretension, the gains and the offset move a little
+towards those before the first touch. A sudden change of the pretension is therefore followed within about twenty
+touches. The changes along the uncertain directions belong to properties that a film keeps, so that their variances only
+decrease.
 
 The network was trained for the film as it was calibrated. The charges of a frame are therefore converted into charges
 that the same contact would cause on the calibrated film, and the network computes the contact from the converted
@@ -127,16 +129,25 @@ The pretension of a nearly slack film is always close to its lower end.
 """
 
 FADING_TOUCHES = 256
-"""Number of touches after which the knowledge from a touch would have decreased to 1/e.
+"""Number of touches after which the pretension would be almost as uncertain again as before the first touch.
 
 With a larger number, a sudden change of a film that did not change before is hardly noticed. With a smaller one, forces
 are less accurate.
 """
 
+SLOW_FADING_TOUCHES = 2 * FADING_TOUCHES
+"""The same number for the gains and the offset, which change more slowly."""
+
+UNCHANGED_ODDS = 0.5
+"""Odds, before the first touch, that the pretension has not changed since the calibration."""
+
 MEMORY_TOUCHES = 16
 """Number of touches after which the weight of a touch in this mean has decreased to 1/e."""
 
-SMALLEST_ERROR_SCALE = 0.2
+EXPECTED_TOUCHES = 3
+"""Number of touches as which the expected mean, 1, counts at first."""
+
+SMALLEST_ERROR_SCALE = 0.1
 """Smallest scale of the error covariance of touches, dimensionless.
 
 With a smaller scale, the statement is too narrow for films that the charge map does not describe well.
@@ -224,6 +235,9 @@ class FilmFollower(Stage):
         std[self._gains] = GAIN_STD
         std[self._offset] = self._offset_std_pC
         self._initial_std = np.maximum(std, SMALLEST_STD)
+        self._fading_touches = np.full(std.size, math.inf)  # for each unknown
+        self._fading_touches[0] = FADING_TOUCHES
+        self._fading_touches[self._gains.start :] = SLOW_FADING_TOUCHES
         highest = MAX_DEVIATION * self._initial_std
         lowest = -highest
         lowest[0], highest[0] = series.node_MPa[[0, -1]]
@@ -293,7 +307,8 @@ class FilmFollower(Stage):
         elapsed_hours = max(clock_s - self._latest_touch_s, 0.0) / 3600.0
         self._latest_touch_s = clock_s
         self._covariance[0, 0] += self._rule.drift_MPa_per_root_hour**2 * elapsed_hours
-        self._covariance += (np.diag(self._initial_std**2) - self._covariance) / FADING_TOUCHES
+        lost_variance = np.maximum(self._initial_std**2 - self._covariance.diagonal(), 0.0)
+        self._covariance += np.diag(lost_variance / self._fading_touches)
         touch_offset_pC = self._offset_std_pC * self._offset_ratio
         model_error_pC = self._series.charge_std * charge_pC
         variance_pC2 = self.predictor.noise.variance(charge_pC) + model_error_pC**2
@@ -312,7 +327,8 @@ class FilmFollower(Stage):
 
         # Twice the cost is the sum of the squared residuals, in which large residuals have little weight. The residuals
         # are divided by the scaled errors. Multiply by the scale, so that the sum refers to the unscaled errors.
-        self._mean_square += (2.0 * scale * estimate.cost - self._mean_square) / MEMORY_TOUCHES
+        mean_touches = min(self._touch_count + EXPECTED_TOUCHES, MEMORY_TOUCHES)
+        self._mean_square += (2.0 * scale * estimate.cost - self._mean_square) / mean_touches
         is_changed = np.abs(estimate.state) > CLEAR_CHANGE * np.sqrt(self._covariance.diagonal())
         is_at_bound = is_changed & np.any(estimate.state == self._state_bounds, axis=0)
         has_implausible_state = bool(is_at_bound[0] or is_at_bound[self._offset])  # the pretension or the offset
@@ -336,16 +352,17 @@ class FilmFollower(Stage):
         """Compute the state of the film for which contacts are corrected.
 
         The pretension may have changed, or it may not have changed. The state is the mean over both cases, weighted by
-        their probabilities. Before the touches, both cases have the probability 1/2. The touches multiply the odds of
-        the second case by the ratio of the probability densities of no change (t = 0) after and before the touches
-        (Savage-Dickey ratio, Dickey 1971).
+        their probabilities. The touches multiply the odds of the second case, before them `UNCHANGED_ODDS`, by the
+        ratio of the probability densities of no change (t = 0) after and before the touches (Savage-Dickey ratio,
+        Dickey 1971).
 
         The covariance remains that of a film which has changed, because hardly any film keeps its pretension exactly.
         Added to it is the outer product of the shift between the two cases, times the probability of no change.
         """
         change_MPa = self._state[0]
         variance = self._covariance[0, 0]
-        odds = self._initial_std[0] / math.sqrt(variance) * math.exp(-0.5 * change_MPa**2 / variance)
+        density_ratio = self._initial_std[0] / math.sqrt(variance) * math.exp(-0.5 * change_MPa**2 / variance)
+        odds = UNCHANGED_ODDS * density_ratio
         probability = odds / (1.0 + odds)
 
         # Without a change, the other unknowns have their conditional distribution for t = 0.

@@ -7,7 +7,6 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.presses.measured_presses import MeasuredPresses
-from isocharge.simulate import FilmSlopes
 from isocharge.simulate.solver.assembly import single_threaded_blas
 from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.diagnosis import (
@@ -20,7 +19,7 @@ from isocharge.train.calibration.diagnosis import (
     unexplained_error,
 )
 from isocharge.train.calibration.estimator import Estimation, estimate
-from isocharge.train.calibration.film_charges import PROBE_RADIUS, STEP, FilmCharges, solve_even_map
+from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.press_data import PressData
 from isocharge.train.calibration.problem import CalibrationProblem, domain_words
@@ -147,15 +146,8 @@ def solve_even(
             Imperfections are ignored.
     """
     layout = problem.prior.layout
-    prior = layout.prior
-    even_values = prior.even(problem.prior.mean[layout.film] if values is None else values)
-    film = solve_even_map(prior, even_values, problem.solved_domain, executor)
-    larger_probe = None  # map of a larger probe, for the derivatives with respect to the radius of the probe
-    is_radius = np.array(prior.names) == PROBE_RADIUS
-    if is_radius.any():
-        larger_values = even_values + STEP * prior.std * is_radius
-        larger_probe = solve_even_map(prior, larger_values, problem.solved_domain, executor)
-    return FilmCharges(prior, even_values, film, FilmSlopes.build(film, executor=executor), larger_probe)
+    film_values = problem.prior.mean[layout.film] if values is None else values
+    return FilmCharges.even(layout.prior, film_values, problem.solved_domain, executor)
 
 
 def _fit_even_film(

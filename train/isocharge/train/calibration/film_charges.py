@@ -53,6 +53,24 @@ class FilmCharges:
     slopes: FilmSlopes
     larger_probe: ForwardMap | None
 
+    @classmethod
+    def even(cls, prior: FilmPrior, values: Array, domain: Domain, executor: Executor | None) -> "FilmCharges":
+        """Solve the axisymmetric film with given properties under an axisymmetric probe, at a few presses.
+
+        Args:
+            prior: Declarations of the properties, with the described sensor and probe.
+            values: Properties of the film, shape (n_property,). Imperfections are ignored.
+            domain: Contacts for which the charges are needed.
+            executor: Executor that runs the solves; None for this process.
+        """
+        even_values = prior.even(values)
+        film = solve_even_map(prior, even_values, domain, executor)
+        larger_probe = None  # map of a larger probe, for the derivatives with respect to the radius of the probe
+        is_radius = np.array(prior.names) == PROBE_RADIUS
+        if is_radius.any():
+            larger_probe = solve_even_map(prior, even_values + STEP * prior.std * is_radius, domain, executor)
+        return cls(prior, even_values, film, FilmSlopes.build(film, executor=executor), larger_probe)
+
     def solved(self, values: Array, executor: Executor | None) -> "FilmCharges":
         """Solve a similar film under the probe itself, even if the probe is not circular, and return its charges.
 

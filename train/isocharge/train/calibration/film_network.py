@@ -6,12 +6,13 @@ noise. Its standard deviations therefore contain the noise and everything that i
 The posterior distribution has many unknowns, of which only a few linear combinations change the charges. These
 combinations are the directions of the compact charge map (`ChargeSeries`), from which both the training and the live
 follower know what is uncertain. The nodes of the map are films with other pretensions. Their charges are those of the
-calibrated film, times the ratio of the charges of nearly axisymmetric films with both pretensions.
+calibrated film, times the ratio of the charges of nearly axisymmetric films with both pretensions. They also give
+the derivatives of the directions with respect to the pretension.
 """
 
 import logging
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,11 +20,11 @@ from isocharge.common.arrays import Array
 from isocharge.common.files import sha256_of
 from isocharge.serve.model.charge_series import CHUNK_SIZE, ChargeSeries, series_size
 from isocharge.serve.presses.measured_presses import CONTACT
-from isocharge.simulate import Domain, FilmSlopes, Sweep
+from isocharge.simulate import Domain, Sweep
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.film_properties import PRETENSION, UNEVEN_TENSIONS
 from isocharge.simulate.solver.stress_limit import yield_force
-from isocharge.train.calibration.film_charges import FilmCharges, solve_even_map
+from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import FilmEstimate, discrepancy_jacobian
 from isocharge.train.data.charge_fit import fit_film_series, fit_series
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
@@ -74,23 +75,81 @@ def compact_charges(
     discrepancy = discrepancy_jacobian(film_charge, contact, charges.domain) @ film.values[film.layout.coefficients]
     charge = film_charge + discrepancy  # most probable charges without offset, shape (n, n_electrode)
     names = charges.prior.sensor.electrode_names
-    node_MPa = np.zeros(1)
-    node_charge = charge[:, None]
+    calibrated = _ChangedFilm(0.0, charges, film.film_values, np.eye(film.film_values.size))
+    films = [calibrated]
     if len(names) > len(CONTACT):  # three charges only determine the contact
-        node_MPa = _nodes(film)
-        node_charge = node_charge * _tension_factors(charges, film, contact, node_MPa, executor)
+        films = [_ChangedFilm.solve(calibrated, change_MPa, executor) for change_MPa in _nodes(film).tolist()]
+    node_MPa = np.array([one.change_MPa for one in films])
+    node_charge = charge[:, None] * _tension_factors(films, contact)
     series = _fit_followable_nodes(domain, names, contact, node_charge, node_MPa)
     few_contacts = slice(DIRECTION_CONTACTS)
-    changes = _directions(charges, film, contact[few_contacts], charge[few_contacts])
+    followed_films = [one for one in films if one.change_MPa in series.node_MPa]
     return replace(
         series,
-        directions=_fit_directions(series, contact[few_contacts], charge[few_contacts], changes),
+        directions=_directions(series, film, calibrated, followed_films, contact[few_contacts], charge[few_contacts]),
         # A film is at most as well described as its charges can be measured.
         charge_std=max(series.charge_std, film.noise.gain),
         offset_pC=film.value("offset"),
         pretension_MPa=film.value(PRETENSION.name),
         tension_std_MPa=PRETENSION.drift,
     )
+
+
+@dataclass(frozen=True)
+class _ChangedFilm:
+    """Film whose tension differs from that of the calibrated film by the same amount in all directions.
+
+    Attributes:
+        change_MPa: Change of the pretension, MPa.
+        charges: Charges of a solved film and of similar films. Unless the change is that of the calibrated film itself,
+            the solved film is axisymmetric.
+        values: Properties of the changed film, shape (n_property,).
+        by_calibrated: Derivatives of the properties with respect to those of the calibrated film, shape (n_property,
+            n_property).
+    """
+
+    change_MPa: float
+    charges: FilmCharges
+    values: Array
+    by_calibrated: Array
+
+    @classmethod
+    def solve(cls, calibrated: "_ChangedFilm", change_MPa: float, executor: Executor | None) -> "_ChangedFilm":
+        """Solve the axisymmetric film with a changed pretension.
+
+        Args:
+            calibrated: The calibrated film.
+            change_MPa: Change of the pretension, MPa.
+            executor: Executor that runs the solves; None for this process.
+        """
+        charges = calibrated.charges
+        tension = charges.prior.index(PRETENSION.name)
+        uneven = [charges.prior.index(name) for name in UNEVEN_TENSIONS]
+        values = calibrated.values.copy()
+        values[tension] += change_MPa
+        # The values contain the uneven parts of the tension as shares of the mean tension. In MPa, they do not change.
+        share_ratio = calibrated.values[tension] / values[tension]
+        values[uneven] *= share_ratio
+        by_calibrated = np.eye(values.size)
+        by_calibrated[uneven, uneven] = share_ratio
+        by_calibrated[uneven, tension] = calibrated.values[uneven] * change_MPa / values[tension] ** 2
+        even_charges = FilmCharges.even(charges.prior, values, charges.domain, executor)
+        return cls(change_MPa, even_charges, values, by_calibrated)
+
+    def linearised(self, contact: Array) -> tuple[Array, Array]:
+        """Compute charges, and their derivatives with respect to the unknowns of the calibrated film.
+
+        The unknowns are the properties of the film and the coefficients of the discrepancy.
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Charges, shape (n, n_electrode), pC, and derivatives, shape (n, n_electrode, n_unknown), pC per unit.
+        """
+        charge, _, by_property = self.charges.linearised(self.values, contact)
+        by_coefficient = discrepancy_jacobian(charge, contact, self.charges.domain)
+        return charge, np.concatenate([by_property @ self.by_calibrated, by_coefficient], axis=2)
 
 
 def _fit_followable_nodes(
@@ -122,29 +181,6 @@ def _fit_followable_nodes(
     return _fit_followable_nodes(domain, electrodes, contact, charge[:, is_nearer], remaining_MPa)
 
 
-def _fit_directions(series: ChargeSeries, contact: Array, charge: Array, changes: Array) -> Array:
-    """Fit polynomials to the effects of the directions, in which the charges are uncertain.
-
-    A charge map contains values v instead of charges. If v is the logarithm of the charge, a small change of the charge
-    divided by the charge is the change of v. Otherwise, v is the charge divided by the typical size of the charges at
-    the same force.
-
-    Args:
-        series: Map of the charges without directions.
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        charge: Their charges, shape (n, n_electrode), pC.
-        changes: Changes of the charges by each direction, shape (n, n_direction, n_electrode), pC.
-
-    Returns:
-        Coefficients, as in `ChargeSeries.directions`.
-    """
-    unit_contact = series.domain.to_unit(contact)
-    charge_per_value = charge if series.log_size is None else series_size(series.log_size, unit_contact[:, 2])[0]
-    value_changes = changes / charge_per_value[:, None]
-    coefficients = fit_series(unit_contact, value_changes.reshape(len(contact), -1), *DIRECTION_DEGREES)
-    return coefficients.reshape(*coefficients.shape[:3], *changes.shape[1:])
-
-
 def _nodes(film: FilmEstimate) -> Array:
     """Return the changes of the pretension at the nodes, of which none makes the film slack, shape (n_node,), MPa."""
     node_MPa = np.array(NODES_MPa)
@@ -154,75 +190,79 @@ def _nodes(film: FilmEstimate) -> Array:
     return np.unique(np.where(node_MPa < 0.0, factor * node_MPa, node_MPa))
 
 
-def _tension_factors(
-    charges: FilmCharges, film: FilmEstimate, contact: Array, node_MPa: Array, executor: Executor | None
-) -> Array:
+def _tension_factors(films: list[_ChangedFilm], contact: Array) -> Array:
     """Compute the factors by which changes of the pretension multiply the charges.
 
-    The tension changes equally in all directions. For each change, an axisymmetric film under a circular probe is
-    solved, and the imperfections of an uneven film are added as first-order changes. If a change reverses the sign of a
-    charge, no factor can describe it, and the result is 1.
+    If a change reverses the sign of a charge, no factor can describe it, and the result is 1.
 
     Args:
-        charges: Charges of the solved film and of similar films.
-        film: The estimate.
+        films: Films with changed pretensions, one of them without a change.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        node_MPa: Changes of the pretension, shape (n_node,), MPa.
-        executor: Executor that solves the films; None for this process.
 
     Returns:
-        Factors, shape (n, n_node, n_electrode), dimensionless.
+        Factors, shape (n, n_film, n_electrode), dimensionless.
     """
-    prior = charges.prior
-    mean_tension = film.layout.index(PRETENSION.name)
-    uneven_tensions = [film.layout.index(name) for name in UNEVEN_TENSIONS]
-
-    def charges_after(change_MPa: float) -> Array:
-        """Solve the film after an equal change of its tension in all directions, and return its charges."""
-        values = film.film_values.copy()
-        values[mean_tension] += change_MPa
-        # The values contain the uneven parts of the tension as shares of the mean tension. In MPa, they do not change.
-        values[uneven_tensions] *= film.values[mean_tension] / values[mean_tension]
-        even_map = solve_even_map(prior, values, charges.domain, executor)
-        is_even = charges.film.sensor.film.is_axisymmetric
-        if is_even:
-            return even_map.charges(contact)
-        slopes = FilmSlopes.build(even_map, executor=executor)
-        # The values contain the same radius of the probe, so that its derivatives are not needed.
-        similar_films = FilmCharges(prior, prior.even(values), even_map, slopes, larger_probe=None)
-        return similar_films.charges(values, contact)
-
-    charge = np.stack([charges_after(change_MPa) for change_MPa in node_MPa], axis=1)
-    charge_before = charge[:, node_MPa == 0.0]
+    charge = np.stack([one.charges.charges(one.values, contact) for one in films], axis=1)
+    charge_before = charge[:, [one.change_MPa == 0.0 for one in films]]
     return np.divide(charge, charge_before, out=np.ones_like(charge), where=charge_before * charge > 0.0)
 
 
-def _directions(charges: FilmCharges, film: FilmEstimate, contact: Array, charge: Array) -> Array:
-    """Compute the directions in which the charges are uncertain, and omit effects below `MIN_DIRECTION`.
+def _directions(
+    series: ChargeSeries,
+    film: FilmEstimate,
+    calibrated: _ChangedFilm,
+    films: list[_ChangedFilm],
+    contact: Array,
+    charge: Array,
+) -> Array:
+    """Fit polynomials to the effects of the directions in which the charges of the film are uncertain.
+
+    The directions are combinations of the unknowns whose effects are uncorrelated. Directions whose effects are below
+    `MIN_DIRECTION` are left out. The effects count at the pretension of the calibrated film and at the two nodes beside
+    it, because a combination may only change the charges at another pretension.
+
+    A charge map contains values v instead of charges. If v is the logarithm of the charge, a small change of the charge
+    divided by the charge is the change of v. Otherwise, v is the charge divided by the typical size of the charges at
+    the same force.
 
     Args:
-        charges: Charges of the solved film and of similar films.
-        film: The estimate.
+        series: Map of the charges without directions.
+        film: The estimate of the calibrated film.
+        calibrated: The calibrated film.
+        films: The films at the nodes of the series, by ascending change of the pretension.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         charge: Their most probable charges, shape (n, n_electrode), pC.
 
     Returns:
-        Changes by one standard deviation of each direction, shape (n, n_direction, n_electrode), pC.
+        Coefficients, as in `ChargeSeries.directions`.
     """
-    layout = film.layout
-    *_, film_jacobian = charges.linearised(film.film_values, contact)
-    jacobian = np.concatenate([film_jacobian, discrepancy_jacobian(charge, contact, charges.domain)], axis=2)
-
-    # Square root of the covariance of the film's properties and of the coefficients
-    unknowns = np.r_[layout.film, layout.coefficients]
+    unknowns = np.r_[film.layout.film, film.layout.coefficients]
     eigenvalues, vectors = np.linalg.eigh(film.covariance[np.ix_(unknowns, unknowns)])
-    changes = jacobian @ (vectors * np.sqrt(np.maximum(eigenvalues, 0.0)))  # shape (n, n_electrode, n_unknown)
+    covariance_root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
+    unit_contact = series.domain.to_unit(contact)
+    size = None if series.log_size is None else series_size(series.log_size, unit_contact[:, 2])[0]
+
+    def value_changes(one: _ChangedFilm) -> Array:
+        """Return the changes of v by one standard deviation of each unknown, shape (n, n_electrode, n_unknown)."""
+        film_charge, jacobian = one.linearised(contact)
+        return np.asarray((jacobian / (film_charge if size is None else size)[:, :, None]) @ covariance_root)
+
+    changes = value_changes(calibrated)
+    slopes = np.zeros_like(changes)  # derivatives of the changes with respect to the pretension, 1/MPa
+    node = [one.change_MPa for one in films].index(0.0)
+    lower, upper = films[max(node - 1, 0)], films[min(node + 1, len(films) - 1)]
+    if lower is not upper:
+        slopes = (value_changes(upper) - value_changes(lower)) / (upper.change_MPa - lower.change_MPa)
 
     # Rotate the directions so that their effects are uncorrelated in units of the noise, and keep the large ones.
-    weighted = (changes / film.noise.sigma(charge)[:, :, None]).reshape(-1, changes.shape[2])
+    weight = ((charge if size is None else size) / film.noise.sigma(charge))[:, :, None]
+    weighted = np.stack([weight * (changes + one.change_MPa * slopes) for one in (lower, calibrated, upper)])
+    weighted = weighted.reshape(-1, unknowns.size)
     _, singular_values, rotation = np.linalg.svd(weighted, full_matrices=False)
-    kept = rotation[singular_values > MIN_DIRECTION * np.sqrt(charge.size)]
-    return np.asarray((changes @ kept.T).swapaxes(1, 2))
+    kept = rotation[singular_values > MIN_DIRECTION * np.sqrt(len(weighted))]
+    effects = np.stack([changes @ kept.T, slopes @ kept.T], axis=1).swapaxes(2, 3)  # (n, 2, n_direction, n_electrode)
+    coefficients = fit_series(unit_contact, effects.reshape(len(contact), -1), *DIRECTION_DEGREES)
+    return coefficients.reshape(*coefficients.shape[:3], *effects.shape[1:])
 
 
 def training_data(
