@@ -211,7 +211,7 @@ def test_the_base_tests_pass_with_the_lower_bounds_of_all_packages(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("constraints", ["", lower_bounds()], ids=["newest", "lower bounds"])
+@pytest.mark.parametrize("constraints", ["", lower_bounds()])
 @pytest.mark.parametrize("extra", sorted(COMMANDS_OF_EXTRAS))
 def test_the_wheel_with_an_extra_runs_the_readme_and_a_command_of_the_extra(wheel, tmp_path, extra, constraints):
     bin_folder = install([f"{wheel}[{extra}]"], tmp_path, 3000, constraints)

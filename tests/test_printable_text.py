@@ -12,26 +12,25 @@ from isocharge.common.errors import InputError, OutputError, cut, is_printable, 
 from isocharge.common.toml_text import to_toml
 from kept import ROOT
 
-FOREIGN = {
-    "escape sequence": ("A\x1b[2J", r"A\u001b[2J"),
-    "bell, return, delete": ("\aA\r\x7f", r"\u0007A\r\u007f"),
-    "C1 control": ("\x9b31m", r"\u009b31m"),
-    "right-to-left override": ("A\u202eB", r"A\u202eB"),
-    "bidi isolate": ("\u2066A\u2069", r"\u2066A\u2069"),
-    "zero-width": ("A\u200b\u200d\ufeff", r"A\u200b\u200d\ufeff"),
-    "invisible letter": ("\u3164A\u115f", r"\u3164A\u115f"),
-    "variation selector": ("A\ufe0f\U000e0101", r"A\ufe0f\udb40\udd01"),
-    "line separator": ("A\u2028B\nC", r"A\u2028B\nC"),
-    "lone surrogate": ("A\udc1b", r"A\udc1b"),
-    "tag": ("\U000e0041", r"\udb40\udc41"),
-}
+FOREIGN = [
+    ("A\x1b[2J", r"A\u001b[2J"),  # escape sequence
+    ("\aA\r\x7f", r"\u0007A\r\u007f"),  # bell, return, delete
+    ("\x9b31m", r"\u009b31m"),  # C1 control
+    ("A\u202eB", r"A\u202eB"),  # right-to-left override
+    ("\u2066A\u2069", r"\u2066A\u2069"),  # bidi isolate
+    ("A\u200b\u200d\ufeff", r"A\u200b\u200d\ufeff"),  # zero-width
+    ("\u3164A\u115f", r"\u3164A\u115f"),  # invisible letter
+    ("A\ufe0f\U000e0101", r"A\ufe0f\udb40\udd01"),  # variation selector
+    ("A\u2028B\nC", r"A\u2028B\nC"),  # line separator
+    ("A\udc1b", r"A\udc1b"),  # lone surrogate
+    ("\U000e0041", r"\udb40\udc41"),  # tag
+]
 
 HARMFUL_CATEGORIES = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
 
 
-@pytest.mark.parametrize("kind", FOREIGN)
-def test_foreign_characters_are_escaped(kind):
-    text, escaped = FOREIGN[kind]
+@pytest.mark.parametrize(("text", "escaped"), FOREIGN)
+def test_foreign_characters_are_escaped(text, escaped):
     assert printable(text) == escaped
     assert not is_printable(text)
 

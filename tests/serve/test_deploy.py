@@ -174,7 +174,7 @@ SERVICES = [
 ]
 
 
-@pytest.mark.parametrize(("words", "secrets"), SERVICES, ids=["unit", "stream unit", "container", "stream container"])
+@pytest.mark.parametrize(("words", "secrets"), SERVICES)
 def test_the_command_of_a_service_listens_with_tls_and_needs_the_token(
     words, secrets, tmp_path, monkeypatch, authority, trusted, start_command
 ):

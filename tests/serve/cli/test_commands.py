@@ -130,9 +130,7 @@ def test_stream_ends_cleanly_when_the_pipe_closes(board, start_stream):
     assert "Error" not in process.stderr.read()
 
 
-@pytest.mark.parametrize(
-    ("stop", "exit_code"), [(("--seconds", 0.2), 1), ((), 0)], ids=["option --seconds", "Ctrl-C or SIGTERM"]
-)
+@pytest.mark.parametrize(("stop", "exit_code"), [(("--seconds", 0.2), 1), ((), 0)])
 def test_stream_that_waits_for_its_port_can_be_stopped(tmp_path, stream, stop, exit_code):
     ctrl_c = threading.Timer(0.3, interrupt)
     if not stop:

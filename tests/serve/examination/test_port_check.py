@@ -145,7 +145,7 @@ def test_proposed_device_file_ignores_unused_inputs_and_reads_the_same_charges()
     assert (again.unit, again.unused) == ("pC", ("2", "5"))
 
 
-@pytest.mark.parametrize("electrodes", [FOUR[:3], ()], ids=["with a model", "without a model"])
+@pytest.mark.parametrize("electrodes", [FOUR[:3], ()])
 @pytest.mark.parametrize("notation", ["csv", "json"])
 def test_gain_by_electrode_applies_without_a_section_channels(electrodes, notation):
     device = device_from_table({"gain": {"pC_per_unit": {"A": 1.0, "B": 2.0, "C": -1.0}}}, "board.toml")

@@ -57,8 +57,8 @@ def test_old_readings_in_the_first_chunk_do_not_freeze_the_time():
 
 @pytest.mark.parametrize(
     ("jump_us", "n_resets"),
+    # The first and the last jump are restarts, the last one after half of the range.
     [(-2_000_000, 1), (700_000_000, 0), (800_000, 0), (MODULUS - 3_000_000_000, 0)],
-    ids=["a restart", "twelve minutes", "0.8 s", "a restart after half of the range"],
 )
 def test_clock_of_a_device_that_jumps(jump_us, n_resets):
     """After a jump, the host time follows the arrivals, and no step is longer than the others."""

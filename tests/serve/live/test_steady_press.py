@@ -172,7 +172,6 @@ def leaking_and_released(t):
             "the port was lost",
         ),
     ],
-    ids=["leaks", "moves", "shakes", "leaks and is released", "no rest before it", "short", "saturated", "lost port"],
 )
 def test_press_is_refused_with_a_reason_and_the_other_press_is_not(parts, flags, phases, reason):
     results = watch_presses(*parts, flags=flags)

@@ -15,7 +15,7 @@ from isocharge.serve.outputs.targets import Outputs, output_kind
 
 ELECTRODES = ("A", "B")
 
-live_and_replayed = pytest.mark.parametrize("is_live", [True, False], ids=["live", "replay"])
+live_and_replayed = pytest.mark.parametrize("is_live", [True, False])
 
 
 def context(**changes):

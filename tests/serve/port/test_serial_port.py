@@ -307,13 +307,13 @@ BYTES = (b"\xaa\x00", b"\xaa\x55", b"1\x002", b"\x7f")
     ("sent", "chunks"),
     [
         ((b"\x00\xff" * 20, b"\x01", b"\x02\n" * 700), (b"\x00\xff" * 20, b"\x01", b"\x02\n" * 700)),
+        # Lines without an end get one, unless the board ends its lines itself, also after a message.
         ((*TEXT, *BYTES), (*(line + b"\n" for line in TEXT), *BYTES)),
         ((b"1,2\n", b"3,", b"4\n"), (b"1,2\n", b"3,", b"4\n")),
         ((b"tared\n", *[b"1,2"] * 10), (b"tared\n", *[b"1,2"] * 8, *[b"1,2\n"] * 2)),
-        ((b"1,2\0",), (b"1,2\0\n",)),
+        ((b"1,2\0",), (b"1,2\0\n",)),  # C string
         ((b"\x01", b"", b"\x02"), (b"\x01", b"\x02")),
     ],
-    ids=["each", "lines without an end get one", "a board ends its lines itself", "a message", "C string", "empty"],
 )
 def test_datagrams_are_chunks(address, sent, chunks):
     with udp_port(address, *sent) as port:

@@ -47,7 +47,6 @@ def read(write):
         b"x_mm,y_mm,force_N,A,B,C,,\n1,2,0.5,10,20,30,,\n,,,,,,,\n",
         b"day,x_mm,y_mm,force_N,A,B,C\nMonday,1,2,0.5,10,20,30\n",
     ],
-    ids=["spreadsheet", "comments", "order and blanks", "quotes", "empty columns", "another column"],
 )
 def test_the_same_press_from_every_kind_of_file(read, text):
     np.testing.assert_equal(read(text).columns, read(f"{HEADER}\n1,2,0.5,10,20,30\n").columns)

@@ -78,7 +78,7 @@ def test_predict_and_predict_batch_refuse_wrong_charges(predictor, charge_pC, me
         predict(charge_pC)
 
 
-@pytest.mark.parametrize("gap", [1, 2], ids=["together", "with gaps"])
+@pytest.mark.parametrize("gap", [1, 2])
 def test_predict_into_fills_an_array(film, predictor, plain_session, gap):
     charges, out = np.zeros(3 * gap, np.float32)[::gap], np.full(10 * gap, -1.0, np.float32)[::gap]
     for row in film.golden_pC():

@@ -97,9 +97,7 @@ def test_common_shift_is_detected_with_a_smaller_p_value_than_chi_squared(checke
     assert any(note.startswith("positions are off by (0.0") for note in check.notes)
 
 
-@pytest.mark.parametrize(
-    ("known", "degrees"), [((True, False), 40), ((False, True), 20)], ids=["positions only", "forces only"]
-)
+@pytest.mark.parametrize(("known", "degrees"), [((True, False), 40), ((False, True), 20)])
 def test_presses_with_only_positions_or_only_forces(checked, known, degrees):
     check = checked(20, known=known)
     assert (check.fits, check.agreement.degrees) == (True, degrees)

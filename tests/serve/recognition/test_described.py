@@ -170,10 +170,9 @@ PATTERN = np.random.default_rng(0).bytes(98)
         b"",
         b"\xaa" * 1000,
         b"\xaa\x55\x01\x02\x03\x04" * 100,
-        (PATTERN + PATTERN[::-1] + PATTERN[:54]) * 100,
+        (PATTERN + PATTERN[::-1] + PATTERN[:54]) * 100,  # constant frames with many repeated pairs
         *(np.random.default_rng(seed).bytes(20_000) for seed in (0, 1)),
     ],
-    ids=["nothing", "a byte", "constant frames", "constant frames with many repeated pairs", "noise", "other noise"],
 )
 def test_noise_and_constant_bytes_are_not_recognised(data):
     assert described_frames_section([data], 2.0) is None
@@ -200,12 +199,11 @@ NUMBERS = np.arange(FRAMES)
 @pytest.mark.parametrize(
     ("number_format", "numbers", "rate_Hz", "field"),
     [
-        ("B", NUMBERS % 256, RATE_HZ, {"name": "seq", "type": "u8"}),
-        ("I", NUMBERS + (NUMBERS % 10 == 3), 1000.0, {"name": "t_ms", "type": "u32"}),
+        ("B", NUMBERS % 256, RATE_HZ, {"name": "seq", "type": "u8"}),  # counter that wraps
+        ("I", NUMBERS + (NUMBERS % 10 == 3), 1000.0, {"name": "t_ms", "type": "u32"}),  # repeats milliseconds
         ("I", 31250.0 / RATE_HZ * NUMBERS, RATE_HZ, {"name": "t_us", "type": "u32", "scale": 32.0}),
         ("I", 32768.0 / RATE_HZ * NUMBERS, RATE_HZ, {"name": "t_us", "type": "u32", "scale": 1e6 / 32768.0}),
     ],
-    ids=["counter that wraps", "clock that repeats milliseconds", "clock of 31250 Hz", "clock of 32768 Hz"],
 )
 def test_number_before_the_channels_is_a_counter_or_a_clock_with_a_usual_rate(number_format, numbers, rate_Hz, field):
     assert recognised_fields(f"<{number_format}4h", numbers, VALUES, rate_Hz)[0] == pytest.approx(field)

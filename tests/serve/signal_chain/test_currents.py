@@ -35,7 +35,7 @@ def run(values, **sections):
 
 
 @pytest.mark.parametrize("tau_s", [math.inf, 5.0])
-@pytest.mark.parametrize("force", [FORCE, np.zeros_like(FORCE)], ids=["two presses", "noise only"])
+@pytest.mark.parametrize("force", [FORCE, np.zeros_like(FORCE)])
 def test_integral_of_currents_is_the_charge_and_detects_touches(tau_s, force):
     charge_pC = 1000.0 * force[:, None] * RATIOS
     sections = {} if math.isinf(tau_s) else {"leak": {"tau_s": tau_s}}

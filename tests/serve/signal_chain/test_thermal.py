@@ -99,7 +99,7 @@ def warming_of(chain):
     return chain.stage(Warming)._charge_pC
 
 
-@pytest.mark.parametrize("leak", [{}, {"leak": {"tau_s": 1e9}}], ids=["no leak", "leak"])
+@pytest.mark.parametrize("leak", [{}, {"leak": {"tau_s": 1e9}}])
 def test_reading_is_corrected_in_the_frame_of_the_estimate(leak):
     """Without a leak, the warming is added to the tare, so that raw charge, tare and touch charge are consistent."""
     chain = chain_in_contact(**leak)

@@ -48,7 +48,7 @@ def expected(tmp_path_factory) -> dict[str, bytes]:
         return sweep_with(executor, tmp_path_factory.mktemp("one") / "presses")
 
 
-@pytest.mark.parametrize("pool", [local_workers, ThreadPoolExecutor], ids=["processes", "thread pool"])
+@pytest.mark.parametrize("pool", [local_workers, ThreadPoolExecutor])
 def test_bytes_from_two_workers_are_equal_to_those_from_one_process(tmp_path, expected, pool):
     with pool(2) as executor:
         assert sweep_with(executor, tmp_path / "presses") == expected

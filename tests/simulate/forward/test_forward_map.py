@@ -38,9 +38,7 @@ TRACED = Electrode.of_square("A", (5.0, 0.0), 3.0).with_trace(((5.0, 0.0), (-2.0
 """An electrode whose trace crosses the positions of the presses."""
 
 
-@pytest.fixture(
-    params=[Polygon.triangle(2.5), pytest.param(Ellipse(2.0, 1.4), marks=pytest.mark.slow)], ids=["triangle", "ellipse"]
-)
+@pytest.fixture(params=[Polygon.triangle(2.5), pytest.param(Ellipse(2.0, 1.4), marks=pytest.mark.slow)])
 def oriented_map(near_electrodes, request) -> ForwardMap:
     """A map of a probe whose orientation matters, for a sensor whose electrodes lie near the centre."""
     return kept(ForwardMap.build, near_electrodes, request.param, **QUICK)

@@ -65,10 +65,9 @@ def film():
     ("charge_map", "axis"),
     [
         (folded_map(), 0),
-        (folded_map(constant), 0),
+        (folded_map(constant), 0),  # a fourth charge
         (shaped_charges(lambda x, _: x, lambda _, y: y - y**2 / (2.0 * FOLD_X)), 1),
     ],
-    ids=["three charges", "constant fourth charge", "fold line along x"],
 )
 def test_find_folds_finds_a_known_fold_line(charge_map, axis):
     """Both sides of a line are compared across the line."""
@@ -143,7 +142,7 @@ def test_nearest_fold_agrees_with_signs_of_the_determinant_on_a_fine_grid(film):
     assert np.hypot(*folds[0]) == pytest.approx(np.hypot(x, y)[is_beyond_fold].min(), abs=0.1)
 
 
-@pytest.mark.parametrize("forces", [FORCES, (0.5, 0.5)], ids=["a range", "one force"])
+@pytest.mark.parametrize("forces", [FORCES, (0.5, 0.5)])
 def test_ambiguous_pairs_are_mirror_images_in_the_fold_line(forces):
     pairs = find_ambiguous_pairs(folded_map(forces=forces), REFERENCE, 0.5, places=400)
     assert pairs.first[:, 0] + pairs.second[:, 0] == pytest.approx(2.0 * FOLD_X, abs=0.5)

@@ -34,12 +34,11 @@ def test_area_in_a_disk_is_the_limit_of_areas_in_polygons(a, x, y, radius):
 @pytest.mark.parametrize(
     "corners",
     [
-        [0, 1, 2, 2 + 1j, 1j],
-        [0, 1, 1 + 1j, 0.5 + 0.2j, 1j],
+        [0, 1, 2, 2 + 1j, 1j],  # straight corner
+        [0, 1, 1 + 1j, 0.5 + 0.2j, 1j],  # reentrant corner
         [0, 1, 1, 1j],
         np.exp(0.8j * np.pi * np.arange(5)),  # it turns left at every corner, but it crosses itself
     ],
-    ids=["straight corner", "reentrant corner", "repeated corner", "star"],
 )
 def test_polygon_is_not_convex(corners):
     assert not is_convex(to_corners(np.array(corners)))

@@ -28,7 +28,7 @@ INNER = (PROBE, (8.0, 2.0), 1.0)
 NEAR_THE_RIM = (Circle(2.0), (28.0, 0.0), 0.1)
 
 
-@pytest.mark.parametrize("scene", [INNER, NEAR_THE_RIM], ids=["inner", "rim"])
+@pytest.mark.parametrize("scene", [INNER, NEAR_THE_RIM])
 def test_needed_resolution_is_that_of_the_press(scene):
     assert needed_resolution(FILM, *scene) == press(FILM, *scene).mesh.resolution
 
