@@ -119,7 +119,6 @@ def test_check_reports_missing_settings(board, message):
 @pytest.mark.parametrize(
     ("encode", "settings", "is_missing"),
     [(LINES, {"device": AT_REST}, True), (LINES, {}, False), (encode_frame, {"device": AT_REST}, False)],
-    ids=["lines and a leak", "lines", "frames with a clock and a leak"],
 )
 def test_missing_clock_is_reported_only_with_leak(encode, settings, is_missing):
     report = examined(charges(encode=encode), **settings)

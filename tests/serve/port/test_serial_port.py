@@ -342,9 +342,9 @@ def test_udp_address_in_use_is_refused(address):
     [
         ([(0.003, b"1,2\n"), (0.0069, b"3\n")], [REPEAT_TIME_s, 0.007, QUIET_TIME_s]),
         ([(0.5 * REPEAT_TIME_s, b"")] * 2, [REPEAT_TIME_s, 0.5 * REPEAT_TIME_s, 0.0]),
+        # The board first sends the request back.
         ([(0.001, b"?\n"), (0.05, b"1,2\n")], [REPEAT_TIME_s, REPEAT_TIME_s - 0.001, QUIET_TIME_s]),
     ],
-    ids=["the answer and the rate", "no answer", "the answer after the echo of the request"],
 )
 def test_the_next_request_waits(answers, waits_s, monkeypatch):
     clock = SimpleNamespace(now_s=100.0)

@@ -38,9 +38,9 @@ def test_derivatives_of_a_film_after_warming_are_those_with_respect_to_the_calib
     monkeypatch.setattr(FilmCharges, "even", lambda *_: synthetic)
     contact = np.array([[3.0, 2.0, 0.5], [-5.0, 1.0, 1.5]])
 
-    def charges_after(values):
+    def charges_after(values, change_MPa=-0.3):
         calibrated = _ChangedFilm(0.0, synthetic, values, np.eye(values.size))
-        return _ChangedFilm.solve(calibrated, -0.3, None).linearised(contact)
+        return _ChangedFilm.solve(calibrated, change_MPa, None).linearised(contact)
 
     values = uneven_film(problem).film_values
     _, derivatives = charges_after(values)
@@ -49,6 +49,8 @@ def test_derivatives_of_a_film_after_warming_are_those_with_respect_to_the_calib
         step = 1e-4 * np.eye(values.size)[index]
         expected = (charges_after(values + step)[0] - charges_after(values - step)[0]) / 2e-4
         np.testing.assert_allclose(derivatives[:, :, index], expected, rtol=1e-4)
+    values[synthetic.prior.index("pretension")] = 0.0
+    assert all(np.isfinite(array).all() for array in charges_after(values, 0.0))
 
 
 def test_no_node_makes_a_film_slack_in_one_direction(problem):

@@ -128,11 +128,13 @@ class _ChangedFilm:
         values = calibrated.values.copy()
         values[tension] += change_MPa
         # The values contain the uneven parts of the tension as shares of the mean tension. In MPa, they do not change.
-        share_ratio = calibrated.values[tension] / values[tension]
+        # Without any tension, there are no shares, and the smallest tension avoids a division by zero.
+        tension_MPa = max(float(values[tension]), 1e-9)
+        share_ratio = calibrated.values[tension] / tension_MPa
         values[uneven] *= share_ratio
         by_calibrated = np.eye(values.size)
         by_calibrated[uneven, uneven] = share_ratio
-        by_calibrated[uneven, tension] = calibrated.values[uneven] * change_MPa / values[tension] ** 2
+        by_calibrated[uneven, tension] = calibrated.values[uneven] * change_MPa / tension_MPa**2
         even_charges = FilmCharges.even(charges.prior, values, charges.domain, executor)
         return cls(change_MPa, even_charges, values, by_calibrated)
 
@@ -245,7 +247,8 @@ def _directions(
     def value_changes(one: _ChangedFilm) -> Array:
         """Return the changes of v by one standard deviation of each unknown, shape (n, n_electrode, n_unknown)."""
         film_charge, jacobian = one.linearised(contact)
-        return np.asarray((jacobian / (film_charge if size is None else size)[:, :, None]) @ covariance_root)
+        charge_per_value = np.where(film_charge > 0.0, film_charge, charge) if size is None else size
+        return np.asarray((jacobian / charge_per_value[:, :, None]) @ covariance_root)
 
     changes = value_changes(calibrated)
     slopes = np.zeros_like(changes)  # derivatives of the changes with respect to the pretension, 1/MPa
