@@ -109,7 +109,7 @@ def press_command(
         say(f"{output} has {len(presses)} presses; the session continues with them. Delete the file to begin again")
     elif output.exists() or not output.parent.is_dir():
         raise OutputError(f"{output}: expected a file in an existing folder; choose another output")
-    if earlier is not None:
+    if earlier:
         problem = replace(problem, earlier=read_earlier(earlier, problem, presses))
     with executor_for() as executor:
         say("solving the film of the sensor file")
@@ -148,7 +148,7 @@ def press_command(
     if session.refusal:  # the reason why the presses cannot be used for a calibration
         raise PressError(f"{output}: {session.refusal}")
     options = ["--sensor", sensor, "--probe", probe, "--radius", f"{radius:g}"]
-    if earlier is not None:
+    if earlier:
         options += ["--from", str(earlier)]
     if stress_limit != DEFAULT_STRESS_LIMIT:
         options += ["--stress-limit", f"{stress_limit:g}"]
