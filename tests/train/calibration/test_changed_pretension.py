@@ -35,7 +35,7 @@ def test_derivatives_of_a_film_after_warming_are_those_with_respect_to_the_calib
     problem, synthetic, monkeypatch
 ):
     """If the calibrated film was tauter or more uneven than estimated, so is the film after warming."""
-    monkeypatch.setattr(FilmCharges, "even", lambda *_: synthetic)
+    monkeypatch.setattr(FilmCharges, "of_even_film", lambda *_: synthetic)
     contact = np.array([[3.0, 2.0, 0.5], [-5.0, 1.0, 1.5]])
 
     def charges_after(values, change_MPa=-0.3):
@@ -69,7 +69,7 @@ def test_node_at_which_the_charges_are_unknown_is_left_out(problem, synthetic, m
 
     monkeypatch.setattr(film_network, "_nodes", lambda _: np.array([-0.3, 0.0, 0.9]))
     monkeypatch.setattr(film_network, "_tension_factors", factors)
-    monkeypatch.setattr(FilmCharges, "even", lambda *_: synthetic)
+    monkeypatch.setattr(FilmCharges, "of_even_film", lambda *_: synthetic)
     series = film_network.compact_charges(problem.domain, synthetic, uneven_film(problem), None)
     assert series.node_MPa.tolist() == [-0.3, 0.0]
     assert "changes from -0.3 to +0 MPa can be followed" in caplog.text

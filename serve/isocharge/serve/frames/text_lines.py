@@ -450,8 +450,8 @@ def header_names(header: str, line: Line) -> tuple[str, ...]:
 
     The result is empty if the text is no header of the line. A column of the header is a name, which begins with a
     letter. The mark of a comment, a label before the first column, and columns of the line that contain a text are
-    ignored. Words with only blanks between them, such as `the tare is done`, are no header of a line with another
-    separator.
+    ignored. If the numbers of the line are separated by commas, for example, then words with only blanks between them,
+    such as `the tare is done`, are a message and no header.
 
     Args:
         header: A line without numbers.

@@ -22,7 +22,7 @@ A calibrated film may change. The map then also depends on the state of the film
 - z_k is the change of the film along direction k, in standard deviations. A direction is a linear combination of
   properties of the film that remained uncertain after the calibration. A change adds z_k (d_ke + t d'_ke) to v_e, where
   d_ke(x, y, F) and d'_ke(x, y, F) are further Chebyshev series. The second one is needed because some combinations of
-  properties hardly change the charges of the calibrated film, but those of a film with another pretension.
+  properties hardly change the charges at the pretension of the calibration, but do so at another pretension.
 """
 
 from dataclasses import dataclass, field
@@ -250,17 +250,13 @@ class ChargeSeries:
         states = np.broadcast_to(state, (n_contact, 1 + self.direction_count))
         pretension, directions = states[:, 0], states[:, 1:]
 
-        # Evaluate v at the nodes, and the change of v by each direction. An axis of length 4 contains the value and its
+        # Evaluate v at the nodes, and d and d' of each direction. The axis of length 4 contains the value and its
         # derivatives with respect to the three coordinates of the contact.
         at_nodes = self._node_series.values_and_derivatives(nearest, excess).reshape(n_contact, 4, -1, n_electrode)
-        at_zero, by_tension = np.moveaxis(
-            self._direction_series.values_and_derivatives(nearest, excess).reshape(
-                n_contact, 4, 2, self.direction_count, n_electrode
-            ),
-            2,
-            0,
-        )
-        by_directions = at_zero + pretension[:, None, None, None] * by_tension
+        direction_values = self._direction_series.values_and_derivatives(nearest, excess)
+        direction_values = direction_values.reshape(n_contact, 4, 2, self.direction_count, n_electrode)
+        at_calibration, by_tension = direction_values[:, :, 0], direction_values[:, :, 1]  # d and d'
+        by_directions = at_calibration + pretension[:, None, None, None] * by_tension  # d + t d'
 
         # Interpolate between the nodes (index k), and add the changes by the directions (index d). The other indices
         # are the press (n), the value or one of its derivatives (s) and the electrode (e).
@@ -286,7 +282,7 @@ class ChargeSeries:
 
     @cached_property
     def _direction_series(self) -> Series:
-        """Series of d and d' of all directions. They, the directions and the electrodes share the last axis."""
+        """Series of d and d' of all directions at all electrodes, which share the last axis."""
         return Series(self.directions.reshape(*self.directions.shape[:3], -1))
 
     def _nearest_in_domain(self, contact: Array) -> tuple[Array, Array]:

@@ -382,9 +382,10 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
     Raises:
         OutputExists: If the version exists already, or a file has the folder's name.
         OutputError: If the folder cannot be written.
-        ModelError: If the name of the folder is not a valid name of a model, if the folder contains a model with
-            another number of electrodes, or if the folder contains files but no model, as a dataset, a version of a
-            model and a folder of several models do.
+        ModelError: If the name of the folder is not a valid name of a model, or if the folder contains a model with
+            another number of electrodes. Also if the folder contains other files, and is therefore no folder of one
+            model: it may be a dataset, one version of a model, or the folder in which several models have their
+            folders.
     """
     target = folder / str(version)
     refuse_existing(target)

@@ -143,9 +143,9 @@ class Tare(Stage):
     def _change_pC(self, frame: Frame) -> Array | float:
         """Return by how much the tare changes after a frame, shape (n_electrode,) or one number, pC.
 
-        While something touches the film, only its warming changes the tare. Otherwise, the charge that the frame has
-        above the tare belongs to the tare, which approaches it with the time constant `relax_s`. A large charge may be
-        the beginning of a touch, and counts only up to `noise_limit_pC`.
+        While something touches the film, only the warming of the film changes the tare. Otherwise, the charges of the
+        frame are those of a film at rest, and the tare approaches them with the time constant `relax_s`. A large charge
+        may be the beginning of a touch, and counts only up to `noise_limit_pC`.
 
         Args:
             frame: The frame, whose charges no longer contain the tare.

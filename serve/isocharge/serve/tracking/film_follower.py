@@ -10,10 +10,12 @@ The state of the film is a vector of these unknowns:
 The charges of four electrodes have one degree of freedom more than a contact (x, y, force). If the pretension of a film
 changes, for example because the room becomes warmer by 1 K, no contact explains the charges of touches exactly. Each
 touch therefore updates the estimate of the state. An iterated extended Kalman filter finds the most probable state
-together with the contact of the touch. The estimate from the earlier touches is the Gaussian prior of the state, and
-the contact has no prior. Before each touch, the variances of the pretension, the gains and the offset move a little
-towards those before the first touch. A sudden change of the pretension is therefore followed within about twenty
-touches. The changes along the uncertain directions belong to properties that a film keeps, so that their variances only
+together with the contact of the touch. The prior distribution of the state is Gaussian: the estimate from the earlier
+touches. The contact has no prior distribution, because nothing is known about it before the touch.
+
+The pretension, the gains and the offset may change between touches. Before each touch, their variances therefore
+increase a little, up to those before the first touch. A sudden change of the pretension is followed within about twenty
+touches. The changes along the uncertain directions belong to properties that a film keeps, so their variances only
 decrease.
 
 The network was trained for the film as it was calibrated. The charges of a frame are therefore converted into charges
@@ -129,29 +131,27 @@ The pretension of a nearly slack film is always close to its lower end.
 """
 
 FADING_TOUCHES = 256
-"""Number of touches after which the pretension would be almost as uncertain again as before the first touch.
+"""Number of touches that decides how fast the variance of the pretension increases between touches.
 
-With a larger number, a sudden change of a film that did not change before is hardly noticed. With a smaller one, forces
-are less accurate.
+If so many touches showed nothing about the pretension, 63 % of the knowledge from earlier touches would be lost. With a
+larger number, a sudden change of a film that did not change before is hardly noticed. With a smaller one, forces are
+less accurate.
 """
 
 SLOW_FADING_TOUCHES = 2 * FADING_TOUCHES
-"""The same number for the gains and the offset, which change more slowly."""
+"""The same number for the variances of the gains and of the offset, which change more slowly than the pretension."""
 
 UNCHANGED_ODDS = 0.5
-"""Odds, before the first touch, that the pretension has not changed since the calibration."""
+"""Odds, before the first touch, that the pretension has not changed since the calibration.
+
+With larger odds, the forces on a changed film are less accurate; with smaller odds, those on an unchanged film are.
+"""
 
 MEMORY_TOUCHES = 16
-"""Number of touches after which the weight of a touch in this mean has decreased to 1/e."""
-
-EXPECTED_TOUCHES = 3
-"""Number of touches as which the expected mean, 1, counts at first."""
+"""Number of touches after which the weight of a touch in the mean squared distance has decreased to 1/e."""
 
 SMALLEST_ERROR_SCALE = 0.1
-"""Smallest scale of the error covariance of touches, dimensionless.
-
-With a smaller scale, the statement is too narrow for films that the charge map does not describe well.
-"""
+"""Smallest scale of the error covariance of touches, dimensionless, in case the latest touches agree by chance."""
 
 
 class FollowRule(Rule, frozen=True, kw_only=True):
@@ -327,8 +327,7 @@ class FilmFollower(Stage):
 
         # Twice the cost is the sum of the squared residuals, in which large residuals have little weight. The residuals
         # are divided by the scaled errors. Multiply by the scale, so that the sum refers to the unscaled errors.
-        mean_touches = min(self._touch_count + EXPECTED_TOUCHES, MEMORY_TOUCHES)
-        self._mean_square += (2.0 * scale * estimate.cost - self._mean_square) / mean_touches
+        self._mean_square += (2.0 * scale * estimate.cost - self._mean_square) / MEMORY_TOUCHES
         is_changed = np.abs(estimate.state) > CLEAR_CHANGE * np.sqrt(self._covariance.diagonal())
         is_at_bound = is_changed & np.any(estimate.state == self._state_bounds, axis=0)
         has_implausible_state = bool(is_at_bound[0] or is_at_bound[self._offset])  # the pretension or the offset

@@ -435,8 +435,9 @@ class Bending:
             [ sqrt(beta) (L - s M)        -M                     ] [mu] = [0],
 
         where r is the right-hand side for W, beta is the bending stiffness, L is the matrix of the weak Laplacian, and
-        M is the diagonal mass matrix. The solution W does not depend on the constant s, which is `BENDING_SHIFT`. With
-        this constant, the matrix can be factorised without pivoting. The unknowns mu of interior nodes are eliminated.
+        M is the diagonal mass matrix. The solution W does not depend on the constant s, which is `BENDING_SHIFT`. It is
+        chosen so that the matrix can be factorised without pivoting. The unknowns mu of the interior nodes of each
+        element have been eliminated from the blocks that this method adds.
 
         Args:
             tangent: Matrices for (U1, U2, W, mu), shape (n_element, 4, n_local, 4, n_local). The entries of mu are

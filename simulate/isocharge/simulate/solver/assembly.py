@@ -131,7 +131,10 @@ class Assembly:
         self._indptr = np.concatenate([[0], np.cumsum(entries_per_column)]).astype(np.int32)
 
     def factor(self, matrix: Array) -> SolveTangent:
-        """Factorise the matrix of the mesh.
+        """Factorise the matrix of the mesh, which is the sum of the matrices of its elements.
+
+        The unknowns in the interior of an element belong to this element only. They are eliminated element by element,
+        so that a sparse matrix of the other unknowns remains, the skeleton matrix.
 
         Args:
             matrix: Symmetric element matrices, shape (n_element, unknowns_per_node, n_local, unknowns_per_node,
@@ -145,8 +148,8 @@ class Assembly:
         n_element, n_component, n_local, _, _ = matrix.shape
         element_matrix = matrix.reshape(n_element, n_component * n_local, n_component * n_local)
 
-        # Eliminate the interior unknowns of each element by static condensation. With the blocks A (interior), B
-        # (coupling) and C (sides), the Schur complement is C - B' A^-1 B.
+        # Eliminate the interior unknowns of each element (static condensation). With the blocks A (interior), B
+        # (coupling) and C (sides), the Schur complement C - B' A^-1 B remains for the skeleton matrix.
         coupling = element_matrix[:, interior[:, None], sides]  # B
         interior_block = element_matrix[:, interior[:, None], interior]  # A
         interior_inverse = np.linalg.inv(interior_block).astype(float, copy=False)  # A^-1
@@ -154,8 +157,8 @@ class Assembly:
         side_block = element_matrix[:, sides[:, None], sides]  # C
         schur_complement = side_block - coupling.transpose(0, 2, 1) @ reduced_coupling
 
-        # Add the Schur complements of all elements. The last sum is not used, because it contains the entries of fixed
-        # unknowns.
+        # Add the Schur complements of all elements. All entries of fixed unknowns are added to the last number of the
+        # result, which is not used.
         entry_count = self._indices.size + 1
         skeleton_entries = np.bincount(self._entry_positions, schur_complement.ravel(), entry_count)[:-1]
         skeleton_factor = _factorise(self._skeleton_matrix(skeleton_entries), "NATURAL")

@@ -147,7 +147,7 @@ def solve_even(
     """
     layout = problem.prior.layout
     film_values = problem.prior.mean[layout.film] if values is None else values
-    return FilmCharges.even(layout.prior, film_values, problem.solved_domain, executor)
+    return FilmCharges.of_even_film(layout.prior, film_values, problem.solved_domain, executor)
 
 
 def _fit_even_film(

@@ -54,14 +54,21 @@ class FilmCharges:
     larger_probe: ForwardMap | None
 
     @classmethod
-    def even(cls, prior: FilmPrior, values: Array, domain: Domain, executor: Executor | None) -> "FilmCharges":
-        """Solve the axisymmetric film with given properties under an axisymmetric probe, at a few presses.
+    def of_even_film(cls, prior: FilmPrior, values: Array, domain: Domain, executor: Executor | None) -> "FilmCharges":
+        """Solve a film without its imperfections, and return its charges and their derivatives.
+
+        The probe is axisymmetric as well, so that few presses need to be solved. `solved` takes the charges of the film
+        with its imperfections, and keeps these derivatives.
 
         Args:
             prior: Declarations of the properties, with the described sensor and probe.
             values: Properties of the film, shape (n_property,). Imperfections are ignored.
             domain: Contacts for which the charges are needed.
             executor: Executor that runs the solves; None for this process.
+
+        Raises:
+            SceneError: If some presses of the domain cannot exist.
+            SolveError: If a press has no equilibrium.
         """
         even_values = prior.even(values)
         film = solve_even_map(prior, even_values, domain, executor)

@@ -1,13 +1,16 @@
-"""Charge map and training data of a calibrated film.
+"""Compact charge map of a calibrated film, and the presses from which its network learns.
 
 The network of a calibrated film learns from presses on films that are drawn from the posterior distribution, with
 noise. Its standard deviations therefore contain the noise and everything that is not known about the film.
 
 The posterior distribution has many unknowns, of which only a few linear combinations change the charges. These
-combinations are the directions of the compact charge map (`ChargeSeries`), from which both the training and the live
-follower know what is uncertain. The nodes of the map are films with other pretensions. Their charges are those of the
-calibrated film, times the ratio of the charges of nearly axisymmetric films with both pretensions. They also give
-the derivatives of the directions with respect to the pretension.
+combinations are called directions. The compact charge map (`ChargeSeries`) contains the changes of the charges along
+each direction. The training uses them to draw films, and the live follower uses them to find out how the real film
+differs from the estimated one.
+
+The nodes of the map are films with other pretensions. Their charges are those of the calibrated film, times a ratio:
+that of the charges of two nearly axisymmetric films, with the other pretension and with that of the calibration. The
+changes along the directions are also computed for these films, because they depend on the pretension.
 """
 
 import logging
@@ -97,12 +100,12 @@ def compact_charges(
 
 @dataclass(frozen=True)
 class _ChangedFilm:
-    """Film whose tension differs from that of the calibrated film by the same amount in all directions.
+    """The calibrated film, or a film whose tension differs from it by the same amount in all directions.
 
     Attributes:
         change_MPa: Change of the pretension, MPa.
-        charges: Charges of a solved film and of similar films. Unless the change is that of the calibrated film itself,
-            the solved film is axisymmetric.
+        charges: Charges of a solved film and of similar films. For the calibrated film, it is the film that the
+            calibration has solved. For a changed film, it is axisymmetric.
         values: Properties of the changed film, shape (n_property,).
         by_calibrated: Derivatives of the properties with respect to those of the calibrated film, shape (n_property,
             n_property).
@@ -128,20 +131,20 @@ class _ChangedFilm:
         values = calibrated.values.copy()
         values[tension] += change_MPa
         # The values contain the uneven parts of the tension as shares of the mean tension. In MPa, they do not change.
-        # Without any tension, there are no shares, and the smallest tension avoids a division by zero.
+        # A film without tension has no shares. The smallest tension then avoids a division by zero.
         tension_MPa = max(float(values[tension]), 1e-9)
         share_ratio = calibrated.values[tension] / tension_MPa
         values[uneven] *= share_ratio
         by_calibrated = np.eye(values.size)
         by_calibrated[uneven, uneven] = share_ratio
         by_calibrated[uneven, tension] = calibrated.values[uneven] * change_MPa / tension_MPa**2
-        even_charges = FilmCharges.even(charges.prior, values, charges.domain, executor)
+        even_charges = FilmCharges.of_even_film(charges.prior, values, charges.domain, executor)
         return cls(change_MPa, even_charges, values, by_calibrated)
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """Compute charges, and their derivatives with respect to the unknowns of the calibrated film.
+        """Compute the charges of this film, and their derivatives with respect to the unknowns of the calibrated film.
 
-        The unknowns are the properties of the film and the coefficients of the discrepancy.
+        The unknowns are the properties of the film and the coefficients of the discrepancy; see `Layout`.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -219,9 +222,10 @@ def _directions(
 ) -> Array:
     """Fit polynomials to the effects of the directions in which the charges of the film are uncertain.
 
-    The directions are combinations of the unknowns whose effects are uncorrelated. Directions whose effects are below
-    `MIN_DIRECTION` are left out. The effects count at the pretension of the calibrated film and at the two nodes beside
-    it, because a combination may only change the charges at another pretension.
+    A direction is a linear combination of the unknowns. The combinations are chosen so that their effects on the
+    charges are uncorrelated, and those with effects below `MIN_DIRECTION` are left out. The effects are considered at
+    the pretension of the calibration and at the two nodes beside it, because a combination may change the charges only
+    at another pretension.
 
     A charge map contains values v instead of charges. If v is the logarithm of the charge, a small change of the charge
     divided by the charge is the change of v. Otherwise, v is the charge divided by the typical size of the charges at
