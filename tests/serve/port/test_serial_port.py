@@ -283,7 +283,6 @@ def udp_port(address, *datagrams):
 @pytest.mark.parametrize(
     ("datagrams", "lengths"),
     [([b"1,2,3\n"] * 20, [120]), ([b"\0" * 12, b"\0" * 5, b"\0" * 12], [12, 5, 12])],
-    ids=["lines", "bytes"],
 )
 def test_binary_datagrams_that_waited_are_not_joined(address, datagrams, lengths):
     """A datagram of another length would otherwise make the frames of the other datagrams unreadable."""

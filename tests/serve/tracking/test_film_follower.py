@@ -267,6 +267,13 @@ def test_models_that_cannot_be_followed_are_refused(series, tmp_path):
         new_follower(model_in(tmp_path, three))
 
 
+def test_a_bad_first_touch_does_not_mean_that_the_film_is_lost(series, model):
+    rng = np.random.default_rng(0)
+    _, charge = touches(series, np.zeros(3), rng, 8)
+    charge[0, 1] *= 1.2
+    assert not any(followed(model, charge, rng)[1])
+
+
 def test_contacts_are_corrected_from_the_first_touch(series, model):
     rng = np.random.default_rng(8)
     contact, charge = touches(series, [-0.4, 0.0, 0.0], rng, 31)

@@ -210,7 +210,6 @@ def test_errors_that_are_announced_after_noisy_presses_contain_the_noise(fit, pr
         (lambda p: replace(p, contact=p.contact + np.array([20.0, 0.0, 0.0])), r"and of .* N \(--radius\); is it"),
         (lambda p: replace(p, contact=p.contact[::-1].copy()), "no film of 'four-25um-biaxial' explains these 12"),
     ],
-    ids=["unknown", "outside", "mixed up"],
 )
 def test_presses_that_no_film_explains_are_refused(fit, press_film, change, message):
     presses = press_film(12, seed=21)

@@ -156,8 +156,10 @@ def say_missing_records(outputs: Outputs, state: str) -> None:
         state: What is printed about an output if the number is unknown.
     """
     for target, missing_records in outputs.not_written.items():
-        count = f"{missing_records} records not written, the oldest: the output was too slow"
-        say(f"{target}: {state if missing_records is None else count}")
+        if missing_records is None:
+            say(f"{target}: {state}")
+        else:
+            say(f"{target}: {missing_records} records not written, the oldest: the output was too slow")
 
 
 def summary(touch: TouchStream) -> str:
