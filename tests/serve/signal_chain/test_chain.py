@@ -41,7 +41,6 @@ def run(frames_pC, **sections):
         (rest(300) + 800.0, r"rests at 81\d.* pC, expected at most 100 pC; take off"),
         (rest(300, std_pC=50.0), "varies by"),
     ],
-    ids=["a resting weight", "a moving finger"],
 )
 def test_tare_gives_up_with_the_reason(charges_pC, message):
     with pytest.raises(TareError, match=message):

@@ -31,7 +31,6 @@ def step(n=2000, at=200, height=400.0, electrodes=3):
         (Amplifier(noise=CLEAN, tau=10.0), 10.0),
         (load_amplifier("clean"), np.inf),
     ],
-    ids=["1 s", "10 s", "clean"],
 )
 def test_held_charge_decays_exponentially(part, tau):
     """The charge arrives between two readings, half an interval before the second one on average."""

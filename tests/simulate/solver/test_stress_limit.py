@@ -50,7 +50,6 @@ def test_force_within_stress_reaches_the_stress_limit():
 @pytest.mark.parametrize(
     ("changes", "radius", "force_range"),
     [({"pretension": 30.0}, 1.0, (1e-3, 20.0)), ({"radius": 1.0, "thickness": 5e-4}, 0.02, (1e-6, 1e-3))],
-    ids=["taut", "small"],
 )
 def test_yield_force_of_a_taut_film_lies_in_the_range_and_that_of_a_small_film_is_not_rounded_to_zero(
     changes, radius, force_range
