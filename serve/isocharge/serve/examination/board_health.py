@@ -260,7 +260,7 @@ def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress
 
     - If the device file contains time constants of a leak, each frame must contain the time of a clock of the device.
     - If no press was held, the time constants of the amplifiers are requested, unless the device file contains them.
-      A press that was held shows whether they are needed, and its description states them.
+      If a press was held, it shows whether they are needed, and the description of the press states them.
 
     Args:
         capture: The frames, at least one.

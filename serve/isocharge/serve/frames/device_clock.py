@@ -130,7 +130,7 @@ class DeviceClock:
         return elapsed_s
 
     def _stamp_with_device(self, frame: Frame, t_us: int, modulus: int, arrival_s: float) -> None:
-        """Write the time of a frame from the clock of the device.
+        """Compute the time of a frame from the clock of the device, and write it into the frame.
 
         Args:
             frame: The frame, which is changed in place.

@@ -195,8 +195,8 @@ class TextParser(DelimitedParser):
         """Examine a line that does not have the recognised layout, and return the frames that become readable.
 
         Until a layout is recognised, lines with numbers are collected, and other lines are stored as possible headers.
-        As soon as `MAX_CYCLE_LINES` of these are stored, each next one is also counted as rejected. Later, a line is
-        rejected unless it is a header that names the columns without names.
+        Once `MAX_CYCLE_LINES` possible headers are stored, further lines without numbers are counted as rejected, too.
+        Later, a line is rejected unless it is a header that names the columns without names.
 
         Args:
             text: The line.
@@ -426,12 +426,12 @@ def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
     ]
 
     def order(first: int) -> tuple[float, bool, str]:
-        """Return a key that is the smallest for the first line of a frame."""
+        """Return a key by which the lines are sorted. The key of the first line of a frame is the smallest."""
         frame = fields_of_lines[first : first + cycle_length]
         clocks = [fields[name] for fields in frame for name in TIMES_US if name in fields]
         duration = clocks[-1] - clocks[0] if len(clocks) == cycle_length else 0.0
         first_name = next((name for name in frame[0] if name not in TIMES_US), "")
-        return duration, first_name != SEQ, first_name
+        return duration, first_name != SEQ, first_name  # False is smaller than True
 
     return min(range(cycle_length), key=order)
 

@@ -87,13 +87,13 @@ class ReadingStream:
         self._begin()
 
     def _begin(self) -> None:
-        """Begin without any byte."""
+        """Create the parser, the clock and the stages of a stream that has not received any byte."""
         self.parser = self._device.parser()
         self.clock = DeviceClock()
         self._stages = create_stages(self._setup)
         self._pending_flags: list[str] = []  # flags that the next frame gets
         self._previous_values: tuple[float, ...] = ()
-        self._readable_until = 0.0  # number of dropped bytes at the latest frame; infinite after a warning
+        self._dropped_at_frame = 0.0  # number of dropped bytes at the latest frame; infinite after a warning
 
     def tare(self) -> None:
         """Discard the tare and the present touch, and measure the tare again from the next quiet frames."""
@@ -127,7 +127,7 @@ class ReadingStream:
         parser = self.parser
         frames = parser.feed(chunk.data)
         if frames:
-            self._readable_until = parser.counts.bytes_dropped
+            self._dropped_at_frame = parser.counts.bytes_dropped
         self._check_recognised()
         self.clock.stamp(chunk, frames, parser.t_us_modulus)
         for frame in frames:
@@ -161,12 +161,12 @@ class ReadingStream:
             NoFramesError: If the stream has contained no frame.
         """
         counts = self.parser.counts
-        dropped_bytes = counts.bytes_dropped - self._readable_until
+        dropped_bytes = counts.bytes_dropped - self._dropped_at_frame
         if dropped_bytes <= max_bytes:
             return
         line = f", such as {shown(self.parser.unread_line)}" if self.parser.unread_line else ""
         if counts.frames:
-            self._readable_until = math.inf
+            self._dropped_at_frame = math.inf
             log.warning(
                 "no intact frame among the latest %d bytes%s; expected %s, as before: check the cable, and start again "
                 "if the board sends other frames now",
@@ -234,7 +234,7 @@ class TouchStream(ReadingStream):
         super().__init__(predictor.metadata.electrodes, device, predictor=predictor)
 
     def _begin(self) -> None:
-        """Begin without any byte, and with new stages that compute contacts."""
+        """Begin a stream as in the base class, with stages that also compute contacts."""
         super()._begin()
         self._set_model(self.predictor)
 
@@ -261,8 +261,8 @@ class TouchStream(ReadingStream):
     def use(self, predictor: Predictor) -> None:
         """Use another model with the same electrodes from the next frame on.
 
-        The tare, the state of the signal chain and the present touch are not changed. The estimates of the contact
-        stages, for example of the tracked contact and of the pretension of the film, begin again.
+        The tare, the state of the signal chain and the present touch are not changed. The tracker, the follower of the
+        film and all other contact stages start from their initial states again.
 
         Raises:
             ModelError: If the model has other electrodes or another order of the electrodes, or if a stage cannot use

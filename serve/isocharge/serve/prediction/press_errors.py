@@ -311,8 +311,8 @@ def chi_squared_deviate(statistic: ArrayLike, degrees: ArrayLike) -> Array:
 def chi_squared_survival(statistic: float, degrees: int) -> float:
     """Compute the probability that a chi-squared variable exceeds a value.
 
-    The error of a probability is below 0.03 with one degree of freedom, below 0.006 with more, and below a fifth of a
-    probability of 0.02 or less.
+    The error of the probability is below 0.03 with one degree of freedom, and below 0.006 with more. If the probability
+    is at most 0.02, its relative error is below a fifth.
 
     Args:
         statistic: The value, not negative.

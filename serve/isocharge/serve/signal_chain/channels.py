@@ -118,7 +118,7 @@ class Channels(Stage):
         if is_each_named_once and not advice:
             return tuple(index for (index,) in indices)
 
-        # The names may stand in the line of text in the order of the values, but not beside the values.
+        # A line of text may contain all names before or after the values, in the same order as the values.
         places = self._matches(tuple(word for text in frame.words for word in _words_of(text)))
         has_all_names = all(len(places_of_electrode) == 1 for places_of_electrode in places)
         has_other_count = len(frame.values) != len(self._electrodes)
@@ -129,7 +129,8 @@ class Channels(Stage):
         if has_other_count:
             return None
         if has_all_names:
-            return tuple(np.argsort(np.argsort(np.ravel(places))).tolist())  # rank of each electrode in the line
+            places_in_order = sorted(places)
+            return tuple(places_in_order.index(place) for place in places)
         if not _are_in_order(frame.names):
             raise self._assignment_error(frame)
         return tuple(range(len(self._electrodes)))

@@ -120,10 +120,10 @@ class Touch(Stage):
         self._touch_direction: Array | None = None  # sum of the directions of the frames of the latest touch
         self._base = np.zeros(n_electrode)  # charges that are no touch
         self._previous = np.zeros(n_electrode)  # charges of the previous frame
-        self._mean = np.zeros(n_electrode)  # exponential mean of the charges out of contact
-        self._has_drifted = False  # whether the charges rose too slowly at the beginning of this touch
+        self._idle_mean = np.zeros(n_electrode)  # exponential mean of the charges out of contact
+        self._rose_slowly = False  # whether the charges rose too slowly at the beginning of this touch
         self._is_contact = False
-        self._peak = 0.0  # largest size in this touch
+        self._peak_size = 0.0  # largest size in this touch
         self._rest_s = 0.0  # time for which the charges have been small
 
     @property
@@ -149,7 +149,7 @@ class Touch(Stage):
                 self._await(frame, charge, direction)
             self._previous = charge
         frame.is_contact = self._is_contact
-        if self._is_contact and self._has_drifted:
+        if self._is_contact and self._rose_slowly:
             frame.flags.append(DRIFT)
 
     def _continue(self, rule: TouchRule, charge: Array, direction: Array) -> None:
@@ -161,14 +161,16 @@ class Touch(Stage):
             direction: Sum of the directions of the earlier frames of the touch, shape (n_electrode,), dimensionless.
         """
         size = _norm(charge)
-        self._peak = max(self._peak, min(size, _norm(self._previous)))  # a spike of a single frame is not a peak
-        release_size = max((rule.release_share or 0.0) * self._peak, 0.5)
+        self._peak_size = max(
+            self._peak_size, min(size, _norm(self._previous))
+        )  # a spike of a single frame is not a peak
+        release_size = max((rule.release_share or 0.0) * self._peak_size, 0.5)
         reference = self._previous if self._setup.has_any_sign else self._rest_direction
         is_reversed = charge @ reference < 0.0
         if size < release_size or is_reversed:
             self._is_contact = False
             self._base = charge
-            self._mean = charge
+            self._idle_mean = charge
             self._rest_s = 0.0
         else:
             self._touch_direction = direction + charge / size
@@ -198,14 +200,14 @@ class Touch(Stage):
             self._base = charge  # a release or a drift
         elif change_size > 1.0:  # a touch begins
             self._is_contact = True
-            self._peak = min(size, _norm(self._previous))
+            self._peak_size = min(size, _norm(self._previous))  # a spike of a single frame is not a peak
             self._touch_direction = charge / max(size, 1.0)
-            self._has_drifted = _norm(self._mean - self._base) > 0.5
+            self._rose_slowly = _norm(self._idle_mean - self._base) > 0.5
             return
         elif is_remainder and size < _norm(self._base):
             self._base = charge  # the charge that remains of the latest touch becomes smaller
 
-        self._mean = charge + math.exp(-frame.dt_s / RISE_S) * (self._mean - charge)
+        self._idle_mean = charge + math.exp(-frame.dt_s / RISE_S) * (self._idle_mean - charge)
         if size > 1.0 and charge @ direction < 0.0:
             frame.flags.append(NEGATIVE)
         self._rest_s = 0.0 if size > 1.0 else self._rest_s + frame.dt_s

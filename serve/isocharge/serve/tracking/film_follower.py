@@ -351,8 +351,8 @@ class FilmFollower(Stage):
         """Compute the state of the film for which contacts are corrected.
 
         The pretension may have changed, or it may not have changed. The state is the mean over both cases, weighted by
-        their probabilities. The touches multiply the odds of the second case, before them `UNCHANGED_ODDS`, by the
-        ratio of the probability densities of no change (t = 0) after and before the touches (Savage-Dickey ratio,
+        their probabilities. Before the touches, the odds of the second case are `UNCHANGED_ODDS`. The touches multiply
+        these odds by a ratio of two probability densities at t = 0, after and before the touches (Savage-Dickey ratio,
         Dickey 1971).
 
         The covariance remains that of a film which has changed, because hardly any film keeps its pretension exactly.

@@ -307,5 +307,5 @@ def single_threaded_blas() -> AbstractContextManager[object]:
 
 @lru_cache
 def _blas_libraries() -> ThreadpoolController:
-    """Return the controller of all libraries that are loaded when this function is called first: NumPy and SciPy."""
+    """Return the controller of the BLAS libraries. The first call finds those that NumPy and SciPy have loaded."""
     return ThreadpoolController()

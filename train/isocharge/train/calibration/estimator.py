@@ -5,10 +5,10 @@ contact may be known, known with an error, or unknown. The contacts are eliminat
 Golub and Pereyra 1973). Presses that do not agree with the others get a lower weight, according to Student's t
 distribution (Lange and others, 1989), and are left out of the final estimate.
 
-How uneven a film is, how large its discrepancy and the errors of the presses are, and whether the session has an offset
-or a drift, is not known beforehand. Each combination of these cases is a hypothesis. The evidence of a hypothesis
-follows from the linearised problem (MacKay 1992), and the estimate is the mean over the hypotheses, weighted by their
-evidence.
+Some facts are not known beforehand: how uneven a film is, how large its discrepancy and the errors of the presses are,
+and whether the session has an offset or a drift. Each combination of these cases is a hypothesis. The evidence of a
+hypothesis follows from the linearised problem (MacKay 1992), and the estimate is the mean over the hypotheses, weighted
+by their evidence.
 """
 
 from collections.abc import Iterator
@@ -250,7 +250,8 @@ def estimate(charges: FilmCharges, data: PressData, prior: Prior, previous: Esti
     if estimation.is_bad.any():
         # With larger errors of the positions, a press at a wrong place would not be recognised.
         middle_ratio, _ = POSITION_RATIOS[len(POSITION_RATIOS) // 2]
-        probable = PressErrors(all_hypotheses[-1].errors.noise, middle_ratio)
+        largest_noise = all_hypotheses[-1].errors.noise
+        probable = PressErrors(largest_noise, middle_ratio)
     for _ in range(MAX_SEARCHES):
         if probable == assumed:
             break

@@ -107,7 +107,7 @@ class FilmCharges:
     def charges(self, values: Array, contact: Array) -> Array:
         """Compute the charges of presses on a film with given properties, shape (n, n_electrode), pC."""
         solved_charge, _, stress_derivatives = self._solved_charges(self._electrodes(values), contact)
-        charge, _ = self._changed(values, solved_charge, stress_derivatives)
+        charge, _ = self._with_other_stress(values, solved_charge, stress_derivatives)
         return charge
 
     def linearised(self, values: Array, contact: Array) -> ModelValues:
@@ -123,10 +123,12 @@ class FilmCharges:
         """
         sensor = self._electrodes(values)
         solved_charge, contact_slopes, stress_derivatives = self._solved_charges(sensor, contact)
-        charge, factor = self._changed(values, solved_charge, stress_derivatives)
+        charge, factor = self._with_other_stress(values, solved_charge, stress_derivatives)
 
         derivatives = {**stress_derivatives, "crosstalk": solved_charge.sum(axis=1, keepdims=True) - solved_charge}
-        for name in UNEVEN_TENSIONS:  # shares of the pretension
+        # Each uneven part of the pretension is the product of a share and the pretension. The derivatives with respect
+        # to the parts become derivatives with respect to the shares, and the pretension also changes the parts.
+        for name in UNEVEN_TENSIONS:
             share = values[self.prior.index(name)]
             derivatives[PRETENSION.name] = derivatives[PRETENSION.name] + share * derivatives[name]
             derivatives[name] = values[self.prior.index(PRETENSION.name)] * derivatives[name]
@@ -138,10 +140,10 @@ class FilmCharges:
         ]
         return ModelValues(charge, contact_slopes, factor[:, :, None] * np.stack(columns, axis=2))
 
-    def _changed(
+    def _with_other_stress(
         self, values: Array, solved_charge: Array, stress_derivatives: dict[str, Array]
     ) -> tuple[Array, Array]:
-        """Apply the first-order change by the properties that change the stress.
+        """Add the first-order change of the charges that the properties with an effect on the stress cause.
 
         The change is applied to the logarithm of a charge, unless the charge is negative or changes its sign.
 
@@ -153,14 +155,14 @@ class FilmCharges:
         Returns:
             Charges, shape (n, n_electrode), pC, and the factors by which the derivatives change, of the same shape.
         """
-        solved, changed = self._mechanics(self.values), self._mechanics(values)
-        charge_change = np.zeros_like(solved_charge)
+        solved_film, changed_film = self._mechanics(self.values), self._mechanics(values)
+        addition = np.zeros_like(solved_charge)
         for name, derivative in stress_derivatives.items():
-            charge_change += (changed[name] - solved[name]) * derivative
-        log_change = np.divide(charge_change, solved_charge, out=np.zeros_like(solved_charge), where=solved_charge > 0)
-        is_logarithmic = (solved_charge > 0.0) & (np.abs(log_change) < MAX_LOG_CHANGE)
-        factor = np.where(is_logarithmic, np.exp(np.where(is_logarithmic, log_change, 0.0)), 1.0)
-        charge = np.where(is_logarithmic, solved_charge * factor, solved_charge + charge_change)
+            addition += (changed_film[name] - solved_film[name]) * derivative
+        relative = np.divide(addition, solved_charge, out=np.full_like(addition, np.inf), where=solved_charge > 0.0)
+        is_logarithmic = np.abs(relative) < MAX_LOG_CHANGE
+        factor = np.exp(relative, out=np.ones_like(relative), where=is_logarithmic)
+        charge = np.where(is_logarithmic, solved_charge * factor, solved_charge + addition)
         return charge, factor
 
     def _electrodes(self, values: Array) -> Sensor:

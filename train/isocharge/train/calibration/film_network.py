@@ -249,7 +249,7 @@ def _directions(
     size = None if series.log_size is None else series_size(series.log_size, unit_contact[:, 2])[0]
 
     def value_changes(one: _ChangedFilm) -> Array:
-        """Return the changes of v by one standard deviation of each unknown, shape (n, n_electrode, n_unknown)."""
+        """Return by how much one standard deviation of each unknown changes v, shape (n, n_electrode, n_unknown)."""
         film_charge, jacobian = one.linearised(contact)
         charge_per_value = np.where(film_charge > 0.0, film_charge, charge) if size is None else size
         return np.asarray((jacobian / charge_per_value[:, :, None]) @ covariance_root)

@@ -89,7 +89,7 @@ class PressData:
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def with_errors(self, errors: PressErrors) -> "PressData":
-        """Return presses with stated errors as presses with other errors."""
+        """Return a copy of these presses whose stated errors are replaced by errors of the given sizes."""
         noise, position_ratio, force_scatter = errors
         charge_std = np.where(np.isfinite(self.charge_std), noise.sigma(self.charge), UNKNOWN_STD)
         force_std = np.hypot(self.contact_std[:, 2], force_scatter)

@@ -5,8 +5,8 @@ estimates the contacts of the presses that were left out of its training. The er
 these answers. The same answers determine factors by which the standard deviations are multiplied. With these factors,
 the confidence intervals contain the true values as often as they should (split conformal prediction, Papadopoulos et
 al., 2002). The mean answer of the five networks has smaller errors than the answer of a single network. One further
-network learns this mean answer (Hinton et al., 2015). Only the further network is released, so the model is as small
-and fast as the models of simulated sensors.
+network learns this mean answer (Hinton et al., 2015). Only this last network is released, so the model is as small and
+fast as the models of simulated sensors.
 
 The noise of the charges is estimated from the presses themselves (`isocharge.train.data.channel_noise`). In every
 training step, random noise with half of the estimated size is added to the charges as a regularisation.
@@ -287,7 +287,7 @@ def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]
     """Compute the factors by which standard deviations must be multiplied to agree with the observed errors.
 
     With these factors, the intervals of one standard deviation contain 68 % of the true values. If the errors have
-    longer tails than a normal distribution, the 95 % intervals contain fewer than 95 %.
+    longer tails than a normal distribution, the 95 % intervals contain less than 95 % of them.
 
     Args:
         contact: Contacts (x, y, F) that were estimated by networks that were not trained on these presses, shape (n,
