@@ -100,7 +100,7 @@ def test_check_of_a_channel_without_a_number(others):
         # The board is restarted after ten frames, because its port was opened.
         (lambda k: b"t_ms:%d,A:%d,B:1\n" % (5 * k + 1_000_000 * (k < 9), 3 * k % 7), "channel B is dead"),
         (lambda _: b"t_ms:5\n", "lines of text are not understood, for example 't_ms:5'"),
-        (lambda k: f"#{k} 3.1 -2.0 5.2\n".encode(), "lines of text are not understood, for example '#"),
+        (lambda k: f"#{k} 3.1 -2.0 5.2\n".encode(), "a line that begins with # is a comment"),
         (
             lambda k: b"%d,%d,3.1\n" % (k // 3, k % 3),
             "for example '133,0,3.1': send the numbers of all channels in each",
@@ -216,9 +216,17 @@ def test_channels_are_proposed_by_their_names(names, channels, message):
     assert message in missing(report)
 
 
-def test_channels_with_different_units_are_not_taken_for_voltages_because_their_noise_is_small():
+@pytest.mark.parametrize(
+    ("line", "scale", "unit"),
+    [
+        ("A_nC:{:.4f},B_pC:{:.4f}\n", 0.01, "pC"),
+        ("T:{:.2f},A_nC:{:.4f},B_nC:{:.4f}\n", 0.01, "nC"),
+        ("T:{:.2f},A:{:.0f},B:{:.0f}\n", 10.0, "counts"),
+    ],
+)
+def test_unit_is_that_of_the_electrodes_and_not_volts_because_the_noise_is_small(line, scale, unit):
     rng = np.random.default_rng(0)
-    assert examined(lambda _: "A_nC:{:.4f},B_pC:{:.4f}\n".format(*rng.normal(0, 0.01, 2)).encode()).unit == "pC"
+    assert examined(lambda _: line.format(*rng.normal(0, scale, 3)).encode(), electrodes=FOUR[:2]).unit == unit
 
 
 def test_channels_without_names_beside_others_are_proposed_by_their_numbers():

@@ -3,7 +3,7 @@
 The charge of one count cannot be derived from the bytes. The user has to state this charge.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -58,19 +58,20 @@ def propose(
         table["channels"] = {electrode: capture.names[position] for electrode, position in positions.items()}
     offset = {electrode: _rest_level(rest_values[:, position]) for electrode, position in positions.items()}
     has_large_offset = any(abs(level) > TareRule().offset_limit_pC for level in offset.values())
-    is_in_pC = unit_of(capture) == "pC"
+    is_in_pC = unit_of(capture, list(positions.values())) == "pC"
     if gain or has_large_offset or not is_in_pC:
         known_gain = dict(gain) or ({"pC_per_unit": 1.0} if is_in_pC else {})
         table["gain"] = ({"offset": offset} if any(offset.values()) else {}) | known_gain
     return table
 
 
-def unit_of(capture: Capture, max_noise_V: float = 0.02) -> str:
+def unit_of(capture: Capture, positions: Sequence[int], max_noise_V: float = 0.02) -> str:
     """Return the unit of the values of a board whose gain is unknown: "pC", "counts", "V", or a unit in the names.
 
-    The unit is guessed from the names and the values of the channels. The first rule that applies determines the unit.
+    The unit is guessed from the names and the values of the electrodes' channels. Other channels, such as a
+    temperature, have units of their own. The first rule that applies determines the unit.
 
-    - If all names of channels state the same unit, this is the unit, such as nC for `A_nC`.
+    - If the names of channels state one unit, this is the unit, such as nC for `A_nC`.
     - If some names state different units, the unit is assumed to be pC. The report requests the gains.
     - The unit is pC for binary frames of isocharge.
     - The unit is counts if all values are whole numbers.
@@ -80,19 +81,22 @@ def unit_of(capture: Capture, max_noise_V: float = 0.02) -> str:
 
     Args:
         capture: The frames that were received. Without frames, the result is "pC".
+        positions: Positions of the electrodes' channels in the frame; empty for all channels.
         max_noise_V: Largest noise of a board that sends volts, V. Charges of a film in pC have more noise.
     """
-    units = {stated_unit(name) for name in capture.names}
-    if len(units) == 1 and units != {""}:
+    channels = list(positions) or list(range(len(capture.names)))
+    names = [capture.names[position] for position in channels]
+    units = {stated_unit(name) for name in names} - {""}
+    if len(units) == 1:
         return units.pop()
-    if len(units - {""}) > 1 or not capture.frames or capture.parser.format == BINARY:
+    if units or not capture.frames or capture.parser.format == BINARY:
         return "pC"
-    values, _times_s = capture.values()  # shape (frames, channels)
+    values = capture.values()[0][:, channels]  # shape (frames, channels)
     finite_values = values[np.isfinite(values)]
     if finite_values.size and bool((finite_values == np.round(finite_values)).all()):
         return "counts"
     largest_noise = estimate_noise(values).max()
-    names_state_volts = all(name.endswith("V") for name in capture.names)
+    names_state_volts = all(name.endswith("V") for name in names)
     return "V" if names_state_volts or 0.0 < largest_noise <= max_noise_V else "pC"
 
 
