@@ -19,7 +19,6 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from boards import TcpBoard, interrupt, taps
-from isocharge.cli.serve.doctor import _parse_gain
 from isocharge.serve import Recording, Script, VirtualSensor, load_device
 from isocharge.serve.signal_chain.gain import GainRule
 from isocharge.serve.virtual_sensor.sensor import PseudoPort
@@ -229,29 +228,44 @@ def test_doctor_lists_the_ports_and_what_they_send(resting, run, monkeypatch):
     assert none.startswith("/dev/ttyNone (n/a): /dev/ttyNone: there is no such port")
 
 
+MINE = """name = "mine"
+[film]
+radius_mm = 45.0
+thickness_um = 25.0
+young_GPa = 3.0
+poisson = 0.34
+[piezo]
+d31 = 8.0
+d32 = 8.0
+[electrodes]
+side_mm = 3.0
+"électrode 1" = [0.0, 9.0]
+B = [9.0, 0.0]
+C = [-9.0, 0.0]
+"""
+
+
 def test_doctor_writes_no_file_of_which_the_unit_is_missing(resting, command, tmp_path):
-    """The command that is completed with the unit can then write the file, and the file is valid."""
+    """The command that is completed with the unit and a sensor file can then write the file, and the file is valid."""
     path = tmp_path / "board.toml"
+    sensor_file = tmp_path / "mine.toml"
+    sensor_file.write_text(MINE)
 
     def line_of_counts(frame):
-        return b"%d,%d,%d\n" % (300 + frame.seq % 5, 300 + frame.seq % 3, 300 + frame.seq % 7)
+        return b"%d,%d,%d\n" % (2 * frame.seq % 5, 4 * frame.seq % 11, 3 * frame.seq % 7)
 
     with resting(encode=line_of_counts) as sensor:
         words = ("serve", "doctor", "--port", sensor.url, "--seconds", 0.6, "--write", path)
         code, out, err = command(*words)
         assert (code, path.exists()) == (1, False)
         assert "--pc-per-unit NUMBER" in out
-        assert "is not written, because the charge of one unit is missing" in err
+        assert "no device file is written, because the charge of one unit is missing" in err
         code, _, err = command(*words[:-1], "/proc/none/board.toml", "--pc-per-unit", ".1")
         assert code == 1
         assert "OutputError: /proc/none/board.toml cannot be written: No such file" in err
-        code, _, err = command(*words, "--pc-per-unit", ".1")
+        code, _, err = command(*words, "--pc-per-unit", "électrode 1=.5, B=-2,C=1", "--model", sensor_file)
         assert code == 0, err
-    assert load_device(path).rule(GainRule).pC_per_unit == 0.1
-
-
-def test_gain_of_electrodes_whose_names_have_blanks_and_accents():
-    assert _parse_gain("électrode 1=.5, B=-2") == {"électrode 1": 0.5, "B": -2.0}
+    assert load_device(path).rule(GainRule).pC_per_unit == {"électrode 1": 0.5, "B": -2.0, "C": 1.0}
 
 
 ISOCHARGE = f"{sys.executable} -m isocharge.cli"

@@ -38,7 +38,8 @@ def doctor_command(
         str | None,
         typer.Option(
             metavar="MODEL",
-            help="Model that is to be used, name or path: its electrodes are looked for. (default: none)",
+            help="Model that is to be used, name or path, or a sensor file: its electrodes are looked for. (default: "
+            "none)",
         ),
     ] = None,
     models: ModelsOption = None,
@@ -88,19 +89,25 @@ def doctor_command(
     if port is None:
         show("\n".join(port_lines()) or "no serial ports; is the board plugged in?")
         return
-    if write is not None:
+    if write:
         refuse_existing(write)
-    electrodes = Predictor(model, models=models).metadata.electrodes if model else ()  # empty for any model
+    electrodes: tuple[str, ...] = ()  # for any model
+    if model and model.endswith(".toml"):  # a sensor file, as long as the film has no model
+        from isocharge.simulate import load_sensor
+
+        electrodes = load_sensor(model).electrode_names
+        model = None
+    elif model:
+        electrodes = Predictor(model, models=models).metadata.electrodes
     gain = None if pC_per_unit is None else {"pC_per_unit": _parse_gain(pC_per_unit)}
-    for option, value, section in (("--pc-per-unit", gain, "gain"), ("--request", request, "frames")):
-        if value is not None and device is not None:
-            raise InputError(
-                f"{option}: expected none beside --device, because the device file states it; leave the option out, "
-                f"or write it into the section [{section}] of {device}"
-            )
-    if gain is not None:
+    if device and (gain or request):
+        option, section = ("--pc-per-unit", "gain") if gain else ("--request", "frames")
+        raise InputError(
+            f"{option}: expected none beside --device, because the device file states it; leave the option out, "
+            f"or write it into the section [{section}] of {device}"
+        )
+    if gain:
         device_from_table({"gain": gain}, "--pc-per-unit")  # raises an error for 0 or a number that is not finite
-    request_table = device_from_table({"frames": {"request": request}}, "--request")
     say(f"listening for {seconds:g} s; leave the film alone")
     examination = examine(
         port,
@@ -109,7 +116,7 @@ def doctor_command(
         device=load_device(device),
         electrodes=electrodes,
         gain=gain,
-        request=request_table.request,
+        request=device_from_table({"frames": {"request": request}}, "--request").request,
         wait=wait,
     )
     if not json:
@@ -128,12 +135,11 @@ def doctor_command(
             show("\n".join(wiring.sentences))
     if json:
         show_json(asdict(examination) | {"found_channels": found_channels})
-    if not examination.good:
-        raise typer.Exit(1)
     if obstacle:
-        say(obstacle if write is None else f"{write} is not written, because {obstacle}")
+        say(f"no device file is written, because {obstacle}")
+    if obstacle or not examination.good:
         raise typer.Exit(1)
-    if write is not None:
+    if write:
         _write_device_file(write, examination, model or "MODEL")
 
 
