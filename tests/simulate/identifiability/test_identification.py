@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from tests.simulate.conftest import COARSE
 
+from drawn_contacts import draw_contacts
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate import (
     Circle,
@@ -18,6 +19,7 @@ from isocharge.simulate import (
     parse_probe,
 )
 from isocharge.simulate.identifiability.identification import Identification, map_to_search
+from isocharge.simulate.plots.error_maps import identification_picture
 from kept import kept
 from solved_charges import with_squares
 
@@ -42,12 +44,12 @@ def test_identification_to_dict_can_be_written_as_json(identification):
     assert numbers["noise"] == {"name": "reference", "white_pC": 1.0, "gain": 0.002}
     area = numbers["working_area"]
     assert (area["radius_mm"], area["why"], area["fold_radius_mm"]) == (5.0, "searched", None)
+    title = "four-25um-uniaxial, rectangle:4.0x2.0@30, noise reference"
+    assert identification_picture(turned).get_suptitle() == title
 
 
 def test_statistics_agree_with_random_positions(film, identification):
-    rng = np.random.default_rng(0)
-    at = 5.0 * np.sqrt(rng.random(800)) * np.exp(2j * np.pi * rng.random(800))
-    contacts = (np.column_stack([at.real, at.imag, np.full(800, force)]) for force in (0.05, 1.0, 2.0))
+    contacts = (draw_contacts(0, 800, 5.0, (force, force)) for force in (0.05, 1.0, 2.0))
     limits = [limits_at(film, contact, REFERENCE) for contact in contacts]
     rows = identification.to_dict()["limits_in_working_area"]
     medians = [(row["position_median_mm"], row["force_median_percent"]) for row in rows]

@@ -50,7 +50,7 @@ def identification_picture(identification: Identification) -> Figure:
         axes.set_title(f"{limit_map.force:g} N; dashed: working area, {area.radius:g} mm{folds}")
     _add_colour_bar(figure, coloured_area, map_axes)
     _draw_distance(distance_axes, identification)
-    title = f"{identification.sensor.name}, {identification.probe.notation}, noise {identification.noise.name}"
+    title = f"{identification.sensor.name}, {identification.probe.rotated_notation}, noise {identification.noise.name}"
     figure.suptitle(title, fontsize=13)
     return figure
 
