@@ -96,7 +96,7 @@ def test_forces_that_scatter_more_than_stated_are_named(fit, press_film):
     scattered = presses.contact.copy()
     scattered[:, 2] *= np.exp(0.04 * np.random.default_rng(0).standard_normal(25))
     result = fit(replace(presses, contact=np.clip(scattered, [-9, -9, 0.05], [9, 9, 2.0])))
-    assert any("forces scatter by about 3 % more than stated: is the load cell zero" in caution for caution in result.cautions)
+    assert any("about 3 % more than stated: is the load cell zero" in caution for caution in result.cautions)
 
 
 def presses_on_shifted_electrodes(problem, press_film, shift_mm):
