@@ -135,10 +135,9 @@ def encode_damaged(frame):
     [
         # The pause is shorter than the time in which the rest level is measured. A block may contain half of a release.
         *(((0, 1, 2), (1, 0, 2), {"rest_s": delay_s}) for delay_s in (0.1, 0.48, 0.5, 0.58)),
-        ((2, 0, 1, 2), (0, 1, 2), {"first_rest_s": 0.1}),
+        ((2, 0, 1, 2), (0, 1, 2), {"first_rest_s": 0.1}),  # a finger is on the film at first
         ((0, 1, 2), (0, 1, 2), {"first_rest_s": 3.0, "encode": encode_damaged}),
     ],
-    ids=[*["a press right after the request"] * 4, "a finger is on the film at first", "damaged frames before a press"],
 )
 def test_presses_near_the_electrodes_find_the_channels(film, check, presses, wiring, options):
     result = check(sensor_with_wiring(film.charges, film.directions[[*presses]], wiring, **options), "ABC")

@@ -107,7 +107,7 @@ SENSORS_OF_ANY_SIGN = [
 ]
 
 
-@pytest.mark.parametrize("sensor", SENSORS_OF_ANY_SIGN, ids=lambda sensor: sensor["name"])
+@pytest.mark.parametrize("sensor", SENSORS_OF_ANY_SIGN)
 @pytest.mark.parametrize("is_replaced", [False, True])
 def test_touch_with_negative_charges(film, predictor, press_pC, sensor, is_replaced, tmp_path):
     """The model is the first one of the stream, or it replaces the model of a film with positive charges."""

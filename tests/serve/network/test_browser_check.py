@@ -24,40 +24,40 @@ def headers_of(**headers):
     return {name.replace("_", "-").encode(): value.encode() for name, value in headers.items()}
 
 
-SERVED = {
-    "curl by address": {"host": "127.0.0.1:8000"},
-    "client by IPv6": {"host": "[::1]:8000"},
-    "client by another address": {"host": "192.168.1.7:8000"},
-    "client by localhost": {"host": "LocalHost:8000"},
-    "fully qualified localhost": {"host": "localhost.:8000"},
-    "HTTP/1.0 without Host": {},
-    "own page": {"host": "localhost:8000", "origin": "http://localhost:8000", "sec_fetch_site": "same-origin"},
-    "address typed in": {"host": "localhost:8000", "sec_fetch_site": "none", "sec_fetch_mode": "navigate"},
-}
+SERVED = [
+    {"host": "127.0.0.1:8000"},
+    {"host": "[::1]:8000"},
+    {"host": "192.168.1.7:8000"},
+    {"host": "LocalHost:8000"},
+    {"host": "localhost.:8000"},
+    {},  # HTTP/1.0
+    {"host": "localhost:8000", "origin": "http://localhost:8000", "sec_fetch_site": "same-origin"},
+    {"host": "localhost:8000", "sec_fetch_site": "none", "sec_fetch_mode": "navigate"},  # the address was typed
+]
 
-REFUSED = {
-    "rebound name": ({"host": "evil.example:8000"}, "Host"),
-    "rebound name as its own origin": ({"host": "evil.example", "origin": "http://evil.example"}, "Host"),
-    "name with localhost before it": ({"host": "localhost.evil.example"}, "Host"),
-    "user name before the host": ({"host": "localhost@evil.example"}, "Host"),
-    "short form of an address": ({"host": "127.1:8000"}, "Host"),
-    "broken address": ({"host": "[::1"}, "Host"),
-    "form of another site": ({"host": "127.0.0.1:8000", "origin": "https://evil.example"}, "Origin"),
-    "page of another port": ({"host": "127.0.0.1:8000", "origin": "http://127.0.0.1:3000"}, "Origin"),
-    "sandboxed page": ({"host": "127.0.0.1:8000", "origin": "null"}, "Origin"),
-    "file on the disk": ({"host": "127.0.0.1:8000", "origin": "file://"}, "Origin"),
-    "no-cors fetch": ({"host": "127.0.0.1:8000", "sec_fetch_site": "cross-site"}, "Sec-Fetch-Site"),
-    "page of the same site": ({"host": "127.0.0.1:8000", "sec_fetch_site": "same-site"}, "Sec-Fetch-Site"),
-    "unknown relation": ({"host": "127.0.0.1:8000", "sec_fetch_site": "new-value"}, "Sec-Fetch-Site"),
-}
+REFUSED = [
+    ({"host": "evil.example:8000"}, "Host"),
+    ({"host": "evil.example", "origin": "http://evil.example"}, "Host"),
+    ({"host": "localhost.evil.example"}, "Host"),
+    ({"host": "localhost@evil.example"}, "Host"),  # a user name
+    ({"host": "127.1:8000"}, "Host"),
+    ({"host": "[::1"}, "Host"),
+    ({"host": "127.0.0.1:8000", "origin": "https://evil.example"}, "Origin"),
+    ({"host": "127.0.0.1:8000", "origin": "http://127.0.0.1:3000"}, "Origin"),
+    ({"host": "127.0.0.1:8000", "origin": "null"}, "Origin"),  # a page in a sandbox
+    ({"host": "127.0.0.1:8000", "origin": "file://"}, "Origin"),
+    ({"host": "127.0.0.1:8000", "sec_fetch_site": "cross-site"}, "Sec-Fetch-Site"),
+    ({"host": "127.0.0.1:8000", "sec_fetch_site": "same-site"}, "Sec-Fetch-Site"),
+    ({"host": "127.0.0.1:8000", "sec_fetch_site": "new-value"}, "Sec-Fetch-Site"),
+]
 
 
-@pytest.mark.parametrize("headers", SERVED.values(), ids=SERVED)
+@pytest.mark.parametrize("headers", SERVED)
 def test_clients_and_own_pages_are_served(headers):
     AccessCheck().check("POST", headers_of(**headers))
 
 
-@pytest.mark.parametrize(("headers", "header"), REFUSED.values(), ids=REFUSED)
+@pytest.mark.parametrize(("headers", "header"), REFUSED)
 def test_pages_of_other_sites_are_refused(headers, header):
     for method in ("GET", "POST"):
         with pytest.raises(OriginError, match=f"^{header}: expected"):

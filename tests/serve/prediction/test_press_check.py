@@ -173,8 +173,11 @@ def test_proposed_rig_std_is_not_below_the_stated_one(predictor, measure):
 
 @pytest.mark.parametrize(
     ("misfits", "ratio", "fits"),
-    [(2, 1.6, True), (4, 1.6, False), (4, 1.4, True)],
-    ids=["two of 30 are chance", "four are not", "the noise is 1.4 times as large as that of the model"],
+    [
+        (2, 1.6, True),  # two of 30 are chance
+        (4, 1.6, False),
+        (4, 1.4, True),  # the noise is 1.4 times as large as that of the model
+    ],
 )
 def test_verdict_depends_on_the_number_of_misfits(film, tmp_path, measure, misfits, ratio, fits):
     """The ratio is that of the largest misfits to the misfit that 1 % of good presses exceed."""

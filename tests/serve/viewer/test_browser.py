@@ -126,3 +126,20 @@ def test_live_page_takes_the_numbers_away_when_the_frames_stop(stream, page, tou
     process.send_signal(signal.SIGSTOP)
     shown = wait_for(page, f"isocharge.page.film.drawnKind === 'silent' && {{shown: {SHOWN}}}")["shown"]
     assert np.all(np.isnan(shown))
+
+
+def test_typed_token_opens_the_page_of_a_recording(chromium, start_page):
+    """The page has one button to pause, and the film in relief becomes low again after its row was high."""
+    page = chromium.new_page()
+    page.goto(start_page(token="s3cret", is_recording=True).url)
+    responses = {"other": page.get_by_text("token is wrong"), "s3cret": page.get_by_role("button", name="Pause")}
+    for token, response in responses.items():
+        page.get_by_label("Token").fill(token)
+        page.keyboard.press("Enter")
+        response.wait_for()  # fails if there are two
+    relief = page.locator(".relief")
+    box = relief.bounding_box()
+    for flags_height in ("900px", ""):
+        page.locator(".flags").evaluate(f"flags => flags.style.height = '{flags_height}'")
+        page.wait_for_timeout(500)
+    assert relief.bounding_box() == box

@@ -145,11 +145,10 @@ def test_a_press_with_the_mouse_gives_its_place_and_force(open_page):
     page.evaluate("isocharge.playground.setFaults({ noise: 0 })")
     page.mouse.move(box["x"] + 0.45 * box["width"], box["y"] + 0.4 * box["height"])
     page.mouse.down()
-    page.wait_for_function("Math.abs(isocharge.playground.press.x + 0.1 * 24) < 0.2")
+    page.wait_for_function("Math.abs(isocharge.playground.press.x + 2.4) < 0.2")
     page.wait_for_timeout(300)
     x, y, force = page.evaluate("(({ x, y, force }) => [x, y, force])(isocharge.playground.result.answer)")
-    assert (x, y) == pytest.approx((-0.1 * 24, 0.2 * 24), abs=0.2)
-    assert force == pytest.approx(0.5, rel=0.05)
+    assert (x, y, force) == (pytest.approx(-2.4, abs=0.2), pytest.approx(4.8, abs=0.2), pytest.approx(0.5, rel=0.05))
     assert "mm from your press" in page.inner_text("#verdict")
     assert page.errors == []
 

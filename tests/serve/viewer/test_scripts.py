@@ -56,19 +56,22 @@ def test_page_shows_the_whole_area_of_a_film_whose_corner_is_the_origin(radius_m
         "film": {"radius_mm": radius_mm},
         "electrodes": [],
     }
-    at, reach, on_pad, beyond = node(
+    at, reach, on_pad, beyond, lens_y = node(
         f"""globalThis.document = {{ createElement: () => ({{}}), documentElement: {{}} }};
         globalThis.getComputedStyle = () => ({{ getPropertyValue: () => "" }});
         globalThis.matchMedia = () => ({{ addEventListener() {{}} }});
         const {{ Plan }} = await import("{(VIEWER / "page/plan.js").as_uri()}");
         const plan = new Plan({{ width: 400, height: 400, clientWidth: 400 }}, {json.dumps(film)});
         const shown = (x, y) => {{ const place = plan.inView({{ x, y }}); return [place.x, place.y]; }};
-        console.log(JSON.stringify([[plan.middle.x, plan.middle.y], plan.reach, shown(50, 0), shown(500, 0)]));"""
+        const lens = plan.lensPlace(0.7 * plan.reach, plan.css, {{ x: plan.middle.x + plan.reach, y: 0 }});
+        const {{ x, y }} = plan.middle;
+        console.log(JSON.stringify([[x, y], plan.reach, shown(50, 0), shown(500, 0), lens[1]]));"""
     )
     assert at == middle
     assert reach == pytest.approx(1.16 * np.hypot(60.0 - middle[0], 15.0))
     assert on_pad == [50.0, 0.0]
     assert middle[0] + 0.9 * reach < beyond[0] < middle[0] + reach
+    assert lens_y < 0.13 * reach  # below the scale in the upper left corner
 
 
 def test_page_decodes_the_samples_of_the_server(record):

@@ -75,7 +75,6 @@ def test_every_route_answers_its_method_only(ask, method, path):
 @pytest.mark.parametrize(
     "form",
     [np.ravel, np.asarray, lambda rows: np.where(rows == rows.min(), 1, rows).astype(int).ravel()],
-    ids=["flat", "rows", "whole, some of them 1"],
 )
 def test_outputs_equal_those_of_onnxruntime(ask, bare, film, n, datatype, form):
     data = form(np.resize(film.golden_pC(), (n, 3)))
@@ -313,7 +312,7 @@ def operations(handler, start_http):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", GenerationMode, ids=lambda mode: mode.value)
+@pytest.mark.parametrize("mode", GenerationMode)
 def test_server_conforms_to_its_openapi_document(operations, mode):
     answered = set()
     for operation in operations:

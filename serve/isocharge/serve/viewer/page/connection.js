@@ -21,7 +21,7 @@ export class Connection {
       this.id = session.id;
       await this.follow(session);
     } catch (error) {
-      if (error.status === 401) return this.on.door(this.token ? "The server knows another one." : "");
+      if (error.status === 401) return this.on.door(this.token ? "This token is wrong." : "");
       this.on.link("lost", `${error instanceof TypeError ? "no answer" : error.message}; trying again`);
       setTimeout(() => this.open(), this.pause);
       this.pause = Math.min(2 * this.pause, LONGEST_PAUSE_MS);

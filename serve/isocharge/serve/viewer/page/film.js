@@ -20,7 +20,7 @@ export class FilmView {
     this.find(".name").textContent = description.name;
     this.showModel(description.model);
     this.root.addEventListener("click", (event) => { const button = event.target.closest("[data-do]"); if (button) { act(button.dataset.do); if (event.detail) button.blur(); } });
-    if (this.isReplay) for (const button of this.root.querySelectorAll("[data-do]")) button.hidden = button.dataset.do !== "pause";
+    this.find(".buttons").hidden = this.isReplay; // the time line has the button of a recording
     this.latencies = [];
     this.ages = [];
   }

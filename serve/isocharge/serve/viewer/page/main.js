@@ -44,7 +44,7 @@ function door(reason) {
   const form = document.getElementById("door");
   form.hidden = false;
   setText(form.querySelector(".reason"), reason);
-  form.querySelector("input").focus();
+  form.querySelector("[type=password]").focus();
   link("waiting", "a token, please");
 }
 
@@ -107,7 +107,7 @@ addEventListener("resize", () => { page.film?.refresh(); page.timeline?.drawTrac
 document.getElementById("help-button").addEventListener("click", () => document.getElementById("help").showModal());
 document.getElementById("door").addEventListener("submit", (event) => {
   event.preventDefault();
-  connection.enter(event.target.querySelector("input").value);
+  connection.enter(event.target.querySelector("[type=password]").value);
 });
 globalThis.isocharge = { page, connection };
 connection.open();

@@ -213,10 +213,10 @@ export class Plan {
     this.text(g, "0.5 mm", x, below - 9 * px, 10 * px, theme.ink, "center");
   }
 
-  /** The corner in which the lens hides neither touch nor electrode. */
+  /** The corner in which the lens hides neither touch nor electrode; on the upper left it is below the scale. */
   lensPlace(size, px, touch) {
     const far = this.reach - size - 10 * px;
-    const corners = [[far, -far], [far, far], [-far, far]].map(([x, y]) => [this.middle.x + x, this.middle.y + y]);
+    const corners = [[far, -far], [far, far], [-far, far - 34 * px]].map(([x, y]) => [this.middle.x + x, this.middle.y + y]);
     const edges = this.pads.flat();
     const hides = ([x, y]) => Math.hypot(touch.x - x, touch.y - y) < size + 24 * px || edges.some(([u, v]) => Math.hypot(u - x, v - y) < size + 4 * px);
     return corners.find((corner) => !hides(corner)) ?? corners[0];
