@@ -144,18 +144,14 @@ def test_irregular_times_and_the_beginning_of_a_slide_are_not_taken_for_noise(ra
 def test_slide_is_tracked_without_lag_and_better_than_by_any_moving_average(speed):
     path, t = slide(speed)
     is_moving = (t > 0.3) & (t < 0.6)
-    errors = []
-    measured = []
-    for _ in range(4):
-        errors.append(position_errors(track_contacts(noisy_contacts(path)), path))
-        measured.append([complex(contact.x_mm, contact.y_mm) for contact in noisy_contacts(path)])
-    errors = np.array(errors)
+    measured = [[complex(contact.x_mm, contact.y_mm) for contact in noisy_contacts(path)] for _ in range(4)]
+    errors = np.array([position_errors(track_contacts(noisy_contacts(path)), path) for _ in range(4)])
     lag_ms = -1e3 * np.mean((errors[:, is_moving] / np.exp(0.7j)).real) / speed
     assert abs(lag_ms) < (5.0 if speed >= 20.0 else 10.0)
 
     average_rms = []
     for count in range(1, 50):
-        averages = np.array([np.convolve(row, np.ones(count) / count)[: len(t)] for row in measured])
+        averages = [np.convolve(row, np.ones(count) / count)[: len(t)] for row in measured]
         average_rms.append(np.sqrt(np.mean(np.abs(averages - path)[:, 50:] ** 2)))
     assert np.sqrt(np.mean(np.abs(errors[:, 50:]) ** 2)) < min(average_rms)
 
@@ -279,3 +275,8 @@ def test_records_with_track_only_add_fields(film, predictor):
     for record, plain_record in zip(tracked, plain, strict=True):
         assert (record["tracked"] is None) == (not record["contact"])
         assert record == plain_record | {name: record[name] for name in ("tracked", "event", "other")}
+
+
+def test_contact_with_very_small_and_very_large_standard_deviations_is_tracked():
+    contacts = noisy_contacts(np.zeros(100), correlation=0.99999)
+    assert np.isfinite(track_contacts(contact._replace(x_std_mm=1e-9, y_std_mm=1e9) for contact in contacts)).all()

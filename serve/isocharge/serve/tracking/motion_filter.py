@@ -335,11 +335,12 @@ def _measured_values(contact: Contact) -> tuple[Array, Array]:
     """Return x, y and ln F of a contact, shape (3,), and their covariance, shape (3, 3).
 
     The standard deviations are limited, and the correlations are made slightly smaller, so that the covariance has only
-    positive eigenvalues.
+    positive eigenvalues in spite of rounding errors. Far from the training, a model may state 1e-6 mm or 1e14 mm.
     """
     smallest_force_N = float(np.finfo(np.float32).tiny)  # ln F would be infinite if the force were zero
     force_N = max(smallest_force_N, contact.force_N)
-    std = np.minimum([contact.x_std_mm, contact.y_std_mm, contact.force_std_N / force_N], LARGEST_STD)
+    stated_std = [contact.x_std_mm, contact.y_std_mm, contact.force_std_N / force_N]
+    std = np.clip(stated_std, 1e-5 * LARGEST_STD, LARGEST_STD)
     xy, xF, yF = contact.xy_correlation, contact.xF_correlation, contact.yF_correlation
     correlation = np.array([[1.0, xy, xF], [xy, 1.0, yF], [xF, yF, 1.0]]) + CORRELATION_RIDGE * _IDENTITY
     return np.array([contact.x_mm, contact.y_mm, math.log(force_N)]), correlation * np.outer(std, std)
