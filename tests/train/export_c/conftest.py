@@ -14,7 +14,7 @@ from isocharge.train.export_c.folder import export_c
 from processes import finished
 
 HERE = Path(__file__).parent
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic")
 
 
 def compile_strictly(compiler, folder, output, *sources, options=("-O0",)):

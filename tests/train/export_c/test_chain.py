@@ -110,9 +110,9 @@ def draw_frames(board, seed, seconds=20.0):
     return Frames(values, t_s, dt_s, limited, tare)
 
 
-def regular_frames(values):
+def regular_frames(values, rate_Hz=RATE_Hz):
     """Return frames of which none is limited or begins a tare."""
-    dt_s = np.full(len(values), 1.0 / RATE_Hz)
+    dt_s = np.full(len(values), 1.0 / rate_Hz)
     never = np.zeros(len(values), dtype=bool)
     return Frames(values, np.cumsum(dt_s), dt_s, limited=never, tare=never)
 
@@ -188,7 +188,7 @@ def test_single_precision_changes_charges_by_less_than_a_twentieth_of_a_picocoul
     compare_chains(exported, device(board), frames, misfit, tolerance_pC=0.05)
 
 
-@pytest.mark.parametrize(("tau_s", "learn"), [(10.0, True), (1000.0, False)])
+@pytest.mark.parametrize(("tau_s", "learn"), [(10.1, True), (1000.0, False)])
 def test_single_precision_does_not_add_up_its_errors_in_a_held_press(tau_s, learn, build):
     """The sampling interval is constant, so that the errors of all frames have the same sign."""
     board = device_from_table({"leak": {"tau_s": tau_s, "learn": learn}}, "board")
@@ -206,8 +206,7 @@ def test_single_precision_learns_the_leak_from_the_same_frames_after_a_release(r
     pressed_pC = np.where((t_s > 2.0) & (t_s % 3.7 < 2.0), 850.0, 0.0)
     decay = np.exp(-1.0 / (rate_Hz * 10.0))
     leaking_pC = lfilter([1.0, -1.0], [1.0, -decay], pressed_pC)  # output of an amplifier that leaks
-    values = leaking_pC[:, None] + np.random.default_rng(1).standard_normal((len(t_s), 4))
-    frames = regular_frames(values)._replace(t_s=t_s, dt_s=np.full(len(t_s), 1.0 / rate_Hz))
+    frames = regular_frames(leaking_pC[:, None] + np.random.default_rng(1).standard_normal((len(t_s), 4)), rate_Hz)
     exported = build("four-25um-biaxial", board, options=SINGLE_PRECISION)
     compare_chains(exported, board, frames, tolerance_pC=0.1)
 
@@ -246,18 +245,18 @@ def test_failed_first_tare_is_reported_after_the_patience_of_the_board(build, re
 
 def test_tare_that_is_too_long_for_c_is_refused():
     with pytest.raises(DeviceError, match=r"board: tare.frames: expected a whole number from 1 to 10000.*got 50000"):
-        device_header(device_from_table({"tare": {"frames": 50_000, "patience": 0}}, "board"), ("A", "B", "C"))
+        device_header(device_from_table({"tare": {"frames": 50_000, "patience": 0}}, "board"), ELECTRODES)
 
 
 def test_stage_without_code_in_c_is_refused_by_its_name(monkeypatch):
     monkeypatch.setattr(Hum, "section", "notch")
     board = device_from_table({"hum": {}}, "board")
     with pytest.raises(DeviceError, match="board: notch: this stage does not exist"):
-        device_header(board, ("A", "B", "C"))
+        device_header(board, ELECTRODES)
 
 
 def test_sections_that_only_the_host_executes_are_named_in_a_warning(caplog):
-    device_header(device_from_table({"track": {}, "follow": {}}, "board"), ("A", "B", "C"))
+    device_header(device_from_table({"track": {}, "follow": {}}, "board"), ELECTRODES)
     assert "board: follow, track: not exported" in caplog.text
 
 

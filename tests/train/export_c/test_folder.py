@@ -49,7 +49,7 @@ def test_command_writes_the_folder_once(command, refused, tmp_path):
     code, out, err = command(*words)
     assert (code, out, "isocharge_model.c" in err) == (0, "", True)
     header = (tmp_path / "c" / "isocharge_device.h").read_text()
-    assert "#define ISOCHARGE_LEAK_TAU_S {10.0, 10.0, 10.0}" in header
+    assert "#define ISOCHARGE_LEAK_TAU_S {(isocharge_real)10.0, " in header
     assert header.startswith('/* The numbers of the signal chain, from the device file "bench board". Written by')
     readme = (tmp_path / "c" / "README.md").read_text()
     assert 'the numbers of the signal chain, from the device file "bench board" |' in readme
@@ -141,8 +141,7 @@ def test_a_recording_gives_our_records_frame_by_frame(host, film, tmp_path):
 def test_host_example_says_what_is_wrong(host, tmp_path):
     program, _ = host
     (tmp_path / "text").write_text("801.2,799.5,803.3\n" * 1000)
-    four = b"".join(encode_frame(Frame(k, 5000 * k, (1.0,) * 4)) for k in range(3))
-    (tmp_path / "four").write_bytes(four)
+    (tmp_path / "four").write_bytes(b"".join(encode_frame(Frame(k, 5000 * k, (1.0,) * 4)) for k in range(3)))
     noisy = np.random.default_rng(0).normal(0.0, 100.0, (2500, 3))
     (tmp_path / "noisy").write_bytes(b"".join(encode_frame(Frame(k, 5000 * k, tuple(q))) for k, q in enumerate(noisy)))
     for name, message in [

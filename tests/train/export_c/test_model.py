@@ -32,7 +32,6 @@ def run_self_test(compile_c, tmp_path):
         ("-O3", "-march=native", "-ffp-contract=fast"),
         ("-O0", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"),
     ],
-    ids=lambda options: options[-1],
 )
 def test_self_test_passes_in_strict_c99(compiler, options, exports, run_self_test):
     for folder in exports:
@@ -57,16 +56,15 @@ def test_self_test_fails_if_a_weight_is_changed(exports, run_self_test, tmp_path
     assert "expected" in printed
 
 
-LIMITS = {
-    "round area": {},
-    "no yield": {"yield_force_N": None},
-    "area beside the centre": {"working_area_mm": ((2.0, 1.0), (9.0, 2.0), (8.0, 7.0), (5.0, 3.0), (3.0, 8.0))},
-    "larger misfits": {"errors": {"misfit_p999": 7.0}},
-}
-"""Changes of the metadata of a model."""
-
-
-@pytest.mark.parametrize("changes", LIMITS.values(), ids=LIMITS)
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"yield_force_N": None},
+        {"working_area_mm": ((2.0, 1.0), (9.0, 2.0), (8.0, 7.0), (5.0, 3.0), (3.0, 8.0))},  # beside the centre
+        {"errors": {"misfit_p999": 7.0}},
+    ],
+)
 def test_flags_in_c_are_those_of_python(changes, build, tmp_path):
     model = write_random_model(tmp_path / "limits", random_network(4, (4, 4), (4, 4)), **changes)
     random = np.random.default_rng(0)

@@ -71,15 +71,15 @@ def settings_origin(device: Device) -> str:
 
 
 def _c_literal(value: Any) -> str:
-    """Return a number or a truth value as a C literal, and an array as an initialiser, for example `{1.0, 2.0}`.
+    """Return a number or a truth value as a C literal, and an array as an initialiser.
 
-    A truth value becomes 0 or 1.
+    A truth value becomes 0 or 1. The numbers of an array are converted to the precision of the signal chain.
 
     Args:
         value: The number, truth value or array.
     """
     if isinstance(value, np.ndarray):
-        return "{" + ", ".join(map(_c_literal, value)) + "}"
+        return "{" + ", ".join(f"(isocharge_real){_c_literal(number)}" for number in value) + "}"
     if isinstance(value, int):  # truth values are integers as well
         return str(int(value))
     return repr(float(value))  # the shortest literal of a double
