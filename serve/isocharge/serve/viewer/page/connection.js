@@ -22,7 +22,7 @@ export class Connection {
       await this.follow(session);
     } catch (error) {
       if (error.status === 401) return this.on.door(this.token ? "This token is wrong." : "");
-      this.on.link("lost", `${error instanceof TypeError ? "no answer" : error.message}; trying again`);
+      this.on.link("lost", `${wordsOf(error)}; trying again`);
       setTimeout(() => this.open(), this.pause);
       this.pause = Math.min(2 * this.pause, LONGEST_PAUSE_MS);
     }
@@ -56,7 +56,7 @@ export class Connection {
   }
 
   async request(content) {
-    try { await this.post(content); } catch (error) { this.on.error(error.message); }
+    try { await this.post(content); } catch (error) { this.on.error(wordsOf(error)); }
   }
 
   post(content) { return this.fetch("request", { method: "POST", body: JSON.stringify(content) }); }
@@ -69,6 +69,9 @@ export class Connection {
     return content;
   }
 }
+
+/** Browsers have different words for a server that does not answer. */
+function wordsOf(error) { return error instanceof TypeError ? "no answer" : error.message; }
 
 /** The token in the address after #, which is taken out of it and never sent as part of it. */
 function takeToken() {

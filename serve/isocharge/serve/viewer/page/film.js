@@ -96,7 +96,7 @@ export class FilmView {
       contact: "touch", none: this.history.latest ? "no touch" : "waiting for the first frame", tare: "taring: leave the film alone",
       outside: "outside the area or the forces that the model knows: place and force are guesses",
       misfit: "no single contact fits these charges: two touches, or another film? The place means little",
-      silent: Number.isFinite(this.arrivedMs) ? "no frame comes: is the sensor plugged in?" : "waiting for the first frame",
+      silent: Number.isFinite(this.arrivedMs) ? "no frame comes: does the stream run, and is the sensor plugged in?" : "waiting for the first frame",
     }[kind];
     verdict.dataset.kind = kind;
     setText(verdict.querySelector(".text"), words);
