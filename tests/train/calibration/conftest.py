@@ -35,7 +35,7 @@ FEW_VALUES = {
 
 @pytest.fixture
 def few_hypotheses(monkeypatch):
-    """To save time, the estimator compares 128 hypotheses instead of 2,916."""
+    """To save time, the estimator compares 256 hypotheses instead of 5,832."""
     for name, values_and_probabilities in FEW_VALUES.items():
         monkeypatch.setattr(estimator, name, values_and_probabilities)
 

@@ -71,14 +71,15 @@ def test_working_area_beyond_the_clamp_is_refused(problem, radius):
         replace(problem, radius=radius)
 
 
-@pytest.mark.parametrize("offset", [10.0, -12.0])
-def test_offset_of_all_charges_is_found_with_its_sign(fit, press_film, offset):
+@pytest.mark.parametrize(("name", "offset"), [("offset", 10.0), ("offset", -12.0), ("force_offset", 0.03)])
+def test_offset_of_all_charges_or_forces_is_found_with_its_sign(fit, press_film, name, offset):
     presses = press_film(15, seed=12)
-    result = fit(replace(presses, charge_pC=presses.charge_pC + offset))
-    assert abs(result.film.value("offset") - offset) < 4.0 * result.film.std("offset") < 8.0
+    readings = presses.charge_pC if name == "offset" else presses.contact[:, 2]
+    readings += offset
+    result = fit(presses)
+    assert abs(result.film.value(name) - offset) < 5.0 * result.film.std(name) < abs(offset)
     (caution,) = result.cautions
-    assert "contain an offset of" in caution
-    assert re.search(r"offset of (-?\d+)", caution)[1].startswith("-") == (offset < 0.0)
+    assert re.search(r"contain an offset of (-?\d+)", caution)[1].startswith("-") == (offset < 0.0)
 
 
 def test_bad_press_and_press_outside_are_named_by_their_lines(fit, press_film):

@@ -48,7 +48,7 @@ REMOVED = None
 """Value of an entry that is missing."""
 
 FAULTS = {
-    "older": ("format_version", 4, "format_version: expected 5, got 4; .* calibrate again with its presses"),
+    "older": ("format_version", 5, "format_version: expected 6, got 5; .* calibrate again with its presses"),
     "no version": ("format_version", REMOVED, "key 'format_version' is missing; .* calibrate again with its presses"),
     "sensor": ("described_sensor.name", "mine", "expected the sensor file .*, got one with another name"),
     "probe": ("probe", "circle:2", "probe: expected circle:1"),
@@ -60,9 +60,9 @@ FAULTS = {
         r"unknowns\.pretension\.value: expected 0 to",
     ),
     "negative": ("unknowns.young", {"value": 0.0, "std": -0.1}, r"unknowns\.young\.std: expected a number from 0"),
-    "rows": ("correlations", [[], [0.1, 0.2]], "correlations: expected 147 rows of 0 to 146 numbers"),
-    "large": ("correlations", [[1.0 - 2.0 * (i == 2)] * i for i in range(147)], "positive semidefinite"),
-    "beyond": ("correlations", [[1.5] * i for i in range(147)], r"correlations\[1\]\[0\]: expected"),
+    "rows": ("correlations", [[], [0.1, 0.2]], "correlations: expected 148 rows of 0 to 147 numbers"),
+    "large": ("correlations", [[1.0 - 2.0 * (i == 2)] * i for i in range(148)], "positive semidefinite"),
+    "beyond": ("correlations", [[1.5] * i for i in range(148)], r"correlations\[1\]\[0\]: expected"),
 }
 """Key of an entry, joined by dots, its changed value, and the message that names the fault."""
 

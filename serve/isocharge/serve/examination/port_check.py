@@ -184,7 +184,7 @@ def examine_received(
         device = device_from_table({key: value for key, value in table.items() if gain or key != "gain"}, "board")
         Gain(Setup(electrodes, device))  # raises an error for the numbers of other electrodes
     electrode_at_position = electrodes_by_position(capture, device, electrodes)
-    unit = unit_of(capture, list(electrode_at_position))
+    unit = unit_of(capture, electrode_at_position)
     charges = values[is_rest][:, list(electrode_at_position)]  # shape (n, n_electrode)
     gain_rule = device.rule(GainRule)
     if gain_rule is not None:

@@ -3,7 +3,7 @@
 The charge of one count cannot be derived from the bytes. The user has to state this charge.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -58,14 +58,14 @@ def propose(
         table["channels"] = {electrode: capture.names[position] for electrode, position in positions.items()}
     offset = {electrode: _rest_level(rest_values[:, position]) for electrode, position in positions.items()}
     has_large_offset = any(abs(level) > TareRule().offset_limit_pC for level in offset.values())
-    is_in_pC = unit_of(capture, list(positions.values())) == "pC"
+    is_in_pC = unit_of(capture, positions.values()) == "pC"
     if gain or has_large_offset or not is_in_pC:
         known_gain = dict(gain) or ({"pC_per_unit": 1.0} if is_in_pC else {})
         table["gain"] = ({"offset": offset} if any(offset.values()) else {}) | known_gain
     return table
 
 
-def unit_of(capture: Capture, positions: Sequence[int], max_noise_V: float = 0.02) -> str:
+def unit_of(capture: Capture, positions: Iterable[int], max_noise_V: float = 0.02) -> str:
     """Return the unit of the values of a board whose gain is unknown: "pC", "counts", "V", or a unit in the names.
 
     The unit is guessed from the names and the values of the electrodes' channels. Other channels, such as a

@@ -252,8 +252,8 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
     if errors.force_scatter > 0.0:
         cautions.append(
             f"the forces scatter by about {100.0 * errors.force_scatter:.2g} % more than stated: is the load cell zero "
-            "without a load, does it lag behind, or do the charges leak between the press and its reading? An error "
-            "that all forces share makes the standard deviations of the model too small"
+            "without a load, does it lag behind, or do the charges leak between the press and its reading? Errors that "
+            "many forces share are larger than the model states"
         )
     cautions.extend(film.session_cautions())
     cautions.extend(

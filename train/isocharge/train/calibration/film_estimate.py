@@ -103,13 +103,14 @@ class SessionProperty:
         name: Name of the unknown.
         stds: Standard deviations of the prior distribution that are considered, with their probabilities.
         effect: Function that computes the derivatives of the charges, shape (n, n_electrode). Its arguments are the
-            times of the presses, shape (n,), and the charges of the film, shape (n, n_electrode).
+            times of the presses, shape (n,), the charges of the film, and their derivatives with respect to the force,
+            both of shape (n, n_electrode).
         caution: Words about a value that is certainly not zero, with the fields `value` and `std`.
     """
 
     name: str
     stds: tuple[tuple[float, float], ...]
-    effect: Callable[[Array, Array], Array]
+    effect: Callable[[Array, Array, Array], Array]
     caution: str
 
 
@@ -117,16 +118,23 @@ SESSION = (
     SessionProperty(
         "offset",
         ((1e-6, 0.9), (30.0, 0.1)),
-        lambda _, charge: np.ones_like(charge),
+        lambda _time, charge, _slope: np.ones_like(charge),
         "all charges of all presses contain an offset of {value:.2g} +- {std:.2g} pC: is the tare right? The model "
         "expects the same offset in later contacts; after a new tare, calibrate again",
     ),
     SessionProperty(
         "drift",
         ((1e-6, 0.95), (0.15, 0.05)),
-        lambda time, charge: time[:, None] * charge,
+        lambda time, charge, _slope: time[:, None] * charge,
         "the charges change by a share of {value:.2g} +- {std:.2g} from the first press to the last: does an amplifier "
         "drift? The standard deviations of the model contain this change",
+    ),
+    SessionProperty(
+        "force_offset",
+        ((1e-6, 0.9), (0.03, 0.1)),
+        lambda _time, _charge, slope: -slope,  # the charges are those of the stated force without its offset
+        "all known forces contain an offset of {value:.2g} +- {std:.2g} N: is the load cell zero without a load? The "
+        "forces of the model are without this offset",
     ),
 )
 """All unknowns of a session, in the order of the vector.

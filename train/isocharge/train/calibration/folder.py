@@ -13,9 +13,9 @@ A further calibration in the same folder becomes its next version. A server load
 models. Programs only read the version folders, and the copies above the version folders are for people.
 
 The file `calibration.json` contains the value and the standard deviation of each unknown, in the unit of the property
-of the same name. The unit of an offset is pC, and coefficients have no unit. `correlations` is the lower triangle of
-the correlation matrix of all unknowns, in this order: one row for each unknown, without the diagonal, rounded to six
-digits. The correlations of an unknown whose standard deviation is zero are zero.
+of the same name. The unit of `offset` is pC, that of `force_offset` is N, and coefficients have no unit. `correlations`
+is the lower triangle of the correlation matrix of all unknowns, in this order: one row for each unknown, without the
+diagonal, rounded to six digits. The correlations of an unknown whose standard deviation is zero are zero.
 """
 
 import json
@@ -69,7 +69,7 @@ class _Unknown(Struct, frozen=True):
 class _CalibrationFile(Struct, frozen=True):
     """Entries of calibration.json that `read_film` uses."""
 
-    format_version: Annotated[int, Meta(ge=5, le=5, description="5")]
+    format_version: Annotated[int, Meta(ge=6, le=6, description="6")]
     probe: Text
     radius_mm: Number
     force_range_N: tuple[Number, Number]
@@ -92,7 +92,7 @@ def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any
     correlations = np.divide(film.covariance, product, out=np.zeros_like(product), where=product > 0.0)
     rounded = np.clip(np.round(correlations, DIGITS), -1.0, 1.0)
     return {
-        "format_version": 5,  # the version that `_CalibrationFile` reads
+        "format_version": 6,  # the version that `_CalibrationFile` reads
         "probe": problem.probe.rotated_notation,
         "radius_mm": problem.radius,
         "force_range_N": list(problem.force_range),

@@ -167,7 +167,8 @@ def model_values(charges: FilmCharges, layout: Layout, data: PressData, unknowns
     """
     metric_contact = in_domain(contact, charges.domain)  # (x, y, F), mm and N
     charge, contact_slopes, film_jacobian = charges.linearised(unknowns[layout.film], metric_contact)
-    session_jacobian = np.stack([one.effect(data.time, charge) for one in SESSION], axis=2)
+    force_slope = contact_slopes[:, :, 2] / metric_contact[:, 2:]  # with respect to F instead of ln F, pC/N
+    session_jacobian = np.stack([one.effect(data.time, charge, force_slope) for one in SESSION], axis=2)
 
     coefficient_jacobian = discrepancy_jacobian(charge, metric_contact, charges.domain)
     jacobian = np.concatenate([film_jacobian, session_jacobian, coefficient_jacobian], axis=2)
