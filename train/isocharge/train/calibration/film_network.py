@@ -16,6 +16,7 @@ changes along the directions are also computed for these films, because they dep
 import logging
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from isocharge.common.files import sha256_of
 from isocharge.serve.model.charge_series import CHUNK_SIZE, ChargeSeries, series_size
 from isocharge.serve.presses.measured_presses import CONTACT
 from isocharge.simulate import Domain, Sweep
+from isocharge.simulate.execution import in_order
 from isocharge.simulate.forward.whole_film import outermost_distance, whole_film_map
 from isocharge.simulate.sensor.film_properties import PRETENSION, UNEVEN_TENSIONS
 from isocharge.simulate.solver.stress_limit import yield_force
@@ -83,7 +85,7 @@ def compact_charges(
     if len(names) > len(CONTACT):  # three charges only determine the contact
         films = [_ChangedFilm.solve(calibrated, change_MPa, executor) for change_MPa in _nodes(film).tolist()]
     node_MPa = np.array([one.change_MPa for one in films])
-    node_charge = charge[:, None] * _tension_factors(films, contact)
+    node_charge = charge[:, None] * _tension_factors(films, contact, executor)
     series = _fit_followable_nodes(domain, names, contact, node_charge, node_MPa)
     few_contacts = slice(DIRECTION_CONTACTS)
     followed_films = [one for one in films if one.change_MPa in series.node_MPa]
@@ -195,7 +197,7 @@ def _nodes(film: FilmEstimate) -> Array:
     return np.unique(np.where(node_MPa < 0.0, factor * node_MPa, node_MPa))
 
 
-def _tension_factors(films: list[_ChangedFilm], contact: Array) -> Array:
+def _tension_factors(films: list[_ChangedFilm], contact: Array, executor: Executor | None) -> Array:
     """Compute the factors by which changes of the pretension multiply the charges.
 
     If a change reverses the sign of a charge, no factor can describe it, and the result is 1.
@@ -203,13 +205,19 @@ def _tension_factors(films: list[_ChangedFilm], contact: Array) -> Array:
     Args:
         films: Films with changed pretensions, one of them without a change.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        executor: Executor that computes the charges of the films; None for this process.
 
     Returns:
         Factors, shape (n, n_film, n_electrode), dimensionless.
     """
-    charge = np.stack([one.charges.charges(one.values, contact) for one in films], axis=1)
+    charge = np.stack(list(in_order(executor, partial(_film_charge, contact), films)), axis=1)
     charge_before = charge[:, [one.change_MPa == 0.0 for one in films]]
     return np.divide(charge, charge_before, out=np.ones_like(charge), where=charge_before * charge > 0.0)
+
+
+def _film_charge(contact: Array, film: _ChangedFilm) -> Array:
+    """Compute the charges of contacts on a changed film, shape (n, n_electrode), pC."""
+    return film.charges.charges(film.values, contact)
 
 
 def _directions(
