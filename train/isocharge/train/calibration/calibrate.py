@@ -252,8 +252,8 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
     if errors.force_scatter > 0.0:
         cautions.append(
             f"the forces scatter by about {100.0 * errors.force_scatter:.2g} % more than stated: is the load cell zero "
-            "without a load, does it lag behind, or do the charges leak between the press and its reading? Errors that "
-            "many forces share are larger than the model states"
+            "without a load, does it lag behind, or do the charges leak between the press and its reading? The "
+            "standard deviations of the model do not contain errors that many forces share"
         )
     cautions.extend(film.session_cautions())
     cautions.extend(
