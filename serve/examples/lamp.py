@@ -44,8 +44,8 @@ with port as chunks:
             is_on = not is_on  # a real program would switch its lamp here
             state = "on" if is_on else "off"
             print(f"{state} by {record.force_N:.2f} N at ({record.x_mm:.1f}, {record.y_mm:.1f}) mm")
-        is_touched = record.force_N != 0.0  # the force of an invalid frame is None
-        has_switched = is_touched and (has_switched or is_hard_press)
+        is_released = record.force_N == 0.0  # the force of an invalid frame is None, so the touch goes on
+        has_switched = not is_released and (has_switched or is_hard_press)
         times_s.append(record.timestamp)
         forces_N.append(record.force_N or 0.0)
         lamp_states.append(is_on)

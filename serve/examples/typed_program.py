@@ -35,7 +35,7 @@ def touches(records: Iterable[PredictionRecord]) -> Iterator[Touch]:
             else:
                 hardest = touch.hardest
             touch = Touch(hardest, 1 if touch is None else touch.frames + 1)
-        elif touch is not None and record.force_N == 0.0:  # the force of an invalid frame is None
+        elif touch is not None and record.force_N == 0.0:  # an invalid frame has the force None
             yield touch
             touch = None
 

@@ -254,9 +254,10 @@ def channel_sentences(
 
 
 def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress) -> Iterator[str]:
-    """Yield one sentence for each missing setting or property without which the force of a held press seems to change.
+    """Yield one sentence for each missing setting or property that is needed for the force of a held press.
 
-    The force seems to change because the amplifiers leak. Touches are computed in any case.
+    Without it, the force seems to change during the press, because the amplifiers leak. Touches are computed in any
+    case.
 
     - If the device file contains time constants of a leak, each frame must contain the time of a clock of the device.
     - If no press was held, the time constants of the amplifiers are requested, unless the device file contains them.

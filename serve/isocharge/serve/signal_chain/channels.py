@@ -100,10 +100,17 @@ class Channels(Stage):
         return indices
 
     def indices_by_name_or_order(self, frame: Frame) -> tuple[int, ...] | None:
-        """Return, for each electrode, the index of its channel in `frame.values` without the section `[channels]`.
+        """Find the channel of each electrode by the names or the order of the channels, without the device file.
 
-        The result is None if no channel has the name of an electrode, and there are more or fewer channels than
-        electrodes.
+        A channel belongs to the electrode whose name it has. If the channels have no names of electrodes, they belong
+        to the electrodes in their order.
+
+        Args:
+            frame: A frame, whose channels may have names.
+
+        Returns:
+            For each electrode, the index of its channel in `frame.values`. None if no channel has the name of an
+            electrode, and there are more or fewer channels than electrodes.
 
         Raises:
             ChargeError: If not exactly one channel has the name of each electrode, if a channel states a unit other
@@ -129,7 +136,7 @@ class Channels(Stage):
         if has_other_count:
             return None
         if has_all_names:
-            places_in_order = sorted(places)
+            places_in_order = sorted(places)  # of the names of the electrodes in the line of text
             return tuple(places_in_order.index(place) for place in places)
         if not _are_in_order(frame.names):
             raise self._assignment_error(frame)

@@ -154,7 +154,8 @@ class Tare(Stage):
         if frame.is_contact or rule is None or frame.charge_pC is None:
             return frame.warming_pC
         limited_charge_pC = frame.charge_pC.clip(-rule.noise_limit_pC, rule.noise_limit_pC)
-        return limited_charge_pC * -math.expm1(-frame.dt_s / rule.relax_s)
+        approached_share = -math.expm1(-frame.dt_s / rule.relax_s)  # 1 - exp(-dt_s / relax_s)
+        return approached_share * limited_charge_pC
 
     def _search(self, frame: Frame, charge_pC: Array) -> None:
         """Add a frame to the latest frames, and measure the tare if these frames are enough and quiet.

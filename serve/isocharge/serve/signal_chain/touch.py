@@ -161,9 +161,8 @@ class Touch(Stage):
             direction: Sum of the directions of the earlier frames of the touch, shape (n_electrode,), dimensionless.
         """
         size = _norm(charge)
-        self._peak_size = max(
-            self._peak_size, min(size, _norm(self._previous))
-        )  # a spike of a single frame is not a peak
+        held_size = min(size, _norm(self._previous))  # a spike of a single frame is not a peak
+        self._peak_size = max(self._peak_size, held_size)
         release_size = max((rule.release_share or 0.0) * self._peak_size, 0.5)
         reference = self._previous if self._setup.has_any_sign else self._rest_direction
         is_reversed = charge @ reference < 0.0

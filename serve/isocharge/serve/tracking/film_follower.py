@@ -350,24 +350,27 @@ class FilmFollower(Stage):
     def _apply_estimate(self) -> None:
         """Compute the state of the film for which contacts are corrected.
 
-        The pretension may have changed, or it may not have changed. The state is the mean over both cases, weighted by
-        their probabilities. Before the touches, the odds of the second case are `UNCHANGED_ODDS`. The touches multiply
-        these odds by a ratio of two probability densities at t = 0, after and before the touches (Savage-Dickey ratio,
-        Dickey 1971).
+        There are two cases: since the calibration, the pretension has changed, or it has not. The state is the mean
+        over both cases, weighted by their probabilities.
 
-        The covariance remains that of a film which has changed, because hardly any film keeps its pretension exactly.
-        Added to it is the outer product of the shift between the two cases, times the probability of no change.
+        Before the first touch, the odds of no change are `UNCHANGED_ODDS`. The touches multiply these odds by the
+        Savage-Dickey ratio (Dickey 1971). It is the probability density of t = 0 after the touches, divided by the
+        probability density of t = 0 before the first touch.
+
+        The covariance is that of a changed pretension, because hardly any film keeps its pretension exactly. It is
+        increased by the outer product of the difference between the states of both cases, times the probability of no
+        change.
         """
         change_MPa = self._state[0]
         variance = self._covariance[0, 0]
         density_ratio = self._initial_std[0] / math.sqrt(variance) * math.exp(-0.5 * change_MPa**2 / variance)
-        odds = UNCHANGED_ODDS * density_ratio
-        probability = odds / (1.0 + odds)
+        unchanged_odds = UNCHANGED_ODDS * density_ratio
+        unchanged_probability = unchanged_odds / (1.0 + unchanged_odds)
 
         # Without a change, the other unknowns have their conditional distribution for t = 0.
-        shift = change_MPa * self._covariance[0] / variance
-        self._applied_state = self._state - probability * shift
-        self._applied_covariance = self._covariance + probability * np.outer(shift, shift)
+        difference = change_MPa * self._covariance[0] / variance  # of the state with a change from that without one
+        self._applied_state = self._state - unchanged_probability * difference
+        self._applied_covariance = self._covariance + unchanged_probability * np.outer(difference, difference)
         self._applied_covariance[self._offset, self._offset] += self._error_scale * self._offset_std_pC**2
 
     def _values(self, contacts: Array, state: Array) -> ModelValues:

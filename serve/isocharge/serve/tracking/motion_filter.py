@@ -335,7 +335,8 @@ def _measured_values(contact: Contact) -> tuple[Array, Array]:
     """Return x, y and ln F of a contact, shape (3,), and their covariance, shape (3, 3).
 
     The standard deviations are limited, and the correlations are made slightly smaller, so that the covariance has only
-    positive eigenvalues in spite of rounding errors. Far from the training, a model may state 1e-6 mm or 1e14 mm.
+    positive eigenvalues in spite of rounding errors. For charges that differ much from those of its training, a model
+    may state 1e-6 mm or 1e14 mm.
     """
     smallest_force_N = float(np.finfo(np.float32).tiny)  # ln F would be infinite if the force were zero
     force_N = max(smallest_force_N, contact.force_N)

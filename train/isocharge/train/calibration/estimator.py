@@ -1,14 +1,14 @@
 """Estimator of a film: the most probable unknowns, given measured presses and a Gaussian prior distribution.
 
 The unknowns of the film and the contacts of the presses are found together by nonlinear least squares (Gauss-Newton). A
-contact may be known, known with an error, or unknown. The contacts are eliminated in every step (variable projection,
-Golub and Pereyra 1973). Presses that do not agree with the others get a lower weight, according to Student's t
-distribution (Lange and others, 1989), and are left out of the final estimate.
+contact may be known exactly, known with an error, or unknown. The contacts are eliminated in every step (variable
+projection, Golub and Pereyra 1973). Presses that do not agree with the others get a lower weight, according to
+Student's t distribution (Lange and others, 1989), and are left out of the final estimate.
 
 Some facts are not known beforehand: how uneven a film is, how large its discrepancy and the errors of the presses are,
-and whether the session has an offset or a drift. Each combination of these cases is a hypothesis. The evidence of a
-hypothesis follows from the linearised problem (MacKay 1992), and the estimate is the mean over the hypotheses, weighted
-by their evidence.
+and whether the session has an offset of the charges or of the forces, or a drift. Each combination of these cases is a
+hypothesis. The evidence of a hypothesis follows from the linearised problem (MacKay 1992), and the estimate is the mean
+over the hypotheses, weighted by their evidence.
 """
 
 from collections.abc import Iterator

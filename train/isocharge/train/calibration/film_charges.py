@@ -143,9 +143,10 @@ class FilmCharges:
     def _with_other_stress(
         self, values: Array, solved_charge: Array, stress_derivatives: dict[str, Array]
     ) -> tuple[Array, Array]:
-        """Add the first-order change of the charges that the properties with an effect on the stress cause.
+        """Add to the charges the first-order effect of the properties that change the stress.
 
-        The change is applied to the logarithm of a charge, unless the charge is negative or changes its sign.
+        The change is applied to the logarithm of a charge, unless the charge is negative, or the change is larger than
+        the charge.
 
         Args:
             values: Properties of the film, shape (n_property,).

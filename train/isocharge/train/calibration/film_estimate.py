@@ -132,7 +132,7 @@ SESSION = (
     SessionProperty(
         "force_offset",
         ((1e-6, 0.98), (0.03, 0.02)),
-        lambda _time, _charge, slope: -slope,  # the charges are those of the stated force without its offset
+        lambda _time, _charge, slope: -slope,  # the true force is the stated force minus the offset
         "all known forces contain an offset of {value:.2g} +- {std:.2g} N: is the load cell zero without a load? The "
         "forces of the model are without this offset",
     ),

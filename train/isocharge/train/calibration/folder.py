@@ -88,9 +88,9 @@ def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any
     """
     layout = film.layout
     std = np.sqrt(np.diag(film.covariance))
-    product = np.outer(std, std)
-    correlations = np.divide(film.covariance, product, out=np.zeros_like(product), where=product > 0.0)
-    rounded = np.clip(np.round(correlations, DIGITS), -1.0, 1.0)
+    std_product = np.outer(std, std)
+    correlations = np.divide(film.covariance, std_product, out=np.zeros_like(std_product), where=std_product > 0.0)
+    rounded_correlations = np.clip(np.round(correlations, DIGITS), -1.0, 1.0)
     return {
         "format_version": 6,  # the version that `_CalibrationFile` reads
         "probe": problem.probe.rotated_notation,
@@ -101,7 +101,7 @@ def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any
             name: {"value": value, "std": one_std}
             for name, value, one_std in zip(layout.names, film.values, std, strict=True)
         },
-        "correlations": [row[:index] for index, row in enumerate(rounded)],
+        "correlations": [row[:index] for index, row in enumerate(rounded_correlations)],  # the lower triangle
         "described_sensor": sensor_to_dict(problem.sensor),
     }
 
