@@ -39,6 +39,10 @@ class SyntheticFilm:
     def values(self):
         return self.prior.mean
 
+    @property
+    def even(self):
+        return self
+
     @cached_property
     def effects(self):
         """Derivatives of the coefficients with respect to the properties, shape (4, n_property, n_electrode)."""

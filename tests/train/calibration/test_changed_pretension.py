@@ -10,7 +10,7 @@ from isocharge.train import calibrate
 from isocharge.train.calibration import film_network
 from isocharge.train.calibration.calibrate import solve_even
 from isocharge.train.calibration.film_charges import FilmCharges
-from isocharge.train.calibration.film_network import _ChangedFilm, _nodes, _tension_factors
+from isocharge.train.calibration.film_network import _ChangedFilm, _film_charge, _nodes, _tension_factors
 from solved_charges import solved_charges, with_film
 
 
@@ -26,7 +26,9 @@ def test_charges_of_an_uneven_film_after_warming_agree_with_full_solves(problem)
 
     charges = solve_even(problem, values=film.film_values)
     calibrated = _ChangedFilm(0.0, charges, film.film_values, np.eye(film.film_values.size))
-    factors = _tension_factors([_ChangedFilm.solve(calibrated, change, None) for change in (0.0, -0.4)], contact, None)
+    changes = np.array([0.0, -0.4])
+    charge = [_film_charge(contact, _ChangedFilm.solve(calibrated, change, None)) for change in changes]
+    factors = _tension_factors(np.stack(charge, axis=1), changes)
     np.testing.assert_array_equal(factors[:, 0], 1.0)
     np.testing.assert_allclose(factors[:, 1], after / before, rtol=1e-3)
 
@@ -63,8 +65,8 @@ def test_no_node_makes_a_film_slack_in_one_direction(problem):
 def test_node_at_which_the_charges_are_unknown_is_left_out(problem, synthetic, monkeypatch, caplog):
     """Otherwise, the fit to its charges would also spoil the charges at the other nodes."""
 
-    def factors(_films, contact, _executor):
-        ratio = 0.5 * np.random.default_rng(3).standard_normal((len(contact), 3, 4))
+    def factors(charge, _node_MPa):
+        ratio = 0.5 * np.random.default_rng(3).standard_normal(charge.shape)
         return 1.0 + ratio * np.array([0.0, 0.0, 1.0])[:, None]
 
     monkeypatch.setattr(film_network, "_nodes", lambda _: np.array([-0.3, 0.0, 0.9]))

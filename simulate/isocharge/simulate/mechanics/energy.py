@@ -23,6 +23,7 @@ are in units of E_young h a^2 A^4, where h is the thickness of the film. For an 
 to tau I (`theory.DimensionlessGroups`). The bending stiffness is always computed for an isotropic film.
 """
 
+from functools import cached_property
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -356,7 +357,7 @@ class Bending:
     """
 
     def __init__(self, mesh: PlacedMesh, stiffness: float) -> None:
-        """Compute the matrices L and M of a mesh, from which the bending energy is computed.
+        """Take the matrices L and M of a mesh, from which the bending energy is computed.
 
         The matrix L contains the integrals of dot(grad p, grad q) for all pairs of basis functions p and q. The mass
         matrix M contains the integrals of p q. With the quadrature rule of the nodes, M is diagonal.
@@ -367,24 +368,25 @@ class Bending:
         """
         self.mesh = mesh
         self.stiffness = stiffness
-
-        # Matrix L of each mesh element, shape (n_element, n_local, n_local). The array `stacked_gradient` contains both
-        # derivatives of the basis functions at each quadrature point, so the weight of each point is repeated.
-        weights = np.repeat(mesh.weights, 2, axis=1)[..., None]
-        self._laplace = mesh.stacked_gradient.transpose(0, 2, 1) @ (weights * mesh.stacked_gradient)
-
+        self._laplace = mesh.laplace  # L, shape (n_element, n_local, n_local)
         self._mass = mesh.gather(mesh.mass)  # diagonal of M, shape (n_node,)
 
-        # Compute the blocks of the matrix of the linear solves. The unknowns mu of interior nodes are eliminated: their
-        # coupling becomes zero, and their Schur complement is added to the block of W.
-        self._mass_blocks = np.eye(mesh.mass.shape[1]) * mesh.mass[:, None]  # M, shape (n_element, n_local, n_local)
-        self._coupling = np.sqrt(stiffness) * (self._laplace - BENDING_SHIFT * self._mass_blocks)  # symmetric
+    @cached_property
+    def _blocks(self) -> tuple[Array, Array, Array]:
+        """Blocks (W, W), (W, mu) and (mu, mu) of the linear solves, each of shape (n_element, n_local, n_local).
+
+        The unknowns mu of interior nodes are eliminated: their coupling becomes zero, and their Schur complement is
+        added to the block of W.
+        """
+        mesh = self.mesh
+        mass = np.eye(mesh.mass.shape[1]) * mesh.mass[:, None]  # M
+        coupling = np.sqrt(self.stiffness) * (self._laplace - BENDING_SHIFT * mass)  # symmetric
         interior = mesh.template.is_interior
-        interior_coupling = self._coupling[:, interior]  # shape (n_element, n_interior, n_local)
+        interior_coupling = coupling[:, interior]  # shape (n_element, n_interior, n_local)
         schur_complement = interior_coupling.transpose(0, 2, 1) @ (interior_coupling / mesh.mass[:, interior, None])
-        shifted_laplace = 2.0 * BENDING_SHIFT * self._laplace - BENDING_SHIFT**2 * self._mass_blocks
-        self._deflection_block = stiffness * shifted_laplace + schur_complement
-        self._coupling[:, interior] = 0.0
+        shifted_laplace = 2.0 * BENDING_SHIFT * self._laplace - BENDING_SHIFT**2 * mass
+        coupling[:, interior] = 0.0
+        return self.stiffness * shifted_laplace + schur_complement, coupling.transpose(0, 2, 1), -mass
 
     def laplacian(self, deflection: Array) -> Array:
         """Compute the Laplacian m = -M^-1 L W of the deflection W.
@@ -444,10 +446,11 @@ class Bending:
                 zero.
         """
         # The indices of the unknowns of a node are 0 for U1, 1 for U2, 2 for W and 3 for mu.
-        tangent[:, 2, :, 2] += self._deflection_block
-        tangent[:, 2, :, 3] = self._coupling.transpose(0, 2, 1)
-        tangent[:, 3, :, 2] = self._coupling
-        tangent[:, 3, :, 3] = -self._mass_blocks
+        deflection_block, coupling, auxiliary_block = self._blocks
+        tangent[:, 2, :, 2] += deflection_block
+        tangent[:, 2, :, 3] = coupling
+        tangent[:, 3, :, 2] = coupling.transpose(0, 2, 1)
+        tangent[:, 3, :, 3] = auxiliary_block
 
 
 def _symmetric_matrix(stress: Array) -> Array:

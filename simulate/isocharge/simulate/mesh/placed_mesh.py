@@ -81,6 +81,15 @@ class PlacedMesh:
         return self._element_rule.film_weights(self.points)
 
     @cached_property
+    def laplace(self) -> Array:
+        """Integrals of dot(grad p, grad q) for all pairs (p, q) of basis functions of each element.
+
+        The shape is (n_element, n_local, n_local).
+        """
+        weights = np.repeat(self.weights, 2, axis=1)[..., None]  # for both derivatives at each quadrature point
+        return np.asarray(self.stacked_gradient.transpose(0, 2, 1) @ (weights * self.stacked_gradient))
+
+    @cached_property
     def mass(self) -> Array:
         """Integration weights of the nodes of each element, shape (n_element, n_local)."""
         return _lobatto_rule(self.resolution.order).film_weights(self.points)

@@ -1,4 +1,4 @@
-"""Effect of small imperfections of the film and of friction under the probe on an equilibrium.
+"""Effect of small changes of the film or the probe, and of friction under the probe, on an equilibrium.
 
 The displacements u of an equilibrium satisfy R(u, m) = 0, where R is the residual and m is the value of an
 imperfection. The tangent is K = dR/du. The derivative of the displacements with respect to m is
@@ -47,6 +47,8 @@ from isocharge.simulate.mechanics.theory import elasticity, side_force_unit
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Surface, increased
+from isocharge.simulate.sensor.footprint import Probe
+from isocharge.simulate.sensor.probe import RoundProbe
 from isocharge.simulate.solver.assembly import SolveTangent, factor_tangent, single_threaded_blas
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
 
@@ -54,7 +56,7 @@ STEP = 1e-3
 """Step of the central differences, in units of the imperfection."""
 
 AddImperfection = Callable[[Equilibrium, float], Equilibrium]
-"""Function that adds a given value of an imperfection to the film of an equilibrium.
+"""Function that adds a given value of an imperfection to the film of an equilibrium, or changes its probe.
 
 The displacements of the returned equilibrium are unchanged, and are therefore not in equilibrium.
 """
@@ -118,19 +120,34 @@ def _add_oval(solved: Equilibrium, value: float, direction: complex) -> Equilibr
         value: Parameter e of the oval clamp; see `mesh.oval`.
         direction: exp(2 i alpha), where alpha is the angle from the direction of the press to the longer axis.
     """
+    placement = solved.mesh.placement
+    return _placed_anew(solved, placement.probe, placement.oval + value * direction)
+
+
+def _add_radius(solved: Equilibrium, value: float) -> Equilibrium:
+    """Increase the radius of a round probe by a value in mm."""
+    placement = solved.mesh.placement
+    assert isinstance(placement.probe, RoundProbe)
+    larger_probe = replace(placement.probe, radius=placement.probe.radius + value)
+    return _placed_anew(solved, larger_probe, placement.oval)
+
+
+def _placed_anew(solved: Equilibrium, probe: Probe, oval: complex | Complexes) -> Equilibrium:
+    """Return a press with the same displacements at the nodes of a mesh for another probe or another clamp.
+
+    Args:
+        solved: The press.
+        probe: Probe for which the mesh is placed, of the same topology.
+        oval: Shape of the clamp in the frame of the press.
+    """
     mesh = solved.mesh
-    placement = Placement.of(
-        mesh.template,
-        mesh.placement.probe,
-        np.array(np.hypot(*solved.at)),
-        solved.film.radius,
-        mesh.layer,
-        oval=mesh.placement.oval + value * direction,
-    )
+    distance = np.array(np.hypot(*solved.at))
+    placement = Placement.of(mesh.template, probe, distance, solved.film.radius, mesh.layer, oval=oval)
     return replace(solved, mesh=replace(mesh, placement=placement))
 
 
 FILM_FIELDS = (
+    StressField("probe_radius", _add_radius, odd=False),
     StressField("pretension", partial(_add_tension, direction=(1.0, 1.0, 0.0)), odd=False),
     StressField("tension_difference", partial(_add_tension, direction=(1.0, -1.0, 0.0)), odd=False),
     StressField("tension_shear", partial(_add_tension, direction=(0.0, 0.0, 1.0)), odd=True),
@@ -139,22 +156,25 @@ FILM_FIELDS = (
     StressField("oval_x", partial(_add_oval, direction=1.0), odd=False),
     StressField("oval_xy", partial(_add_oval, direction=1j), odd=True),
 )
-"""Stress fields of a changed film: mean tension, uneven tension, uneven stiffness, and oval clamp.
+"""Stress fields of a changed probe or film: radius of the probe, mean and uneven tension, uneven stiffness, oval clamp.
 
-The mean tension has one field. Each other imperfection has an even field and an odd field, in this order. They belong
-to two properties of the film: the size of the imperfection times the cosine and the sine of twice the angle from the x
-axis to its axis 1.
+The radius of the probe and the mean tension have one field each. Each imperfection has an even field and an odd field,
+in this order. They belong to two properties of the film: the size of the imperfection times the cosine and the sine of
+twice the angle from the x axis to its axis 1.
 """
 
-TENSION_FIELDS = 3
-"""Number of stress fields of a changed tension, which are the first of `FILM_FIELDS`."""
+SCALAR_FIELDS = 2
+"""Number of fields without a direction, which are the first of `FILM_FIELDS`."""
+
+TENSION_FIELDS = slice(1, 4)
+"""Stress fields of a changed tension in `FILM_FIELDS`."""
 
 FILM_IS_ODD = np.array([field.odd for field in FILM_FIELDS])
 """Whether each of `FILM_FIELDS` is odd about the direction of the press, shape (n_field,)."""
 
 
 def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
-    """Compute how the scaled stress at the nodes changes if a property of the film changes.
+    """Compute how the scaled stress at the nodes changes if a property of the film or the radius of the probe changes.
 
     The properties are those of `FILM_FIELDS`. The film is rotated such that the press lies on the positive x axis. The
     stress is compared at fixed points of the rotated film. A change of the tension is in units of E A^2 + T, where E is
@@ -220,8 +240,8 @@ def _change_by_imperfection(
     negative_stress = nodal_stress(negative_equilibrium, surface)
     change = (positive_stress - negative_stress) / (2.0 * STEP)
 
-    # The nodes of an oval film move with the rim. Subtract the change of the stress that the movement of the nodes
-    # causes, so that the result holds for fixed points of the film.
+    # The nodes move with an oval rim or with the edge of the probe. Subtract the change of the stress that the movement
+    # of the nodes causes, so that the result holds for fixed points of the film.
     if positive_press.mesh is not negative_press.mesh:
         node_shift = (positive_press.mesh.points - negative_press.mesh.points) / (2.0 * STEP)
         change -= change_by_node_shift(solved.mesh, nodal_stress(solved, surface), node_shift)

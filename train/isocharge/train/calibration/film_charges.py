@@ -15,20 +15,12 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.serve.model.robust_estimate import ModelValues
 from isocharge.simulate import Circle, Domain, FilmPrior, FilmSlopes, ForwardMap, Probe, Sensor, SolveSettings
-from isocharge.simulate.forward.derivative_maps import few_nodes
 from isocharge.simulate.forward.family import nearest_to_clamp
 from isocharge.simulate.sensor.film_properties import PRETENSION, UNEVEN_TENSIONS, FilmProperty, changed_film
 from isocharge.simulate.solver.press import needed_resolution
 
 STEP = 1.0 / 3.0
 """Step of the difference quotients, in prior standard deviations of the property."""
-
-PROBE_RADIUS = "probe_radius"
-"""Name of the radius of the probe.
-
-It is the only property for which a second film is solved. The derivatives with respect to all other properties follow
-from the solved film and from `FilmSlopes`.
-"""
 
 MAX_LOG_CHANGE = 1.0
 """Largest change of the logarithm of a charge to which a first-order change is applied."""
@@ -42,16 +34,15 @@ class FilmCharges:
         prior: Declarations of the properties.
         values: Properties of the solved film, shape (n_property,).
         film: Forward map of the solved film.
-        slopes: Derivatives with respect to the mechanical properties, for the axisymmetric film.
-        larger_probe: Forward map of the axisymmetric film under a circular probe whose radius is larger by `STEP`; None
-            if the radius of the probe is not a property.
+        slopes: Charges of an axisymmetric film, and their derivatives with respect to the mechanical properties.
+        even_values: Properties of the axisymmetric film, shape (n_property,).
     """
 
     prior: FilmPrior
     values: Array
     film: ForwardMap
     slopes: FilmSlopes
-    larger_probe: ForwardMap | None
+    even_values: Array
 
     @classmethod
     def of_even_film(cls, prior: FilmPrior, values: Array, domain: Domain, executor: Executor | None) -> "FilmCharges":
@@ -71,12 +62,15 @@ class FilmCharges:
             SolveError: If a press has no equilibrium.
         """
         even_values = prior.even(values)
-        film = solve_even_map(prior, even_values, domain, executor)
-        larger_probe = None  # map of a larger probe, for the derivatives with respect to the radius of the probe
-        is_radius = np.array(prior.names) == PROBE_RADIUS
-        if is_radius.any():
-            larger_probe = solve_even_map(prior, even_values + STEP * prior.std * is_radius, domain, executor)
-        return cls(prior, even_values, film, FilmSlopes.build(film, executor=executor), larger_probe)
+        sensor, probe = prior.film(even_values)
+        film = replace(sensor.film, deviator=(0.0, 0.0), young_ratio=1.0, shear=None, oval=0.0)
+        slopes = FilmSlopes.build(replace(sensor, film=film), round_probe(probe), domain, executor=executor)
+        return cls(prior, even_values, slopes.film, slopes, even_values)
+
+    @property
+    def even(self) -> "FilmCharges":
+        """Charges of the axisymmetric film whose derivatives are used."""
+        return replace(self, values=self.even_values, film=self.slopes.film)
 
     def solved(self, values: Array, executor: Executor | None) -> "FilmCharges":
         """Solve a similar film under the probe itself, even if the probe is not circular, and return its charges.
@@ -106,8 +100,16 @@ class FilmCharges:
 
     def charges(self, values: Array, contact: Array) -> Array:
         """Compute the charges of presses on a film with given properties, shape (n, n_electrode), pC."""
-        solved_charge, _, stress_derivatives = self._solved_charges(self._electrodes(values), contact)
-        charge, _ = self._with_other_stress(values, solved_charge, stress_derivatives)
+        sensor = self._electrodes(values)
+        film = _read(self.film, sensor)
+        solved_charge = film.charges(contact)
+        # The derivatives with respect to the force take most of the time. Only those with respect to Young's modulus
+        # and to the thickness follow from them.
+        changes = self._stress_changes(values)
+        needs_force_slope = changes["young"] != 0.0 or changes["thickness"] != 0.0
+        force_slope = film.derivatives(contact)[:, :, 2] if needs_force_slope else np.zeros_like(solved_charge)
+        derivatives = self._stress_derivatives(sensor, contact, solved_charge, force_slope)
+        charge, _ = _with_other_stress(solved_charge, changes, derivatives)
         return charge
 
     def linearised(self, values: Array, contact: Array) -> ModelValues:
@@ -122,8 +124,9 @@ class FilmCharges:
             derivatives with respect to the state are those with respect to the properties.
         """
         sensor = self._electrodes(values)
-        solved_charge, contact_slopes, stress_derivatives = self._solved_charges(sensor, contact)
-        charge, factor = self._with_other_stress(values, solved_charge, stress_derivatives)
+        solved_charge, contact_slopes = _read(self.film, sensor).linearised(contact)
+        stress_derivatives = self._stress_derivatives(sensor, contact, solved_charge, contact_slopes[:, :, 2])
+        charge, factor = _with_other_stress(solved_charge, self._stress_changes(values), stress_derivatives)
 
         derivatives = {**stress_derivatives, "crosstalk": solved_charge.sum(axis=1, keepdims=True) - solved_charge}
         # Each uneven part of the pretension is the product of a share and the pretension. The derivatives with respect
@@ -139,32 +142,6 @@ class FilmCharges:
             for one in self.prior.properties
         ]
         return ModelValues(charge, contact_slopes, factor[:, :, None] * np.stack(columns, axis=2))
-
-    def _with_other_stress(
-        self, values: Array, solved_charge: Array, stress_derivatives: dict[str, Array]
-    ) -> tuple[Array, Array]:
-        """Add to the charges the first-order effect of the properties that change the stress.
-
-        The change is applied to the logarithm of a charge, unless the charge is negative, or the change is larger than
-        the charge.
-
-        Args:
-            values: Properties of the film, shape (n_property,).
-            solved_charge: Charges of the solved film, shape (n, n_electrode), pC.
-            stress_derivatives: See `_solved_charges`.
-
-        Returns:
-            Charges, shape (n, n_electrode), pC, and the factors by which the derivatives change, of the same shape.
-        """
-        solved_film, changed_film = self._mechanics(self.values), self._mechanics(values)
-        addition = np.zeros_like(solved_charge)
-        for name, derivative in stress_derivatives.items():
-            addition += (changed_film[name] - solved_film[name]) * derivative
-        relative = np.divide(addition, solved_charge, out=np.full_like(addition, np.inf), where=solved_charge > 0.0)
-        is_logarithmic = np.abs(relative) < MAX_LOG_CHANGE
-        factor = np.exp(relative, out=np.ones_like(relative), where=is_logarithmic)
-        charge = np.where(is_logarithmic, solved_charge * factor, solved_charge + addition)
-        return charge, factor
 
     def _electrodes(self, values: Array) -> Sensor:
         """Return a sensor with the electrodes and the piezoelectric coefficients of given properties.
@@ -186,38 +163,40 @@ class FilmCharges:
             value[name] = described_MPa + value[name] * value[PRETENSION.name]
         return value
 
-    def _solved_charges(self, sensor: Sensor, contact: Array) -> tuple[Array, Array, dict[str, Array]]:
-        """Compute the charges of the solved film, and their derivatives with respect to the contact and to properties.
+    def _stress_changes(self, values: Array) -> dict[str, float]:
+        """Return by how much properties differ from those of the solved film, by their names; see `_mechanics`."""
+        solved, changed = self._mechanics(self.values), self._mechanics(values)
+        return {name: changed[name] - solved[name] for name in changed}
 
-        The properties are those that change the stress. The derivatives with respect to the uneven parts of the
-        pretension are those per MPa.
+    def _stress_derivatives(
+        self, sensor: Sensor, contact: Array, solved_charge: Array, force_slope: Array
+    ) -> dict[str, Array]:
+        """Compute the derivatives of charges with respect to the properties that change the stress.
+
+        The derivatives with respect to the uneven parts of the pretension are those per MPa.
 
         The stress in units of Young's modulus E depends on E, the thickness h and the force F only through F / (E h)
-        and the tensions divided by E. The small effect of the bending is neglected here.
+        and the tensions divided by E. The small effect of the bending is neglected here, and so is that of the radius
+        of the probe on the charges of the contact pressure (d33).
 
         Args:
             sensor: Sensor with the electrodes and the coefficients.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
+            solved_charge: Their charges on the solved film, shape (n, n_electrode), pC.
+            force_slope: Derivatives of these charges with respect to ln F, of the same shape, pC.
 
         Returns:
-            Charges, shape (n, n_electrode), pC. Derivatives with respect to (x, y, ln F), shape (n, n_electrode, 3).
             Derivatives by the name of the property, each of shape (n, n_electrode), pC per unit.
         """
-        solved_film = _read(self.film, sensor)
-        charge, contact_slopes = solved_film.linearised(contact)
         film, fields = _read(self.slopes.film, sensor), _read(self.slopes.fields, sensor)
-        derivatives = replace(self.slopes, film=film, fields=fields).jacobian(contact)
-        force_slope = contact_slopes[:, :, 2]
+        slopes = replace(self.slopes, film=film, fields=fields).jacobian(contact)
+        # The radius of the probe is only a property if the probe is a circle.
+        derivatives = {name: slope for name, slope in slopes.items() if name in self.prior.names}
         derivatives["thickness"] = -force_slope
         mechanics = self._mechanics(self.values)
         tension_terms = (mechanics[name] * derivatives[name] for name in (PRETENSION.name, *UNEVEN_TENSIONS))
-        derivatives["young"] = charge - force_slope - sum(tension_terms)
-        if self.larger_probe is not None:
-            step = STEP * self.prior.std[self.prior.index(PROBE_RADIUS)]
-            derivatives[PROBE_RADIUS] = (
-                _read(self.larger_probe, sensor).charges(contact) - film.charges(contact)
-            ) / step
-        return charge, contact_slopes, derivatives
+        derivatives["young"] = solved_charge - force_slope - sum(tension_terms)
+        return derivatives
 
     def _read_difference(self, sensor: Sensor, one: FilmProperty, contact: Array) -> Array:
         """Compute the derivative with respect to a property that does not change the stress, by central differences."""
@@ -227,24 +206,31 @@ class FilmCharges:
         return (forward - backward) / (2.0 * step)
 
 
-def solve_even_map(prior: FilmPrior, values: Array, domain: Domain, executor: Executor | None) -> ForwardMap:
-    """Solve the film with given properties but without its unevenness, under an axisymmetric probe, at a few presses.
+def _with_other_stress(
+    solved_charge: Array, changes: dict[str, float], derivatives: dict[str, Array]
+) -> tuple[Array, Array]:
+    """Add to charges the first-order effect of the properties that change the stress.
+
+    The change is applied to the logarithm of a charge, unless the charge is negative, or the change is larger than the
+    charge.
 
     Args:
-        prior: Declarations of the properties, with the described sensor and probe.
-        values: Properties of the film, shape (n_property,).
-        domain: Contacts for which the charges are needed.
-        executor: Executor that runs the solves; None for this process.
+        solved_charge: Charges of the solved film, shape (n, n_electrode), pC.
+        changes: By how much properties differ from those of the solved film, by their names.
+        derivatives: Derivatives of the charges with respect to the properties that change the stress, by their names,
+            each of shape (n, n_electrode), pC per unit.
 
-    Raises:
-        SceneError: If some presses of the domain cannot exist.
-        SolveError: If a press has no equilibrium.
+    Returns:
+        Charges, shape (n, n_electrode), pC, and the factors by which the derivatives change, of the same shape.
     """
-    sensor, probe = prior.film(values)
-    nodes = few_nodes(sensor.film, domain)
-    film = replace(sensor.film, deviator=(0.0, 0.0), young_ratio=1.0, shear=None, oval=0.0)
-    even_sensor = replace(sensor, film=film)
-    return ForwardMap.build_unchecked(even_sensor, round_probe(probe), domain, nodes, executor=executor)
+    addition = np.zeros_like(solved_charge)
+    for name, derivative in derivatives.items():
+        addition += changes[name] * derivative
+    relative = np.divide(addition, solved_charge, out=np.full_like(addition, np.inf), where=solved_charge > 0.0)
+    is_logarithmic = np.abs(relative) < MAX_LOG_CHANGE
+    factor = np.exp(relative, out=np.ones_like(relative), where=is_logarithmic)
+    charge = np.where(is_logarithmic, solved_charge * factor, solved_charge + addition)
+    return charge, factor
 
 
 def round_probe(probe: Probe) -> Probe:

@@ -76,22 +76,22 @@ def compact_charges(
         executor: Executor that solves the films at the nodes; None for this process.
     """
     contact = draw_contacts(np.random.default_rng(SEED), domain, SERIES_CONTACTS)
-    film_charge = charges.charges(film.film_values, contact)
-    discrepancy = discrepancy_jacobian(film_charge, contact, charges.domain) @ film.values[film.layout.coefficients]
-    charge = film_charge + discrepancy  # most probable charges without offset, shape (n, n_electrode)
     names = charges.prior.sensor.electrode_names
     calibrated = _ChangedFilm(0.0, charges, film.film_values, np.eye(film.film_values.size))
     films = [calibrated]
     if len(names) > len(CONTACT):  # three charges only determine the contact
         films = [_ChangedFilm.solve(calibrated, change_MPa, executor) for change_MPa in _nodes(film).tolist()]
+    film_charge, *changed_charges = in_order(executor, partial(_film_charge, contact), [calibrated, *films])
+    discrepancy = discrepancy_jacobian(film_charge, contact, charges.domain) @ film.values[film.layout.coefficients]
+    charge = film_charge + discrepancy  # most probable charges without offset, shape (n, n_electrode)
     node_MPa = np.array([one.change_MPa for one in films])
-    node_charge = charge[:, None] * _tension_factors(films, contact, executor)
+    node_charge = charge[:, None] * _tension_factors(np.stack(changed_charges, axis=1), node_MPa)
     series = _fit_followable_nodes(domain, names, contact, node_charge, node_MPa)
-    few_contacts = slice(DIRECTION_CONTACTS)
+    few = slice(DIRECTION_CONTACTS)
     followed_films = [one for one in films if one.change_MPa in series.node_MPa]
     return replace(
         series,
-        directions=_directions(series, film, calibrated, followed_films, contact[few_contacts], charge[few_contacts]),
+        directions=_directions(series, film, calibrated, followed_films, contact[few], charge[few], executor),
         # A film is at most as well described as its charges can be measured.
         charge_std=max(series.charge_std, film.noise.gain),
         offset_pC=film.value("offset"),
@@ -122,6 +122,9 @@ class _ChangedFilm:
     def solve(cls, calibrated: "_ChangedFilm", change_MPa: float, executor: Executor | None) -> "_ChangedFilm":
         """Solve the axisymmetric film with a changed pretension.
 
+        Without a change, the axisymmetric film that the calibration has solved is used. Its properties hardly differ
+        from those of the estimate.
+
         Args:
             calibrated: The calibrated film.
             change_MPa: Change of the pretension, MPa.
@@ -140,7 +143,9 @@ class _ChangedFilm:
         by_calibrated = np.eye(values.size)
         by_calibrated[uneven, uneven] = share_ratio
         by_calibrated[uneven, tension] = calibrated.values[uneven] * change_MPa / tension_MPa**2
-        even_charges = FilmCharges.of_even_film(charges.prior, values, charges.domain, executor)
+        even_charges = charges.even
+        if change_MPa != 0.0:
+            even_charges = FilmCharges.of_even_film(charges.prior, values, charges.domain, executor)
         return cls(change_MPa, even_charges, values, by_calibrated)
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
@@ -197,21 +202,19 @@ def _nodes(film: FilmEstimate) -> Array:
     return np.unique(np.where(node_MPa < 0.0, factor * node_MPa, node_MPa))
 
 
-def _tension_factors(films: list[_ChangedFilm], contact: Array, executor: Executor | None) -> Array:
+def _tension_factors(charge: Array, node_MPa: Array) -> Array:
     """Compute the factors by which changes of the pretension multiply the charges.
 
     If a change reverses the sign of a charge, no factor can describe it, and the result is 1.
 
     Args:
-        films: Films with changed pretensions, one of them without a change.
-        contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        executor: Executor that computes the charges of the films; None for this process.
+        charge: Charges of films with changed pretensions, shape (n, n_node, n_electrode), pC.
+        node_MPa: Changes of the pretension, one of which is zero, shape (n_node,), MPa.
 
     Returns:
-        Factors, shape (n, n_film, n_electrode), dimensionless.
+        Factors, shape (n, n_node, n_electrode), dimensionless.
     """
-    charge = np.stack(list(in_order(executor, partial(_film_charge, contact), films)), axis=1)
-    charge_before = charge[:, [one.change_MPa == 0.0 for one in films]]
+    charge_before = charge[:, node_MPa == 0.0]
     return np.divide(charge, charge_before, out=np.ones_like(charge), where=charge_before * charge > 0.0)
 
 
@@ -227,6 +230,7 @@ def _directions(
     films: list[_ChangedFilm],
     contact: Array,
     charge: Array,
+    executor: Executor | None,
 ) -> Array:
     """Fit polynomials to the effects of the directions in which the charges of the film are uncertain.
 
@@ -246,6 +250,7 @@ def _directions(
         films: The films at the nodes of the series, by ascending change of the pretension.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         charge: Their most probable charges, shape (n, n_electrode), pC.
+        executor: Executor that computes the charges of the films; None for this process.
 
     Returns:
         Coefficients, as in `ChargeSeries.directions`.
@@ -256,18 +261,17 @@ def _directions(
     unit_contact = series.domain.to_unit(contact)
     size = None if series.log_size is None else series_size(series.log_size, unit_contact[:, 2])[0]
 
-    def value_changes(one: _ChangedFilm) -> Array:
-        """Return by how much one standard deviation of each unknown changes v, shape (n, n_electrode, n_unknown)."""
-        film_charge, jacobian = one.linearised(contact)
-        charge_per_value = np.where(film_charge > 0.0, film_charge, charge) if size is None else size
-        return np.asarray((jacobian / charge_per_value[:, :, None]) @ covariance_root)
-
-    changes = value_changes(calibrated)
-    slopes = np.zeros_like(changes)  # derivatives of the changes with respect to the pretension, 1/MPa
     node = [one.change_MPa for one in films].index(0.0)
     lower, upper = films[max(node - 1, 0)], films[min(node + 1, len(films) - 1)]
-    if lower is not upper:
-        slopes = (value_changes(upper) - value_changes(lower)) / (upper.change_MPa - lower.change_MPa)
+    beside = [] if lower is upper else [lower, upper]
+    changes_of_films = []  # changes of v by one standard deviation of each unknown, shape (n, n_electrode, n_unknown)
+    for film_charge, jacobian in in_order(executor, partial(_film_slopes, contact), [calibrated, *beside]):
+        charge_per_value = np.where(film_charge > 0.0, film_charge, charge) if size is None else size
+        changes_of_films.append((jacobian / charge_per_value[:, :, None]) @ covariance_root)
+    changes = changes_of_films[0]
+    slopes = np.zeros_like(changes)  # derivatives of the changes with respect to the pretension, 1/MPa
+    if beside:
+        slopes = (changes_of_films[2] - changes_of_films[1]) / (upper.change_MPa - lower.change_MPa)
 
     # Rotate the directions so that their effects are uncorrelated in units of the noise, and keep the large ones.
     weight = ((charge if size is None else size) / film.noise.sigma(charge))[:, :, None]
@@ -278,6 +282,11 @@ def _directions(
     effects = np.stack([changes @ kept.T, slopes @ kept.T], axis=1).swapaxes(2, 3)  # (n, 2, n_direction, n_electrode)
     coefficients = fit_series(unit_contact, effects.reshape(len(contact), -1), *DIRECTION_DEGREES)
     return coefficients.reshape(*coefficients.shape[:3], *effects.shape[1:])
+
+
+def _film_slopes(contact: Array, film: _ChangedFilm) -> tuple[Array, Array]:
+    """Compute the charges of contacts on a changed film, and their derivatives; see `_ChangedFilm.linearised`."""
+    return film.linearised(contact)
 
 
 def training_data(
