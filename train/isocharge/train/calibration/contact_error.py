@@ -16,7 +16,7 @@ Pukelsheim 1993).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -213,14 +213,16 @@ def _linearise_at(
         contact: Contacts (x, y, F) of the presses, shape (n, 3), mm and N.
         contact_std: Standard deviations of x and y, mm, and of ln F. By default, the contacts are not measured.
     """
-    charge = charges.charges(film.film_values, contact)
     log_contact = with_log_force(contact)
-    data = PressData(
-        charge=charge,
-        charge_std=film.noise.sigma(charge),
+    unknown_charge = np.zeros((len(contact), len(charges.prior.sensor.electrodes)))
+    planned = PressData(
+        charge=unknown_charge,
+        charge_std=unknown_charge,
         noise=film.noise,
         contact=log_contact,
         contact_std=np.broadcast_to(contact_std, contact.shape),
         time=np.linspace(-0.5, 0.5, len(contact)),
     )
-    return Linearised.of(model_values(charges, film.layout, data, film.values, log_contact), data, log_contact)
+    model = model_values(charges, film.layout, planned, film.values, log_contact)
+    data = replace(planned, charge=model.charge_pC, charge_std=film.noise.sigma(model.charge_pC))
+    return Linearised.of(model, data, log_contact)

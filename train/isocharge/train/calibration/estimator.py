@@ -14,10 +14,9 @@ over the hypotheses, weighted by their evidence.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import compress, product
+from itertools import compress, groupby, product
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 from scipy.special import chdtrc, chdtri, softmax
 
 from isocharge.common.arrays import Array, Booleans
@@ -299,24 +298,30 @@ def _estimate_with_errors(
     probable = all_hypotheses
     for _ in range(2):
         model = model_values(charges, prior.layout, used_data, unknowns, used_contact)
-        evidence = {
-            errors: _Evidence.of(model, stated[is_used].with_errors(errors), used_contact, unknowns, prior)
-            for errors in {one.errors for one in probable}
-        }
-        all_weights = softmax([evidence[one.errors].log_evidence(one) for one in probable])
-        is_probable = all_weights >= MIN_WEIGHT
-        weight = all_weights[is_probable]
+        evidences = [
+            _Evidence.of(model, stated[is_used].with_errors(errors), used_contact, unknowns, prior, list(group))
+            for errors, group in groupby(probable, lambda one: one.errors)
+        ]
+        all_chi2, log_evidence = np.concatenate([one.compare() for one in evidences], axis=1)
+        all_weights = softmax(log_evidence)
+        all_weights[all_weights < MIN_WEIGHT] = 0.0
+        all_weights /= all_weights.sum()
+        weights_of_evidences = np.split(all_weights, np.cumsum([len(one.hypotheses) for one in evidences])[:-1])
+        posteriors = [one.posterior(weight) for one, weight in zip(evidences, weights_of_evidences, strict=True)]
+        means = np.concatenate([mean for mean, _ in posteriors])
+
+        is_probable = all_weights > 0.0
+        weight, chi2 = all_weights[is_probable], all_chi2[is_probable]
         probable = list(compress(probable, is_probable))
-        means, covariances = zip(*(evidence[one.errors].posterior(one) for one in probable), strict=True)
-        mean = np.average(means, axis=0, weights=weight)
-        covariance = np.average(covariances, axis=0, weights=weight)
+        mean = weight @ means
+        covariance = prior.covariance(np.sqrt(weight @ np.array([one.sizes**2 for one in probable])))
+        covariance -= sum(reduction for _, reduction in posteriors)
         # The means of the hypotheses differ, which adds to the covariance of the average.
         covariance += np.cov(means, rowvar=False, ddof=0, aweights=weight)
         used_contact = used_contact + Linearised.of(model, used_data, used_contact).contact_change(mean - unknowns)
         unknowns = np.clip(mean, *prior.bounds)
 
-    best = probable[int(weight.argmax())]
-    *_, best_chi2 = evidence[best.errors].solve(best)
+    best = int(weight.argmax())
     log_contact = point.contacts.copy()
     log_contact[is_used] = used_contact
     final_model = model_values(charges, prior.layout, data, unknowns, log_contact)
@@ -330,9 +335,9 @@ def _estimate_with_errors(
         contact=in_domain(log_contact, charges.domain),
         is_bad=is_bad,
         press_chi2=np.divide(final_chi2, redundancy, out=np.full(len(data), np.nan), where=redundancy > 0),
-        chi2=best_chi2,
+        chi2=float(chi2[best]),
         redundancy=float(redundancy[is_used].sum()),
-        hypothesis=best,
+        hypothesis=probable[best],
     )
 
 
@@ -368,9 +373,11 @@ class _Evidence:
     """What presses with given errors state about the unknowns, in the linearised problem.
 
     The residuals r at the prior means, without the effect of the contacts, have the covariance S = 1 + J P J', where
-    J contains their derivatives, and P is the prior covariance of the unknowns.
+    J contains their derivatives, and P is the prior covariance of the unknowns. The prior covariance, and therefore S,
+    depends on the hypothesis.
 
     Attributes:
+        hypotheses: Hypotheses with these errors of the presses.
         prior: Prior distribution of the unknowns.
         residual: Residuals r, shape (m,), in a basis of all residuals that the unknowns change.
         jacobian: Derivatives J, shape (m, n_unknown).
@@ -379,6 +386,7 @@ class _Evidence:
         log_volume: Logarithm of the density of the measurements, and of the volume of the possible contacts.
     """
 
+    hypotheses: list[Hypothesis]
     prior: Prior
     residual: Array
     jacobian: Array
@@ -387,7 +395,15 @@ class _Evidence:
     log_volume: float
 
     @classmethod
-    def of(cls, model: ModelValues, data: PressData, contact: Array, unknowns: Array, prior: Prior) -> "_Evidence":
+    def of(
+        cls,
+        model: ModelValues,
+        data: PressData,
+        contact: Array,
+        unknowns: Array,
+        prior: Prior,
+        hypotheses: list[Hypothesis],
+    ) -> "_Evidence":
         """Linearise the residuals, and eliminate the contacts from them, so that they only depend on the unknowns.
 
         The hypotheses differ only in the prior of the unknowns. Therefore, the residuals are projected onto the column
@@ -400,6 +416,7 @@ class _Evidence:
             contact: Contacts (x, y, ln F), shape (n, 3).
             unknowns: The unknowns, shape (n_unknown,).
             prior: Prior distribution of the unknowns.
+            hypotheses: Hypotheses with the given errors.
         """
         linearised = Linearised.of(model, data, contact)
         eliminated, eliminated_jacobian = linearised.eliminated()
@@ -412,6 +429,7 @@ class _Evidence:
         log_contact_volume = -0.5 * np.linalg.slogdet(contact_precision)[1].sum()
         log_density = -np.log(data.measured_std[np.isfinite(data.measured_std)]).sum()
         return cls(
+            hypotheses=hypotheses,
             prior=prior,
             residual=residual - jacobian @ (unknowns - prior.mean),
             jacobian=jacobian,
@@ -420,27 +438,44 @@ class _Evidence:
             log_volume=float(log_contact_volume + log_density),
         )
 
-    def solve(self, hypothesis: Hypothesis) -> tuple[tuple[Array, bool], Array, float]:
-        """Compare the residuals with their covariance S under a hypothesis.
+    def compare(self) -> tuple[Array, Array]:
+        """Compare the residuals with their covariance S under each hypothesis.
 
         Returns:
-            Cholesky factor of S, as `cho_factor` returns it. S^-1 r, shape (m,). Sum of the squared residuals of the
-            presses and of the prior distribution after the fit.
+            Sums of the squared residuals of the presses and of the prior distribution after the fit, and logarithms of
+            the evidence, each of shape (n_hypothesis,).
         """
-        covariance = np.eye(self.residual.size) + np.tensordot(hypothesis.sizes**2, self.parts, 1)
-        factor = cho_factor(covariance, lower=True, check_finite=False)
-        weighted = cho_solve(factor, self.residual, check_finite=False)
-        return factor, weighted, self.other_chi2 + float(self.residual @ weighted)
+        covariance = self._covariance(self._squared_sizes)
+        weighted = np.linalg.solve(covariance, self.residual[:, None])[..., 0]  # S^-1 r, shape (n_hypothesis, m)
+        chi2 = self.other_chi2 + weighted @ self.residual
+        log_determinant = np.linalg.slogdet(covariance)[1]
+        log_probability = np.log([one.probability for one in self.hypotheses])
+        return chi2, self.log_volume - 0.5 * (chi2 + log_determinant) + log_probability
 
-    def log_evidence(self, hypothesis: Hypothesis) -> float:
-        """Compute the logarithm of the evidence of a hypothesis."""
-        (factor, _), _, chi2 = self.solve(hypothesis)
-        log_determinant = 2.0 * np.log(np.diag(factor)).sum()
-        return float(self.log_volume - 0.5 * (chi2 + log_determinant) + np.log(hypothesis.probability))
+    def posterior(self, weight: Array) -> tuple[Array, Array]:
+        """Compute the estimates under the hypotheses that have a weight.
 
-    def posterior(self, hypothesis: Hypothesis) -> tuple[Array, Array]:
-        """Return the mean, shape (n_unknown,), and the covariance of the unknowns, shape (n_unknown, n_unknown)."""
-        factor, weighted, _ = self.solve(hypothesis)
-        prior_covariance = self.prior.covariance(hypothesis.sizes)
-        gain = self.jacobian @ prior_covariance
-        return self.prior.mean - gain.T @ weighted, prior_covariance - gain.T @ cho_solve(factor, gain)
+        Args:
+            weight: Weight of each hypothesis, shape (n_hypothesis,).
+
+        Returns:
+            Means of the unknowns under the hypotheses with a positive weight, shape (n, n_unknown). Weighted sum, over
+            these hypotheses, of what the presses subtract from the prior covariance, shape (n_unknown, n_unknown).
+        """
+        is_used = weight > 0.0
+        squared_sizes = self._squared_sizes[is_used]
+        covariance = self._covariance(squared_sizes)
+        gain = np.tensordot(squared_sizes, self.jacobian @ self.prior.parts, 1)  # J P, shape (n, m, n_unknown)
+        weighted = np.linalg.solve(covariance, self.residual[:, None])  # S^-1 r, shape (n, m, 1)
+        means = self.prior.mean - (gain * weighted).sum(axis=1)
+        weighted_gain = weight[is_used, None, None] * np.linalg.solve(covariance, gain)
+        return means, np.tensordot(gain, weighted_gain, ((0, 1), (0, 1)))
+
+    @property
+    def _squared_sizes(self) -> Array:
+        """Squared sizes of the parts of the prior covariance, shape (n_hypothesis, n_part)."""
+        return np.array([one.sizes**2 for one in self.hypotheses])
+
+    def _covariance(self, squared_sizes: Array) -> Array:
+        """Compute the covariances S of the residuals, shape (n, m, m), for squared sizes of shape (n, n_part)."""
+        return np.eye(self.residual.size) + np.tensordot(squared_sizes, self.parts, 1)
