@@ -1,5 +1,6 @@
 """Tests of the estimator of a film on films whose charges are a closed formula."""
 
+import tracemalloc
 from dataclasses import replace
 from functools import partial, partialmethod
 
@@ -198,6 +199,15 @@ def test_touches_at_unknown_places_find_a_change_of_the_pretension(problem, synt
     assert abs(found.film.value("pretension") - changed[0]) < 3.0 * std
     assert std < 0.6 * np.sqrt(prior.earlier.covariance[0, 0])
     assert np.median(np.hypot(*(found.contact - contact)[:, :2].T)) < 0.3
+
+
+def test_one_press_needs_little_memory(problem, synthetic):
+    """After one press, almost all hypotheses are probable, and their covariances would fill gigabytes."""
+    tracemalloc.start()
+    film_estimate(problem, synthetic, presses_on(problem, synthetic, problem.prior.mean, 1, np.random.default_rng(3)))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 2e8
 
 
 def test_warming_changes_the_shares_of_the_uneven_tension(problem):

@@ -29,7 +29,6 @@ def written(problem, synthetic, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(calibrate_module, "SAME_FILM_STD", np.inf)
         patch.setattr(film_network, "_nodes", lambda _: np.zeros(1))
-        patch.setattr(film_network, "_tension_factors", lambda *_: 1.0)
         patch.setattr(film_network, "PRESSES", 6_000)
         patch.setattr(film_network, "_outside_presses", lambda *_: None)
         for name, values_and_probabilities in FEW_VALUES.items():
