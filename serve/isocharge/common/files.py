@@ -82,14 +82,18 @@ def read_needed(path: Path, error_class: type[IsochargeError], advice: str, max_
         raise error_class(f"{path}: cannot be read ({cause.strerror}); {advice}") from cause
 
 
-def refuse_existing(path: Path) -> None:
-    """Check that neither a file nor a folder nor a symbolic link exists at the path of an output.
+def check_new_output(path: Path) -> None:
+    """Check that an output can be created: nothing exists at its path, and the folder of the path is writable.
 
     Raises:
         OutputExists: If the path exists, also as a link to a path that does not exist.
+        OutputError: If the nearest existing folder above the path is not writable.
     """
     if os.path.lexists(path):
         raise OutputExists(f"{path} is already there and is not overwritten; choose another output or remove it")
+    existing = next(parent for parent in path.absolute().parents if os.access(parent, os.F_OK))
+    if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
+        raise OutputError(f"{path} cannot be written: {existing} is not a writable folder; choose another output")
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -129,7 +133,7 @@ class AtomicWriter:
             OutputExists: If the file exists already.
             OSError: If the file cannot be created.
         """
-        refuse_existing(path)
+        check_new_output(path)
         self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         self._size = 0  # number of bytes that complete calls of `write` have written
 
@@ -190,13 +194,13 @@ def new_file(path: Path) -> Iterator[Path]:
         OutputExists: If `path` exists already, or another process creates it in the meantime.
         OutputError: If the file or folder cannot be written.
     """
-    refuse_existing(path)
+    check_new_output(path)
     temporary_path = _temporary_path(path)
     try:
         with as_output_errors(path):
             yield temporary_path
             flush_to_disk(temporary_path)
-            refuse_existing(path)  # another process may have created the path in the meantime
+            check_new_output(path)  # another process may have created the path in the meantime
             temporary_path.rename(path)
             flush_to_disk(path.parent)
     finally:

@@ -8,7 +8,7 @@ import typer
 from isocharge.cli.shared.live_page import LiveOption, TokenOption
 from isocharge.cli.shared.terminal import say
 from isocharge.common.errors import InputError, require
-from isocharge.common.files import as_output_errors, refuse_existing, write_whole
+from isocharge.common.files import as_output_errors, check_new_output, write_whole
 
 
 def demo_command(
@@ -46,7 +46,7 @@ def demo_command(
     if playground is not None:
         from isocharge.serve.viewer.playground_page import playground_html  # imported late, because the import is slow
 
-        refuse_existing(playground)
+        check_new_output(playground)
         with as_output_errors(playground):
             playground.parent.mkdir(parents=True, exist_ok=True)
             write_whole(playground, playground_html().encode())

@@ -10,7 +10,7 @@ import typer
 from isocharge.cli.shared.options import DeviceOption, JsonOption, ModelsOption, WaitOption
 from isocharge.cli.shared.terminal import say, show, show_json, show_result
 from isocharge.common.errors import InputError, printable
-from isocharge.common.files import as_output_errors, refuse_existing, write_whole
+from isocharge.common.files import as_output_errors, check_new_output, write_whole
 from isocharge.common.toml_text import to_toml
 from isocharge.serve import Examination, Port, Predictor, device_from_table, examine, load_device
 from isocharge.serve.examination.electrode_check import ElectrodeCheck, check_electrodes, corrected_table
@@ -90,7 +90,7 @@ def doctor_command(
         show("\n".join(port_lines()) or "no serial ports; is the board plugged in?")
         return
     if write:
-        refuse_existing(write)
+        check_new_output(write)
     electrodes: tuple[str, ...] = ()  # for any model
     if model and model.endswith(".toml"):  # a sensor file, as long as the film has no model
         from isocharge.simulate import load_sensor

@@ -42,7 +42,7 @@ from isocharge.cli.shared.terminal import (
     write_stdout,
 )
 from isocharge.common.errors import InputError, is_printable, shown
-from isocharge.common.files import refuse_existing
+from isocharge.common.files import check_new_output
 from isocharge.serve import (
     PredictionRecord,
     Predictor,
@@ -229,7 +229,7 @@ def stream_command(
         raise InputError(f"--name: expected printable characters, got {shown(name)}")
 
     if record:
-        refuse_existing(record)
+        check_new_output(record)
 
     # The options take precedence over the settings of the device file.
     load_latest = partial(Predictor, model, models=models)

@@ -14,7 +14,7 @@ from isocharge.cli.shared.terminal import announce, say, shown_progress, until_s
 from isocharge.cli.shared.virtual_sensor import film_charges, measure_function, random_script
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
-from isocharge.common.files import refuse_existing
+from isocharge.common.files import check_new_output
 from isocharge.serve import VirtualSensor, encode_frame, encode_text
 from isocharge.serve.virtual_sensor.script import VirtualScript, load_script
 from isocharge.simulate import (
@@ -78,7 +78,7 @@ def virtual_command(
     Example: isocharge serve virtual three-25um-biaxial --link /tmp/film
     """
     if link is not None:
-        refuse_existing(link)
+        check_new_output(link)
     settings = load_script(script) if script else VirtualScript()
     scripted_presses = settings.script(rate)
     played_sensor = load_sensor(sensor)

@@ -28,8 +28,8 @@ import onnxruntime as ort
 from numpy.typing import ArrayLike
 
 from isocharge.common.defaults import MAX_BATCH
-from isocharge.common.errors import ModelError, OutputError, OutputExists, error_prefix, shown
-from isocharge.common.files import new_folder, read_needed, refuse_existing, sha256_of, write_whole
+from isocharge.common.errors import ModelError, OutputExists, error_prefix, shown
+from isocharge.common.files import check_new_output, new_folder, read_needed, sha256_of, write_whole
 from isocharge.serve.model.contact import as_charges
 from isocharge.serve.model.metadata import LABEL, NAME, VERSION, ModelMetadata
 from isocharge.serve.model.session import (
@@ -388,12 +388,9 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
             folders.
     """
     target = folder / str(version)
-    refuse_existing(target)
     if folder.exists() and not folder.is_dir():
         raise OutputExists(f"{folder}: expected a folder or nothing, got a file; choose another place")
-    existing = next(path for path in target.parents if path.exists())
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise OutputError(f"{folder} cannot be written: {existing} is not a writable folder; choose another output")
+    check_new_output(target)
     name = folder.resolve().name
     if not NAME.fullmatch(name):
         raise ModelError(f"model name {name!r}: expected letters, digits, '-', '_' and '.'; rename the folder")

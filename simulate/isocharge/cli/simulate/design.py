@@ -14,7 +14,7 @@ from isocharge.cli.shared.options import (
     WorkersOption,
 )
 from isocharge.cli.shared.terminal import say, show_result, shown_progress
-from isocharge.common.files import refuse_existing
+from isocharge.common.files import check_new_output
 from isocharge.simulate import load_sensor, noise_model, parse_probe
 from isocharge.simulate.artwork import write_design
 from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase, Goal, Nuisances
@@ -63,7 +63,7 @@ def design_command(
     Example: isocharge simulate design four-25um-biaxial --electrodes 5 --keep A,B,C,D --radius 8 -o one-more
     """
     # Check the options, and describe the search.
-    refuse_existing(output)
+    check_new_output(output)
     footprint = parse_probe(probe)
     case = DesignCase(
         load_sensor(sensor),

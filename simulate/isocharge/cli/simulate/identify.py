@@ -10,7 +10,7 @@ from isocharge.cli.shared.forward_maps import ProbeOption, executor_for
 from isocharge.cli.shared.options import ForceRangeOption, JsonOption, NoiseOption, SensorArgument, WorkersOption
 from isocharge.cli.shared.terminal import say, show_result, shown_progress
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
-from isocharge.common.files import new_folder, refuse_existing
+from isocharge.common.files import check_new_output, new_folder
 from isocharge.simulate import identify, load_sensor, noise_model, parse_probe
 from isocharge.simulate.plots.error_maps import identification_picture, mirror_picture
 from isocharge.simulate.plots.figure import save_picture
@@ -49,7 +49,7 @@ def identify_command(
     Example: isocharge simulate identify three-25um-biaxial --probe circle:1.0 --error 0.5 -o limits
     """
     if output is not None:
-        refuse_existing(output)
+        check_new_output(output)
     described_sensor = load_sensor(sensor)
     parsed_probe = parse_probe(probe)
     noise_level = noise_model(noise)

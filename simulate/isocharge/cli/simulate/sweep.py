@@ -15,7 +15,7 @@ from isocharge.cli.shared.options import (
 )
 from isocharge.cli.shared.terminal import say, shown_progress
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
-from isocharge.common.files import refuse_existing
+from isocharge.common.files import check_new_output
 from isocharge.simulate import Sweep, load_sensor, parse_probe, run_sweep
 
 
@@ -47,7 +47,7 @@ def sweep_command(
     film_sensor = load_sensor(sensor)
     probes = [parse_probe(text) for text in probe or [DEFAULT_PROBE]]
 
-    refuse_existing(output)
+    check_new_output(output)
     _, max_force = force
     warn_of_stress(film_sensor.film, probes, max_force)
     with shown_progress(), executor_for(workers, cluster) as executor:

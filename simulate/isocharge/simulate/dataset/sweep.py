@@ -29,7 +29,7 @@ from isocharge.common.arrays import Array, Integers
 from isocharge.common.contact_domain import Domain
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SceneError, SolveError
-from isocharge.common.files import new_folder, refuse_existing
+from isocharge.common.files import check_new_output, new_folder
 from isocharge.common.progress import report, second_thread
 from isocharge.simulate.dataset.shards import (
     MAX_SHARD_BYTES,
@@ -235,7 +235,7 @@ def run_sweep(
     """
     folder = Path(folder)
     probes = tuple(probes)
-    refuse_existing(folder)
+    check_new_output(folder)
     if maps and [(one.sensor, one.probe) for one in maps] != [(sensor, probe) for probe in probes]:
         raise SceneError("maps: expected one forward map of this sensor for each probe, in the order of the probes")
 

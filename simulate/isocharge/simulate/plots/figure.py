@@ -10,7 +10,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from isocharge.common.errors import InputError
-from isocharge.common.files import refuse_existing, write_whole
+from isocharge.common.files import check_new_output, write_whole
 
 INK = "#1b2a41"
 """Colour of outlines."""
@@ -53,7 +53,7 @@ def check_picture(path: Path) -> None:
     """
     if path.suffix.lstrip(".").lower() not in FORMATS:
         raise InputError(f"{path}: expected a picture with the suffix {', '.join(FORMATS)}, got {path.suffix!r}")
-    refuse_existing(path)
+    check_new_output(path)
 
 
 def picture_bytes(figure: Figure, file_format: str = "png") -> bytes:

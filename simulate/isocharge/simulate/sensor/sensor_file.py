@@ -15,7 +15,7 @@ import shapely
 from msgspec import Meta, field
 
 from isocharge.common.errors import SensorError, error_prefix
-from isocharge.common.files import refuse_existing, write_whole
+from isocharge.common.files import check_new_output, write_whole
 from isocharge.common.structs import (
     Finite,
     NotNegative,
@@ -320,7 +320,7 @@ def write_sensor(sensor: Sensor, path: Path, comment: Iterable[str] = ()) -> Non
         SensorError: If a sensor file cannot describe the sensor.
         OutputExists: If `path` exists.
     """
-    refuse_existing(path)
+    check_new_output(path)
     write_whole(path, sensor_to_toml(sensor, comment).encode())
 
 

@@ -27,7 +27,7 @@ from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents
 from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import OutputError, PressError, error_prefix
-from isocharge.common.files import as_output_errors
+from isocharge.common.files import as_output_errors, check_new_output
 from isocharge.serve import ReadingStream, load_device, open_source
 from isocharge.serve.live.steady_press import PressWatch
 from isocharge.serve.presses.measured_presses import MeasuredPresses, read_press_list, read_presses, write_presses
@@ -109,6 +109,8 @@ def press_command(
         say(f"{output} has {len(presses)} presses; the session continues with them. Delete the file to begin again")
     elif output.exists() or not output.parent.is_dir():
         raise OutputError(f"{output}: expected a file in an existing folder; choose another output")
+    else:
+        check_new_output(output)
     if earlier:
         problem = replace(problem, earlier=read_earlier(earlier, problem, presses))
     with executor_for() as executor:

@@ -8,7 +8,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from isocharge.common.files import new_folder, refuse_existing, write_whole
+from isocharge.common.files import check_new_output, new_folder, write_whole
 from isocharge.common.progress import track
 from isocharge.serve.benchmark import machine
 from isocharge.simulate import Dataset
@@ -193,7 +193,7 @@ def write_report(
         ModelError: If a model is for another sensor than its dataset.
         PressError: If there are too few measured presses.
     """
-    refuse_existing(folder)
+    check_new_output(folder)
     settings = settings or Settings()
     with threads_and_seed(1, SEED):  # all methods are timed with one thread
         sections = [
