@@ -259,7 +259,7 @@ def test_doctor_writes_no_file_of_which_the_unit_is_missing(resting, command, tm
         code, out, err = command(*words)
         assert (code, path.exists()) == (1, False)
         assert "--pc-per-unit NUMBER" in out
-        assert "no device file is written, because the charge of one unit is missing" in err
+        assert "no device file can be written, because the charge of one unit is missing" in err
         code, _, err = command(*words[:-1], "/proc/none/board.toml", "--pc-per-unit", ".1")
         assert code == 1
         assert "OutputError: /proc/none/board.toml cannot be written: No such file" in err

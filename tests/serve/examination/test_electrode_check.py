@@ -188,5 +188,5 @@ def test_doctor_does_not_write_a_file_from_a_touched_film(film, command, tmp_pat
             code, out, err = command("serve", "doctor", "--port", sensor.url, "--seconds", 3, "--write", path)
         assert code == 1
         assert "an untouched film: channel " in out
-        assert "no device file is written, because the film was touched: take the finger away, and try again" in err
+        assert "no device file can be written, because the film was touched: take the finger away, and try again" in err
         assert not path.exists()

@@ -136,7 +136,7 @@ def doctor_command(
     if json:
         show_json(asdict(examination) | {"found_channels": found_channels})
     if obstacle:
-        say(f"no device file is written, because {obstacle}")
+        say(f"no device file can be written, because {obstacle}")
     if obstacle or not examination.good:
         raise typer.Exit(1)
     if write:

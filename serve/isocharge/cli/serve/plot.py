@@ -96,5 +96,5 @@ def recording_picture(samples: Samples, title: str) -> Figure:
         axes.set_ylabel(label)
         axes.grid(alpha=0.3)
         if axes.get_legend_handles_labels()[0]:
-            axes.legend(loc="upper right", fontsize=8, ncols=8, markerscale=4.0)
+            axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), fontsize=8, ncols=8, markerscale=4.0)
     return figure
