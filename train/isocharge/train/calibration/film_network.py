@@ -16,7 +16,7 @@ changes along the directions are also computed for these films, because they dep
 import logging
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import partial
+from operator import methodcaller
 
 import numpy as np
 
@@ -81,7 +81,7 @@ def compact_charges(
     films = [calibrated]
     if len(names) > len(CONTACT):  # three charges only determine the contact
         films = [_ChangedFilm.solve(calibrated, change_MPa, executor) for change_MPa in _nodes(film).tolist()]
-    film_charge, *changed_charges = in_order(executor, partial(_film_charge, contact), [calibrated, *films])
+    film_charge, *changed_charges = in_order(executor, methodcaller("charge", contact), [calibrated, *films])
     discrepancy = discrepancy_jacobian(film_charge, contact, charges.domain) @ film.values[film.layout.coefficients]
     charge = film_charge + discrepancy  # most probable charges without offset, shape (n, n_electrode)
     node_MPa = np.array([one.change_MPa for one in films])
@@ -147,6 +147,10 @@ class _ChangedFilm:
         if change_MPa != 0.0:
             even_charges = FilmCharges.of_even_film(charges.prior, values, charges.domain, executor)
         return cls(change_MPa, even_charges, values, by_calibrated)
+
+    def charge(self, contact: Array) -> Array:
+        """Compute the charges of contacts on this film, shape (n, n_electrode), pC."""
+        return self.charges.charges(self.values, contact)
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Compute the charges of this film, and their derivatives with respect to the unknowns of the calibrated film.
@@ -218,11 +222,6 @@ def _tension_factors(charge: Array, node_MPa: Array) -> Array:
     return np.divide(charge, charge_before, out=np.ones_like(charge), where=charge_before * charge > 0.0)
 
 
-def _film_charge(contact: Array, film: _ChangedFilm) -> Array:
-    """Compute the charges of contacts on a changed film, shape (n, n_electrode), pC."""
-    return film.charges.charges(film.values, contact)
-
-
 def _directions(
     series: ChargeSeries,
     film: FilmEstimate,
@@ -265,7 +264,7 @@ def _directions(
     lower, upper = films[max(node - 1, 0)], films[min(node + 1, len(films) - 1)]
     beside = [] if lower is upper else [lower, upper]
     changes_of_films = []  # changes of v by one standard deviation of each unknown, shape (n, n_electrode, n_unknown)
-    for film_charge, jacobian in in_order(executor, partial(_film_slopes, contact), [calibrated, *beside]):
+    for film_charge, jacobian in in_order(executor, methodcaller("linearised", contact), [calibrated, *beside]):
         charge_per_value = np.where(film_charge > 0.0, film_charge, charge) if size is None else size
         changes_of_films.append((jacobian / charge_per_value[:, :, None]) @ covariance_root)
     changes = changes_of_films[0]
@@ -282,11 +281,6 @@ def _directions(
     effects = np.stack([changes @ kept.T, slopes @ kept.T], axis=1).swapaxes(2, 3)  # (n, 2, n_direction, n_electrode)
     coefficients = fit_series(unit_contact, effects.reshape(len(contact), -1), *DIRECTION_DEGREES)
     return coefficients.reshape(*coefficients.shape[:3], *effects.shape[1:])
-
-
-def _film_slopes(contact: Array, film: _ChangedFilm) -> tuple[Array, Array]:
-    """Compute the charges of contacts on a changed film, and their derivatives; see `_ChangedFilm.linearised`."""
-    return film.linearised(contact)
 
 
 def training_data(
