@@ -69,8 +69,8 @@ def recording_picture(samples: Samples, title: str) -> Figure:
     """
     start_s = samples["timestamp"][0]
     time_s = samples["timestamp"] - start_s
-    is_flagged = {flag: samples["flags"].astype(int) & bit > 0 for flag, bit in FLAG_BITS.items()}
-    flags = {flag: time_s[is_set] for flag, is_set in is_flagged.items() if is_set.any()}
+    flag_bits = samples["flags"].astype(int)
+    flags = {flag: time_s[flag_bits & bit > 0] for flag, bit in FLAG_BITS.items() if (flag_bits & bit).any()}
     flag_height = 0.1 * (1 + len(flags))  # grows with the number of rows of flags
     figure = new_figure(12.0, 8.6)
     figure.suptitle(f"{title}: {len(time_s)} records; faint points: ± 2 standard deviations", parse_math=False)

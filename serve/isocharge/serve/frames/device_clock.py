@@ -147,6 +147,7 @@ class DeviceClock:
         has_fit = self._fitted_us is not None and not self._is_fit_provisional
         if has_fit and self._is_new_arrival and predicted_s - arrival_s > MAX_LEAD_s:
             self._fitted_us = None  # discards the fit
+            frame.is_clock_reset = t_us < step_us  # not a wrap, but a restart in the second half of the range
             self._device_us -= step_us  # the time of the device goes on from the previous reading
             step_us = 0  # the time since the previous reading is unknown
 

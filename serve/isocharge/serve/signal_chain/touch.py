@@ -42,10 +42,11 @@ class TouchRule(Rule, frozen=True, kw_only=True):
 
     def resolved(self, *, has_currents: bool) -> "TouchRule":
         """Return the settings with the default values for a board that sends charges, or currents."""
-        floor_pC, release_share = (0.0, 0.3) if has_currents else (10.0, 0.05)
-        defaults = {"floor_pC": floor_pC, "release_share": release_share}
-        stated = {name: value for name, value in structs.asdict(self).items() if value is not None}
-        return TouchRule(**defaults | stated)
+        defaults = {"floor_pC": 10.0, "release_share": 0.05}
+        if has_currents:
+            defaults = {"floor_pC": 0.0, "release_share": 0.3}
+        missing = {name: value for name, value in defaults.items() if getattr(self, name) is None}
+        return structs.replace(self, **missing)
 
     def threshold_pC(self, noise_pC: Array) -> Array:
         """Return the touch threshold of each electrode, shape (n_electrode,), pC. The settings must be resolved.
