@@ -105,10 +105,10 @@ def test_presses_with_only_positions_or_only_forces(checked, known, degrees):
     wrong = checked(20, known=known, noise=8.0, force_scale=1.1)
     assert wrong.fits is False
     assert ("mm" in wrong.verdict, "%" in wrong.verdict) == known
-    assert any(note.startswith("forces are 1.") for note in wrong.notes) == known[1], wrong.notes
+    assert any(note.startswith("forces are 1.") for note in wrong.notes) == known[1]
 
 
-@pytest.mark.parametrize(("count", "fits"), [(1, None), (2, None), (3, True)])
+@pytest.mark.parametrize(("count", "fits"), [(2, None), (3, True)])
 def test_verdict_needs_three_presses(checked, count, fits):
     check = checked(count, seed=4)
     assert check.fits is fits
@@ -123,7 +123,6 @@ def test_bad_press_is_reported_and_excluded(predictor, measure):
     check = check_presses(predictor, presses)
     assert (check.fits, check.compared) == (True, 11)
     assert check.notes == ("line 9: nothing like the other presses, left out; look at it",)
-    assert check.position_mm.max < 1.0
     presses.contact[3:5, :2] -= 2.0  # three of twelve are too many
     assert check_presses(predictor, presses).fits is False
 
@@ -136,8 +135,13 @@ def test_presses_outside_the_domain_or_with_unknown_values_are_excluded(predicto
     presses.charge_pC[3, 1] = np.nan
     check = check_presses(predictor, presses)
     assert (check.presses, check.compared, check.fits) == (10, 6, True)
-    reasons = ["not trained for", "not trained for", "neither place nor force is known", "a charge is unknown", ""]
-    assert check.errors.exclusion_reasons.tolist()[:5] == reasons
+    assert check.errors.exclusion_reasons.tolist()[:5] == [
+        "not trained for",
+        "not trained for",
+        "neither place nor force is known",
+        "a charge is unknown",
+        "",
+    ]
     assert "0.05 to 2 N); if these are most, look at the units (lines 2, 3)" in check.notes[2]
     row = check.to_dict()["each"][3]
     assert (row["x_mm"], row["x_error_mm"], row["left_out"]) == (None, None, "a charge is unknown")
@@ -148,7 +152,8 @@ def test_note_for_a_film_that_does_not_fit_states_the_explaining_rig_std(predict
     presses = measure(30, seed=1)
     presses.contact[:, :2] += np.random.default_rng(0).normal(0.0, 0.2, (30, 2))
     check = check_presses(predictor, presses)
-    assert (check.fits, check.verdict.endswith(" beyond noise")) == (False, True)
+    assert check.verdict.endswith(" beyond noise")
+    assert "columns of the file take precedence" in check.notes[0]
     assert "from 500 presses on" in check.notes[1]
     position_std, force_std = map(float, re.findall(r"-std ([\d.e-]+)", check.notes[0]))
     assert position_std == pytest.approx(np.hypot(0.2, RIG_STD_MM), rel=0.3)
@@ -188,8 +193,11 @@ def test_verdict_depends_on_the_number_of_misfits(film, tmp_path, measure, misfi
     presses = measure(30)
     presses.charge_pC[:misfits] = charge_pC
     presses.contact[:misfits] = np.nan, np.nan, answer.force_N
-    check = check_presses(Predictor("linear", models=tmp_path / "stated"), presses)
+    predictor = Predictor("linear", models=tmp_path / "stated")
+    check = check_presses(predictor, presses)
     assert (check.fits, "4 of 30 presses have a misfit above" in check.verdict) == (fits, not fits)
+    presses.position_std_mm[:] *= 0.1  # too small for the errors
+    assert ("-std" in check_presses(predictor, presses).notes[0]) == fits  # no rig explains charges of no press
 
 
 def test_constant_error_of_the_rig_reduces_the_significance_of_a_common_error():
@@ -201,7 +209,7 @@ def test_constant_error_of_the_rig_reduces_the_significance_of_a_common_error():
         assert common.significance[0] == pytest.approx(0.1 / math.hypot(common.std[0], constant_mm))
 
 
-@pytest.mark.parametrize(("degrees", "tolerance"), [(1, 0.03), (2, 0.006), (5, 0.003), (100, 2e-4), (3_000_000, 1e-6)])
+@pytest.mark.parametrize(("degrees", "tolerance"), [(1, 0.03), (2, 0.006), (100, 2e-4), (3_000_000, 1e-6)])
 def test_chi_squared_survival_is_near_scipy(degrees, tolerance):
     for sigmas in np.linspace(-4.0, 20.0, 49):
         statistic = max(0.3, degrees + sigmas * math.sqrt(2.0 * degrees))

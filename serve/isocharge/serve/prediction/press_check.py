@@ -203,7 +203,7 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     # Collect the explanations for the user.
     notes: list[str] = []
     if fits is False:
-        notes += _remedies(errors, is_selected, position, force)
+        notes += _remedies(errors, is_selected, position, force, misfit_text)
     notes += _exclusion_notes(errors, predictor.validity)
     if is_bad.any():
         notes.append(f"{errors.presses[is_bad].line_words}: nothing like the other presses, left out; look at it")
@@ -310,19 +310,24 @@ def _verdict(
 
 
 def _remedies(
-    errors: PressErrors, is_selected: Booleans, position: ErrorSummary | None, force: ErrorSummary | None
+    errors: PressErrors,
+    is_selected: Booleans,
+    position: ErrorSummary | None,
+    force: ErrorSummary | None,
+    misfit_text: str,
 ) -> Iterator[str]:
     """Yield notes about possible remedies for a model that does not fit.
 
     The first note states how large the uncertainty of the rig would have to be to explain the errors. It is omitted if
-    no uncertainty of the rig explains the errors, for example if all positions are shifted equally. The second note
-    recommends a calibration, or training with the measured presses.
+    no uncertainty of the rig explains the errors, for example if all positions are shifted equally, or if the charges
+    fit no press. The second note recommends a calibration, or training with the measured presses.
 
     Args:
         errors: Errors of all presses.
         is_selected: Whether each press is counted, shape (n,).
         position: Errors of the positions; None if no position is known.
         force: Errors of the forces; None if no force is known.
+        misfit_text: Statement that too many presses have a large misfit; empty if this is not the case.
     """
     rig_std = np.full_like(errors.rig_std, np.nan)
     options = []
@@ -334,8 +339,11 @@ def _remedies(
         options.append(f"--force-std {rig_std[0, FORCE]:.2g}")
     is_possible = not PRESS_RULES["force_std"].violations(rig_std[:, FORCE]).any()
     is_explained = Agreement.from_errors(replace(errors, rig_std=rig_std), is_selected).acceptable
-    if is_possible and is_explained and not Agreement.from_errors(errors, is_selected).acceptable:
-        yield f"the errors would be the rig's if that were as uncertain as {' '.join(options)}"
+    if is_possible and is_explained and not misfit_text:
+        yield (
+            f"the errors would be the rig's if that were as uncertain as {' '.join(options)}; standard deviations in "
+            "columns of the file take precedence over these options"
+        )
 
     yield (
         "if the film has changed since its calibration, or was never calibrated: isocharge train calibrate; what no "
