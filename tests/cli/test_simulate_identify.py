@@ -8,8 +8,7 @@ from matplotlib.image import imread
 UNIAXIAL = ("simulate", "identify", "three-25um-uniaxial", "--radius", "3.5", "--force", "0.9", "1.1", "--workers", "1")
 
 
-def test_a_map_that_folds_is_reported_drawn_and_written(command, refused, tmp_path, monkeypatch):
-    monkeypatch.setattr("isocharge.simulate.forward.whole_film.MIN_COARSE_FORCES", 2)  # enough for a narrow range
+def test_a_map_that_folds_is_reported_drawn_and_written(command, refused, tmp_path):
     noise = tmp_path / "quiet.toml"
     noise.write_text("white_pC = 0.5\n")
     code, out, err = command(*UNIAXIAL, "--noise", noise, "--json", "-o", tmp_path / "out")

@@ -48,7 +48,7 @@ def test_coarse_map_of_a_taut_film_is_accurate_over_a_wide_range_of_forces(monke
     coarse = whole_film_map(sensor, PROBE, (0.005, 5.0))
     for contact in ((9.0, -5.0, 0.026), (-14.0, 9.0, 0.015)):
         direct = solved_charge(sensor, PROBE, contact[:2], contact[2], FINER)
-        assert relative_error(coarse.charges(np.array([contact]))[0], direct) < 0.02
+        assert relative_error(coarse.charges(np.array([contact]))[0], direct) < 0.004
 
 
 @pytest.mark.parametrize("film_radius", [12.0, 45.0])

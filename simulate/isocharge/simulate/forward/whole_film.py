@@ -42,9 +42,6 @@ An element of the coarse mesh would be folded in a narrower gap. The gap decreas
 COARSE_DISTANCES = 10
 """Number of distances at which presses are solved for the coarse map."""
 
-MIN_COARSE_FORCES = 4
-"""Smallest number of forces at which presses are solved for the coarse map, which has one for each factor of e."""
-
 
 def outermost_distance(film: Film, probe: Probe) -> float:
     """Return the largest distance of a press from the centre (mm) for which the coarse map is valid.
@@ -78,7 +75,7 @@ def whole_film_map(
     settings = SolveSettings(resolution=COARSE_RESOLUTION)
     min_force, max_force = force_range
     domain = Domain(outermost_distance(sensor.film, probe.under(max_force)), force_range)
-    n_force = max(MIN_COARSE_FORCES, math.ceil(math.log(max_force / min_force)))
+    n_force = 2 + math.ceil(math.log(max_force / min_force))  # a taut film needs more than one for each factor of e
     count = NodeCount(COARSE_DISTANCES, n_force)
     forward_map = ForwardMap.build_unchecked(sensor, probe, domain, count, settings, executor=executor)
     return replace(forward_map, error=COARSE_ERROR)
