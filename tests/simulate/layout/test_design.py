@@ -14,7 +14,6 @@ from isocharge.simulate.layout import case as case_module
 from isocharge.simulate.layout import design as design_module
 from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase
 from isocharge.simulate.layout.design import (
-    NOT_SEARCHED,
     UNAMBIGUOUS,
     Layout,
     Search,
@@ -126,10 +125,11 @@ def test_ambiguities_reports_folds_and_pairs(sensor):
 
 
 @pytest.mark.usefixtures("_random_layouts")
-def test_design_reports_that_charges_cannot_be_interpolated(sensor, monkeypatch):
+def test_design_reports_why_ambiguities_cannot_be_looked_for(sensor, monkeypatch):
     def refuse(*_, **__):
-        raise SolveError("rough")
+        raise SolveError("no equilibrium at 0.05 N")
 
     monkeypatch.setattr(ForwardMap, "build", refuse)
     found = design(case_of(sensor))
-    assert (found.summary, found.unambiguous) == (NOT_SEARCHED, False)
+    assert found.summary == "folds and ambiguous pairs could not be looked for: no equilibrium at 0.05 N"
+    assert not found.unambiguous

@@ -246,9 +246,6 @@ DECIMALS = 3
 UNAMBIGUOUS = "no folds, no ambiguous pairs"
 """Summary of a layout that has neither folds nor ambiguous pairs."""
 
-NOT_SEARCHED = "folds and ambiguous pairs could not be looked for: the charges vary too quickly"
-"""Summary of a layout whose charges cannot be interpolated accurately enough for the search."""
-
 
 @dataclass(frozen=True)
 class ErrorMap:
@@ -358,18 +355,20 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     refined_layouts = list(track(in_order(executor, search.refine, finalists), "refining", len(finalists)))
     refined_layouts.sort(key=lambda layout: layout.error)
 
-    # Check the layouts in the order of their errors, up to the first layout that is not ambiguous. A layout cannot be
-    # checked if there is no accurate forward map.
-    forward_map = _solve_forward_map(case, executor)
-    summaries = []
+    # Check the layouts in the order of their errors, up to the first layout that is not ambiguous. No layout can be
+    # checked if some presses cannot be solved, or if the forward map is not accurate.
     sensors = [case.layout(np.round(layout.positions, DECIMALS)) for layout in refined_layouts]
-    for sensor in track(sensors, "looking for folds and ambiguous pairs"):
-        summary = NOT_SEARCHED
-        if forward_map is not None:
+    summaries = []
+    try:
+        forward_map = _solve_forward_map(case, executor)
+    except (SceneError, SolveError) as error:
+        summaries.append(f"folds and ambiguous pairs could not be looked for: {error}")
+    else:
+        for sensor in track(sensors, "looking for folds and ambiguous pairs"):
             summary = describe_ambiguities(case, ChargeSpline.of(replace(forward_map, sensor=sensor)))
-        summaries.append(summary)
-        if summary == UNAMBIGUOUS:
-            break
+            summaries.append(summary)
+            if summary == UNAMBIGUOUS:
+                break
 
     # If all layouts are ambiguous, choose the first layout, which has the smallest error.
     chosen = summaries.index(UNAMBIGUOUS) if UNAMBIGUOUS in summaries else 0
@@ -378,7 +377,7 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     return Design(case, sensors[chosen], summaries[chosen], chosen, errors_before, errors_after)
 
 
-def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMap | None:
+def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMap:
     """Build the forward map that the search for folds and ambiguous pairs uses for all layouts of a design case.
 
     All layouts use the same map, because the stress of the film does not depend on the electrodes. The map covers the
@@ -388,15 +387,13 @@ def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMa
         case: Requirements of the layout.
         executor: Executor that runs the solves; None for this process.
 
-    Returns:
-        Forward map of the initial sensor; None if the map cannot be built or is not accurate enough.
+    Raises:
+        SceneError: If the film cannot bear a force of the map.
+        SolveError: If a press has no equilibrium, or the map is not accurate enough.
     """
     default_min_force, default_max_force = DEFAULT_FORCE_RANGE
     force_range = (min(default_min_force, case.force), max(default_max_force, case.force))
-    try:
-        return ForwardMap.build(case.sensor, case.probe, case.radius, force_range, executor=executor)
-    except (SceneError, SolveError):
-        return None
+    return ForwardMap.build(case.sensor, case.probe, case.radius, force_range, executor=executor)
 
 
 def describe_ambiguities(case: DesignCase, charges: ChargeMap) -> str:
