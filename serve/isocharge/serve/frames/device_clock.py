@@ -141,15 +141,16 @@ class DeviceClock:
         step_us = self._unwrap(frame, t_us, modulus)  # time since the previous reading
         predicted_s = self._predict(self._device_us)
 
-        # A reading is taken before it arrives. If the predicted time is much later than the arrival, the clock of the
-        # host or of the device was set, and the fit is wrong. A provisional fit is not examined, because its times may
-        # be wrong by the length of a chunk.
+        # A reading is taken before it arrives. If the predicted time is much later than the arrival, the fit is wrong:
+        # the clock of the host or of the device was set, or readings were lost after others had waited for the program.
+        # A provisional fit is not examined, because its times may be wrong by the length of a chunk.
         has_fit = self._fitted_us is not None and not self._is_fit_provisional
         if has_fit and self._is_new_arrival and predicted_s - arrival_s > MAX_LEAD_s:
             self._fitted_us = None  # discards the fit
-            frame.is_clock_reset = t_us < step_us  # not a wrap, but a restart in the second half of the range
-            self._device_us -= step_us  # the time of the device goes on from the previous reading
-            step_us = 0  # the time since the previous reading is unknown
+            if t_us < step_us:  # not a wrap, but a restart in the second half of the range
+                frame.is_clock_reset = True
+                self._device_us = t_us
+                step_us = 0
 
         # Without a fit, begin a provisional fit in which the host time of this reading is its arrival time, or the host
         # time of the previous reading if that is later.
@@ -222,8 +223,8 @@ class DeviceClock:
         """Remove the wraps from the clock value of the next reading, and store the resulting value in `_device_us`.
 
         If the clock went back by at most `MAX_DELAY_s`, the reading arrived late: for example, another datagram has
-        overtaken it. If the clock went back by more, or ahead by at least half of its range, the device has restarted.
-        The fit is then discarded.
+        overtaken it. If the clock went back by more, the device has restarted. The fit is then discarded. A clock that
+        went back by at least half of its range seems to have wrapped; `_stamp_with_device` recognises this restart.
 
         Args:
             frame: Frame of the reading, which stores whether the clock was reset.
