@@ -154,13 +154,13 @@ def test_presses_of_a_machine_are_those_of_its_list(capsys):
 
 
 @pytest.mark.parametrize(("taken", "next_row"), [([0], 2), ([0, 1, 2], 4), ([0, 2, 0], 5)])
-def test_list_that_repeats_its_presses_is_continued_at_the_next_row(taken, next_row):
-    contacts = np.concatenate([LIST, LIST])
+def test_list_that_repeats_its_presses_is_continued_at_the_next_row(taken, next_row, capsys):
+    """A row that is left out before the port is lost is expected again, so the error states no other row."""
     session = FakeSession()
-    session.taken = [*LIST[taken]]
     session.presses = SimpleNamespace(contact=LIST[taken])
-    with pytest.raises(PortLost, match=f"continue with row {next_row} of its list"):
-        Dialogue(session, Script(TARED, refused(PORT_LOST))).follow_machine(contacts)
+    with pytest.raises(PortLost, match="names the row"):
+        Dialogue(session, Script(TARED, refused("it moves"), refused(PORT_LOST))).follow_machine([*LIST, *LIST])
+    assert f"begin with row {next_row} of its list" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")

@@ -118,7 +118,7 @@ def press_command(
         session = PressSession(
             problem, save=partial(_save, output), presses=presses, until=until, executor=executor, **stds
         )
-        for number, contact in enumerate([] if contacts is None else contacts, start=1):
+        for number, contact in enumerate([] if contacts is None else contacts, 1):
             with error_prefix(f"{press_list}, press {number}: ", PressError):
                 session.check(contact)
         piezo = problem.sensor.piezo
@@ -145,7 +145,7 @@ def press_command(
             if len(session):
                 say(f"presses in {output}: {len(session)}; the same command continues the session")
 
-    if len(session) == 0:
+    if not len(session):
         raise PressError(f"no press was taken, so {output} is not written")
     if session.refusal:  # the reason why the presses cannot be used for a calibration
         raise PressError(f"{output}: {session.refusal}")

@@ -188,12 +188,12 @@ class Dialogue:
         for recorded in self._session.presses.contact:
             is_row = np.isclose(contacts[row_count:], recorded, equal_nan=True).all(axis=1)
             if is_row.any():
-                row_count += int(np.argmax(is_row)) + 1
+                row_count += int(is_row.argmax()) + 1
         try:
             # A press before the tare would be lost, and each later press would be assigned to the wrong row.
             self._wait_for(Phase.waiting)
-            say("The tare is measured. Let the machine begin.")
-            for row_number, contact in enumerate(contacts[row_count:], start=row_count + 1):
+            say(f"The tare is measured. Let the machine begin with row {row_count + 1} of its list.")
+            for row_number, contact in enumerate(contacts[row_count:], row_count + 1):
                 say(f"{row_number}. {describe_press(contact)}")
                 self._shown_phase = ""
                 event = self._wait_for(Phase.taken, Phase.refused)
@@ -201,10 +201,7 @@ class Dialogue:
                     self._say_steady(event.press)
                     self._take(event.press, contact)
                 elif event.reason == PORT_LOST:
-                    raise PortLost(
-                        f"{PORT_LOST}; run the same command again, and let the machine continue with row {row_number} "
-                        "of its list"
-                    )
+                    raise PortLost(f"{PORT_LOST}; run the same command again, which names the row to continue with")
                 else:  # the machine has already moved on to the next row
                     say(f"   row {row_number} is left out: {event.reason}")
         except SessionEnd as end:
