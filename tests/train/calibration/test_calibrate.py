@@ -100,13 +100,15 @@ def test_forces_that_scatter_more_than_stated_are_named(fit, press_film):
     assert any("about 3 % more than stated: is the load cell zero" in caution for caution in result.cautions)
 
 
-def presses_on_shifted_electrodes(problem, press_film, shift_mm):
-    return press_film(20, seed=15, values=film_values(problem.prior.layout.prior, shift_x=shift_mm))
+def presses_on_changed_film(problem, press_film, **changes):
+    return press_film(20, 15, film_values(problem.prior.layout.prior, **changes))
 
 
-def test_electrodes_far_from_their_places_are_named(fit, press_film, problem):
-    cautions = fit(presses_on_shifted_electrodes(problem, press_film, 1.1)).cautions
-    assert any("is the origin of the stage the centre of the film" in caution for caution in cautions)
+@pytest.mark.parametrize("changes", [{"shift_x": 1.1}, {"gain A": 0.2}])
+def test_film_far_from_its_description_is_named(fit, press_film, problem, changes):
+    assert "those of the film, are the forces in N" in str(
+        fit(presses_on_changed_film(problem, press_film, **changes)).cautions
+    )
 
 
 def test_electrodes_that_are_farther_away_than_considered_are_refused(fit, press_film, problem):
@@ -114,7 +116,7 @@ def test_electrodes_that_are_farther_away_than_considered_are_refused(fit, press
     with pytest.raises(
         PressError, match=r"along x: the presses agree best with 1\.2 mm, which is an end .* the origin"
     ):
-        fit(presses_on_shifted_electrodes(problem, press_film, 2.0))
+        fit(presses_on_changed_film(problem, press_film, shift_x=2.0))
 
 
 @pytest.mark.parametrize("scatter_mm", [0.0, 0.005])

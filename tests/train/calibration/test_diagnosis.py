@@ -13,7 +13,6 @@ from isocharge.train import calibrate
 from isocharge.train.calibration.diagnosis import (
     OFFSET_STD,
     SCATTER_STD,
-    SUSPICIOUS_MISFIT,
     check_places,
     expected_charges,
     find_mistakes,
@@ -27,7 +26,6 @@ EXPLAINED = {
     "rotated": (lambda c, q: (c @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]]), q), "turned by -?90 degrees"),
     "mirrored": (lambda c, q: (c * [-1.0, 1.0, 1.0], q), "x is mirrored"),
     "millinewtons": (lambda c, q: (c / [1.0, 1.0, 1e-3], q), "forces are in mN, not N"),
-    "centimetres": (lambda c, q: (c / [10.0, 10.0, 1.0], q), "positions are in cm, not mm"),
     "nanocoulombs": (lambda c, q: (c, q / 1e3), "charges are in nC, not pC"),
 }
 """Functions that put a mistake into contacts and charges, and the sentence that names the mistake."""
@@ -85,14 +83,19 @@ def test_misfit_of_one_usual_offset_and_one_usual_scatter_is_two(problem, synthe
 
 
 @pytest.mark.usefixtures("few_hypotheses")
-def test_centimetres_near_the_centre_are_refused_although_the_charges_are_not_suspicious(problem, synthetic):
-    def shrunk(contact, _charge):
-        contact = contact * [0.4, 0.4, 1.0]
-        return contact / [10.0, 10.0, 1.0], synthetic.charges(synthetic.values, contact)
+@pytest.mark.parametrize(
+    ("unit", "message"),
+    [([10.0, 10.0, 1.0], "positions are in cm, not mm"), ([1.0, 1.0, 4.45], "forces are in lbf, not N")],
+)
+def test_wrong_unit_is_refused_although_the_charges_hardly_differ_from_those_of_a_film(
+    problem, synthetic, unit, message
+):
+    def mistaken(contact, _charge):
+        contact = 0.4 * contact + 0.3  # positions near the centre, and moderate forces
+        return contact / unit, synthetic.charges(synthetic.values, contact)
 
-    presses = with_mistake(problem, synthetic, shrunk)
-    assert misfit(presses, synthetic) < SUSPICIOUS_MISFIT
-    with pytest.raises(PressError, match=r"scatter about 3 times as much as stated.* positions are in cm, not mm"):
+    presses = with_mistake(problem, synthetic, mistaken)
+    with pytest.raises(PressError, match=message):
         calibrate(presses, problem, start=synthetic, accurate=False)
 
 

@@ -49,8 +49,8 @@ MAX_USUAL_NOISE = 0.01
 PLACEMENT = ("shift_x", "shift_y", "rotation")
 """Names of the properties that describe where the electrodes are."""
 
-UNUSUAL_SHIFT = 3.0
-"""Ratio of a shift or rotation of the electrodes to its prior standard deviation above which a caution is given."""
+UNUSUAL_DEVIATION = 3.0
+"""Deviation of a property from its prior mean, in prior standard deviations, above which a caution is given."""
 
 
 def calibrate(
@@ -111,10 +111,11 @@ def calibrate(
             raise unexplained_error(used_presses, charges, "their charges are very different from those of its films")
         data = PressData.of(used_presses, problem.noise, problem.solved_domain)
         estimation = _fit_even_film(problem, data, charges, executor)
-        position_ratio = estimation.hypothesis.errors.position_ratio
-        if position_ratio > 1.0 and find_mistakes(used_presses, charges):
-            reason = f"their positions scatter about {position_ratio:.0f} times as much as stated"
-            raise unexplained_error(used_presses, charges, reason)
+        is_at_bound = np.equal(problem.prior.layout.prior.bounds, estimation.film.film_values).any()
+        if (estimation.hypothesis.errors.position_ratio > 1.0 or is_at_bound) and find_mistakes(used_presses, charges):
+            raise unexplained_error(
+                used_presses, charges, "only larger errors of the positions or an improbable film would explain them"
+            )
         if accurate:
             estimation = _fit_uneven_film(problem, data, estimation, executor)
             if not _is_exact(estimation.charges, estimation.film.film_values, estimation.contact):
@@ -223,8 +224,7 @@ def _check_placement(film: FilmEstimate) -> None:
             deviation is too small.
     """
     for one in film.layout.prior.properties:
-        lowest, highest = one.limits
-        if one.name in PLACEMENT and not lowest < film.value(one.name) < highest:
+        if one.name in PLACEMENT and film.value(one.name) in one.limits:
             raise PressError(
                 f"{one.meaning}: the presses agree best with {film.value(one.name):.3g} {one.unit}, which is "
                 "an end of the considered range: is the origin of the stage the centre of the film, are its axes those "
@@ -233,7 +233,7 @@ def _check_placement(film: FilmEstimate) -> None:
 
 
 def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
-    """Return warnings about presses, the session, and electrodes far from their described places."""
+    """Return warnings about presses, the session, and a film that differs much from its description."""
     cautions = []
     film = estimation.film
     if estimation.is_bad.any():
@@ -258,9 +258,10 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
     cautions.extend(film.session_cautions())
     cautions.extend(
         f"{one.meaning}: {film.value(one.name):.3g} {one.unit}, which is unusually far from the sensor file: is the "
-        "origin of the stage the centre of the film, and are its axes those of the film?"
+        "origin of the stage the centre of the film, are its axes those of the film, are the forces in N, and the "
+        "charges in pC?"
         for one in film.layout.prior.properties
-        if one.name in PLACEMENT and abs(film.value(one.name)) > UNUSUAL_SHIFT * one.std
+        if not one.is_imperfection and abs(film.value(one.name) - one.mean) > UNUSUAL_DEVIATION * one.std
     )
     if is_one_place(presses):
         cautions.append("all known positions are at one place, so they do not determine where the electrodes are")
