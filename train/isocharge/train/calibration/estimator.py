@@ -297,6 +297,7 @@ def _estimate_with_errors(
     unknowns = point.state
     probable = all_hypotheses
     for _ in range(2):
+        # Compare the hypotheses. Those with the same errors of the presses share one linearised problem.
         model = model_values(charges, prior.layout, used_data, unknowns, used_contact)
         evidences = [
             _Evidence.of(model, stated[is_used].with_errors(errors), used_contact, unknowns, prior, list(group))
@@ -306,10 +307,11 @@ def _estimate_with_errors(
         all_weights = softmax(log_evidence)
         all_weights[all_weights < MIN_WEIGHT] = 0.0
         all_weights /= all_weights.sum()
+
+        # Compute the estimates under the probable hypotheses, and average them.
         weights_of_evidences = np.split(all_weights, np.cumsum([len(one.hypotheses) for one in evidences])[:-1])
         posteriors = [one.posterior(weight) for one, weight in zip(evidences, weights_of_evidences, strict=True)]
         means = np.concatenate([mean for mean, _ in posteriors])
-
         is_probable = all_weights > 0.0
         weight, chi2 = all_weights[is_probable], all_chi2[is_probable]
         probable = list(compress(probable, is_probable))
