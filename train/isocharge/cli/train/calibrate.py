@@ -112,10 +112,10 @@ def calibrate_command(
             else read_presses(path, problem.electrodes, position_std_mm=position_std_mm, force_std=force_std)
             for path in (file, held_out)
         )
+        if earlier is not None:
+            problem = replace(problem, earlier=read_earlier(earlier, problem, presses, held_out_presses))
         if presses is not None and held_out_presses is not None:
             held_out_presses = usable_held_out(held_out_presses, presses, problem)  # before anything is solved
-        if earlier is not None:
-            problem = replace(problem, earlier=read_earlier(earlier, problem, presses))
         if presses is None:
             # The presses are chosen for the mean film.
             charges = solve_even(problem, executor)
@@ -140,10 +140,10 @@ def calibrate_command(
                     fields["std_factor"] = std_factor.factor
                     sentences.append(f"Held-out presses: {std_factor.statement}.")
         if next_count:
-            proposed_presses = next_presses(
-                problem, charges, next_count, film, position_std_mm=position_std_mm, force_std=force_std
+            rows += map(
+                vars,
+                next_presses(problem, charges, next_count, film, position_std_mm=position_std_mm, force_std=force_std),
             )
-            rows += map(vars, proposed_presses)
 
     if json:
         show_json(fields | {"next": rows})

@@ -384,13 +384,13 @@ def result_table(result: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def read_earlier(folder: Path, problem: CalibrationProblem, presses: MeasuredPresses | None = None) -> FilmEstimate:
+def read_earlier(folder: Path, problem: CalibrationProblem, *presses: MeasuredPresses | None) -> FilmEstimate:
     """Read the film of an earlier calibration, and add the possible drift since then to its uncertainty.
 
     Args:
         folder: Folder that `write_calibration` wrote, or one of its version folders.
         problem: Problem of the new calibration.
-        presses: Presses of the new calibration with the electrodes of the problem; None if there are none yet.
+        *presses: Presses of the new calibration and held-out presses with the electrodes of the problem; None for none.
 
     Raises:
         PressError: If the folder contains no calibration, or a calibration of another problem, or if one of the presses
@@ -400,9 +400,11 @@ def read_earlier(folder: Path, problem: CalibrationProblem, presses: MeasuredPre
     *_, version = folder, *calibrated_versions
     film = read_film(version / RESULT, problem)
     learned_path = version / PRESSES
-    if presses is not None and learned_path.is_file():
+    if learned_path.is_file():
         learned = read_presses(learned_path, problem.electrodes)
-        _refuse_learned(presses, learned, f"presses that are not among those of the earlier calibration {version}")
+        for one in presses:
+            if one is not None:
+                _refuse_learned(one, learned, f"presses that are not among those of the earlier calibration {version}")
     return film.drifted()
 
 
