@@ -176,8 +176,10 @@ ROW = "1,2,3,4,5,6\n"
         ("x_mm,y_mm,force_N,A_pC,B_pC,C_pC", "rename 'A_pC' to 'A'"),
         ("x [mm],y_mm,force_N,A,B,C", r"rename 'x \[mm\]' to 'x_mm'"),
         ("x_mm,y_mm,Force_STD,A,B,C", "rename 'Force_STD' to 'force_std'"),
+        ("x,y,force,A,B,C", "rename 'x' to 'x_mm' and check its unit"),
         ("x_um,y_um,force_N,A,B,C", "rename 'x_um' to 'x_mm' and check its unit"),
         ("x_mm,y_mm,Force (lbf),A,B,C", r"rename 'Force \(lbf\)' to 'force_N' and check"),
+        ("x_mm,y_mm,Force (cN),A,B,C", r"rename 'Force \(cN\)' to 'force_N' and check"),
         ("x_mm,y_mm,force_N,A [nC],B,C", r"rename 'A \[nC\]' to 'A' and check"),
     ],
 )
@@ -190,7 +192,7 @@ def test_similar_header_names_the_column_to_rename(write, header, message):
 
 def test_headers_where_every_other_column_is_an_electrode(write):
     """A channel may have any name, but not one that stands for position or force."""
-    assert read_presses(write("X_N,X_P,Y\n1,2,3")).electrodes == ("X_N", "X_P", "Y")
+    assert read_presses(write("X_P,Y_P,Z\n1,2,3")).electrodes == ("X_P", "Y_P", "Z")
     assert read_presses(write(f"x_mm,y_mm,force_N,a,f,Ladung [pC]\n{ROW}")).electrodes == ("a", "f", "Ladung [pC]")
     for misspelt, name in (("force [N]", "force_N"), ("Temperature_C", "temperature_C")):
         with pytest.raises(PressError, match=f"rename '{re.escape(misspelt)}' to '{name}' and check"):

@@ -56,8 +56,8 @@ _WRONG_BYTE = re.compile("[\0\udc80-\udcff]")
 _THOUSANDS = re.compile(r"[-+]?[1-9][0-9]{0,2}[.,][0-9]{3}")
 """Number whose mark may be a separator of thousands."""
 
-_UNITS_AT_END = {"length": "(?:[uµμnmc]?m|in)", "force": "(?:[uµμmk]?n|m?k?gf?|lbf?)", "charge": "[uµμfpn]?c"}
-"""Patterns of units in lower case that may stand at the end of the name of a column, by their quantity."""
+_UNIT_AT_END = re.compile(r"[\W_](?:[uµμnmc]?m|in|(?:da|[uµμmck])?n|m?k?gf?|lbf?|[uµμfpn]?c)[\W_]*$")
+"""Unit in lower case of a length, a force or a charge at the end of the name of a column."""
 
 
 class CsvTable:
@@ -370,13 +370,11 @@ def _find_header(lines: list[str], names: Collection[str]) -> tuple[int, str]:
 def _spellings(name: str) -> set[str]:
     """Return spellings of the name of a column, two of which are equal if the names are similar.
 
-    They are the letters and digits of the name in lower case, and the same with a quantity instead of a unit. For
-    example, `x_mm` gives `xmm` and `xlength`, and `X (cm)` gives `xcm` and `xlength`.
+    They are the letters and digits of the name in lower case, with and without a unit at the end. For example, `x_mm`
+    gives `xmm` and `x`, and `X (cm)` gives `xcm` and `x`.
     """
-    with_quantity = name.casefold()
-    for quantity, unit in _UNITS_AT_END.items():
-        with_quantity = re.sub(rf"[\W_]{unit}[\W_]*$", quantity, with_quantity)
-    return {re.sub(r"[\W_]+", "", text) for text in (name.casefold(), with_quantity)}
+    text = name.casefold()
+    return {re.sub(r"[\W_]+", "", one) for one in (text, _UNIT_AT_END.sub("", text))}
 
 
 @contextmanager
