@@ -17,6 +17,7 @@ from functools import cached_property
 from itertools import compress, groupby, product
 
 import numpy as np
+from scipy.linalg import cho_solve
 from scipy.special import chdtrc, chdtri, softmax
 
 from isocharge.common.arrays import Array, Booleans
@@ -447,10 +448,10 @@ class _Evidence:
             Sums of the squared residuals of the presses and of the prior distribution after the fit, and logarithms of
             the evidence, each of shape (n_hypothesis,).
         """
-        covariance = self._covariance(self._squared_sizes)
-        weighted = np.linalg.solve(covariance, self.residual[:, None])[..., 0]  # S^-1 r, shape (n_hypothesis, m)
-        chi2 = self.other_chi2 + weighted @ self.residual
-        log_determinant = np.linalg.slogdet(covariance)[1]
+        factors = np.linalg.cholesky(self._covariance(self._squared_sizes))
+        weighted = [cho_solve((factor, True), self.residual, check_finite=False) for factor in factors]  # S^-1 r
+        chi2 = self.other_chi2 + np.array(weighted) @ self.residual
+        log_determinant = 2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)
         log_probability = np.log([one.probability for one in self.hypotheses])
         return chi2, self.log_volume - 0.5 * (chi2 + log_determinant) + log_probability
 
