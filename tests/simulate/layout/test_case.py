@@ -9,6 +9,7 @@ from isocharge.common.errors import InputError
 from isocharge.simulate import Calibration, Electrode, Finger, NoiseModel
 from isocharge.simulate.layout.case import DesignCase, Nuisances
 from isocharge.simulate.layout.design import _solve_forward_map, design
+from solved_charges import with_film
 
 
 def test_clearances_are_distances_from_rim_kept_electrodes_and_other_squares(sensor):
@@ -79,7 +80,8 @@ def test_squares_that_do_not_fit_raise_input_error_before_the_film_is_solved(sen
             design(case)
 
 
-def test_folds_of_a_film_that_the_default_forces_stretch_too_far_are_not_searched(sensor):
+def test_folds_of_a_film_that_the_default_forces_stretch_too_far_cannot_be_searched(sensor):
     """A force of 0.2 N is possible on this soft film, but 2 N stretch it beyond small strains."""
-    soft = replace(sensor, film=replace(sensor.film, young=100.0, radius=20.0))
-    assert _solve_forward_map(DesignCase(soft, 4, 6.0, force=0.2), None) is None
+    soft = with_film(sensor, young=100.0, radius=20.0)
+    with pytest.raises(InputError, match="force 2 N stretches a film"):
+        _solve_forward_map(DesignCase(soft, 4, 6.0, force=0.2), None)
