@@ -141,13 +141,16 @@ class DeviceClock:
         step_us = self._unwrap(frame, t_us, modulus)  # time since the previous reading
         predicted_s = self._predict(self._device_us)
 
-        # A reading is taken before it arrives. If the predicted time is much later than the arrival, the fit is wrong:
-        # the clock of the host or of the device was set, or readings were lost after others had waited for the program.
-        # A provisional fit is not examined, because its times may be wrong by the length of a chunk.
+        # A reading is taken before it arrives. If the predicted time is much later than the arrival, the fit is wrong.
+        # The clock of the host or of the device may have been set. Or the program has paused: the readings that waited
+        # for it arrived late, which the fit took for their time, and the readings after them were lost. A provisional
+        # fit is not examined, because its times may be wrong by the length of a chunk.
         has_fit = self._fitted_us is not None and not self._is_fit_provisional
         if has_fit and self._is_new_arrival and predicted_s - arrival_s > MAX_LEAD_s:
             self._fitted_us = None  # discards the fit
-            if t_us < step_us:  # not a wrap, but a restart in the second half of the range
+            # Only a step in which the clock went back is larger than the clock value. `_unwrap` has taken this for a
+            # wrap. However, not enough time has passed for a wrap, so the device has restarted.
+            if t_us < step_us:
                 frame.is_clock_reset = True
                 self._device_us = t_us
                 step_us = 0

@@ -102,8 +102,8 @@ class Channels(Stage):
     def indices_by_name_or_order(self, frame: Frame) -> tuple[int, ...] | None:
         """Find the channel of each electrode by the names or the order of the channels, without the device file.
 
-        A channel belongs to the electrode whose name it has. If the channels have no names of electrodes, they belong
-        to the electrodes in their order.
+        A channel belongs to the electrode whose name it has. If no channel has the name of an electrode, the first
+        channel belongs to the first electrode, the second channel to the second electrode, and so on.
 
         Args:
             frame: A frame, whose channels may have names.

@@ -350,16 +350,16 @@ class FilmFollower(Stage):
     def _apply_estimate(self) -> None:
         """Compute the state of the film for which contacts are corrected.
 
-        There are two cases: since the calibration, the pretension has changed, or it has not. The state is the mean
-        over both cases, weighted by their probabilities.
+        There are two cases: since the calibration, the pretension has changed by an unknown amount t, or it has not
+        changed (t = 0). The state is the mean over both cases, weighted by their probabilities.
 
         Before the first touch, the odds of no change are `UNCHANGED_ODDS`. The touches multiply these odds by the
         Savage-Dickey ratio (Dickey 1971). It is the probability density of t = 0 after the touches, divided by the
         probability density of t = 0 before the first touch.
 
-        The covariance is that of a changed pretension, because hardly any film keeps its pretension exactly. It is
-        increased by the outer product of the difference between the states of both cases, times the probability of no
-        change.
+        The covariance is not a mean over both cases, but that of the first case, because hardly any film keeps its
+        pretension exactly. The mean state differs from the states of both cases. Therefore, the covariance is
+        increased by the outer product of the difference between these states, times the probability of no change.
         """
         change_MPa = self._state[0]
         variance = self._covariance[0, 0]

@@ -36,7 +36,7 @@ def sweep_command(
         str | None,
         typer.Option(
             metavar="ADDRESS",
-            help="Dask scheduler whose workers are used instead, such as tcp://10.0.0.1:8786. (default: none)",
+            help="Dask scheduler whose workers solve the presses instead, such as tcp://10.0.0.1:8786. (default: none)",
         ),
     ] = None,
 ) -> None:

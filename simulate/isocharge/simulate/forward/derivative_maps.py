@@ -57,7 +57,7 @@ def few_nodes(film: Film, domain: Domain) -> NodeCount:
 
 @dataclass(frozen=True)
 class FilmSlopes:
-    """Derivatives of the charges with respect to properties of one film, at any position and force.
+    """Derivatives of the charges with respect to properties of one film and to the radius of the probe.
 
     Attributes:
         film: Forward map of the film.
@@ -93,13 +93,14 @@ class FilmSlopes:
         if not probe.is_axisymmetric:
             raise SceneError(f"properties of a film: expected a circular probe, got {probe.notation}")
         count = few_nodes(sensor.film, domain)
-        both = ForwardMap.build_unchecked(
+        solved_map = ForwardMap.build_unchecked(
             sensor, probe, domain, count, settings, read=_stress_and_changes, executor=executor
         )
-        fields = both.table.reshape(len(both.table), -1, 1 + len(FILM_FIELDS), 3)  # the stress is the first field
+        table = solved_map.table
+        fields = table.reshape(len(table), -1, 1 + len(FILM_FIELDS), 3)  # the stress is the first field
         stress, changes = (part.reshape(len(part), -1) for part in np.split(fields, [1], axis=2))
         # Single precision is enough for derivatives, and halves the time in which they are interpolated.
-        return cls(film=replace(both, table=stress), fields=replace(both, table=changes.astype(np.float32)))
+        return cls(replace(solved_map, table=stress), replace(solved_map, table=changes.astype(np.float32)))
 
     def jacobian(self, contact: Array) -> dict[str, Array]:
         """Compute the derivatives of the charges with respect to the properties of the film.

@@ -1,7 +1,8 @@
 """Effect of small changes of the film or the probe, and of friction under the probe, on an equilibrium.
 
 The displacements u of an equilibrium satisfy R(u, m) = 0, where R is the residual and m is the value of an
-imperfection. The tangent is K = dR/du. The derivative of the displacements with respect to m is
+imperfection, or of another property of the film or the probe. The tangent is K = dR/du. The derivative of the
+displacements with respect to m is
 
     du/dm = -K^-1 dR/dm.
 
@@ -53,10 +54,10 @@ from isocharge.simulate.solver.assembly import SolveTangent, factor_tangent, sin
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
 
 STEP = 1e-3
-"""Step of the central differences, in units of the imperfection."""
+"""Step of the central differences, in units of the changed property."""
 
-AddImperfection = Callable[[Equilibrium, float], Equilibrium]
-"""Function that adds a given value of an imperfection to the film of an equilibrium, or changes its probe.
+AddChange = Callable[[Equilibrium, float], Equilibrium]
+"""Function that changes a property of the film or of the probe of an equilibrium by a given value.
 
 The displacements of the returned equilibrium are unchanged, and are therefore not in equilibrium.
 """
@@ -64,16 +65,16 @@ The displacements of the returned equilibrium are unchanged, and are therefore n
 
 @dataclass(frozen=True)
 class StressField:
-    """Field of the stress changes that an imperfection causes.
+    """Field of the stress changes that a change of the film or of the probe causes.
 
     Attributes:
-        name: Name of the property of the film that the imperfection changes.
-        add: Function that adds the imperfection to the film of an equilibrium.
+        name: Name of the changed property.
+        add: Function that adds a value to this property.
         odd: Whether the field is odd about the direction of the press.
     """
 
     name: str
-    add: AddImperfection
+    add: AddChange
     odd: bool
 
 
@@ -203,29 +204,27 @@ def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
             groups = elastic.back.at_constant_pressure(solved.field[:, 2])
             solved_for_odd = replace(solved, groups=groups)
         changes = [
-            _change_by_imperfection(solved_for_odd if field.odd else solved, field.add, solves[field.odd], surface)
+            _change_of_stress(solved_for_odd if field.odd else solved, field.add, solves[field.odd], surface)
             for field in FILM_FIELDS
         ]
         return np.stack(changes, axis=2)
 
 
-def _change_by_imperfection(
-    solved: Equilibrium, add_imperfection: AddImperfection, solve: SolveTangent, surface: Surface
-) -> Array:
-    """Compute how one imperfection changes the scaled stress at the nodes.
+def _change_of_stress(solved: Equilibrium, add_change: AddChange, solve: SolveTangent, surface: Surface) -> Array:
+    """Compute how a change of one property changes the scaled stress at the nodes.
 
     Args:
         solved: The solved press.
-        add_imperfection: Function that adds a given value of the imperfection to the film of the press.
+        add_change: Function that adds a given value to the property of the film or the probe.
         solve: Function that solves linear systems with the tangent of the press.
         surface: Surface of the film at which the stress is computed.
 
     Returns:
-        Change per unit of the imperfection, shape (n_element, n_local, 3).
+        Change per unit of the property, shape (n_element, n_local, 3).
     """
-    # Add a positive and a negative step of the imperfection. The displacements are not in equilibrium yet.
-    positive_press = add_imperfection(solved, STEP)
-    negative_press = add_imperfection(solved, -STEP)
+    # Add a positive and a negative step to the property. The displacements are not in equilibrium yet.
+    positive_press = add_change(solved, STEP)
+    negative_press = add_change(solved, -STEP)
 
     # Compute the change of the displacements that restores the equilibrium after one positive step. The change of the
     # residual by one step is half of the difference between both residuals.

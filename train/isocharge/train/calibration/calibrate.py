@@ -111,8 +111,10 @@ def calibrate(
             raise unexplained_error(used_presses, charges, "their charges are very different from those of its films")
         data = PressData.of(used_presses, problem.noise, problem.solved_domain)
         estimation = _fit_even_film(problem, data, charges, executor)
-        is_at_bound = np.equal(problem.prior.layout.prior.bounds, estimation.film.film_values).any()
-        if (estimation.hypothesis.errors.position_ratio > 1.0 or is_at_bound) and find_mistakes(used_presses, charges):
+        lowest, highest = problem.prior.layout.prior.bounds
+        is_at_end = (estimation.film.film_values <= lowest) | (estimation.film.film_values >= highest)
+        is_doubtful = estimation.hypothesis.errors.position_ratio > 1.0 or is_at_end.any()
+        if is_doubtful and find_mistakes(used_presses, charges):
             raise unexplained_error(
                 used_presses, charges, "only larger errors of the positions or an improbable film would explain them"
             )
@@ -217,14 +219,15 @@ def _is_uninformative(presses: MeasuredPresses) -> bool:
 
 
 def _check_placement(film: FilmEstimate) -> None:
-    """Check that the shift and the rotation of the electrodes are within their bounds.
+    """Check that the estimated shift and rotation of the electrodes are inside the ranges that the estimator considers.
 
     Raises:
-        PressError: If one of them is at a bound. The true value is then probably beyond the bound, and the standard
-            deviation is too small.
+        PressError: If one of them is at an end of its range. The true value then probably lies outside the range, so
+            that neither the estimate nor its standard deviation is right.
     """
     for one in film.layout.prior.properties:
-        if one.name in PLACEMENT and film.value(one.name) in one.limits:
+        lowest, highest = one.limits
+        if one.name in PLACEMENT and not lowest < film.value(one.name) < highest:
             raise PressError(
                 f"{one.meaning}: the presses agree best with {film.value(one.name):.3g} {one.unit}, which is "
                 "an end of the considered range: is the origin of the stage the centre of the film, are its axes those "

@@ -2,8 +2,8 @@
 
 The unknowns of the film and the contacts of the presses are found together by nonlinear least squares (Gauss-Newton). A
 contact may be known exactly, known with an error, or unknown. The contacts are eliminated in every step (variable
-projection, Golub and Pereyra 1973). Presses that do not agree with the others get a lower weight, according to
-Student's t distribution (Lange and others, 1989), and are left out of the final estimate.
+projection, Golub and Pereyra 1973). During the search, presses that do not agree with the others get a lower weight,
+according to Student's t distribution (Lange and others, 1989). The final estimate is computed without them.
 
 Some facts are not known beforehand: how uneven a film is, how large its discrepancy and the errors of the presses are,
 and whether the session has an offset of the charges or of the forces, or a drift. Each combination of these cases is a
@@ -304,7 +304,7 @@ def _estimate_with_errors(
             _Evidence.of(model, stated[is_used].with_errors(errors), used_contact, unknowns, prior, list(group))
             for errors, group in groupby(probable, lambda one: one.errors)
         ]
-        all_chi2, log_evidence = np.concatenate([one.compare() for one in evidences], axis=1)
+        all_chi2, log_evidence = np.concatenate([one.chi2_and_log_evidence() for one in evidences], axis=1)
         all_weights = softmax(log_evidence)
         all_weights[all_weights < MIN_WEIGHT] = 0.0
         all_weights /= all_weights.sum()
@@ -386,7 +386,8 @@ class _Evidence:
         jacobian: Derivatives J, shape (m, n_unknown).
         parts: J P J' for each part of the prior covariance, shape (n_part, m, m).
         other_chi2: Sum of the squared residuals that the unknowns do not change.
-        log_volume: Logarithm of the density of the measurements, and of the volume of the possible contacts.
+        log_volume: Part of the logarithm of the evidence that is the same for all these hypotheses. It contains the
+            standard deviations of the measurements, and the volume of the contacts that agree with them.
     """
 
     hypotheses: list[Hypothesis]
@@ -409,9 +410,9 @@ class _Evidence:
     ) -> "_Evidence":
         """Linearise the residuals, and eliminate the contacts from them, so that they only depend on the unknowns.
 
-        The hypotheses differ only in the prior of the unknowns. Therefore, the residuals are projected onto the column
-        space of their Jacobian (QR factorisation), which has fewer dimensions. The squares of the other components,
-        and the logarithms of the volumes and densities, are the same for all hypotheses.
+        The residuals are then projected onto the column space of their Jacobian (QR factorisation), which has fewer
+        dimensions. The unknowns do not change the other components of the residuals, so that the sum of the squares of
+        these components is the same under all hypotheses.
 
         Args:
             model: Charges at the unknowns, as `model_values` returns them.
@@ -441,12 +442,15 @@ class _Evidence:
             log_volume=float(log_contact_volume + log_density),
         )
 
-    def compare(self) -> tuple[Array, Array]:
-        """Compare the residuals with their covariance S under each hypothesis.
+    def chi2_and_log_evidence(self) -> tuple[Array, Array]:
+        """Compute how well the measurements agree with each hypothesis.
+
+        Under a hypothesis, the residuals are normally distributed with the covariance S. The evidence is their
+        probability density, times the prior probability of the hypothesis.
 
         Returns:
-            Sums of the squared residuals of the presses and of the prior distribution after the fit, and logarithms of
-            the evidence, each of shape (n_hypothesis,).
+            Smallest sum of the squared residuals of the presses and of the prior distribution that any unknowns give,
+            and logarithm of the evidence, each of shape (n_hypothesis,).
         """
         factors = np.linalg.cholesky(self._covariance(self._squared_sizes))
         weighted = [cho_solve((factor, True), self.residual, check_finite=False) for factor in factors]  # S^-1 r
@@ -456,14 +460,16 @@ class _Evidence:
         return chi2, self.log_volume - 0.5 * (chi2 + log_determinant) + log_probability
 
     def posterior(self, weight: Array) -> tuple[Array, Array]:
-        """Compute the estimates under the hypotheses that have a weight.
+        """Compute the estimates of the unknowns under the hypotheses whose weight is positive.
+
+        The covariance of an estimate is P - P J' S^-1 J P: the prior covariance minus a reduction by the presses.
 
         Args:
             weight: Weight of each hypothesis, shape (n_hypothesis,).
 
         Returns:
-            Means of the unknowns under the hypotheses with a positive weight, shape (n, n_unknown). Weighted sum, over
-            these hypotheses, of what the presses subtract from the prior covariance, shape (n_unknown, n_unknown).
+            Means of the unknowns under each of these hypotheses, shape (n, n_unknown), and the weighted sum of the
+            reductions, shape (n_unknown, n_unknown).
         """
         is_used = weight > 0.0
         squared_sizes = self._squared_sizes[is_used]

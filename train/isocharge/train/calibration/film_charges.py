@@ -105,7 +105,7 @@ class FilmCharges:
         solved_charge = film.charges(contact)
         # The derivatives with respect to the force take most of the time. Only those with respect to Young's modulus
         # and to the thickness follow from them.
-        changes = self._stress_changes(values)
+        changes = self._property_changes(values)
         needs_force_slope = changes["young"] != 0.0 or changes["thickness"] != 0.0
         force_slope = film.derivatives(contact)[:, :, 2] if needs_force_slope else np.zeros_like(solved_charge)
         derivatives = self._stress_derivatives(sensor, contact, solved_charge, force_slope)
@@ -126,7 +126,7 @@ class FilmCharges:
         sensor = self._electrodes(values)
         solved_charge, contact_slopes = _read(self.film, sensor).linearised(contact)
         stress_derivatives = self._stress_derivatives(sensor, contact, solved_charge, contact_slopes[:, :, 2])
-        charge, factor = _with_other_stress(solved_charge, self._stress_changes(values), stress_derivatives)
+        charge, factor = _with_other_stress(solved_charge, self._property_changes(values), stress_derivatives)
 
         derivatives = {**stress_derivatives, "crosstalk": solved_charge.sum(axis=1, keepdims=True) - solved_charge}
         # Each uneven part of the pretension is the product of a share and the pretension. The derivatives with respect
@@ -163,7 +163,7 @@ class FilmCharges:
             value[name] = described_MPa + value[name] * value[PRETENSION.name]
         return value
 
-    def _stress_changes(self, values: Array) -> dict[str, float]:
+    def _property_changes(self, values: Array) -> dict[str, float]:
         """Return by how much properties differ from those of the solved film, by their names; see `_mechanics`."""
         solved, changed = self._mechanics(self.values), self._mechanics(values)
         return {name: changed[name] - solved[name] for name in changed}

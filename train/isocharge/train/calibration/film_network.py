@@ -87,11 +87,11 @@ def compact_charges(
     node_MPa = np.array([one.change_MPa for one in films])
     node_charge = charge[:, None] * _tension_factors(np.stack(changed_charges, axis=1), node_MPa)
     series = _fit_followable_nodes(domain, names, contact, node_charge, node_MPa)
-    few = slice(DIRECTION_CONTACTS)
+    few_contacts, few_charges = contact[:DIRECTION_CONTACTS], charge[:DIRECTION_CONTACTS]
     followed_films = [one for one in films if one.change_MPa in series.node_MPa]
     return replace(
         series,
-        directions=_directions(series, film, calibrated, followed_films, contact[few], charge[few], executor),
+        directions=_directions(series, film, calibrated, followed_films, few_contacts, few_charges, executor),
         # A film is at most as well described as its charges can be measured.
         charge_std=max(series.charge_std, film.noise.gain),
         offset_pC=film.value("offset"),
@@ -262,15 +262,16 @@ def _directions(
 
     node = [one.change_MPa for one in films].index(0.0)
     lower, upper = films[max(node - 1, 0)], films[min(node + 1, len(films) - 1)]
-    beside = [] if lower is upper else [lower, upper]
+    neighbours = [] if lower is upper else [lower, upper]
     changes_of_films = []  # changes of v by one standard deviation of each unknown, shape (n, n_electrode, n_unknown)
-    for film_charge, jacobian in in_order(executor, methodcaller("linearised", contact), [calibrated, *beside]):
+    for film_charge, jacobian in in_order(executor, methodcaller("linearised", contact), [calibrated, *neighbours]):
         charge_per_value = np.where(film_charge > 0.0, film_charge, charge) if size is None else size
         changes_of_films.append((jacobian / charge_per_value[:, :, None]) @ covariance_root)
-    changes = changes_of_films[0]
+    changes, *neighbour_changes = changes_of_films
     slopes = np.zeros_like(changes)  # derivatives of the changes with respect to the pretension, 1/MPa
-    if beside:
-        slopes = (changes_of_films[2] - changes_of_films[1]) / (upper.change_MPa - lower.change_MPa)
+    if neighbour_changes:
+        lower_changes, upper_changes = neighbour_changes
+        slopes = (upper_changes - lower_changes) / (upper.change_MPa - lower.change_MPa)
 
     # Rotate the directions so that their effects are uncorrelated in units of the noise, and keep the large ones.
     weight = ((charge if size is None else size) / film.noise.sigma(charge))[:, :, None]

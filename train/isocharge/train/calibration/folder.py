@@ -390,7 +390,8 @@ def read_earlier(folder: Path, problem: CalibrationProblem, *presses: MeasuredPr
     Args:
         folder: Folder that `write_calibration` wrote, or one of its version folders.
         problem: Problem of the new calibration.
-        *presses: Presses of the new calibration and held-out presses with the electrodes of the problem; None for none.
+        *presses: Presses of the new calibration and held-out presses, with the electrodes of the problem. None stands
+            for presses that do not exist.
 
     Raises:
         PressError: If the folder contains no calibration, or a calibration of another problem, or if one of the presses
