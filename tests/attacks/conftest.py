@@ -1,7 +1,7 @@
 """Fixtures that send faulty inputs to a reader and check its behaviour.
 
 A reader may accept an input or refuse it by an `IsochargeError`. It may not raise other errors, and its time and memory
-are limited. `make attack` sends more than a million inputs, and `make test` one in two hundred of each kind,
+are limited. `make attack` sends more than a million inputs, and `make test` one in four hundred of each kind,
 but at least 20, or one in eighty if reading is slow.
 """
 
@@ -13,7 +13,7 @@ import pytest
 
 from isocharge.common.errors import IsochargeError
 
-FAST_SHARE = 0.005
+FAST_SHARE = 0.0025
 """Share of the inputs in `make test`."""
 
 LONGEST_S, MOST_BYTES = 3.0, 200e6
@@ -30,7 +30,7 @@ LONGEST_MESSAGE = 5000
 
 
 def pytest_addoption(parser):
-    parser.addoption("--all-attacks", action="store_true", help="send every input, not one in two hundred")
+    parser.addoption("--all-attacks", action="store_true", help="send every input, not one in four hundred")
 
 
 def peak_bytes():

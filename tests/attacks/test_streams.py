@@ -94,7 +94,7 @@ def test_bombs(attack):
         return piece * count + rng.choice((b"", b"\n", closed))
 
     def read(data):
-        for make_parser, _ in FORMATS.values():
+        for make_parser in {make_parser for make_parser, _ in FORMATS.values()}:
             parser = make_parser()
             parser.feed(data)
             parser.reset()

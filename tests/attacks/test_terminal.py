@@ -91,9 +91,9 @@ def checked_terminal():
 
 
 def without_separators(names):
-    """The names as notations with separators can carry them, so that the lines are recognised."""
+    """The names as notations with separators can carry them, so that the lines are recognised as text."""
     for position, name in enumerate(names):
-        kept = (character for character in name if not character.isspace() and character not in ":;=,\x1c\x1d\x1e")
+        kept = (character for character in name if character.isprintable() and character not in " :;=,")
         yield "A" + "".join(kept) + str(position)
 
 

@@ -13,7 +13,7 @@ from cobs import cobs
 from isocharge.serve import Frame, device_from_table
 from isocharge.serve.frames.transmission import CHECKSUMS
 from isocharge.serve.recognition.framing import find_checks
-from isocharge.serve.recognition.recognise import described_frames_section, recognise
+from isocharge.serve.recognition.recognise import recognise
 from layout_encoder import encode_layout
 
 FRAMES = 300
@@ -175,7 +175,6 @@ PATTERN = np.random.default_rng(0).bytes(98)
     ],
 )
 def test_noise_and_constant_bytes_are_not_recognised(data):
-    assert described_frames_section([data], 2.0) is None
     assert recognise([data], 2.0) is None
 
 
@@ -189,7 +188,7 @@ c04844e8e900020503a861010104206144
 
 def test_first_byte_that_is_constant_in_too_few_rows_belongs_to_the_pattern():
     """A byte is constant in most frames. Behind the first frame, it is constant in too few of them."""
-    section = described_frames_section([bytes.fromhex(DAMAGED_FRAMES)], 1.0)
+    section = recognise([bytes.fromhex(DAMAGED_FRAMES)], 1.0)
     assert (section["sync"], section["length"]) == ("44", 14)
 
 

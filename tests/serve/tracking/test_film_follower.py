@@ -98,15 +98,15 @@ def followed(model, charge, rng, frames=2, noise=NOISE):
     """Return a follower that has observed touches, and whether the film was lost after each of them.
 
     Args:
-        frames: Number of frames of a touch.
+        frames: Number of frames of a touch. The follower gets their mean as a single frame, which costs less time.
         noise: Noise of the frames.
     """
     follower = new_follower(model)
     was_lost = []
     for number, row in enumerate(charge):
-        for frame_charge in noise.add(np.repeat(row[None], frames, axis=0), rng):
-            contact = model.predict(frame_charge)
-            follower.step(Frame(None, None, (), clock_s=float(number), charge_pC=frame_charge, contact=contact))
+        mean_charge = noise.add(np.repeat(row[None], frames, axis=0), rng).mean(axis=0)
+        contact = model.predict(mean_charge)
+        follower.step(Frame(None, None, (), clock_s=float(number), charge_pC=mean_charge, contact=contact))
         follower.step(Frame(None, None, (), clock_s=number + 0.04))
         was_lost.append(follower.is_lost)
     return follower, was_lost

@@ -218,9 +218,11 @@ class TextParser(DelimitedParser):
         if not line.names:  # it contains no numbers
             self._headers.append(text)
             return self._reject(size) if len(self._headers) == MAX_CYCLE_LINES else []
-        line_below_header = parse_line(text, has_header=True, counters=self._counters)
-        has_header = any(header_names(header, line_below_header) for header in self._headers)
-        return self._recognise_layout(line_below_header if has_header else line, size)
+        if self._headers:
+            line_below_header = parse_line(text, has_header=True, counters=self._counters)
+            if any(header_names(header, line_below_header) for header in self._headers):
+                line = line_below_header
+        return self._recognise_layout(line, size)
 
     def _describe_layout(self, layout: Layout) -> None:
         """Set the attribute `format`, which describes the recognised layout, and the modulus of the clock."""

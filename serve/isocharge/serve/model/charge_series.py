@@ -26,7 +26,7 @@ A calibrated film may change. The map then also depends on the state of the film
 """
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.polynomial import chebyshev, polynomial
@@ -69,11 +69,10 @@ class Series:
             value and the derivatives with respect to x, y and the logarithm of the force.
         """
         n_x, _n_y, n_force, n_electrode = self.coefficients.shape  # numbers of polynomials, and of electrodes
-        degree = n_x - 1  # the same in x and in y
         n_chunk = len(coordinates) // CHUNK_SIZE + 1  # at least one chunk, even if there are no points
         evaluated_chunks = []
         for chunk in np.array_split(coordinates, n_chunk):
-            position_terms, force_terms = chebyshev_terms(chunk, degree, force_degree=n_force - 1)
+            position_terms, force_terms = chebyshev_terms(chunk, degree=n_x - 1, force_degree=n_force - 1)
 
             # Sum over the products of polynomials in x and y: (points, n_term) @ (n_term, n_force * 4 * n_electrode).
             # The factor 4 stands for the value and its three derivatives. For each point, the sums are the coefficients
@@ -107,6 +106,7 @@ class Series:
         return coefficients_by_term.reshape(len(x_degree), -1)
 
 
+@cache
 def position_degrees(degree: int) -> tuple[Integers, Integers]:
     """Return the degrees in x and in y of all products of polynomials whose total degree is at most `degree`.
 
@@ -134,14 +134,12 @@ def chebyshev_terms(coordinates: Array, degree: int, force_degree: int) -> tuple
         Products of the polynomials in x and y, in the order of `position_degrees`, shape (n, n_term). Polynomials in
         the logarithm of the force, shape (n, force_degree + 1).
     """
-    x, y, log_force = np.clip(coordinates, -1.0, 1.0).T
-    x_polynomials = chebyshev.chebvander(x, degree)  # shape (n, degree + 1)
-    y_polynomials = chebyshev.chebvander(y, degree)
-    force_polynomials = chebyshev.chebvander(log_force, force_degree)
+    polynomials = chebyshev.chebvander(np.clip(coordinates, -1.0, 1.0).T, max(degree, force_degree))
+    x_polynomials, y_polynomials, force_polynomials = polynomials  # each of shape (n, largest degree + 1)
 
     x_degree, y_degree = position_degrees(degree)
     position_terms = x_polynomials[:, x_degree] * y_polynomials[:, y_degree]
-    return position_terms, force_polynomials
+    return position_terms, force_polynomials[:, : force_degree + 1]
 
 
 def _derivative(coefficients: Array, axis: int) -> Array:

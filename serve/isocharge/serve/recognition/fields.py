@@ -137,7 +137,7 @@ def possible_parts(rows: Bytes, order: ByteOrder, checksum_start: int, frame_rat
             is_covered_in_part = position < checksum_start < end  # a checksum covers all bytes of a number or none
             if end > length or is_covered_in_part:
                 continue
-            if is_constant[position:end].all():
+            if all(is_constant[position:end]):
                 parts.append(Part(CHANNEL, type_name, end - position, Weights.constant, is_constant=True))
                 continue
             lowest_first = list(range(position, end)[::byte_step])
@@ -184,14 +184,14 @@ def _number_parts(
         counter_steps = (steps + half_range) % (2 * half_range) - half_range  # a counter that overflows restarts at 0
 
     is_counter, clock = identify(counter_steps, frame_rate_Hz)
-    has_all_bytes = not _wraps_early(counter_steps, size)
-    high_score = Weights.constant_high * (is_constant & ~is_zero).sum() if size == 3 else 0.0
-    if has_all_bytes and is_counter:
-        yield Part(SEQ, type_name, size, high_score)  # the values of a counter need no bits
-    elif has_all_bytes and clock is not None:
-        name, tick_duration = clock
-        clock_score = high_score + _bits(counter_steps - np.median(counter_steps), unit, size)
-        yield Part(name, type_name, size, clock_score, scale=tick_duration)
+    if (is_counter or clock is not None) and not _wraps_early(counter_steps, size):
+        score = Weights.constant_high * (is_constant & ~is_zero).sum() if size == 3 else 0.0
+        if is_counter:
+            yield Part(SEQ, type_name, size, score)  # the values of a counter need no bits
+        elif clock is not None:
+            name, tick_duration = clock
+            score += _bits(counter_steps - np.median(counter_steps), unit, size)
+            yield Part(name, type_name, size, score, scale=tick_duration)
 
     # The magnitude is added to the steps, so that a type has a lower score if its values are close to 0 or, for an
     # unsigned type, close to the middle of its range.
