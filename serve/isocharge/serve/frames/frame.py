@@ -312,8 +312,8 @@ class Parser(ABC):
 
         Args:
             seq: Counter of the next frame; None if the format has no counter.
-            is_clock_reset: Whether the clock of the device was reset before this frame. If the format has no counter,
-                this shows that the device has restarted.
+            is_clock_reset: Whether the clock of the device was reset before this frame. If the counter also
+                decreases, or the format has no counter, the device has restarted.
 
         Returns:
             Flags of the frame: empty, or one of `gap`, `repeat` and `restart` (see `isocharge.serve.flags`). A late
@@ -333,11 +333,12 @@ class Parser(ABC):
             self.counts.repeated += 1
             return (REPEAT,)
         # Modulo `seq_modulus`, a decrease is the same as an increase across the end of the range. A counter that has
-        # exceeded the modulus does not wrap at it, so each decrease is a restart.
+        # exceeded the modulus does not wrap at it, so each decrease is a restart. So is a decrease together with a
+        # reset of the clock.
         smallest_restart = self.seq_modulus // 2
         if seq < previous_seq:
-            has_exceeded_modulus = previous_seq >= self.seq_modulus
-            smallest_restart = 0 if has_exceeded_modulus else min(smallest_restart, SMALLEST_RESTART)
+            is_no_wrap = is_clock_reset or previous_seq >= self.seq_modulus
+            smallest_restart = 0 if is_no_wrap else min(smallest_restart, SMALLEST_RESTART)
         if increase >= smallest_restart:
             decrease = (previous_seq - seq) % self.seq_modulus
             # A late frame was overtaken by a few others. A board that has restarted counts from 0 or 1.

@@ -86,8 +86,8 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
     """
     metadata = predictor.metadata
     # Few rows are predicted at a time, because the model and Python numbers need a hundred times as much memory as the
-    # array. An array without rows is one empty block.
-    for start in range(0, max(len(charge_pC), 1), MAX_BATCH):
+    # array.
+    for start in range(0, len(charge_pC), MAX_BATCH):
         block = charge_pC[start : start + MAX_BATCH]
         contacts = predictor.predict_batch(block)
         flags_of_rows = predictor.validity.batch_flags(contacts)
