@@ -7,10 +7,10 @@ import pytest
 from tests.train.calibration.conftest import rig, uneven_film
 
 from isocharge.train import calibrate
-from isocharge.train.calibration import film_network
+from isocharge.train.calibration import compact_map
 from isocharge.train.calibration.calibrate import solve_even
+from isocharge.train.calibration.compact_map import _ChangedFilm, _nodes
 from isocharge.train.calibration.film_charges import FilmCharges
-from isocharge.train.calibration.film_network import _ChangedFilm, _nodes
 from solved_charges import solved_charges, with_film
 
 
@@ -26,7 +26,7 @@ def test_charges_of_an_uneven_film_after_warming_agree_with_full_solves(problem)
 
     charges = solve_even(problem, values=film.film_values)
     calibrated = _ChangedFilm(0.0, charges, film.film_values, np.eye(film.film_values.size))
-    first, second = (_ChangedFilm.solve(calibrated, change, None).charge(contact) for change in (0.0, -0.4))
+    first, second = (calibrated.changed(change, None).charge(contact) for change in (0.0, -0.4))
     np.testing.assert_allclose(second / first, after / before, rtol=1e-3)
 
 
@@ -39,7 +39,7 @@ def test_derivatives_of_a_film_after_warming_are_those_with_respect_to_the_calib
 
     def charges_after(values, change_MPa=-0.3):
         calibrated = _ChangedFilm(0.0, synthetic, values, np.eye(values.size))
-        return _ChangedFilm.solve(calibrated, change_MPa, None).linearised(contact)
+        return calibrated.changed(change_MPa, None).linearised(contact)
 
     values = uneven_film(problem).film_values
     _, derivatives = charges_after(values)
@@ -66,10 +66,10 @@ def test_node_at_which_the_charges_are_unknown_is_left_out(problem, synthetic, m
         ratio = 0.5 * np.random.default_rng(3).standard_normal(charge.shape)
         return 1.0 + ratio * np.array([0.0, 0.0, 1.0])[:, None]
 
-    monkeypatch.setattr(film_network, "_nodes", lambda _: np.array([-0.3, 0.0, 0.9]))
-    monkeypatch.setattr(film_network, "_tension_factors", factors)
+    monkeypatch.setattr(compact_map, "_nodes", lambda _: np.array([-0.3, 0.0, 0.9]))
+    monkeypatch.setattr(compact_map, "_tension_factors", factors)
     monkeypatch.setattr(FilmCharges, "of_even_film", lambda *_: synthetic)
-    series = film_network.compact_charges(problem.domain, synthetic, uneven_film(problem), None)
+    series = compact_map.compact_charges(problem.domain, synthetic, uneven_film(problem), None)
     assert series.node_MPa.tolist() == [-0.3, 0.0]
     assert "changes from -0.3 to +0 MPa can be followed" in caplog.text
     contact = np.array([[3.0, 2.0, 0.5], [-5.0, 1.0, 1.5]])

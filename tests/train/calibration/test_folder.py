@@ -16,7 +16,7 @@ from isocharge.serve import Predictor, read_presses
 from isocharge.simulate import NoiseModel, load_sensor
 from isocharge.train import CalibrationProblem, calibrate
 from isocharge.train.calibration import calibrate as calibrate_module
-from isocharge.train.calibration import estimator, film_network
+from isocharge.train.calibration import compact_map, estimator, film_network
 from isocharge.train.calibration.folder import check_calibration_folder, read_earlier, write_calibration
 from kept import kept
 
@@ -28,7 +28,7 @@ def written(problem, synthetic, tmp_path_factory):
     """Folder of a calibrated film, the result of the calibration, and the properties of the film."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(calibrate_module, "SAME_FILM_STD", np.inf)
-        patch.setattr(film_network, "_nodes", lambda _: np.zeros(1))
+        patch.setattr(compact_map, "_nodes", lambda _: np.zeros(1))
         patch.setattr(film_network, "PRESSES", 6_000)
         patch.setattr(film_network, "_outside_presses", lambda *_: None)
         for name, values_and_probabilities in FEW_VALUES.items():

@@ -42,8 +42,9 @@ from isocharge.serve.presses.table_file import csv_text
 from isocharge.simulate import NoiseModel
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict, sensor_to_toml
 from isocharge.simulate.solver.assembly import single_threaded_blas
+from isocharge.train.calibration.compact_map import compact_charges
 from isocharge.train.calibration.film_estimate import FilmEstimate
-from isocharge.train.calibration.film_network import compact_charges, training_data
+from isocharge.train.calibration.film_network import training_data
 from isocharge.train.calibration.problem import CalibrationProblem, domain_words
 from isocharge.train.calibration.result import CalibrationResult
 from isocharge.train.data.presses import have_charges_of

@@ -1,0 +1,274 @@
+"""Compact charge map of a calibrated film (`ChargeSeries`), from which films similar to it can be drawn.
+
+The posterior distribution of a calibration has many unknowns, of which only a few linear combinations change the
+charges. These combinations are called directions. The compact charge map contains the changes of the charges along each
+direction. The training uses them to draw films, and the live follower uses them to find out how the real film differs
+from the estimated one.
+
+The nodes of the map are films with other pretensions. Their charges are those of the calibrated film, times a ratio:
+that of the charges of two nearly axisymmetric films, with the other pretension and with that of the calibration. The
+changes along the directions are also computed for these films, because they depend on the pretension.
+
+Worker processes compute the charges of the films. This module does not import torch, so that they start quickly.
+"""
+
+import logging
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from operator import methodcaller
+
+import numpy as np
+
+from isocharge.common.arrays import Array
+from isocharge.serve.model.charge_series import ChargeSeries, series_size
+from isocharge.serve.presses.measured_presses import CONTACT
+from isocharge.simulate import Domain
+from isocharge.simulate.execution import in_order
+from isocharge.simulate.sensor.film_properties import PRETENSION, UNEVEN_TENSIONS
+from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.calibration.film_estimate import FilmEstimate, discrepancy_jacobian
+from isocharge.train.data.charge_fit import fit_film_series, fit_series
+from isocharge.train.data.presses import draw_contacts
+
+log = logging.getLogger(__name__)
+
+SERIES_CONTACTS = 4000
+"""Number of contacts to which the series of the charges are fitted."""
+
+DIRECTION_CONTACTS = 1200
+"""Number of contacts to which the series of the directions are fitted."""
+
+DIRECTION_DEGREES = (8, 3)
+"""Degrees of the series of the directions in the position and in the force."""
+
+MIN_DIRECTION = 0.1
+"""Smallest root-mean-square effect of a direction on a charge, in standard deviations of the noise, that is kept."""
+
+MAX_SERIES_ERROR = 0.03
+"""Largest relative error of the charges at all nodes. If it is larger, the outermost node is left out."""
+
+NODES_MPa = (-0.7, -0.3, 0.0, 0.4, 0.9)
+"""Changes of the pretension at the nodes of a film that can be followed, MPa.
+
+The negative changes are smaller for a film that they would make slack."""
+
+SEED = 3
+"""Seed of the contacts and of the drawn films."""
+
+
+def compact_charges(
+    domain: Domain, charges: FilmCharges, film: FilmEstimate, executor: Executor | None
+) -> ChargeSeries:
+    """Compute the compact charge map of an estimated film.
+
+    Args:
+        domain: Contacts for which the map is needed.
+        charges: Charges of the solved film and of similar films.
+        film: The estimate, with the noise of the charges, which decides how many directions are needed.
+        executor: Executor that solves the films at the nodes; None for this process.
+    """
+    contact = draw_contacts(np.random.default_rng(SEED), domain, SERIES_CONTACTS)
+    names = charges.prior.sensor.electrode_names
+    calibrated = _ChangedFilm(0.0, charges, film.film_values, np.eye(film.film_values.size))
+    films = [calibrated]
+    if len(names) > len(CONTACT):  # three charges only determine the contact
+        films = [calibrated.changed(change_MPa, executor) for change_MPa in _nodes(film)]
+    film_charge, *changed_charges = in_order(executor, methodcaller("charge", contact), [calibrated, *films])
+    discrepancy = discrepancy_jacobian(film_charge, contact, charges.domain) @ film.values[film.layout.coefficients]
+    charge = film_charge + discrepancy  # most probable charges without offset, shape (n, n_electrode)
+    node_MPa = np.array([one.change_MPa for one in films])
+    node_charge = charge[:, None] * _tension_factors(np.stack(changed_charges, axis=1), node_MPa)
+    series = _fit_followable_nodes(domain, names, contact, node_charge, node_MPa)
+    few_contacts, few_charges = contact[:DIRECTION_CONTACTS], charge[:DIRECTION_CONTACTS]
+    followed_films = [one for one in films if one.change_MPa in series.node_MPa]
+    return replace(
+        series,
+        directions=_directions(series, film, calibrated, followed_films, few_contacts, few_charges, executor),
+        # A film is at most as well described as its charges can be measured.
+        charge_std=max(series.charge_std, film.noise.gain),
+        offset_pC=film.value("offset"),
+        pretension_MPa=film.value(PRETENSION.name),
+        tension_std_MPa=PRETENSION.drift,
+    )
+
+
+@dataclass(frozen=True)
+class _ChangedFilm:
+    """The calibrated film, or a film whose tension differs from it by the same amount in all directions.
+
+    Attributes:
+        change_MPa: Change of the pretension, MPa.
+        charges: Charges of a solved film and of similar films. For the calibrated film, it is the film that the
+            calibration has solved. For a changed film, it is axisymmetric.
+        values: Properties of the changed film, shape (n_property,).
+        by_calibrated: Derivatives of the properties with respect to those of the calibrated film, shape (n_property,
+            n_property).
+    """
+
+    change_MPa: float
+    charges: FilmCharges
+    values: Array
+    by_calibrated: Array
+
+    def changed(self, change_MPa: float, executor: Executor | None) -> "_ChangedFilm":
+        """Solve the axisymmetric film with another pretension than this calibrated film.
+
+        Without a change, the axisymmetric film that the calibration has solved is used. Its properties hardly differ
+        from those of the estimate.
+
+        Args:
+            change_MPa: Change of the pretension, MPa.
+            executor: Executor that runs the solves; None for this process.
+        """
+        prior = self.charges.prior
+        tension = prior.index(PRETENSION.name)
+        uneven = [prior.index(name) for name in UNEVEN_TENSIONS]
+        values = self.values.copy()
+        values[tension] += change_MPa
+        # The values contain the uneven parts of the tension as shares of the mean tension. In MPa, they do not change.
+        # A film without tension has no shares. The smallest tension then avoids a division by zero.
+        tension_MPa = max(float(values[tension]), 1e-9)
+        share_ratio = self.values[tension] / tension_MPa
+        values[uneven] *= share_ratio
+        by_calibrated = np.eye(values.size)
+        by_calibrated[uneven, uneven] = share_ratio
+        by_calibrated[uneven, tension] = self.values[uneven] * change_MPa / tension_MPa**2
+        even_charges = self.charges.even
+        if change_MPa != 0.0:
+            even_charges = FilmCharges.of_even_film(prior, values, self.charges.domain, executor)
+        return _ChangedFilm(change_MPa, even_charges, values, by_calibrated)
+
+    def charge(self, contact: Array) -> Array:
+        """Compute the charges of contacts on this film, shape (n, n_electrode), pC."""
+        return self.charges.charges(self.values, contact)
+
+    def linearised(self, contact: Array) -> tuple[Array, Array]:
+        """Compute the charges of this film, and their derivatives with respect to the unknowns of the calibrated film.
+
+        The unknowns are the properties of the film and the coefficients of the discrepancy; see `Layout`.
+
+        Args:
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Charges, shape (n, n_electrode), pC, and derivatives, shape (n, n_electrode, n_unknown), pC per unit.
+        """
+        charge, _, by_property = self.charges.linearised(self.values, contact)
+        by_coefficient = discrepancy_jacobian(charge, contact, self.charges.domain)
+        return charge, np.concatenate([by_property @ self.by_calibrated, by_coefficient], axis=2)
+
+
+def _fit_followable_nodes(
+    domain: Domain, electrodes: tuple[str, ...], contact: Array, charge: Array, node_MPa: Array
+) -> ChargeSeries:
+    """Fit the charges at the nodes, and leave out outermost nodes until the relative error is small enough.
+
+    At a distant node, the imperfections may nearly cancel a charge. Their first-order effect is then not accurate. A
+    warning is logged for each change of the nodes.
+
+    Args:
+        domain: Contacts for which the series is needed.
+        electrodes: Names of the electrodes.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        charge: Their charges at the nodes, shape (n, n_node, n_electrode), pC.
+        node_MPa: Changes of the pretension at the nodes, shape (n_node,), MPa.
+    """
+    series = fit_film_series(domain, electrodes, contact, charge, node_MPa)
+    if series.charge_std <= MAX_SERIES_ERROR or node_MPa.size == 1:
+        return series
+    is_nearer = np.abs(node_MPa) < np.abs(node_MPa).max()
+    remaining_MPa = node_MPa[is_nearer]
+    log.warning(
+        "the charges of this film are not known after large changes of its pretension; changes from %+.2g to "
+        "%+.2g MPa can be followed",
+        remaining_MPa[0],
+        remaining_MPa[-1],
+    )
+    return _fit_followable_nodes(domain, electrodes, contact, charge[:, is_nearer], remaining_MPa)
+
+
+def _nodes(film: FilmEstimate) -> Array:
+    """Return the changes of the pretension at the nodes, of which none makes the film slack, shape (n_node,), MPa."""
+    node_MPa = np.array(NODES_MPa)
+    sensor, _ = film.layout.prior.film(film.film_values)
+    lowest_MPa = -0.95 * (sensor.film.pretension - np.hypot(*sensor.film.deviator))
+    factor = min(1.0, lowest_MPa / node_MPa.min())
+    return np.unique(np.where(node_MPa < 0.0, factor * node_MPa, node_MPa))
+
+
+def _tension_factors(charge: Array, node_MPa: Array) -> Array:
+    """Compute the factors by which changes of the pretension multiply the charges.
+
+    If a change reverses the sign of a charge, no factor can describe it, and the result is 1.
+
+    Args:
+        charge: Charges of films with changed pretensions, shape (n, n_node, n_electrode), pC.
+        node_MPa: Changes of the pretension, one of which is zero, shape (n_node,), MPa.
+
+    Returns:
+        Factors, shape (n, n_node, n_electrode), dimensionless.
+    """
+    charge_before = charge[:, node_MPa == 0.0]
+    return np.divide(charge, charge_before, out=np.ones_like(charge), where=charge_before * charge > 0.0)
+
+
+def _directions(
+    series: ChargeSeries,
+    film: FilmEstimate,
+    calibrated: _ChangedFilm,
+    films: list[_ChangedFilm],
+    contact: Array,
+    charge: Array,
+    executor: Executor | None,
+) -> Array:
+    """Fit polynomials to the effects of the directions in which the charges of the film are uncertain.
+
+    A direction is a linear combination of the unknowns. The combinations are chosen so that their effects on the
+    charges are uncorrelated, and those with effects below `MIN_DIRECTION` are left out. The effects are considered at
+    the pretension of the calibration and at the two nodes beside it, because a combination may change the charges only
+    at another pretension.
+
+    A charge map contains values v instead of charges. If v is the logarithm of the charge, a small change of the charge
+    divided by the charge is the change of v. Otherwise, v is the charge divided by the typical size of the charges at
+    the same force.
+
+    Args:
+        series: Map of the charges without directions.
+        film: The estimate of the calibrated film.
+        calibrated: The calibrated film.
+        films: The films at the nodes of the series, by ascending change of the pretension.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        charge: Their most probable charges, shape (n, n_electrode), pC.
+        executor: Executor that computes the charges of the films; None for this process.
+
+    Returns:
+        Coefficients, as in `ChargeSeries.directions`.
+    """
+    unknowns = np.r_[film.layout.film, film.layout.coefficients]
+    eigenvalues, vectors = np.linalg.eigh(film.covariance[np.ix_(unknowns, unknowns)])
+    covariance_root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
+    unit_contact = series.domain.to_unit(contact)
+    size = None if series.log_size is None else series_size(series.log_size, unit_contact[:, 2])[0]
+
+    node = [one.change_MPa for one in films].index(0.0)
+    lower, upper = films[max(node - 1, 0)], films[min(node + 1, len(films) - 1)]
+    neighbours = [] if lower is upper else [lower, upper]
+    changes_of_films = []  # changes of v by one standard deviation of each unknown, shape (n, n_electrode, n_unknown)
+    for film_charge, jacobian in in_order(executor, methodcaller("linearised", contact), [calibrated, *neighbours]):
+        charge_per_value = np.where(film_charge > 0.0, film_charge, charge) if size is None else size
+        changes_of_films.append((jacobian / charge_per_value[:, :, None]) @ covariance_root)
+    changes, *neighbour_changes = changes_of_films
+    slopes = np.zeros_like(changes)  # derivatives of the changes with respect to the pretension, 1/MPa
+    if neighbour_changes:
+        lower_changes, upper_changes = neighbour_changes
+        slopes = (upper_changes - lower_changes) / (upper.change_MPa - lower.change_MPa)
+
+    # Rotate the directions so that their effects are uncorrelated in units of the noise, and keep the large ones.
+    weight = ((charge if size is None else size) / film.noise.sigma(charge))[:, :, None]
+    weighted = np.stack([weight * (changes + one.change_MPa * slopes) for one in (lower, calibrated, upper)])
+    weighted = weighted.reshape(-1, unknowns.size)
+    _, singular_values, rotation = np.linalg.svd(weighted, full_matrices=False)
+    kept = rotation[singular_values > MIN_DIRECTION * np.sqrt(len(weighted))]
+    effects = np.stack([changes @ kept.T, slopes @ kept.T], axis=1).swapaxes(2, 3)  # (n, 2, n_direction, n_electrode)
+    coefficients = fit_series(unit_contact, effects.reshape(len(contact), -1), *DIRECTION_DEGREES)
+    return coefficients.reshape(*coefficients.shape[:3], *effects.shape[1:])
