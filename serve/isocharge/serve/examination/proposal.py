@@ -71,7 +71,7 @@ def unit_of(capture: Capture, positions: Iterable[int], max_noise_V: float = 0.0
     The unit is guessed from the names and the values of the electrodes' channels. Other channels, such as a
     temperature, have units of their own. The first rule that applies determines the unit.
 
-    - If the names of channels state one unit, this is the unit, such as nC for `A_nC`.
+    - If all names of channels with a unit state the same one, such as `A_nC` and `B_nC`, it is this unit.
     - If some names state different units, the unit is assumed to be pC. The report requests the gains.
     - The unit is pC for binary frames of isocharge.
     - The unit is counts if all values are whole numbers.

@@ -95,7 +95,7 @@ class Layout:
         self.columns = Columns(names, (1.0,) * len(names), words=self._words)  # values in text have no scale
 
     def name_unnamed(self, names: Sequence[str]) -> bool:
-        """Give names to the values without a name, and return whether there are such values and as many names."""
+        """Name the values without a name. Return False if there are none, or if their number is not that of `names`."""
         if all(self.names) or len(names) != len(self.unnamed):
             return False
         new_names = dict(zip(self.unnamed, names, strict=True))

@@ -450,8 +450,8 @@ def header_names(header: str, line: Line) -> tuple[str, ...]:
 
     The result is empty if the text is no header of the line. A column of the header is a name, which begins with a
     letter. The mark of a comment, a label before the first column, and columns of the line that contain a text are
-    ignored. If the numbers of the line are separated by commas, for example, then words with only blanks between them,
-    such as `the tare is done`, are a message and no header.
+    ignored. If the numbers of the line are separated by commas, for example, then words that are only separated by
+    blanks, such as `the tare is done`, are not a header but a message.
 
     Args:
         header: A line without numbers.

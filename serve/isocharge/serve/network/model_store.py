@@ -135,7 +135,7 @@ class ModelStore:
         return [row.reason for row in self._find(name, version) if row.reason]
 
     def _find(self, name: str | None = None, version: str = "") -> list[Version]:
-        """Return versions as `versions_of`, but also the versions that are not loaded."""
+        """Return the versions that `versions_of` returns, and those that are not loaded."""
         return [row for row in self._versions if name in (None, row.name) and version in ("", str(row.number))]
 
     def index(self) -> list[dict[str, str]]:

@@ -132,7 +132,7 @@ class MeasuredPresses:
 
     @property
     def line_words(self) -> str:
-        """Numbers of the presses for a message, such as "line 3" or "lines 3, 4, 7".
+        """Line numbers of the presses for a message, such as "line 3" or "lines 3, 4, 7".
 
         Only the first ones are listed.
         """

@@ -132,8 +132,8 @@ def _may_be_sync(rows: Bytes) -> Booleans:
 def _fields(parts: Sequence[Part]) -> tuple[Field, ...]:
     """Convert the parts of a frame to fields and padding.
 
-    Channels are called ch1, ch2, and so on. A second counter, or a second clock of the same name, becomes padding,
-    because the names of fields must differ. Adjacent padding is joined.
+    Channels are called ch1, ch2, and so on. The names of fields must differ. Therefore a second counter
+    becomes padding, and so does a second clock with the same name as the first. Adjacent padding is joined.
     """
     fields: list[Field] = []
     channel_numbers = count(1)
@@ -200,8 +200,9 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
     """Return the keys that describe the counter, the clock and the columns of lines of text in a device file.
 
     A counter increases by 1 from frame to frame, and a clock increases at one of the usual rates. A clock in ms that
-    increases by about 1 is recognised by its name, or because it repeats some values. If the parser has already
-    recognised a counter, the function does not search for another counter. The same applies to the clock.
+    increases by about 1 could be a counter. It is recognised by its name, or because it repeats some values. If the
+    parser has already recognised a counter, the function does not search for another counter. The same applies to the
+    clock.
 
     For values with names in each line, the keys `seq`, `t_us`, `t_ms` and `t_s` state the names that the board uses for
     its counter and its clock. For the other values, the key `columns` lists the names, which are copied from a header,

@@ -144,7 +144,7 @@ class Setup:
         self.has_any_sign |= self.device.has_currents
 
     def use(self, predictor: Predictor) -> None:
-        """Use a model, and store its label and whether its film has charges of any sign."""
+        """Store the model to be used, its label, and whether charges of its film may be negative."""
         self.predictor = predictor
         self.reader = f"model {predictor.metadata.label}"
         self.has_any_sign = self.device.has_currents or predictor.metadata.has_any_sign

@@ -95,7 +95,7 @@ class Warming(Stage):
         self._is_blind = False  # whether temperature could not be distinguished from force at the last estimate
 
     def step(self, frame: Frame) -> None:
-        """Estimate the warming of a frame in contact, subtract its change from the charges, and add the flags.
+        """Estimate the warming of a frame in contact, subtract the charge of its change, and add the flags.
 
         The stage that stores the charge at rest has already subtracted the earlier changes of the warming. It reads the
         present change from the frame. While an amplifier is saturated, the warming is not estimated, because then the

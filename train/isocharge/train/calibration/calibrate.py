@@ -183,7 +183,7 @@ def _fit_uneven_film(
 
 
 def _solved_distance(estimation: Estimation) -> float:
-    """Return the largest distance of the even properties from those of the solved film, in standard deviations."""
+    """Return the largest difference of an even property from that of the solved film, in standard deviations."""
     film, charges = estimation.film, estimation.charges
     is_even = charges.prior.changes_stress & ~charges.prior.is_imperfection
     std = np.sqrt(np.diagonal(film.covariance)[film.layout.film])
