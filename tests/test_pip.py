@@ -1,12 +1,13 @@
 """What pip installs: the wheel in an empty environment serves a released model, without torch or scipy.
 
-The wheel is built from the source distribution, so both are tested.
+The slow tests build the wheel from the source distribution, and install the dependencies, too.
 """
 
 import json
 import re
 import subprocess
 import sys
+import sysconfig
 import tomllib
 import venv
 
@@ -32,28 +33,26 @@ COMMANDS_OF_EXTRAS = {
 """A command that imports the packages of each extra. It runs in an install with this extra only."""
 
 
-def check_prediction(bin_folder, folder):
+def check_prediction(bin_folder, folder, **options):
     """Check the contact that the installed command computes."""
-    words = [bin_folder / "isocharge", "serve", "predict", "three-25um-biaxial", "-", "--json"]
-    done = finished(words, input="A,B,C\n942.9,910.4,690.8\n", cwd=folder, timeout=120)
+    words = ("serve", "predict", "three-25um-biaxial", "-", "--json")
+    done = run(bin_folder, "isocharge", *words, input="A,B,C\n942.9,910.4,690.8\n", cwd=folder, **options)
     assert done.returncode == 0, done.stderr
     record = json.loads(done.stdout)
     assert [record["x_mm"], record["y_mm"], record["force_N"]] == pytest.approx([3.0, -2.0, 1.0], abs=0.06)
 
 
-@pytest.fixture(scope="module")
-def distributions(tmp_path_factory):
-    """The source distribution and the wheel that is built from it."""
-    folder = tmp_path_factory.mktemp("dist")
-    subprocess.run([sys.executable, "-m", "build", "-o", folder, ROOT], check=True, timeout=280, capture_output=True)
+def build(folder, *options):
+    """Build distributions in a folder, and return their paths."""
+    words = [sys.executable, "-m", "build", *options, "-o", folder, ROOT]
+    subprocess.run(words, check=True, timeout=280, capture_output=True)
     return sorted(folder.iterdir())
 
 
 @pytest.fixture(scope="module")
-def wheel(distributions):
+def wheel(tmp_path_factory):
     """The wheel."""
-    (path,) = (path for path in distributions if path.suffix == ".whl")
-    return path
+    return build(tmp_path_factory.mktemp("dist"), "--wheel")[0]
 
 
 BASE_TESTS = (
@@ -109,8 +108,11 @@ def lower_bounds():
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory, wheel):
-    """The bin folder of an empty environment into which the wheel was installed, with nothing else in it."""
-    return install([wheel], tmp_path_factory.mktemp("fresh"), timeout=280)
+    """The bin folder of an empty environment into which the wheel was installed. It finds the packages of this one."""
+    bin_folder = install(["--no-deps", wheel], tmp_path_factory.mktemp("fresh"), timeout=280)
+    (site_packages,) = bin_folder.parent.glob("lib/*/site-packages")
+    (site_packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    return bin_folder
 
 
 def run(base, program, *words, timeout=60, **options):
@@ -118,19 +120,35 @@ def run(base, program, *words, timeout=60, **options):
     return finished([base / program, *words], timeout=timeout, **options)
 
 
-def check_example(bin_folder, folder, page, number):
+def check_example(bin_folder, folder, page, number, **options):
     """Check that a Python example of a page prints what its comments say."""
     example = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)[number]
-    done = run(bin_folder, "python", "-c", example, cwd=folder)
+    done = run(bin_folder, "python", "-c", example, cwd=folder, **options)
     assert done.stdout.splitlines() == re.findall(r"^print\(.*\)  # (.+)$", example, re.MULTILINE), done.stderr
 
 
-def test_twine_accepts_both_distributions(distributions):
-    names = [path.name for path in distributions]
-    assert names == [f"isocharge-{VERSION}-py3-none-any.whl", f"isocharge-{VERSION}.tar.gz"]
-    twine = [sys.executable, "-m", "twine", "check", "--strict", *distributions]
-    done = finished(twine, timeout=60)
+@pytest.mark.slow
+def test_twine_accepts_both_distributions_and_nothing_heavy_is_installed(tmp_path):
+    """The size does not include compiled Python modules, which are a tenth of the stated size."""
+    distributions = build(tmp_path / "dist")
+    assert [path.name for path in distributions] == [
+        f"isocharge-{VERSION}-py3-none-any.whl",
+        f"isocharge-{VERSION}.tar.gz",
+    ]
+    done = finished([sys.executable, "-m", "twine", "check", "--strict", *distributions], timeout=60)
     assert done.returncode == 0, done.stdout + done.stderr
+
+    bin_folder = install(distributions[:1], tmp_path, timeout=280)
+    code = "from importlib.metadata import distributions as all; print(*(one.name.lower() for one in all()))"
+    names = {*run(bin_folder, "python", "-c", code, cwd=tmp_path).stdout.split()}
+    assert {"isocharge", "numpy", "onnxruntime"} <= names
+    assert not names & {"torch", "scipy", "scikit-learn", "onnx", "matplotlib"}
+
+    page = (ROOT / "serve/docs/getting_started.md").read_text("utf-8")
+    stated_MB = float(re.search(r"^\| none \|.*\| (\d+) MB \|$", page, re.MULTILINE)[1])
+    size_MB = sum(path.stat().st_size for path in bin_folder.parent.rglob("*") if path.is_file()) / 2**20
+    assert 0.7 * stated_MB < size_MB < 1.05 * stated_MB
+    check_prediction(bin_folder, tmp_path)
 
 
 def test_the_version_is_that_of_the_changelog_and_of_the_citation():
@@ -146,34 +164,15 @@ def test_the_conda_recipe_has_the_version_and_the_requirements_of_the_package():
     assert f">={recipe['context']['python_min']}" == PROJECT["requires-python"]
 
 
-def test_nothing_heavy_came_along(base, tmp_path):
-    code = "from importlib.metadata import distributions as all; print(*(one.name.lower() for one in all()))"
-    names = {*run(base, "python", "-c", code, cwd=tmp_path).stdout.split()}
-    assert {"isocharge", "numpy", "onnxruntime"} <= names
-    assert not names & {"torch", "scipy", "scikit-learn", "onnx", "matplotlib"}
-
-
-def test_the_size_of_the_base_install_is_as_stated(base):
-    """The size does not include compiled Python modules, which are a tenth of the stated size."""
-    page = (ROOT / "serve/docs/getting_started.md").read_text("utf-8")
-    stated_MB = float(re.search(r"^\| none \|.*\| (\d+) MB \|$", page, re.MULTILINE)[1])
-    size_MB = sum(path.stat().st_size for path in base.parent.rglob("*") if path.is_file()) / 2**20
-    assert 0.7 * stated_MB < size_MB < 1.05 * stated_MB
-
-
-def test_predict_works_from_any_folder(base, tmp_path):
-    check_prediction(base, tmp_path)
-
-
-@pytest.mark.parametrize(("page", "number"), [("README.md", 0), ("serve/docs/tutorial.md", 1)])
-def test_examples_of_the_base_install_work_from_any_folder(base, tmp_path, page, number):
-    """The examples print what their comments say in an installation without extras."""
-    check_example(base, tmp_path, page, number)
+def test_commands_and_examples_of_the_base_install_work_from_any_folder(base, tmp_path, installed):
+    """The example prints what its comments say in an installation without extras."""
+    check_prediction(base, tmp_path, env=installed("base"))
+    check_example(base, tmp_path, "serve/docs/tutorial.md", 1, env=installed("base"))
 
 
 @pytest.mark.parametrize("stage", ["simulate", "train"])
-def test_a_missing_extra_says_so_in_python_too(base, tmp_path, stage):
-    done = run(base, "python", "-c", f"import isocharge.{stage}", cwd=tmp_path)
+def test_a_missing_extra_says_so_in_python_too(base, tmp_path, stage, installed):
+    done = run(base, "python", "-c", f"import isocharge.{stage}", cwd=tmp_path, env=installed("base"))
     assert "isocharge.common.errors.MissingExtra" in done.stderr
     assert f"pip install 'isocharge[{stage}]'" in done.stderr
 
