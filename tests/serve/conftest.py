@@ -9,6 +9,7 @@ with the contacts that were pressed.
 import errno
 import os
 import re
+import shutil
 import ssl
 from dataclasses import dataclass
 from threading import Thread
@@ -188,12 +189,19 @@ def trusted(authority):
     return context
 
 
+@pytest.fixture(scope="session")
+def two_versions(film, tmp_path_factory):
+    """A model repository that contains two versions of the linear model. Tests must not write to it."""
+    root = tmp_path_factory.mktemp("two_versions")
+    film.write(root)
+    film.write(root, version=2)
+    return root
+
+
 @pytest.fixture
-def store(film, tmp_path):
+def store(two_versions, tmp_path):
     """A store with two versions of the linear model, in a folder that only this test uses."""
-    film.write(tmp_path / "models")
-    film.write(tmp_path / "models", version=2)
-    return ModelStore(tmp_path / "models")
+    return ModelStore(shutil.copytree(two_versions, tmp_path / "models"))
 
 
 @pytest.fixture

@@ -166,31 +166,29 @@ def compose_command(name):
 
 COMPOSE = DEPLOY / "compose/compose.yaml"
 
-SERVICES = [
-    (unit_command("tls.conf"), "${CREDENTIALS_DIRECTORY}"),
-    (unit_command("isocharge-stream.service"), "${CREDENTIALS_DIRECTORY}"),
-    (compose_command("server"), "/run/secrets"),
-    (compose_command("stream"), "/run/secrets"),
-]
+
+def local_command(words, secrets, folder):
+    """The command of a service on a free port of this machine; the stream reads frames from a pipe."""
+    line = " ".join(words).replace(secrets, str(folder))
+    line = re.sub(r"0\.0\.0\.0(:| --port )\d+", r"127.0.0.1\g<1>0", line)
+    return re.sub(r"--port /dev/\S+", "--port -", line)
 
 
-@pytest.mark.parametrize(("words", "secrets"), SERVICES)
-def test_the_command_of_a_service_listens_with_tls_and_needs_the_token(
-    words, secrets, tmp_path, monkeypatch, authority, trusted, start_command
+@pytest.mark.parametrize(("unit", "service"), [("tls.conf", "server"), ("isocharge-stream.service", "stream")])
+def test_the_commands_of_a_unit_and_of_a_service_are_equal_listen_with_tls_and_need_the_token(
+    unit, service, tmp_path, monkeypatch, authority, trusted, start_command
 ):
-    """On a free port of this machine; the stream reads frames from a pipe in place of the port."""
     issued = authority.issue_cert("127.0.0.1")
     issued.cert_chain_pems[0].write_to_path(tmp_path / "fullchain.pem")
     issued.private_key_pem.write_to_path(tmp_path / "privkey.pem")
     (tmp_path / "board.toml").write_text('name = "board"\n')
-    line = " ".join(word.replace(secrets, str(tmp_path)) for word in words)
-    line = re.sub(r"0\.0\.0\.0(:| --port )\d+", r"127.0.0.1\g<1>0", line)
-    line = re.sub(r"--port /dev/\S+", "--port -", line)
+    line = local_command(unit_command(unit), "${CREDENTIALS_DIRECTORY}", tmp_path)
+    assert line == local_command(compose_command(service), "/run/secrets", tmp_path)
     monkeypatch.setenv("ISOCHARGE_TOKEN", "s3cret")
     process = start_command(*line.split())
-    printed = process.stderr if "stream" in words else process.stdout
+    printed = process.stderr if service == "stream" else process.stdout
     url = next(found[0] for text in printed if (found := re.search(r"https://127\.0\.0\.1:\d+", text)))
-    path = "/session.json" if "stream" in words else "/v2/models/three-25um-biaxial"
+    path = "/session.json" if service == "stream" else "/v2/models/three-25um-biaxial"
     with pytest.raises(urllib.error.HTTPError, match="401"):
         urllib.request.urlopen(url + path, timeout=20, context=trusted)
     request = urllib.request.Request(url + path, headers={"Authorization": "Bearer s3cret"})

@@ -9,12 +9,13 @@ import tomllib
 from contextlib import ExitStack
 from pathlib import Path
 
+import numpy as np
 import pytest
 from cobs import cobs
 from msgspec.structs import fields
 
 from isocharge.common.errors import DeviceError
-from isocharge.serve import Frame, device_from_table, encode_frame, flags
+from isocharge.serve import Frame, Script, VirtualSensor, device_from_table, encode_frame, flags
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.live.device import STAGES
 from isocharge.serve.network.model_store import ModelStore
@@ -26,7 +27,7 @@ SERVE = Path(__file__).parents[2] / "serve"
 PAGES = {path.name: path.read_text("utf-8") for path in (SERVE / "README.md", *sorted((SERVE / "docs").glob("*.md")))}
 
 SLOW = {"mcap.md", "recordings.md", "virtual_sensor.md", "live_page.md", "secure_service.md"}
-"""Pages whose commands simulate a film or start several servers. The tutorial, which simulates a film, runs always."""
+"""Pages whose commands simulate a film or start several servers. The tutorial runs always, with another sensor."""
 
 
 EXAMPLE_PAGES = ["serve/README.md", *(f"serve/docs/{name}" for name in PAGES if name != "README.md")]
@@ -71,15 +72,20 @@ def desks(tmp_path_factory):
     return {page: tmp_path_factory.mktemp("desk") for page in EXAMPLE_PAGES}
 
 
+@pytest.fixture
+def sensor(film, desks):
+    """A sensor at rest for the tutorial, in place of that of `serve virtual`, which would solve a film."""
+    link = desks["serve/docs/tutorial.md"] / "film"
+    with VirtualSensor(film.charges, Script(np.zeros((1, 3)), 200.0), link=link):
+        yield
+
+
+@pytest.mark.usefixtures("sensor")
 def test_examples_of_the_pages_run(page_example, desks, installed, start_http, run_example, run_commands):
     """In the order of the page, in the install that it names; Python prints what the comments say."""
-    text, folder, environment = (
-        page_example.text.replace("--link film", "--link film --force-max 0.05").replace(  # one force: solved sooner
-            "--seconds 10", "--seconds 3"
-        ),
-        desks[page_example.page],
-        installed(*page_example.extras),
-    )
+    text = re.sub("isocharge serve virtual .* --rest 30 &", "sleep 60 &", page_example.text)
+    text = text.replace("--seconds 10", "--seconds 1")
+    folder, environment = desks[page_example.page], installed(*page_example.extras)
     if page_example.language == "python":
         if "127.0.0.1:8000" in text:
             text = text.replace("127.0.0.1:8000", start_http(Handler(ModelStore())).url.removeprefix("http://"))

@@ -13,7 +13,6 @@ from cobs import cobs
 from crcmod.predefined import mkPredefinedCrcFun
 
 from isocharge.serve import BinaryParser, Frame, encode_frame
-from isocharge.serve.frames.binary import MAX_STUFFED_LENGTH
 from isocharge.serve.frames.transmission import CHECKSUMS, STUFFINGS
 
 
@@ -88,10 +87,9 @@ def test_piece_that_is_no_frame_is_counted(data, counter):
     assert (getattr(parser.counts, counter), parser.counts.bytes_dropped) == (1, len(data))
 
 
-@pytest.mark.parametrize("size", [2 * MAX_STUFFED_LENGTH, 100_000])
 @pytest.mark.parametrize("step", [1, 700, 5000])
-def test_overlong_piece_is_counted_once_and_the_next_frame_is_found(size, step):
-    piece_of_zeros = b"\x01" * size + b"\0"  # valid stuffing, so that only the length is wrong
+def test_overlong_piece_is_counted_once_and_the_next_frame_is_found(step):
+    piece_of_zeros = b"\x01" * 20_000 + b"\0"  # valid stuffing, so that only the length is wrong
     frame = Frame(7, 8, (9.0,))
     data = piece_of_zeros + encode_frame(frame)
     parser = BinaryParser()

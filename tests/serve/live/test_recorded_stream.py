@@ -169,9 +169,9 @@ def test_recording_that_begins_later_contains_the_header_of_the_board(film, pred
     """
     path = tmp_path / "later.rec"
     live = RecordedStream(TouchStream(predictor))
-    rows = taps(film, rest=300, press=2_500)
-    lines = [b"C,A,B\n", *(f"{c:.3f},{a:.3f},{b:.3f}\n".encode() for a, b, c in islice(rows, 5_500))]
-    chunks = [Chunk(line, 1e9 + 0.005 * i, 5_000_000 * i) for i, line in enumerate(lines)]
+    rows = taps(film, rest=300, press=1_000)
+    lines = [b"C,A,B\n", *(f"{c:.3f},{a:.3f},{b:.3f}\n".encode() for a, b, c in islice(rows, 2_500))]
+    chunks = [Chunk(line, 1e9 + 0.0125 * i, 12_500_000 * i) for i, line in enumerate(lines)]
 
     begin = lambda name: live.request_recording(Recorder(tmp_path / name, "linear/1", {}))  # noqa: E731
     requests = {150: lambda: (begin("empty.rec"), live.request_recording(None)), 400: lambda: begin(path.name)}

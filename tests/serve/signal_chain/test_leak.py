@@ -82,8 +82,8 @@ def test_touch_has_the_flag_gap_to_its_end_if_missing_frames_falsify_its_charge(
     gap_s, is_falsified, touch_end_s, is_invalid
 ):
     """The touch of 400 pC begins after 3 s and ends after 11 s. The inflow is 4 pC/s, so that 8 pC remain at rest."""
-    inflow_pC = 4.0 * np.arange(20.0 * RATE_HZ) / RATE_HZ
-    output_pC = np.tile(amplifier_output(touch_charge() + inflow_pC)[:, None], 3)
+    inflow_pC = 4.0 * np.arange(13.0 * RATE_HZ) / RATE_HZ
+    output_pC = np.tile(amplifier_output(touch_charge(seconds=13.0) + inflow_pC)[:, None], 3)
     output_pC += np.random.default_rng(0).normal(0.0, 0.3, output_pC.shape)
     chain = StageRunner(tare={"frames": 20}, leak={"tau_s": TAU_S})
     previous_s = 0.0
@@ -98,7 +98,7 @@ def test_touch_has_the_flag_gap_to_its_end_if_missing_frames_falsify_its_charge(
             assert ("gap" in reading.flags) == is_falsified
             assert t_s < touch_end_s + 0.06
             if 3.1 < t_s < 10.9 and not is_falsified:
-                np.testing.assert_allclose(reading.charge_pC, 400.0, rtol=0.03)
+                assert np.abs(reading.charge_pC - 400.0).max() < 12.0
         elif t_s > touch_end_s + 0.1:
             assert "gap" not in reading.flags
             assert is_falsified or np.abs(reading.charge_pC).max() < 20.0
@@ -115,7 +115,7 @@ def test_press_has_its_charge_at_any_rate(rate_Hz, tau_s):
     rise_s = 0.03
     charges = []
     for delay in range(5):
-        since_touch_s = np.arange(0.0, 3.5, 1.0 / rate_Hz) - 1.5 - 0.2 * delay / rate_Hz
+        since_touch_s = (np.arange(-15.0, 1.0 * rate_Hz) - 0.2 * delay) / rate_Hz
         charging_s = np.clip(since_touch_s, 0.0, rise_s)
         decay = np.exp(-np.maximum(since_touch_s - rise_s, 0.0) / tau_s)
         output_pC = 400.0 / rise_s * tau_s * -np.expm1(-charging_s / tau_s) * decay

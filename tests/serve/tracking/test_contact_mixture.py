@@ -100,7 +100,7 @@ def test_contact_at_rest_beside_a_fold_has_an_other_contact_of_equal_probability
     assert tracked.force_std_N / tracked.force_N == pytest.approx(GAIN_STD / 0.7, rel=0.05)
 
 
-@pytest.mark.parametrize("speed", [10.0, 50.0, 200.0])
+@pytest.mark.parametrize("speed", [20.0, 50.0, 200.0])
 @pytest.mark.parametrize("gains", [(1.0, 1.0, 1.0), (1.007, 0.993, 1.0), (0.99, 1.01, 1.0)])
 def test_sliding_contact_is_followed_across_a_fold(speed, gains):
     """The contact begins at x = -4, which has no mirror image on the film. Gain errors displace or hide the fold.
@@ -127,11 +127,11 @@ def test_sliding_contact_is_followed_across_a_fold(speed, gains):
 
 
 def test_contact_that_turns_back_in_front_of_a_fold_stays_on_its_side():
-    t = np.arange(0.0, 1.2, 1e-3)
+    t = np.arange(0.0, 1.2, 2e-3)
     x = np.interp(t, [0.2, 0.6, 1.0], [-4.0, -0.5, -4.0])
-    results = track(x)
+    results = track(x, 500.0)
     _, other_at_end = results[-1]
-    tracked_in_slide, _ = results[400]
+    tracked_in_slide, _ = results[200]
     assert max(tracked.x_mm for tracked, _ in results) < FOLD
     assert other_at_end is None
     assert tracked_in_slide.vx_mm_s == pytest.approx(3.5 / 0.4, rel=0.2)

@@ -116,7 +116,7 @@ def test_reported_std_adapts_to_a_board_whose_noise_differs_from_the_training(no
     path, _ = slide(10.0)
     squared_errors = []
     reported_variances = []
-    for _ in range(4):
+    for _ in range(2):
         contacts = noisy_contacts(path, std=noise_ratio * STD)
         settled = track_contacts(contact._replace(x_std_mm=STD, y_std_mm=STD) for contact in contacts)[100:]
         squared_errors.append(np.abs(position_errors(settled, path[100:])) ** 2)
@@ -144,8 +144,8 @@ def test_irregular_times_and_the_beginning_of_a_slide_are_not_taken_for_noise(ra
 def test_slide_is_tracked_without_lag_and_better_than_by_any_moving_average(speed):
     path, t = slide(speed)
     is_moving = (t > 0.3) & (t < 0.6)
-    measured = [[complex(contact.x_mm, contact.y_mm) for contact in noisy_contacts(path)] for _ in range(4)]
-    errors = np.array([position_errors(track_contacts(noisy_contacts(path)), path) for _ in range(4)])
+    measured = [[complex(contact.x_mm, contact.y_mm) for contact in noisy_contacts(path)] for _ in range(3)]
+    errors = np.array([position_errors(track_contacts(noisy_contacts(path)), path) for _ in range(3)])
     lag_ms = -1e3 * np.mean((errors[:, is_moving] / np.exp(0.7j)).real) / speed
     assert abs(lag_ms) < (5.0 if speed >= 20.0 else 10.0)
 
@@ -230,10 +230,10 @@ def test_frames_with_the_same_time_are_smoothed(frames_per_time):
     tracker = new_tracker(lasting=0.0)
     tracked = [
         track(tracker, contact, 1e-3 * frames_per_time * (number // frames_per_time))[0]
-        for number, contact in enumerate(noisy_contacts(np.zeros(1000)))
+        for number, contact in enumerate(noisy_contacts(np.zeros(600)))
     ]
-    assert np.std([contact.x_mm for contact in tracked[500:]]) < 0.2 * STD
-    assert np.mean([contact.moving for contact in tracked[500:]]) < 0.1
+    assert np.std([contact.x_mm for contact in tracked[300:]]) < 0.2 * STD
+    assert np.mean([contact.moving for contact in tracked[300:]]) < 0.1
 
 
 @pytest.mark.parametrize("name", ["eight-25um-biaxial", "three-25um-biaxial"])
@@ -241,7 +241,7 @@ def test_slow_press_of_a_released_model_is_tracked_from_its_first_frame(name):
     """The first frames state up to 1e5 mm, with correlations that rounding makes indefinite."""
     predictor = Predictor(find_model(name))
     charges = load_model(predictor.folder).golden.charge_pC.astype(float)
-    presses = [charge for charge in charges if not predictor.flags(predictor.predict(charge))][:20]
+    presses = [charge for charge in charges if not predictor.flags(predictor.predict(charge))][:8]
     size = np.minimum(np.arange(1, 101) / 60.0, 1.0)[:, None] ** 2
     for charge in presses:
         frames = charge * size + RNG.standard_normal((100, len(charge)))

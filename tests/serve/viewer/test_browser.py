@@ -78,7 +78,8 @@ def wait_for(page, expression, timeout_s=40.0):
     return value
 
 
-def test_live_page_shows_numbers_and_sends_tare_pause_record_and_marker(page, touch, tmp_path):
+def test_live_page_shows_numbers_until_the_frames_stop_and_sends_requests(stream, page, touch, tmp_path):
+    """The requests are a tare, a pause, a recording and a marker."""
     wait_for(page, "isocharge.page.film.drawnKind === 'none'")
     touch.set()
     # The kind and the numbers are read at once: a press that ends in between takes its numbers away.
@@ -117,13 +118,8 @@ def test_live_page_shows_numbers_and_sends_tare_pause_record_and_marker(page, to
         plan = page.locator(".plan canvas").bounding_box()
         assert plan["y"] + plan["height"] <= height  # the film is seen without scrolling
 
-
-def test_live_page_takes_the_numbers_away_when_the_frames_stop(stream, page, touch):
-    process, _ = stream
-    wait_for(page, "isocharge.page.film.drawnKind === 'none'")
-    touch.set()
     wait_for(page, "isocharge.page.film.drawnKind === 'contact'")
-    process.send_signal(signal.SIGSTOP)
+    stream[0].send_signal(signal.SIGSTOP)
     shown = wait_for(page, f"isocharge.page.film.drawnKind === 'silent' && {{shown: {SHOWN}}}")["shown"]
     assert np.all(np.isnan(shown))
 

@@ -97,20 +97,21 @@ def test_page_decodes_the_samples_of_the_server(record):
 def test_deflection_that_the_page_draws_is_near_that_of_the_solver(changes, largest_error):
     """The error is compared with the largest deflection of each press."""
     film = replace(FILM, **changes)
-    rng = np.random.default_rng(0)
-    for distance_mm, force_N in ((0.0, 0.3), (12.0, 2.0), (20.0, 0.05)):
-        radius_mm = 44.0 * np.sqrt(rng.random(200))
-        points_mm = radius_mm * np.exp(2j * np.pi * rng.random(200))
-        points_mm[0] = distance_mm
-        places = np.stack([points_mm.real, points_mm.imag], axis=1)
+    presses = [(0.0, 0.3), (12.0, 2.0), (20.0, 0.05)]  # distances, mm, and forces, N
+    points_mm = 44.0 * np.sqrt(np.linspace(0.0, 1.0, 200)) * np.exp(2.4j * np.arange(200))  # Fibonacci spiral
+    points_mm[:3] = 0.0, 12.0, 20.0
+    places = np.stack([points_mm.real, points_mm.imag], axis=1)
+    results = node(
+        f"""import {{ Deflection }} from "{(VIEWER / "page/deflection.js").as_uri()}";
+        const field = new Deflection({json.dumps(film_to_dict(film))}, 1.0, 2.0);
+        console.log(JSON.stringify({json.dumps(presses)}.map(([distance, force]) => {{
+          field.press(distance, 0, force);
+          return {places.tolist()}.map(([x, y]) => field.at(x, y));
+        }})));"""
+    )
+    for (distance_mm, force_N), result in zip(presses, results, strict=True):
         expected = deflection(press(film, Circle(1.0), (distance_mm, 0.0), force_N), places)
-        got = node(
-            f"""import {{ Deflection }} from "{(VIEWER / "page/deflection.js").as_uri()}";
-            const field = new Deflection({json.dumps(film_to_dict(film))}, 1.0, 2.0);
-            field.press({distance_mm}, 0, {force_N});
-            console.log(JSON.stringify({places.tolist()}.map(([x, y]) => field.at(x, y))));"""
-        )
-        assert np.abs(np.array(got) - expected).max() < largest_error * expected.max()
+        assert np.abs(np.array(result) - expected).max() < largest_error * expected.max()
 
 
 def test_page_reads_a_token_with_a_percent_sign_as_it_is():
