@@ -33,7 +33,11 @@ from isocharge.serve.record.record import RECORD_FIELDS
 HARMFUL_CATEGORIES = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
 
 CHARACTERS = (
-    *("\x1b[2J", "\x1b]0;title\x07", "\x9b31m", "B_pC", "[red]"),
+    "\x1b[2J",
+    "\x1b]0;title\x07",
+    "\x9b31m",
+    "B_pC",
+    "[red]",
     *"\x07\r\n\t\x00\x7f\u061c\u115f\u200b\u200d\u200e\u202e\u2028\u2066\u3164\ufe0f\ufeff\U000e0041\U000e0101Aé",
 )
 

@@ -109,7 +109,7 @@ def test_charges_are_those_of_the_solver(page, index):
     """Between the electrodes, on an electrode, and far outside of the working area."""
     sensor = load_sensor(MODELS[index])
     on_electrode = np.mean(sensor.electrodes[0].corners, axis=0)
-    presses = [(3.0, -2.0, 0.05), (*on_electrode, 0.3), (-14.0, 11.0, 2.0), (5.0, 24.0, 0.5)]
+    presses = [(3.0, -2.0, 0.05), (*on_electrode, 0.3), (5.0, 24.0, 2.0)]
     expected = [touch_charge(sensor, solve_press(sensor.film, Circle(1.0), (x, y), force)) for x, y, force in presses]
     charges = page.evaluate(CHARGES, [index, presses])
     np.testing.assert_allclose(charges, expected, rtol=1e-3)
