@@ -92,12 +92,10 @@ class ChargeSpline:
                 cells between the knots.
         """
         spacing = spacing or min(MAX_KNOT_SPACING, RELATIVE_KNOT_SPACING * forward_map.probe.reach)
-
-        sensor = forward_map.sensor
         force = _force_nodes(forward_map)
         return cls(
             electrodes=forward_map.electrodes,
-            film=sensor.film,
+            film=forward_map.sensor.film,
             domain=forward_map.domain,
             force=force,
             table=_fit_disk(forward_map, force, spacing),

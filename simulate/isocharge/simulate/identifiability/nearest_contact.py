@@ -16,6 +16,7 @@ converges within a few steps, even if the unconstrained minimum lies far outside
 """
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import scipy  # loads each of its subpackages on first use
@@ -271,7 +272,7 @@ def starting_contacts(
     charge: Array,
     sigma: Array,
     *,
-    starts: int = 2,
+    starts: int,
     candidates: int = CANDIDATES,
 ) -> Array:
     """Find starting points of descents for given charges.
@@ -291,11 +292,9 @@ def starting_contacts(
         their charges, shape (n, starts, 3), mm and N. They do not lie close together.
     """
     # Compute the charges of the candidates, and find the pairs of candidates that lie close together.
-    unit_candidates = _unit_candidates(candidates)
+    unit_candidates, is_neighbour = _unit_candidates(candidates)
     contact = _to_contact(charge_map.domain, INNER_RADIUS * unit_candidates)
     candidate_charges = charge_map.charges(contact)
-    positions = unit_candidates[:, :2]
-    is_neighbour = scipy.spatial.distance.cdist(positions, positions) < START_SEPARATION
 
     start = np.empty((len(charge), starts, 3))
     for first_row in range(0, len(charge), CHUNK):
@@ -304,8 +303,9 @@ def starting_contacts(
     return start
 
 
-def _unit_candidates(count: int) -> Array:
-    """Return contacts that are evenly distributed over a domain (Sobol sequence).
+@cache
+def _unit_candidates(count: int) -> tuple[Array, Booleans]:
+    """Return contacts that are evenly distributed over a domain (Sobol sequence), and which lie close together.
 
     A quarter of the contacts lie on the edge of the disk.
 
@@ -314,14 +314,16 @@ def _unit_candidates(count: int) -> Array:
 
     Returns:
         Contacts in the coordinates (x, y, ln F), shape (count, 3). The coordinates are scaled such that the domain is
-        the unit disk times the interval [-1, 1].
+        the unit disk times the interval [-1, 1]. Whether each pair of contacts lies close together, shape (count,
+        count).
     """
     radius_sample, angle_sample, force_sample = scipy.stats.qmc.Sobol(3, scramble=False).random(count).T
     radius = np.sqrt(radius_sample)  # uniform over the area of the disk
     radius[::4] = 1.0  # every fourth contact lies on the edge
     angle = 2.0 * np.pi * angle_sample
-    log_force = 2.0 * force_sample - 1.0
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), log_force], axis=1)
+    position = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    distance = scipy.spatial.distance.cdist(position, position)
+    return np.column_stack([position, 2.0 * force_sample - 1.0]), distance < START_SEPARATION
 
 
 def _nearest_rows(

@@ -384,5 +384,4 @@ def _round_down(radius: float, step: float = RADIUS_STEP) -> float:
     """Round a radius down to a multiple of a step, mm."""
     # The factor compensates the rounding error of the quotient. The conversion into decimal digits removes the rounding
     # error of the product.
-    steps = np.floor(radius / step * (1.0 + 1e-9))
-    return float(f"{steps * step:.12g}")
+    return float(f"{np.floor(radius / step * (1.0 + 1e-9)) * step:.12g}")
