@@ -16,7 +16,7 @@ VALUES = st.recursive(
 
 
 @given(tables=st.dictionaries(TEXT, VALUES, max_size=5), comment=st.lists(TEXT, max_size=3))
-@settings(derandomize=True, max_examples=300)
+@settings(derandomize=True, max_examples=100)
 def test_what_is_written_is_read(tables, comment):
     assert tomllib.loads(to_toml(tables, comment)) == tables
 

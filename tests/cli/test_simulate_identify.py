@@ -5,10 +5,15 @@ import json
 import pytest
 from matplotlib.image import imread
 
+from isocharge.simulate import ForwardMap
+from whole_films import build_from_default_map
+
 UNIAXIAL = ("simulate", "identify", "three-25um-uniaxial", "--radius", "3.5", "--force", "0.9", "1.1", "--workers", "1")
 
 
-def test_a_map_that_folds_is_reported_drawn_and_written(command, refused, tmp_path):
+def test_a_map_that_folds_is_reported_drawn_and_written(command, refused, tmp_path, monkeypatch):
+    monkeypatch.setattr(ForwardMap, "build", build_from_default_map)
+    monkeypatch.setattr("isocharge.simulate.identifiability.mirror_region.N_SECTORS", 12)
     noise = tmp_path / "quiet.toml"
     noise.write_text("white_pC = 0.5\n")
     code, out, err = command(*UNIAXIAL, "--noise", noise, "--json", "-o", tmp_path / "out")

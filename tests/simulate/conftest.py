@@ -27,4 +27,6 @@ def three_map() -> ForwardMap:
 @pytest.fixture(scope="session")
 def small_dataset(three_map: ForwardMap, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of 500 samples. Tests must not change it."""
-    return write_sweep(tmp_path_factory.mktemp("data") / "presses", (three_map,), Sweep(samples=500, seed=7))
+    return write_sweep(
+        tmp_path_factory.mktemp("data") / "presses", (three_map,), Sweep(samples=500, seed=7, outside=2048)
+    )

@@ -7,7 +7,17 @@ import numpy as np
 import pytest
 
 from isocharge.common.errors import SceneError, SolveError
-from isocharge.simulate import Circle, Film, Polygon, deflection, load_sensor, press, touch_charge
+from isocharge.simulate import (
+    Circle,
+    Film,
+    Polygon,
+    Resolution,
+    SolveSettings,
+    deflection,
+    load_sensor,
+    press,
+    touch_charge,
+)
 from isocharge.simulate.solver.error_estimate import estimated_error
 
 REASONS = (
@@ -23,12 +33,11 @@ CASES = [
     (Film(45.0, 0.96129, 3000.0, 0.2322), Circle(5.6275), (-24.4025, 16.1429), 3.78),
     (Film(45.0, 0.52162, 3000.0, 0.1104, 9.157), Polygon.rectangle(0.5874, 0.4585, 0.033), (-9.985, 28.849), 4.683e-4),
     (Film(45.0, 0.02007, 3000.0, 0.3583, 8.317), Circle(0.59075), (40.5557, -12.3005), 9.626e-4),
-    (Film(45.0, 0.18478, 3000.0, 0.2651, 0.313), Circle(5.129), (-16.565, 36.208), 4.42e-5),
 ]
 """Film, probe, position, mm, and force, N. Some presses are close to the rim."""
 
 
-@pytest.mark.first_cases(3)
+@pytest.mark.first_cases(2)
 @pytest.mark.parametrize(("film", "probe", "at", "force"), CASES)
 def test_hard_cases_converge_or_raise_a_clear_error(film, probe, at, force):
     try:
@@ -47,8 +56,9 @@ def test_hard_cases_converge_or_raise_a_clear_error(film, probe, at, force):
 
 
 def test_more_force_is_advised_on_a_slack_film_and_stretches_it(monkeypatch):
-    monkeypatch.setattr("isocharge.simulate.solver.newton.MAX_ITERATIONS", 12)  # no number suffices for 0.05 N
+    monkeypatch.setattr("isocharge.simulate.solver.newton.MAX_ITERATIONS", 6)  # no number suffices for 0.05 N
     film = Film(45.0, 0.025, 3000.0, 0.34, -2.0)
+    mesh = SolveSettings(resolution=Resolution(4, 8, 5))
     with pytest.raises(SolveError, match=r"it wrinkles, .* with more force, or give the film a pretension"):
-        press(film, Circle(1.0), (10.0, 0.0), 0.05)
-    assert press(film, Circle(1.0), (10.0, 0.0), 0.5).status == "converged"
+        press(film, Circle(1.0), (10.0, 0.0), 0.05, mesh)
+    assert press(film, Circle(1.0), (10.0, 0.0), 0.5, mesh).status == "converged"

@@ -57,7 +57,9 @@ def test_deflection_of_an_oval_film_with_uneven_tension_agrees_with_greens_funct
     deviator = (half_difference * np.cos(2.0 * axis), half_difference * np.sin(2.0 * axis))
     film = replace(SENSOR.film, pretension=mean, deviator=deviator, oval=e, oval_axis=axis)
     at = (0.87 * distance, -0.49 * distance)
-    solved = press(film, Circle(0.1), at, 1e-6, SolveSettings(theory=Theory(bending=False), resolution=Resolution(5, 12, 8)))
+    solved = press(
+        film, Circle(0.1), at, 1e-6, SolveSettings(theory=Theory(bending=False), resolution=Resolution(5, 12, 8))
+    )
 
     def scaled(points):
         in_oval_axes = np.asarray(points) @ [1.0, 1j] * np.exp(-1j * axis) / film.radius

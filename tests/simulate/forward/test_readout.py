@@ -100,7 +100,7 @@ def solved(film) -> Equilibrium:
 # Traces, concave electrodes, and metal on the back
 
 
-@pytest.mark.parametrize("at", [(4.0, 3.0), (10.5, 2.0), (14.0, 0.2)])  # away, beside the square, on the trace
+@pytest.mark.parametrize("at", [(10.5, 2.0), (14.0, 0.2)])  # beside the square, on the trace
 def test_a_trace_collects_the_stress_under_it(film, at):
     """The charge of a square with a bent trace equals the sum of the charges of its three rectangles."""
     traced = SQUARE.with_trace(((10.0, 0.0), (18.0, 0.0), (18.0, 20.0)), 0.5)
@@ -139,7 +139,7 @@ def test_each_rule_is_accurate_from_its_smallest_distance_on(film, readout):
         )
 
 
-@pytest.mark.parametrize("probe", [Circle(0.1), Circle(0.3), Polygon.rectangle(4.0, 0.5, 0.3)], ids=str)
+@pytest.mark.parametrize("probe", [Circle(0.1), Polygon.rectangle(4.0, 0.5, 0.3)], ids=str)
 def test_small_probe_on_a_large_electrode(film, probe):
     """The charge of a square of 12 mm equals the sum over squares of 0.5 mm, for presses and for forward maps."""
     centres = 0.5 * np.arange(-11.5, 12.0)

@@ -1,15 +1,13 @@
 """Complete design of a small layout with three electrodes for presses within 4 mm."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from function_map import folded_map
-from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.common.errors import SolveError
-from isocharge.simulate import Domain, ForwardMap, limits_at
+from isocharge.simulate import ForwardMap, limits_at
 from isocharge.simulate.layout import case as case_module
 from isocharge.simulate.layout import design as design_module
 from isocharge.simulate.layout.case import NO_NUISANCES, DesignCase
@@ -21,6 +19,9 @@ from isocharge.simulate.layout.design import (
     design,
     random_layouts,
 )
+from whole_films import build_from_default_map
+
+FORCES = (0.5, 2.0)
 
 
 def case_of(sensor, **changes):
@@ -28,22 +29,19 @@ def case_of(sensor, **changes):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _rough(fields, three_map):
-    """Fewer presses, positions and layouts, and stress fields and a forward map that have already been solved."""
-
-    def build(sensor, _, *domain, **__):
-        return replace(three_map, sensor=sensor, family=replace(three_map.family, domain=Domain(*domain)))
-
+def _rough(fields):
+    """Fewer presses, forces and layouts, and stress fields and a forward map that have already been solved."""
     with pytest.MonkeyPatch.context() as patch:
         for module, name, value in (
-            (case_module, "FINE_PRESSES", 320),
-            (case_module, "SEARCH_PRESSES", 60),
+            (case_module, "FINE_PRESSES", 160),
+            (case_module, "SEARCH_PRESSES", 40),
             (design_module, "STARTS", 2),
             (design_module, "ROUNDS", 2),
+            (design_module, "DEFAULT_FORCE_RANGE", FORCES),
         ):
             patch.setattr(module, name, value)
         patch.setattr(design_module, "solve_fields", lambda sensor, *_: fields[sensor.name])
-        patch.setattr(ForwardMap, "build", build)
+        patch.setattr(ForwardMap, "build", build_from_default_map)
         yield
 
 
@@ -68,7 +66,7 @@ def test_three_electrodes_form_an_equilateral_triangle(found, centres):
 
 def test_errors_agree_with_the_limits_of_the_forward_map(found):
     """The limits are computed independently from the forward map of the new sensor."""
-    forward_map = ForwardMap.build(found.sensor, found.case.probe, 4.0, DEFAULT_FORCE_RANGE)
+    forward_map = ForwardMap.build(found.sensor, found.case.probe, 4.0, FORCES)
     contact = np.column_stack([found.errors_after.presses, np.ones(len(found.errors_after.presses))])
     limits = limits_at(forward_map, contact, found.case.noise).position
     assert found.errors_after.noise_alone == pytest.approx(limits, rel=0.02)
@@ -81,7 +79,7 @@ def test_no_neighbouring_layout_is_better_by_more_than_one_percent(found, centre
     """Small random moves of the electrodes do not reduce the largest error noticeably."""
     search, rng = Search(found.case, fields["four-25um-biaxial"]), np.random.default_rng(0)
     smallest = found.errors_after.with_nuisances.max()
-    assert all(search.errors(centres + rng.uniform(-0.4, 0.4, (3, 2))).max() > 0.99 * smallest for _ in range(20))
+    assert all(search.errors(centres + rng.uniform(-0.4, 0.4, (3, 2))).max() > 0.99 * smallest for _ in range(10))
 
 
 def test_goal_rms_reduces_the_root_mean_square(centres, sensor, fields):
