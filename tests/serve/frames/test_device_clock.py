@@ -134,8 +134,8 @@ def test_wall_clock_that_is_set_changes_no_step(jump_s, has_clock):
 @pytest.mark.parametrize(
     ("arrivals_s", "tick_ns", "steps_s"),
     [
-        ((0.0, 0.01, 0.03, 0.02), 0, (0.0, 0.01, 0.02, 0.0)),  # no monotonic time
-        ((0.0, 0.0), 10**9, (0.0, 0.0)),  # a file
+        ((0.0, 0.01, 0.03, 0.02), 0, (0.0, 0.01, 0.02, 0.005)),  # no monotonic time
+        ((0.0, 0.0), 10**9, (0.0, 0.005)),  # a file
     ],
 )
 def test_chunks_with_one_clock_only_are_timed_by_their_arrivals(arrivals_s, tick_ns, steps_s):

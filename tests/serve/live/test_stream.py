@@ -60,6 +60,12 @@ def test_timestamps_of_a_file_follow_the_clock_of_the_board(predictor, tmp_path)
     np.testing.assert_allclose(np.diff(times), 0.005, atol=1e-6)
 
 
+def test_tare_follows_the_drift_in_a_file_without_a_clock(predictor):
+    """With 200 frames per second, the charge of A rises by 1 pC/s."""
+    chunks = [Chunk(b"A=%g B=0 C=0\n" % (n / 200), 1e9, 0) for n in range(2000)]
+    assert not any(record.contact for record in stream(chunks, predictor))
+
+
 def test_record_of_a_press(press_pC, record_after_rest):
     record = record_after_rest(*frames_of(press_pC, 1, first=10))
     assert (record.x_mm, record.y_mm, record.force_N) == pytest.approx((2.0, -3.0, 0.5), rel=1e-5)

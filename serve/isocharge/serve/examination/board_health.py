@@ -153,7 +153,7 @@ def transmission_sentences(capture: Capture) -> Iterator[str]:
                 "value; if the line is damaged"
             )
         yield f"{damaged}: {advice}"
-    has_clock = bool(capture.frames) and all(frame.t_us is not None for frame in capture.frames)
+    has_clock = capture.frames and all(frame.t_us is not None for frame in capture.frames)
     if has_clock and received.span_s > LIVE_TIME_s:
         clock_span_s = float(elapsed_times(capture.frames)[-1])
         if not 0.5 < clock_span_s / received.span_s < 2.0:

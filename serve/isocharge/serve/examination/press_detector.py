@@ -118,11 +118,11 @@ def find_touch(
     if len(levels) == 0:
         return None
     total_changes = np.ptp(levels, axis=0)
-    is_slow_touch = unit_is_pC and bool((total_changes > max_slow_change_pC).any())
+    is_slow_touch = unit_is_pC and (total_changes > max_slow_change_pC).any()
     if not (is_touched.any() or is_slow_touch):
         return None
     column = int(np.argmax(total_changes))
-    begin_block = int(np.argmax(is_touched))
+    begin_block = np.argmax(is_touched)
     return TouchFound(column, float(total_changes[column]), float(block_times_s[begin_block]))
 
 

@@ -51,6 +51,9 @@ class DeviceClock:
         rate: Seconds of the host per second of the device.
     """
 
+    FILE_INTERVAL_s = 0.005
+    """Assumed time between the frames of a file without a clock, s. Without it, the tare would not follow a drift."""
+
     def __init__(self) -> None:
         """Start without a reading."""
         self.rate = 1.0
@@ -85,7 +88,7 @@ class DeviceClock:
 
         The clock of the device is converted to the time of the host by a straight line, which is called the fit. If the
         device sends no clock, the frames of the chunk share the time since the previous chunk evenly, and the last
-        frame has the arrival time of the chunk.
+        frame has the arrival time of the chunk. Frames of a file are then assumed to be `FILE_INTERVAL_s` apart.
 
         Args:
             chunk: The bytes that contain the ends of the frames.
@@ -102,7 +105,7 @@ class DeviceClock:
             if frame.t_us is None:
                 before_arrival_s = n_later * share_s
                 frame.host_s = chunk.timestamp - before_arrival_s
-                frame.dt_s = share_s
+                frame.dt_s = 0.0 if is_first_chunk else share_s or self.FILE_INTERVAL_s
                 frame.clock_s = self._monotonic_s - before_arrival_s
             else:
                 self._stamp_with_device(frame, frame.t_us, modulus, chunk.timestamp)

@@ -241,13 +241,13 @@ def _bad_presses(errors: PressErrors) -> Booleans:
     # (Bonferroni correction). If all presses are good, the probability that one of them is found is therefore at most
     # `TEST_SIGNIFICANCE`.
     is_compared = errors.is_compared
-    compared_count = int(is_compared.sum())
+    compared_count = is_compared.sum()
     degrees = np.maximum(np.count_nonzero(~np.isnan(errors.error), axis=1), 1)
     deviate = chi_squared_deviate(np.nansum(errors.squared_ratio, axis=1), degrees)
     limit = NormalDist().inv_cdf(1.0 - TEST_SIGNIFICANCE / max(1, compared_count))
     is_improbable = is_compared & (deviate > limit)
 
-    improbable_count = int(is_improbable.sum())
+    improbable_count = is_improbable.sum()
     few_are_improbable = improbable_count <= max(1.0, MAX_BAD_FRACTION * compared_count)
     enough_others_remain = compared_count - improbable_count >= MIN_PRESSES
     all_agree = Agreement.from_errors(errors, is_compared).acceptable
