@@ -58,12 +58,12 @@ def model_in(folder, series, noise=NOISE):
     def predict(charge_pC):
         contact = np.array([0.0, 0.0, np.log(0.5)])
         for _ in range(4):
-            place = np.array([[contact[0], contact[1], np.exp(contact[2])]])
-            charge, slopes = series.linearised(place)
-            weight = 1.0 / NOISE.sigma(charge[0])
-            step, *_ = np.linalg.lstsq(weight[:, None] * slopes[0], weight * (charge_pC - charge[0]), rcond=None)
+            charge, slopes = series.linearised(np.array([[contact[0], contact[1], np.exp(contact[2])]]))
+            std = NOISE.sigma(charge[0])
+            slopes = slopes[0] / std[:, None]
+            covariance = np.linalg.inv(slopes.T @ slopes)
+            step = covariance @ slopes.T @ ((charge_pC - charge[0]) / std)
             contact = np.clip(contact + step, [-9.0, -9.0, -4.0], [9.0, 9.0, 2.0])
-        covariance = np.linalg.inv((weight[:, None] * slopes[0]).T @ (weight[:, None] * slopes[0]))
         std = np.sqrt(np.diag(covariance))
         force = float(np.exp(contact[2]))
         return Contact(float(contact[0]), float(contact[1]), force, std[0], std[1], std[2] * force, 0.0)
@@ -143,7 +143,7 @@ def test_film_is_followed_with_the_noise_that_the_device_file_states(series, tmp
     rng = np.random.default_rng(4)
     noise = NoiseModel("bench", 5.0, 0.02)
     model = model_in(tmp_path, series, noise)
-    _, charge = touches(series, [0.3, 0.7, -0.8], rng, 80)
+    _, charge = touches(series, [0.3, 0.7, -0.8], rng, 60)
     follower, was_lost = followed(model, charge, rng, 1, noise)
     assert not any(was_lost)
     assert abs(follower.film.pretension_MPa - 1.3) < 2.0 * follower.film.pretension_std_MPa
@@ -167,7 +167,7 @@ def test_a_sudden_change_is_followed_after_twenty_touches(series, model, change_
     errors = []
     for _ in range(2):
         _, charge_before = touches(series, [0.0, 0.7, -0.8], rng, 40)
-        contact, charge = touches(series, [change_MPa, 0.7, -0.8], rng, 60)
+        contact, charge = touches(series, [change_MPa, 0.7, -0.8], rng, 40)
         follower, _ = followed(model, np.concatenate([charge_before, charge[:20]]), rng, frames=4)
         errors.append(force_errors(follower, model, contact[20:], NOISE.add(charge[20:], rng)))
     rms_error, covered_share = np.mean(errors, axis=0)
@@ -195,7 +195,7 @@ def test_nearly_slack_film_that_has_not_changed_is_not_lost(series, tmp_path):
         series, node_MPa=np.array([-0.01, 0.0, 0.7]), coefficients=np.stack([looser, *series.coefficients[1:]])
     )
     model = model_in(tmp_path, slack)
-    _, charge = touches(slack, np.zeros(3), rng, 100)
+    _, charge = touches(slack, np.zeros(3), rng, 60)
     _, was_lost = followed(model, charge, rng, 1)
     assert not any(was_lost)
 
@@ -203,7 +203,7 @@ def test_nearly_slack_film_that_has_not_changed_is_not_lost(series, tmp_path):
 def test_touches_that_agree_determine_the_pretension_better_than_touches_of_warm_fingers(series, model):
     """The assumed errors of a touch are an upper limit. The touches themselves show how large the errors are."""
     rng = np.random.default_rng(3)
-    contact, charge = touches(series, [0.3, 0.7, -0.8], rng, 100)
+    contact, charge = touches(series, [0.3, 0.7, -0.8], rng, 80)
     warmth_pC = 10.0 * rng.standard_normal((60, 1))
     agreeing, _ = followed(model, charge[:60], rng)
     warm, _ = followed(model, charge[:60] + warmth_pC, rng)
