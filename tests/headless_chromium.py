@@ -13,18 +13,18 @@ EXECUTABLE = os.environ.get("CHROMIUM", "/usr/bin/chromium")
 ARGUMENTS = (
     *("--no-sandbox", "--no-first-run", "--disable-quic", "--disable-sync", "--disable-background-networking"),
     *("--disable-component-update", "--disable-gpu", "--enable-unsafe-swiftshader"),
+    "--host-resolver-rules=MAP evil.example 127.0.0.1",
+    # The browser's own protection of local addresses must not hide what the server does.
+    "--disable-features=LocalNetworkAccessChecks,BlockInsecurePrivateNetworkRequests,PrivateNetworkAccessSendPreflights",
 )
-"""Arguments of every start: no network traffic of the browser itself, and WebGL by software."""
+"""Arguments: no network traffic of the browser itself, WebGL by software, and a name of another site."""
 
 
 @contextmanager
-def start_chromium(*arguments: str) -> Iterator[Any]:
+def start_chromium() -> Iterator[Any]:
     """Run Chromium while the block runs. A test is skipped if Chromium or Playwright is not installed.
 
     If the environment variable `CHROMIUM` contains its path, as in `make browser`, the test is not skipped.
-
-    Args:
-        arguments: Further arguments of the command line.
 
     Yields:
         The browser as an object of Playwright.
@@ -33,7 +33,7 @@ def start_chromium(*arguments: str) -> Iterator[Any]:
         pytest.skip(f"needs {EXECUTABLE} (apt-get install chromium)")
     playwright = pytest.importorskip("playwright.sync_api")
     with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=EXECUTABLE, args=[*ARGUMENTS, *arguments])
+        browser = started.chromium.launch(executable_path=EXECUTABLE, args=ARGUMENTS)
         try:
             yield browser
         finally:

@@ -1,5 +1,6 @@
-"""The start page and the live page in headless Chromium: the live page draws each press where and as hard as it is."""
+"""Pages in headless Chromium: the live page draws each press where and as hard as it is; pages of other sites."""
 
+import json
 import re
 import signal
 import threading
@@ -8,7 +9,9 @@ import time
 import numpy as np
 import pytest
 
+from infer_requests import INFER, infer_request
 from isocharge.serve import Script, VirtualSensor
+from isocharge.serve.network.protocol.handler import Handler
 from serve.viewer.conftest import errors_of
 
 RATE_HZ, PRESS_S, PAUSE_S = 200.0, 1.5, 0.9
@@ -122,6 +125,64 @@ def test_live_page_shows_numbers_until_the_frames_stop_and_sends_requests(stream
     stream[0].send_signal(signal.SIGSTOP)
     shown = wait_for(page, f"isocharge.page.film.drawnKind === 'silent' && {{shown: {SHOWN}}}")["shown"]
     assert np.all(np.isnan(shown))
+
+
+UNLOAD = "/v2/repository/models/linear/unload"
+
+ATTACK = """<!doctype html><title>attack</title><iframe name="result"></iframe>
+<form id="form" method="post" enctype="text/plain" target="result" action="{target}{unload}"><input name="x"></form>
+<script>
+async function attack() {{
+  const tensor = {{ name: "charge_pC", datatype: "FP32", shape: [1, 3], data: [1, 2, 3] }};
+  const body = JSON.stringify({{ inputs: [tensor] }});
+  const answers = [];
+  for (const [path, options] of [
+    ["{infer}", {{ method: "POST", mode: "no-cors", body }}], ["{unload}", {{ method: "POST", mode: "no-cors" }}],
+    ["/v2", {{ mode: "no-cors" }}], ["/metrics", {{}}],
+  ]) {{
+    try {{
+      const answer = await fetch("{target}" + path, options);
+      answers.push(answer.type === "opaque" ? "opaque" : answer.status);
+    }} catch (error) {{ answers.push("blocked"); }}
+  }}
+  return answers;
+}}
+</script>"""
+
+
+def test_no_page_of_another_origin_operates_the_server_in_chromium(chromium, store, start_http):
+    handler = Handler(store)
+    url = start_http(handler).url
+    port = url.rpartition(":")[2]
+    attack = ATTACK.format(target=url, infer=INFER, unload=UNLOAD)
+    page = chromium.new_page()
+
+    # A page of another origin: a form, and fetches that may not read the answers.
+    page.route("http://evil.example/", lambda route: route.fulfill(body=attack, content_type="text/html"))
+    page.goto("http://evil.example/")
+    page.evaluate("attack()")
+    page.evaluate("document.getElementById('form').submit()")
+    page.wait_for_timeout(500)
+
+    # A rebound name: the page and the server have the same origin, and the page could read the answers.
+    answer = page.goto(f"http://evil.example:{port}/v2")
+    assert answer.status == 403
+    content = page.evaluate("fetch('/v2/models/linear').then((answer) => answer.text())")
+    assert "Host: expected an IP address" in json.loads(content)["error"]
+
+    # The server's own page, which a user opens by its address, still works.
+    assert page.goto(f"{url}/v2").status == 200
+    statuses = "fetch('/v2/models/linear/infer', { method: 'POST', body: arguments }).then((answer) => answer.status)"
+    body = json.dumps(json.dumps(infer_request()))
+    assert page.evaluate(statuses.replace("arguments", body)) == 200
+    page.close()
+
+    (requests, *_) = handler.traffic.registry.collect()
+    counts = [sample for sample in requests.samples if sample.name == "isocharge_requests_total"]
+    assert sum(sample.value for sample in counts if sample.labels["status"] == "403") >= 5
+    statistics = store.get("linear", "").statistics.to_json()
+    assert statistics["inference_count"] == 1  # the press of the server's own page
+    assert len(store.versions_of()) == 2  # nothing was unloaded
 
 
 def test_typed_token_opens_the_page_of_a_recording(chromium, start_page):
