@@ -43,7 +43,7 @@ def rising(x, _):
 
 def folds_of(charge_map, rings: Rings | None = None) -> np.ndarray:
     """Positions on folds at 1 N, shape (n, 2), mm."""
-    return find_folds(charge_map, rings or Rings.spread(charge_map.domain.radius), 1.0, REFERENCE)
+    return find_folds(charge_map, rings or Rings.spread(charge_map.domain.radius), 1.0, REFERENCE)[0]
 
 
 INNER = ((-0.9, 1.4), (8.7, 11.4), (15.2, -18.1), (-14.7, -5.3))
@@ -127,7 +127,7 @@ def test_find_folds_finds_nothing_in_a_sharply_bent_map():
 
 def test_find_folds_finds_nothing_beside_an_electrode(inner):
     """The orientation seems reversed between rings with a spacing of 0.3 mm, but not between ten times as many."""
-    assert len(find_folds(inner, Rings.spread(4.0, 13, 60), 0.05, REFERENCE)) == 0
+    assert len(find_folds(inner, Rings.spread(4.0, 13, 60), 0.05, REFERENCE)[0]) == 0
 
 
 def test_nearest_fold_agrees_with_signs_of_the_determinant_on_a_fine_grid(film):
@@ -138,7 +138,7 @@ def test_nearest_fold_agrees_with_signs_of_the_determinant_on_a_fine_grid(film):
     contact = np.stack([x, y, np.full(x.size, 0.316)], axis=1)
     sign = np.sign(np.linalg.det(differences(model.charges, contact, (0.01, 0.01, 1e-3))))
     is_beyond_fold = sign != sign[x.size // 2]
-    folds = find_folds(model, Rings.spread(5.5), 0.316, REFERENCE)
+    folds, _ = find_folds(model, Rings.spread(5.5), 0.316, REFERENCE)
     assert np.hypot(*folds[0]) == pytest.approx(np.hypot(x, y)[is_beyond_fold].min(), abs=0.1)
 
 

@@ -40,7 +40,7 @@ circle of four electrodes, the orientation is reversed within about 0.01 mm.
 """
 
 
-def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseModel) -> Array:
+def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseModel) -> tuple[Array, Array]:
     """Find the folds of a charge map for contacts that all have the same force.
 
     Args:
@@ -51,7 +51,8 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
 
     Returns:
         Positions (x, y) on folds, ordered by the distance from the centre, shape (n, 2), mm. With three electrodes, the
-        positions lie on fold lines. With more electrodes, they are points.
+        positions lie on fold lines. With more electrodes, they are points. The second array contains the position
+        errors on the rings, shape (n_ring, n_angle), mm.
     """
     radius = INNER_RADIUS * charge_map.domain.radius
 
@@ -59,18 +60,19 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
         """Return contacts at positions of shape (..., 2), moved onto the disk of the map, shape (n, 3)."""
         return contacts_at(onto_disk(position, radius).reshape(-1, 2), force)
 
-    def precision(position: Array) -> Array:
-        """Return the inverse of the position error, which is zero at a fold, shape of the positions without (2,)."""
-        return (1.0 / limits_at(charge_map, contacts(position), noise).position).reshape(position.shape[:-1])
+    def position_error(position: Array) -> Array:
+        """Return the Cramer-Rao position error, which is infinite at a fold, shape of the positions without (2,)."""
+        return limits_at(charge_map, contacts(position), noise).position.reshape(position.shape[:-1])
 
-    # Refine the minima of the precision. In each round, the step is halved, and each position moves to the best of 25
+    # Refine the maxima of the error. In each round, the step is halved, and each position moves to the best of 25
     # points: itself and the 24 points that are up to two steps away along x and y.
-    position, step = _starting_points(rings, precision(rings.position))
+    error_on_rings = position_error(rings.position)
+    position, step = _starting_points(rings, 1.0 / error_on_rings)
     neighbours = np.stack(np.meshgrid(range(-2, 3), range(-2, 3)), axis=-1).reshape(-1, 2)
     while step.max() > 0.05 * FOLD_WIDTH:
         step *= 0.5
         trial = onto_disk(position[:, None] + step[:, None, None] * neighbours, radius)
-        position = trial[np.arange(len(trial)), precision(trial).argmin(axis=1)]
+        position = trial[np.arange(len(trial)), position_error(trial).argmax(axis=1)]
 
     # A position is on a fold if the charge map reverses its orientation between two opposite points of a circle around
     # it. With the derivatives J1 and J2 at these points, the orientation is reversed if det(J1' J2) is negative.
@@ -83,7 +85,7 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
     products = np.einsum("...ei,...ej->...ij", first, second)
     is_fold = (np.linalg.det(products) < 0.0).any(axis=1)
     folds: Array = position[is_fold]
-    return folds[np.argsort(np.hypot(*folds.T), kind="stable")]
+    return folds[np.argsort(np.hypot(*folds.T), kind="stable")], error_on_rings
 
 
 def _starting_points(rings: Rings, precision: Array) -> tuple[Array, Array]:
@@ -319,7 +321,7 @@ def working_area(
     The error and the folds are computed at several forces, each at most 1.7 times the previous one. On a taut film, the
     charges change their sign with increasing force, and a fold may lie near the centre at a single one of these forces.
 
-    For forces from 0.05 to 2 N, the charge map is evaluated for about 700,000 contacts, or for about 400,000 contacts
+    For forces from 0.05 to 2 N, the charge map is evaluated for about 500,000 contacts, or for about 200,000 contacts
     without the search for ambiguous pairs. Use a `ChargeSpline` instead of a forward map, which would take minutes.
 
     Args:
@@ -344,11 +346,12 @@ def working_area(
     rings = Rings.spread(min(n_rings * step, search_radius), n_rings)
 
     # Find the folds, and the last ring before the error first exceeds its limit. An error that is NaN exceeds it.
-    folds = np.concatenate([find_folds(charge_map, rings, force, noise) for force in forces])
-    fold_radius = float(np.hypot(*folds.T).min(initial=np.inf))
-    errors = np.array(
-        [rings.per_ring(limits_at(charge_map, rings.contacts(force), noise).position).max(axis=1) for force in forces]
+    folds_of_forces, errors_of_forces = zip(
+        *(find_folds(charge_map, rings, force, noise) for force in forces), strict=True
     )
+    folds = np.concatenate(folds_of_forces)
+    fold_radius = float(np.hypot(*folds.T).min(initial=np.inf))
+    errors = np.max(errors_of_forces, axis=2)
     is_within_limit = (errors <= error).all(axis=0)
     first_exceeding = is_within_limit.argmin()
     error_radius = search_radius
