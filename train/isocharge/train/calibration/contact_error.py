@@ -166,14 +166,15 @@ def next_presses(
 
     # Divide the errors of x, y and ln F by those that the noise causes, so that they can be added.
     scale = np.sqrt(np.diagonal(sensitivity.noise_covariance, axis1=1, axis2=2).mean(axis=0))  # shape (3,)
-    gain = (sensitivity.film_gain / scale[:, None]).reshape(-1, len(covariance))
+    gain = sensitivity.film_gain / scale[:, None]
+    squared_gain = np.einsum("nij,nik->jk", gain, gain)
     proposed = []
     for _ in range(count):
         # A candidate with the rows H reduces the covariance C by C H' (1 + H C H')^-1 H C.
-        spread_rows = candidate_rows @ covariance  # H C, shape (n, n_row, n_unknown)
+        spread_rows = np.tensordot(candidate_rows, covariance, 1)  # H C, shape (n, n_row, n_unknown)
         innovation = np.eye(candidate_rows.shape[1]) + spread_rows @ candidate_rows.swapaxes(1, 2)  # 1 + H C H'
-        effect = spread_rows @ gain.T  # shape (n, n_row, n_error)
-        reduction = (effect * np.linalg.solve(innovation, effect)).sum(axis=(1, 2))
+        effect = np.tensordot(spread_rows, squared_gain, 1) @ spread_rows.swapaxes(1, 2)
+        reduction = np.trace(np.linalg.solve(innovation, effect), axis1=1, axis2=2)  # of the sum of the squared errors
         best = int(reduction.argmax())
         rows = spread_rows[best]
         covariance = covariance - rows.T @ np.linalg.solve(innovation[best], rows)
