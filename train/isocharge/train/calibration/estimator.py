@@ -473,11 +473,10 @@ class _Evidence:
         """
         is_used = weight > 0.0
         squared_sizes = self._squared_sizes[is_used]
-        covariance = self._covariance(squared_sizes)
         gain = np.tensordot(squared_sizes, self.jacobian @ self.prior.parts, 1)  # J P, shape (n, m, n_unknown)
-        weighted = np.linalg.solve(covariance, self.residual[:, None])  # S^-1 r, shape (n, m, 1)
-        means = self.prior.mean - (gain * weighted).sum(axis=1)
-        weighted_gain = weight[is_used, None, None] * np.linalg.solve(covariance, gain)
+        gain_by_covariance = np.linalg.solve(self._covariance(squared_sizes), gain)  # S^-1 J P
+        means = self.prior.mean - self.residual @ gain_by_covariance
+        weighted_gain = weight[is_used, None, None] * gain_by_covariance
         return means, np.tensordot(gain, weighted_gain, ((0, 1), (0, 1)))
 
     @property
