@@ -3,13 +3,26 @@
 import pytest
 from tests.train.short_training import short_training
 
-from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Sweep, load_sensor, read_dataset
+from isocharge.simulate import Circle, ForwardMap, Sweep, load_sensor, read_dataset
 from isocharge.simulate.dataset.sweep import write_sweep
+from isocharge.simulate.identifiability import working_area
 from isocharge.train import CalibrationProblem, TrainingData, fit
+from isocharge.train.training import contact_training, cross_fit
 from isocharge.train.training.training_data import Split
 from kept import kept
 
-QUICK = short_training(32, 24, 400, 600, 4_000)
+QUICK = short_training(32, 24, 150, 200, 2_000)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def rough_training():
+    """Search for folds on few rings, train fewer networks in a cross-validation, and fit the covariance roughly."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(working_area, "RADIUS_STEP", 0.5)
+        patch.setattr(cross_fit, "HELD_PARTS", 3)
+        patch.setattr(contact_training, "REFIT_PRESSES", 1)
+        patch.setattr(contact_training, "LOSS_TOLERANCE", 1e-3)
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -24,13 +37,8 @@ def film(sensor):
 
 
 @pytest.fixture(scope="session")
-def spline(film):
-    return kept(ChargeSpline.of, film)
-
-
-@pytest.fixture(scope="session")
 def dataset_folder(film, tmp_path_factory):
-    return write_sweep(tmp_path_factory.mktemp("data") / "presses", (film,), Sweep(samples=6_000, outside=4_000))
+    return write_sweep(tmp_path_factory.mktemp("data") / "presses", (film,), Sweep(samples=6_000, outside=2_000))
 
 
 @pytest.fixture(scope="session")

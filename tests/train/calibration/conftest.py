@@ -30,14 +30,18 @@ FEW_VALUES = {
     "POSITION_RATIOS": ((1.0, 0.9), (3.0, 0.1)),
     "NOISE_RATIOS": ((1.0, 0.5), (8.0, 0.5)),
 }
-"""Values and probabilities of the hypotheses of `few_hypotheses`, by their names in the estimator."""
+"""Values and probabilities of the hypotheses of `use_few_hypotheses`, by their names in the estimator."""
+
+
+def use_few_hypotheses(patch):
+    """To save time, let the estimator compare 256 hypotheses instead of 5,832."""
+    for name, values_and_probabilities in FEW_VALUES.items():
+        patch.setattr(estimator, name, values_and_probabilities)
 
 
 @pytest.fixture
 def few_hypotheses(monkeypatch):
-    """To save time, the estimator compares 256 hypotheses instead of 5,832."""
-    for name, values_and_probabilities in FEW_VALUES.items():
-        monkeypatch.setattr(estimator, name, values_and_probabilities)
+    use_few_hypotheses(monkeypatch)
 
 
 def rig(problem, charges, count, seed, values=None):

@@ -8,19 +8,20 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tests.train.calibration.conftest import FEW_VALUES, rig
+from tests.train.calibration.conftest import rig, use_few_hypotheses
 from tests.train.short_training import short_training
 
 from isocharge.common.errors import ModelError, OutputError, PressError
 from isocharge.serve import Predictor, read_presses
 from isocharge.simulate import NoiseModel, load_sensor
-from isocharge.train import CalibrationProblem, calibrate
+from isocharge.train import CalibrationProblem, calibrate, fit
 from isocharge.train.calibration import calibrate as calibrate_module
-from isocharge.train.calibration import compact_map, estimator, film_network
+from isocharge.train.calibration import compact_map, film_network
+from isocharge.train.calibration import folder as folder_module
 from isocharge.train.calibration.folder import check_calibration_folder, read_earlier, write_calibration
 from kept import kept
 
-QUICK = short_training(32, 16, 300, 50, 1_000)
+QUICK = short_training(24, 16, 200, 30, 1_000)
 
 
 @pytest.fixture(scope="module")
@@ -31,9 +32,9 @@ def written(problem, synthetic, tmp_path_factory):
         patch.setattr(compact_map, "_nodes", lambda _: np.zeros(1))
         patch.setattr(film_network, "PRESSES", 6_000)
         patch.setattr(film_network, "_outside_presses", lambda *_: None)
-        for name, values_and_probabilities in FEW_VALUES.items():
-            patch.setattr(estimator, name, values_and_probabilities)
-        patch.setattr(film_network, "yield_force", partial(kept, film_network.yield_force))
+        use_few_hypotheses(patch)
+        patch.setattr(film_network, "yield_force", lambda *_: 0.9)
+        patch.setattr(folder_module, "fit", partial(kept, fit))
         values, _, presses = rig(problem, synthetic, 20, seed=31)
         result = calibrate(presses, problem, start=synthetic, accurate=False)
         path = tmp_path_factory.mktemp("calibrated") / "film"
@@ -74,7 +75,7 @@ def test_folder_contains_the_presses_the_sensor_and_the_estimate(written, proble
 def test_network_is_trained_with_the_noise_of_the_presses(written, tmp_path):
     film = replace(written.result.film, noise=NoiseModel("presses", 1.0, 0.016))
     result = replace(written.result, estimation=replace(written.result.estimation, film=film))
-    few_steps = short_training(32, 16, 100, 50, 1_000)
+    few_steps = short_training(16, 16, 60, 30, 1_000)
     noisy = Predictor(write_calibration(result, tmp_path / "film", config=few_steps))
     quiet = Predictor(written.path)
     assert noisy.metadata.noise.gain == 0.016

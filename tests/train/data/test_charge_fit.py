@@ -36,11 +36,11 @@ def test_presses_with_few_forces_determine_no_higher_powers_of_the_force(film, f
     """A series of a higher degree would agree at these forces, but be wrong by the size of the charge between them."""
     charges = signed_charges if is_signed else film.charges
     rng = np.random.default_rng(0)
-    contact = draw_contacts(rng, DOMAIN, 6000)
-    contact[:, 2] = rng.choice(forces, 6000) * np.exp(scatter * rng.standard_normal(6000))
+    contact = draw_contacts(rng, DOMAIN, 3000)
+    contact[:, 2] = rng.choice(forces, 3000) * np.exp(scatter * rng.standard_normal(3000))
     presses = LabelledPresses(contact, charges(contact))
-    series = fit_charge_series(DOMAIN, film.electrodes, presses[600:], presses[:600])
-    between = draw_contacts(rng, Domain(8.0, (min(forces), max(forces))), 500)
+    series = fit_charge_series(DOMAIN, film.electrodes, presses[500:], presses[:500])
+    between = draw_contacts(rng, Domain(8.0, (min(forces), max(forces))), 200)
     expected = charges(between)
     size = rms(expected) if is_signed else expected  # charges of both signs may be zero
     assert rms((series.charges(between) - expected) / size) < 0.01
@@ -136,7 +136,7 @@ def test_probable_fold_of_presses_with_two_probes_is_stated():
     field, presses = fit_field(of_two_probes)
     domain, (caution,) = invertible_domain(field, presses, REFERENCE)
     assert domain == field.domain
-    assert "probably folds beyond about 3 mm" in caution
+    assert "probably folds beyond about 2.9 mm" in caution
     assert "trained for 8 mm" in caution
 
 

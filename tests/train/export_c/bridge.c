@@ -1,6 +1,6 @@
 /* What the tests call through ctypes: many presses, frames or bytes in one call, with plain arrays. */
-#include "isocharge_chain.h"
-#include "isocharge_frames.h"
+#include "isocharge_chain.c"
+#include "isocharge_frames.c"
 
 void bridge_predict(const float *charge_pC, int count, int times, float *contact)
 {

@@ -10,6 +10,7 @@ import pytest
 
 from isocharge.serve import Contact, find_model, load_model
 from isocharge.serve.live.device import ANY_BOARD
+from isocharge.serve.signal_chain.stage import Device
 from isocharge.train.export_c.folder import export_c
 from processes import finished
 
@@ -38,11 +39,13 @@ class Exported:
         library: The shared library.
         electrodes: Number of electrodes.
         source: Text of `isocharge_model.c`.
+        device: The board.
     """
 
     library: ctypes.CDLL
     electrodes: int
     source: str
+    device: Device
 
     def predict(self, charge_pC):
         """Return contacts, shape (n, 10), from charges of shape (n, electrodes), pC."""
@@ -128,13 +131,14 @@ def build(tmp_path_factory):
             object_file = folder / "network.o"
             object_options = (*options, "-fPIC", "-c")
             networks[key] = compile_strictly(compiler, folder, object_file, "isocharge_model.c", options=object_options)
-        sources = (HERE / "bridge.c", "isocharge_chain.c", "isocharge_frames.c", networks[key])
+        sources = (HERE / "bridge.c", networks[key])
         library_options = (*options, "-fPIC", "-shared")
         library = compile_strictly(compiler, folder, folder / "bridge.so", *sources, options=library_options)
         return Exported(
             library=ctypes.CDLL(str(library)),
             electrodes=len(load_model(find_model(model)).metadata.electrodes),
             source=(folder / "isocharge_model.c").read_text(),
+            device=device,
         )
 
     return build
@@ -148,9 +152,9 @@ def compile_c():
 
 @pytest.fixture(scope="session")
 def exports(tmp_path_factory):
-    """Exports of a model with three and of one with four electrodes, for no special board."""
+    """Exports of a small model with three and of one with four electrodes, for no special board."""
     folder = tmp_path_factory.mktemp("exports")
-    return [export_c(find_model(name), folder / name) for name in ("three-25um-biaxial", "four-25um-biaxial")]
+    return [export_c(find_model(name), folder / name) for name in ("three-25um-biaxial-student", "four-25um-biaxial")]
 
 
 def _pointer(array):

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
@@ -54,6 +54,7 @@ BOARDS = {
 SINGLE_PRECISION = ("-DISOCHARGE_CHAIN_FLOAT", "-Wdouble-promotion")
 """Options of the compiler, of which the second refuses double precision, which small processors would emulate."""
 
+FOUR = "four-25um-biaxial-student"
 ELECTRODES = ("A", "B", "C", "D")
 RATE_Hz = 200.0
 HUM_Hz = 60.0
@@ -83,11 +84,11 @@ class Frames(NamedTuple):
     tare: np.ndarray
 
 
-def draw_frames(board, seed, seconds=20.0):
+def draw_frames(board, seed):
     """Draw the frames of a board: presses with noise, hum, drift and spikes, lost frames, and invalid values."""
     rng = np.random.default_rng(seed)
     n_electrode = len(ELECTRODES)
-    count = int(RATE_Hz * seconds)
+    count = 2400
     dt_s = rng.uniform(0.5, 1.5, count) / RATE_Hz
     dt_s[rng.random(count) < 0.01] *= 20.0  # frames were lost
     dt_s[0] = 0.0
@@ -110,9 +111,9 @@ def draw_frames(board, seed, seconds=20.0):
     return Frames(values, t_s, dt_s, limited, tare)
 
 
-def regular_frames(values, rate_Hz=RATE_Hz):
+def regular_frames(values):
     """Return frames of which none is limited or begins a tare."""
-    dt_s = np.full(len(values), 1.0 / rate_Hz)
+    dt_s = np.full(len(values), 1.0 / RATE_Hz)
     never = np.zeros(len(values), dtype=bool)
     return Frames(values, np.cumsum(dt_s), dt_s, limited=never, tare=never)
 
@@ -145,7 +146,7 @@ def python_chain(device, frames, misfit):
     return charge, tare_charge, np.array(contact), np.array(flags)
 
 
-def compare_chains(exported, device, frames, misfit=None, *, tolerance_pC):
+def compare_chains(exported, frames, misfit=None, *, tolerance_pC):
     """Check that C and Python give the same states and flags, and the same charges and tares within a tolerance.
 
     The flags of an estimated warming may differ in two of a thousand frames.
@@ -153,12 +154,12 @@ def compare_chains(exported, device, frames, misfit=None, *, tolerance_pC):
     Returns:
         Contact states and flags in C, shape (n,) each.
     """
-    expected_charge, expected_tare, expected_contact, expected_flags = python_chain(device, frames, misfit)
+    expected_charge, expected_tare, expected_contact, expected_flags = python_chain(exported.device, frames, misfit)
     charge, tare, contact, flags = exported.chain(*frames)
     np.testing.assert_array_equal(contact, expected_contact)
     other_bits = ALL_BITS - WARMING_BITS
     np.testing.assert_array_equal(flags & other_bits, expected_flags & other_bits)
-    assert np.mean(flags != expected_flags) <= (0.002 if device.rule(ThermalRule) else 0.0)
+    assert np.mean(flags != expected_flags) <= (0.002 if exported.device.rule(ThermalRule) else 0.0)
     np.testing.assert_allclose(charge, expected_charge, rtol=0, atol=tolerance_pC)
     np.testing.assert_allclose(tare, expected_tare, rtol=0, atol=tolerance_pC)
     return contact, flags
@@ -166,26 +167,25 @@ def compare_chains(exported, device, frames, misfit=None, *, tolerance_pC):
 
 @pytest.fixture(scope="module")
 def misfit():
-    predictor = Predictor("four-25um-biaxial")
+    predictor = Predictor(FOUR)
     return lambda charge_pC: predictor.predict_batch(charge_pC).misfit
 
 
 @pytest.mark.parametrize("board", BOARDS)
 def test_c_and_python_give_the_same_charges_and_states_for_each_frame(board, build, misfit):
     """The estimated warming depends on the network, whose values in C have other rounding errors."""
-    exported = build("four-25um-biaxial", device(board))
-    tolerance_pC = 0.2 if device(board).rule(ThermalRule) else 1e-9
-    for seed in range(2):
-        frames = draw_frames(board, seed, seconds=12.0)
-        compare_chains(exported, device(board), frames, misfit, tolerance_pC=tolerance_pC)
+    exported = build(FOUR, device(board))
+    tolerance_pC = 0.2 if exported.device.rule(ThermalRule) else 1e-9
+    frames = draw_frames(board, seed=len(board))
+    compare_chains(exported, frames, misfit, tolerance_pC=tolerance_pC)
 
 
 @pytest.mark.parametrize("board", ["any board", "hum"])
 def test_single_precision_changes_charges_by_less_than_a_twentieth_of_a_picocoulomb(board, build, misfit):
-    exported = build("four-25um-biaxial", device(board), options=SINGLE_PRECISION)
+    exported = build(FOUR, device(board), options=SINGLE_PRECISION)
     frames = draw_frames(board, seed=4)
     frames.values[np.abs(frames.values) > 1e30] = np.inf
-    compare_chains(exported, device(board), frames, misfit, tolerance_pC=0.05)
+    compare_chains(exported, frames, misfit, tolerance_pC=0.05)
 
 
 @pytest.mark.parametrize(("tau_s", "learn"), [(10.1, True), (1000.0, False)])
@@ -194,29 +194,28 @@ def test_single_precision_does_not_add_up_its_errors_in_a_held_press(tau_s, lear
     board = device_from_table({"leak": {"tau_s": tau_s, "learn": learn}}, "board")
     held_pC = np.where(T_OF_HOLD_s < 2.0, 0.0, 850.0 * np.exp(-(T_OF_HOLD_s - 2.0) / tau_s))
     frames = regular_frames(held_pC[:, None] + np.random.default_rng(1).standard_normal((len(held_pC), 4)))
-    exported = build("four-25um-biaxial", board, options=SINGLE_PRECISION)
-    compare_chains(exported, board, frames, tolerance_pC=0.2)
+    exported = build(FOUR, board, options=SINGLE_PRECISION)
+    compare_chains(exported, frames, tolerance_pC=0.2)
 
 
-@pytest.mark.parametrize("rate_Hz", [100.0, 200.0])
-def test_single_precision_learns_the_leak_from_the_same_frames_after_a_release(rate_Hz, build):
+def test_single_precision_learns_the_leak_from_the_same_frames_after_a_release(build):
     """Many sampling intervals add up to the hold-off after a touch, from which the inflow is learned again."""
     board = device_from_table({"leak": {"tau_s": 10.0, "settle_s": 2.5}}, "board")
-    t_s = np.arange(0.0, 40.0, 1.0 / rate_Hz)
+    t_s = np.arange(0.0, 40.0, 1.0 / RATE_Hz)
     pressed_pC = np.where((t_s > 2.0) & (t_s % 3.7 < 2.0), 850.0, 0.0)
-    decay = np.exp(-1.0 / (rate_Hz * 10.0))
+    decay = np.exp(-0.1 / RATE_Hz)
     leaking_pC = lfilter([1.0, -1.0], [1.0, -decay], pressed_pC)  # output of an amplifier that leaks
-    frames = regular_frames(leaking_pC[:, None] + np.random.default_rng(1).standard_normal((len(t_s), 4)), rate_Hz)
-    exported = build("four-25um-biaxial", board, options=SINGLE_PRECISION)
-    compare_chains(exported, board, frames, tolerance_pC=0.1)
+    frames = regular_frames(leaking_pC[:, None] + np.random.default_rng(1).standard_normal((len(t_s), 4)))
+    exported = build(FOUR, board, options=SINGLE_PRECISION)
+    compare_chains(exported, frames, tolerance_pC=0.1)
 
 
 def test_contact_that_a_drift_begins_has_the_flag_drift_in_c_as_in_python(build):
     """The zero of the board drifts by 6 pC/s, which the tare cannot follow."""
     drift_pC = 6.0 * np.arange(1000)[:, None] / RATE_Hz
     frames = regular_frames(np.random.default_rng(0).standard_normal((1000, 4)) + drift_pC)
-    exported = build("four-25um-biaxial", device("any board"))
-    contact, flags = compare_chains(exported, device("any board"), frames, tolerance_pC=1e-9)
+    exported = build(FOUR, device("any board"))
+    contact, flags = compare_chains(exported, frames, tolerance_pC=1e-9)
     np.testing.assert_array_equal((flags & BITS[DRIFT]) != 0, contact)
     assert contact[-1]
 
@@ -234,7 +233,7 @@ IMPATIENT_BOARD = device_from_table({"tare": {"frames": 20, "patience": 50}}, "b
 def test_failed_first_tare_is_reported_after_the_patience_of_the_board(build, restless_frames):
     with pytest.raises(TareError):
         python_chain(IMPATIENT_BOARD, restless_frames, None)
-    exported = build("three-25um-biaxial", IMPATIENT_BOARD)
+    exported = build("three-25um-biaxial-student", IMPATIENT_BOARD)
     _, _, _, flags = exported.chain(*restless_frames)
     first_failed, *_ = np.flatnonzero(flags & TARE_FAILED)
     assert first_failed == 49
@@ -276,11 +275,10 @@ DAMAGE = st.lists(st.tuples(st.integers(0, 3000), st.integers(0, 255)), max_size
 
 @pytest.fixture(scope="module")
 def exported(build):
-    return build("three-25um-biaxial")
+    return build("three-25um-biaxial-student")
 
 
 @given(pieces=st.lists(PIECES, max_size=6), damage=DAMAGE)
-@settings(max_examples=100, deadline=None)
 def test_c_and_python_parse_any_bytes_into_the_same_frames_and_counters(exported, pieces, damage):
     data = bytearray(b"".join(pieces) + b"\0")
     for position, value in damage:
@@ -295,7 +293,6 @@ def test_c_and_python_parse_any_bytes_into_the_same_frames_and_counters(exported
 
 
 @given(frame=FRAMES)
-@settings(max_examples=100, deadline=None)
 def test_c_and_python_write_the_same_frames(exported, frame):
     assert exported.encode(frame) == encode_frame(frame)
 

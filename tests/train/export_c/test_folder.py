@@ -30,6 +30,7 @@ from isocharge.train.export_c.folder import export_c
 from processes import finished
 
 HERE = Path(__file__).parent
+MODEL = "three-25um-biaxial-student"
 EXAMPLE = ("host_example.c", "isocharge_chain.c", "isocharge_frames.c", "isocharge_model.c")
 ONLY_PYTHON = {"gap", "repeat", "restart"}
 """Flags of a record that the example does not compute."""
@@ -100,7 +101,7 @@ def host(tmp_path_factory, compile_c):
     folder = tmp_path_factory.mktemp("host")
     (folder / "board.toml").write_text(BOARD)
     board = load_device(folder / "board.toml")
-    export = export_c(find_model("three-25um-biaxial"), folder / "c", board)
+    export = export_c(find_model(MODEL), folder / "c", board)
     options = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     return compile_c("gcc", export, folder / "host", *EXAMPLE, options=options), board
 
@@ -130,7 +131,7 @@ def test_a_recording_gives_our_records_frame_by_frame(host, film, tmp_path):
     faults = Faults(corrupt_share=0.0005, lose_share=0.01)
     sensor = VirtualSensor(film.charges, play, noise=lambda q, _: amplifier(q), faults=faults)
     data = b"".join(islice(sensor.frames(), 2400))
-    expected = list(TouchStream(Predictor("three-25um-biaxial"), board).feed(Chunk(data, 0.0, 0)))
+    expected = list(TouchStream(Predictor(MODEL), board).feed(Chunk(data, 0.0, 0)))
     (tmp_path / "frames.bin").write_bytes(data)
     code, records, err = played(program, tmp_path / "frames.bin")
     assert (code, err) == (0, "")
@@ -146,7 +147,7 @@ def test_host_example_says_what_is_wrong(host, tmp_path):
     (tmp_path / "noisy").write_bytes(b"".join(encode_frame(Frame(k, 5000 * k, tuple(q))) for k, q in enumerate(noisy)))
     for name, message in [
         ("text", "no intact frame came"),
-        ("four", "expected 3 charges, as the model three-25um-biaxial/1 has electrodes; frame 0 has 4"),
+        ("four", "expected 3 charges, as the model three-25um-biaxial-student/1 has electrodes; frame 0 has 4"),
         ("noisy", "cannot tare"),
         ("missing", "No such file"),
     ]:
@@ -180,7 +181,7 @@ def test_sketch_prints_our_contacts_and_sends_frames_that_we_read(exports, tmp_p
     pins = pins.astype(int)
     printed = run_sketch(export, tmp_path, pins).decode()
     data = b"".join(encode_frame(Frame(k, 5000 * (k + 1), tuple(map(float, row)))) for k, row in enumerate(pins))
-    records = TouchStream(Predictor("three-25um-biaxial"), device_from_table({}, "x")).feed(Chunk(data, 0.0, 0))
+    records = TouchStream(Predictor(MODEL), device_from_table({}, "x")).feed(Chunk(data, 0.0, 0))
     expected = [record.force_N for record in records if record.contact]
     assert len(expected) > 150
     np.testing.assert_allclose([float(force) for force in re.findall(r">force_N:(\S+)", printed)], expected, atol=1e-3)
@@ -193,7 +194,7 @@ def test_sketch_prints_our_contacts_and_sends_frames_that_we_read(exports, tmp_p
 def test_clock_of_a_board_that_begins_again_leaves_the_hum_removed(tmp_path):
     """After 71.6 minutes, `micros` is 0 again. A hum with another phase would look like touches."""
     device = device_from_table({"hum": {"frequency_Hz": 50.0}}, "x")
-    export = export_c(find_model("three-25um-biaxial"), tmp_path / "c", device) / "arduino" / "isocharge_sketch"
+    export = export_c(find_model(MODEL), tmp_path / "c", device) / "arduino" / "isocharge_sketch"
     times_s = 0.005 * np.arange(2000)
     hum = 40.0 * np.sin(2.0 * np.pi * (50.0 * times_s + 0.1))
     pins = np.random.default_rng(1).normal(20.0, 1.0, (2000, 3)) + hum[:, None]

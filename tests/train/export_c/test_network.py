@@ -4,7 +4,6 @@ import itertools
 from dataclasses import replace
 
 import numpy as np
-import onnxruntime
 import pytest
 from tests.train.random_networks import (
     check_agreement,
@@ -15,10 +14,10 @@ from tests.train.random_networks import (
 
 from isocharge.serve import find_model, load_model
 from isocharge.serve.model.session import COLUMNS
-from isocharge.train.model_release.onnx_graph import read_graph, write_graph
+from isocharge.train.model_release.onnx_graph import read_graph
 from isocharge.train.training.network import signed_features
 
-MODELS = ("three-25um-biaxial", "four-25um-biaxial", "four-25um-uniaxial", "four-25um-biaxial-student")
+MODELS = ("three-25um-biaxial", "four-25um-uniaxial", "four-25um-biaxial-student")
 
 
 def onnxruntime_answers(model, charge_pC):
@@ -33,7 +32,7 @@ def test_extreme_charges_are_finite_as_in_onnxruntime_and_nan_is_nan(model, buil
     """Zero, negative, huge, denormal and infinite charges; their misfits are large."""
     exported = build(model)
     values = (0.0, -1.0, -3e38, 1e-45, 1.0, 800.0, 1e6, 3e38, np.inf, -np.inf)
-    charge_pC = np.array(list(itertools.product(values, repeat=exported.electrodes)), np.float32)[::7]
+    charge_pC = np.array(list(itertools.product(values, repeat=exported.electrodes)), np.float32)[::23]
     given = exported.predict(charge_pC)
     assert np.isfinite(given).all()
     # The answers are large there and pass through exponentials, which amplify the error of 4e-7 of tanh to 1e-4.
@@ -70,10 +69,9 @@ def test_large_logarithms_are_limited_as_in_onnxruntime(build, tmp_path):
     """The standard deviations of an unlimited network would be infinite and zero in single precision."""
     network = random_network(4, (24, 24), (16, 16)).with_scaled_std(1e50, 1e-50)
     charge_pC = np.random.default_rng(2).uniform(50.0, 5000.0, (500, 4)).astype(np.float32)
-    graph = write_graph(network, {})
-    in_onnxruntime = onnxruntime.InferenceSession(graph).run(["contact_std"], {"charge_pC": charge_pC})[0]
-    in_c = build(write_random_model(tmp_path / "limited", network)).predict(charge_pC)[:, 3:6]
-    for std in (in_onnxruntime, in_c, network.outputs(charge_pC)[1]):
+    folder = write_random_model(tmp_path / "limited", network)
+    answers = onnxruntime_answers(folder, charge_pC), build(folder).predict(charge_pC)
+    for std in (*(rows[:, 3:6] for rows in answers), network.outputs(charge_pC)[1]):
         np.testing.assert_allclose(np.log(std), np.full((500, 3), [50.0, 50.0, -50.0]), rtol=1e-6)
 
 

@@ -11,18 +11,17 @@ from tests.train.measured import measured_presses, with_samples
 
 from isocharge.cli.train import report as report_module
 from isocharge.common.errors import DatasetError, ModelError, OutputExists, PressError
-from isocharge.serve import benchmark, find_model
+from isocharge.serve import find_model
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.model.model_folder import load_model
-from isocharge.simulate import Circle, NoiseModel, Sweep, load_sensor
-from isocharge.simulate.dataset.sweep import write_sweep
+from isocharge.simulate import Circle, NoiseModel, load_sensor
 from isocharge.train.data.contact_errors import contact_error_statistics
 from isocharge.train.data.presses import LabelledPresses, dataset_of
 from isocharge.train.report import QUICK, evaluation, page, write_report
 from isocharge.train.report.evaluation import Method, measure_methods
 
 NAME = "three-25um-biaxial"
-SMALL = replace(QUICK, presses=128, seconds=1e-3)
+SMALL = replace(QUICK, presses=64, seconds=1e-3)
 METHODS = {  # further methods may be registered
     f"network `{NAME}/1`",
     "triangulation",
@@ -34,9 +33,7 @@ METHODS = {  # further methods may be registered
 def report(dataset, tmp_path_factory):
     """The folder, the record and the page of a report."""
     folder = tmp_path_factory.mktemp("report") / "out"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(benchmark, "ROUNDS", 2)
-        record = write_report(folder, [(dataset, find_model(NAME))], SMALL)
+    record = write_report(folder, [(dataset, find_model(NAME))], SMALL)
     return folder, record, (folder / "report.md").read_text("utf-8")
 
 
@@ -160,7 +157,8 @@ def test_model_of_presses_alone_is_not_tested_on_its_own_presses(dataset):
         evaluation.check_same_sensor(metadata, measured(dataset, (1.0, 1.0)))
 
 
-def test_limit_of_an_inaccurate_series_is_left_out_with_the_reason(dataset, tmp_path):
+def test_limit_of_an_inaccurate_series_is_left_out_with_the_reason(dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluation, "METHOD_BUILDERS", ())
     few = replace(dataset, samples=dataset.samples[np.arange(3_000)])
     record = write_report(tmp_path / "out", [(few, find_model(NAME))], SMALL)
     (section,) = record["datasets"]
@@ -176,7 +174,7 @@ def test_existing_folder_is_refused(dataset, tmp_path):
 
 
 def test_report_command_takes_the_model_of_the_sensor_unless_another_is_given(
-    film, tmp_path, command, refused, monkeypatch
+    dataset_folder, tmp_path, command, refused, monkeypatch
 ):
     out = tmp_path / "out"
     evaluated_models = []
@@ -185,7 +183,7 @@ def test_report_command_takes_the_model_of_the_sensor_unless_another_is_given(
         evaluated_models.extend(model for _, model in subjects)
 
     monkeypatch.setattr(report_module, "write_report", record_models)
-    words = "train", "report", write_sweep(tmp_path / "presses", (film,), Sweep(samples=60)), "-o", out
+    words = "train", "report", dataset_folder, "-o", out
     assert command(*words) == (0, "", f"{out / 'report.md'}\n")
     assert command(*words, "--model", f"{NAME}-student")[0] == 0
     assert evaluated_models == [find_model(NAME), find_model(f"{NAME}-student")]

@@ -22,10 +22,10 @@ from isocharge.train.data.presses import position_ranks
 from isocharge.train.model_release.evaluate import contact_errors
 from isocharge.train.model_release.release import release
 from isocharge.train.training.cross_fit import usable_presses
-from kept import ROOT, kept
+from kept import ROOT
 
-QUICK = short_training(24, 24, 250, 200, 6_000)
-QUICKER = short_training(24, 24, 80, 80, 2_000)
+QUICK = short_training(24, 24, 250, 150, 4_000)
+QUICKER = short_training(16, 16, 60, 40, 1_000)
 """Training of a network whose errors are not compared with the smallest possible errors."""
 
 SLOPES = np.array([[0.6, 0.1, 2.0], [-0.5, 0.4, 1.0], [0.1, -0.6, 2.0], [0.2, 0.2, -4.0]])
@@ -72,15 +72,10 @@ def presses_on_l():
     return measured_presses(contact, charges_on_l(contact, 1), CHANNELS)
 
 
-def fit_to_l():
-    """Train a network on the presses on the L."""
-    return fit_presses(presses_on_l(), "pad", QUICK)
-
-
 @pytest.fixture(scope="module")
 def fitted_pad():
     """The network that was trained on the presses on the L."""
-    return kept(fit_to_l)
+    return fit_presses(presses_on_l(), "pad", QUICK)
 
 
 @pytest.fixture(scope="module")
@@ -211,11 +206,6 @@ def with_column(name, column, new_values):
     return replace(presses, **{name: rows})
 
 
-def with_channel(channel, new_charge):
-    """Return the presses on the L with other charges of one channel; see `with_column`."""
-    return with_column("charge_pC", channel, new_charge)
-
-
 def in_eighth_press(value, column):
     """Return a function that returns a column of an array with another value in the eighth row."""
     return lambda rows: np.where(np.arange(len(rows)) == 7, value, rows[:, column])
@@ -237,11 +227,11 @@ FAULTY_PRESSES = {
         r"expected 3 to 32 channels, got 2 \(Q1, Q2\)",
     ),
     "a sum of channels": (
-        with_channel(3, lambda charge: charge[:, 0] + charge[:, 2]),
+        with_column("charge_pC", 3, lambda charge: charge[:, 0] + charge[:, 2]),
         "channels 'Q1', 'Q3', 'Q4': expected charges that are linearly independent",
     ),
     "a charge of 1e37": (
-        with_channel(2, in_eighth_press(1e37, 2)),
+        with_column("charge_pC", 2, in_eighth_press(1e37, 2)),
         r"^line 9, column 'Q3': expected a value of the size of the others, whose median is .* got 1e\+37; correct it",
     ),
     "a force of 1e20": (
@@ -249,11 +239,11 @@ FAULTY_PRESSES = {
         r"^line 9, column 'force_N': .* got 1e\+20",
     ),
     "a channel that is constant but for rounding": (
-        with_channel(2, lambda charge: 5.0 + 1e-12 * charge[:, 2]),
+        with_column("charge_pC", 2, lambda charge: 5.0 + 1e-12 * charge[:, 2]),
         "channel 'Q3': expected charges that vary, got 5 in 1200 of 1200",
     ),
     "a channel with a single charge": (
-        with_channel(2, lambda _: np.where(np.arange(1_200) == 7, 5.0, 0.0)),
+        with_column("charge_pC", 2, lambda _: np.where(np.arange(1_200) == 7, 5.0, 0.0)),
         "channel 'Q3': expected charges that vary, got 0 in 1199 of 1200 presses",
     ),
     "positions with one y but for rounding": (
@@ -329,14 +319,13 @@ def test_intact_presses_are_accepted_without_a_warning(caplog):
         usable_presses(measured_presses(presses.contact, unit * presses.charge_pC, CHANNELS))
     is_zero = np.random.default_rng(7).random((1_200, 4)) < 0.9
     usable_presses(measured_presses(presses.contact, np.where(is_zero, 0.0, presses.charge_pC), CHANNELS))
-    usable_presses(with_channel(1, lambda charge: charge[:, 0] * (1.0 + 0.01 * JITTER)))
+    usable_presses(with_column("charge_pC", 1, lambda charge: charge[:, 0] * (1.0 + 0.01 * JITTER)))
     assert not caplog.text
 
 
 def test_model_of_three_channels_fits_presses_like_those_of_its_training(fresh, tmp_path):
     """Three charges always fit a plane exactly, but the misfit that the network states is not exactly zero."""
-    few_steps = short_training(24, 24, 50, 50, 1_000)
-    fitted = fit_presses(presses_on_l().of_electrodes(CHANNELS[:3], "pad"), "pad", few_steps)
+    fitted = fit_presses(presses_on_l().of_electrodes(CHANNELS[:3], "pad"), "pad", QUICKER)
     _, _, misfit = fitted.predict(fresh.charge[:, :3])
     assert np.mean(misfit > evaluate(fitted)["misfit_p99"]) < 0.03
     predictor = Predictor(release(fitted, tmp_path / "pad").folder)

@@ -28,6 +28,9 @@ def test_a_training_on_a_dataset_needs_no_solver(dataset_folder, tmp_path):
     (tmp_path / "short.toml").write_text(SHORT_CONFIG)
     code = """import sys
 from isocharge.cli.main import main
+from isocharge.simulate.identifiability import working_area
+from isocharge.train.training import contact_training
+working_area.RADIUS_STEP = contact_training.LOSS_TOLERANCE = 1.0  # to save time
 try:
     main()
 finally:
