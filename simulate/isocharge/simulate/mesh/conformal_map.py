@@ -127,7 +127,6 @@ def _enclosing_radius(outline: Complexes, centre: Array, rim_gap: Array) -> Arra
 def sector_angles(
     blocks: Blocks,
     inner_points: Complexes,
-    inner_extent: Array,
     centroid: Array,
     centre: Array,
     radius: Array,
@@ -137,16 +136,14 @@ def sector_angles(
 
     The sectors divide the rings between the innermost circle and the rim. Their sides begin where rays from the
     centroid of the footprint meet the circle. The last layer of elements inside the circle connects the circle to an
-    inner boundary. The directions of the rays are a compromise between evenly spaced directions and the directions of
-    given points on the inner boundary. If the gap between these points and the circle is narrow, the rays must pass
-    close to the points, because elements would fold otherwise.
+    inner boundary. Each of the given points on the inner boundary has a ray that passes through it. In other
+    directions, elements at the edges of irregular polygons would fold. All other rays divide the angle between two such
+    rays into equal parts.
 
     Args:
         blocks: The elements.
         inner_points: Points x + iy on the inner boundary of the last layer, shape (..., 2 * n_meshed + 1), in film
             radii. They belong to the corners of the core polygon and to the points half-way between the corners.
-        inner_extent: Largest distance of a point of the inner boundary from the centre of the circle, shape (...), in
-            film radii.
         centroid: Position of the centroid of the footprint on the x axis, shape (...), in film radii.
         centre: Position of the centre of the circle on the x axis, shape (...), in film radii.
         radius: Radius of the circle, shape (...), in film radii.
@@ -157,7 +154,8 @@ def sector_angles(
         Angles in the template plane in increasing order, shape (..., n_sector + 1), rad.
     """
     origin = centroid[..., None] + 0j  # common origin of all rays
-    ray_angle = _ray_angles(blocks, inner_points - origin, radius / inner_extent)
+    inner_angle = np.unwrap(np.angle(inner_points - origin), axis=-1)
+    ray_angle = divide_intervals(inner_angle, blocks.n_half_edge)
     ray = np.exp(1j * ray_angle)  # unit vectors x + iy, shape (..., n_sector + 1)
     origin_from_centre = np.asarray(origin - centre[..., None], dtype=complex)
     intersection = _intersections_with_circle(origin_from_centre, ray, radius[..., None])
@@ -187,41 +185,6 @@ def _intersections_with_circle(origin: Complexes, ray: Complexes, radius: Array)
     projection = (origin * np.conj(ray)).real
     length = np.sqrt(projection**2 + radius**2 - np.abs(origin) ** 2) - projection
     return np.asarray(origin + ray * length)
-
-
-def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) -> Array:
-    """Compute the directions of the rays that extend from the centroid of the footprint to the sides of the sectors.
-
-    The last layer of elements inside the innermost circle connects the circle to an inner boundary. Each of the given
-    points on the inner boundary has a ray. The direction of the ray is the direction of the point, rotated by a limited
-    angle towards evenly spaced directions. All other rays divide the angle between two such rays into equal parts.
-
-    Args:
-        blocks: The elements.
-        inner_points: Points x + iy on the inner boundary, relative to the centroid, shape (..., n_point): one point for
-            each corner of the core polygon, and one point half-way between each two corners.
-        radius_ratio: Radius of the innermost circle divided by the largest distance of the inner boundary from the
-            centre of the circle, shape (...).
-
-    Returns:
-        Angles, shape (..., n_sector + 1), rad.
-    """
-    # Angles with equal differences that have the same mean as the angles of the inner points, shape (..., n_point)
-    inner_angle = np.unwrap(np.angle(inner_points), axis=-1)
-    angle_from_first = np.linspace(0.0, 2.0 * np.pi / blocks.copies, inner_angle.shape[-1])
-    mean_difference = np.mean(inner_angle[..., :-1] - angle_from_first[:-1], axis=-1)
-    even_angle = angle_from_first + mean_difference[..., None]
-
-    # Rotate the direction of each inner point towards the even angle. The rotation is small if the circle is close to
-    # the inner points. The function `tanh` limits the rotation. With a larger limit, elements at corners that lie close
-    # together would fold.
-    max_rotation = 0.2  # rad
-    share = 0.5 * np.minimum((radius_ratio - 1.0) / CLEARANCE, 1.0)[..., None]  # of the difference, from 0 to 0.5
-    rotation = max_rotation * np.tanh(share * (even_angle - inner_angle) / max_rotation)
-    mixed_angle = inner_angle + rotation
-
-    # Add the rays between the rays of the inner points.
-    return divide_intervals(mixed_angle, blocks.n_half_edge)
 
 
 def rim_angles(angle: Array, map_parameter: Array, template_radius: Array) -> Array:

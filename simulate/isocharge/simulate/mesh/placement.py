@@ -98,25 +98,21 @@ class Placement:
         # layer of elements inside the circle connects the circle to an inner boundary. The inner boundary is the edge
         # of the core polygon, or the edge of a curved footprint that is not circular. `inner_points` are the points of
         # the inner boundary that belong to the corners of the core polygon and to the points half-way between them.
-        # `inner_extent` is the largest distance of the inner boundary from the centre of the circle.
         inner_points: Complexes = np.asarray(corners @ blocks.core_outline[:: blocks.n_half_edge].T)
         if probe.topology.fills_circle:
             centre = centroid
             radius = np.full(centroid.shape, probe.reach / film_radius)
-            inner_boundary = corners
         else:
-            inner_boundary = centroid[..., None] + probe.outline / film_radius * rotation_factor[..., None]
-            centre, radius = enclosing_circle(inner_boundary, centroid)
+            outline = centroid[..., None] + probe.outline / film_radius * rotation_factor[..., None]
+            centre, radius = enclosing_circle(outline, centroid)
             if isinstance(probe, CurvedProbe) and probe.topology.is_curved:
                 boundary = probe.boundary(blocks.boundary_parameter[:: blocks.n_half_edge])
                 inner_points = centroid[..., None] + boundary / film_radius * rotation_factor[..., None]
 
-        inner_extent = np.abs(inner_boundary - centre[..., None]).max(axis=-1)
-
         # Compute the conformal map of the innermost circle, and the angles and depths of the elements around it.
         map_parameter, template_radius = automorphism_onto(centre, radius)
         circle_stretch = map_stretch(map_parameter, template_radius)
-        circle_angles = sector_angles(blocks, inner_points, inner_extent, centroid, centre, radius, circle_stretch)
+        circle_angles = sector_angles(blocks, inner_points, centroid, centre, radius, circle_stretch)
         template_thin_ring_width = thin_ring_width * map_stretch(map_parameter, 1.0)
         return cls(
             map_parameter=map_parameter,
