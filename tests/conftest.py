@@ -17,7 +17,7 @@ from hypothesis import settings
 from extras import PACKAGES
 from isocharge.cli.main import main
 from processes import finished
-from whole_films import whole_film_map_solved_once
+from whole_films import whole_film_map_solved_once, yield_force_solved_once
 
 ROOT = Path(__file__).parents[1]
 
@@ -80,12 +80,13 @@ def few_solves():
     """Compare each forward map with four direct solves instead of ten when it is built, and solve each film once.
 
     The tests build many maps. The tests of the forward map compare it with further direct solves. The coarse map of a
-    whole film is solved once for all sweeps and all mirror regions of this film.
+    whole film is solved once for all sweeps and all mirror regions of this film, and so is its yield force.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("isocharge.simulate.forward.forward_map.CHECK_COUNT", 4)
         for module in ("dataset.sweep", "identifiability.mirror_region"):
             patch.setattr(f"isocharge.simulate.{module}.whole_film_map", whole_film_map_solved_once)
+        patch.setattr("isocharge.simulate.dataset.sweep.yield_force", yield_force_solved_once)
         yield
 
 

@@ -1,10 +1,11 @@
-"""Maps that the tests solve once, because each takes several seconds, and parts of them."""
+"""Maps and yield forces that the tests solve once, because a map takes several seconds, and parts of maps."""
 
 from dataclasses import replace
 
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE
 from isocharge.simulate import Domain, ForwardMap, load_sensor
 from isocharge.simulate.forward.whole_film import whole_film_map
+from isocharge.simulate.solver.stress_limit import yield_force
 from kept import kept
 
 BUILD = ForwardMap.build  # also if a test replaces the method
@@ -20,6 +21,11 @@ def whole_film_map_solved_once(sensor, probe, force_range, **_executor):
     is_part = low <= force_range[0] and force_range[1] <= high
     solved = kept(whole_film_map, layout, probe, DEFAULT_FORCE_RANGE if is_part else force_range)
     return part_of(solved, sensor, solved.domain.radius, force_range)
+
+
+def yield_force_solved_once(film, probes, force_range):
+    """Return the smallest force at which a film yields."""
+    return kept(yield_force, film, tuple(probes), force_range)
 
 
 def part_of(solved, sensor, radius, force_range):

@@ -25,7 +25,7 @@ from isocharge.simulate import (
 from isocharge.simulate.mechanics.theory import rotate_stress
 from solved_charges import relative_error
 
-REFINED = Resolution(order=7, around=8, rings=6)
+REFINED = Resolution(order=6, around=8, rings=6)
 MEMBRANE = Theory(bending=False)
 FULL = Theory(bending=True)
 SLACK = Film(radius=45.0, thickness=0.025, young=3000.0, poisson=0.34)

@@ -17,7 +17,6 @@ from isocharge.common.errors import InputError, WorkersLost
 from isocharge.common.progress import listening
 from isocharge.simulate import Circle, Sweep, load_sensor, run_sweep
 from isocharge.simulate import execution as module
-from isocharge.simulate.dataset import sweep
 from isocharge.simulate.execution import dask_workers, in_order, local_workers
 from worker_jobs import kill_this_process, send_half_of_a_result, waited
 
@@ -29,14 +28,6 @@ def sweep_with(executor: Executor | None, target: Path) -> dict[str, bytes]:
     """The files of a small sweep of two probes in shards of ten."""
     run_sweep(target, SENSOR, (Circle(1.0), Circle(0.8)), SWEEP, COARSE, executor=executor, shard=10)
     return {path.name: path.read_bytes() for path in target.iterdir()}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _yield_force_is_known():
-    """Do not solve for the yield force, which no worker computes."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweep, "yield_force", lambda *_: 0.9)
-        yield
 
 
 @pytest.fixture(scope="module")

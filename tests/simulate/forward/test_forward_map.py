@@ -84,7 +84,7 @@ def test_forward_map_agrees_with_direct_solves_for_random_orientations(oriented_
 
 def test_footprint_grows_with_the_cube_root_of_the_force(near_electrodes):
     """The expected charges are those of fingers with the radius that each force has, solved one by one."""
-    wide_range = QUICK | {"force_range": (0.125, 1.0)}
+    wide_range = QUICK | {"radius": 2.5, "force_range": (0.125, 1.0)}
     sensor = with_piezo(near_electrodes, d33=-20.0)
     growing = ForwardMap.build(sensor, GrowingFinger(2.0), **wide_range)
     contact, _ = draw(growing, 3, seed=3)

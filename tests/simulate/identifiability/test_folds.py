@@ -10,9 +10,7 @@ from function_map import FOLD_X, FunctionMap, folded_map, shaped_charges
 from isocharge.common.errors import SceneError
 from isocharge.simulate import (
     ChargeSpline,
-    Circle,
     Domain,
-    ForwardMap,
     load_sensor,
     noise_model,
     working_area,
@@ -25,7 +23,6 @@ from isocharge.simulate.identifiability.working_area import (
     find_folds,
 )
 from isocharge.simulate.numerics.disk import Rings
-from kept import kept
 from solved_charges import with_squares
 from whole_films import part_of
 
@@ -52,15 +49,9 @@ INNER = ((-0.9, 1.4), (8.7, 11.4), (15.2, -18.1), (-14.7, -5.3))
 
 
 @pytest.fixture(scope="module")
-def film():
-    """Forward map of one film. Other layouts and coefficients use the same solves."""
-    return kept(ForwardMap.build, load_sensor("three-25um-biaxial"), Circle(1.0), 11.5, FORCES)
-
-
-@pytest.fixture(scope="module")
-def inner(film):
+def inner(three_map):
     """Charges of square electrodes at the positions `INNER` under small forces."""
-    return ChargeSpline.of(part_of(film, with_squares(film.sensor, *INNER), 4.0, (0.05, 0.06)))
+    return ChargeSpline.of(part_of(three_map, with_squares(three_map.sensor, *INNER), 4.0, (0.05, 0.06)))
 
 
 @pytest.mark.parametrize(
@@ -130,9 +121,9 @@ def test_find_folds_finds_nothing_beside_an_electrode(inner):
     assert len(find_folds(inner, Rings.spread(4.0, 13, 60), 0.05, REFERENCE)[0]) == 0
 
 
-def test_nearest_fold_agrees_with_signs_of_the_determinant_on_a_fine_grid(film):
+def test_nearest_fold_agrees_with_signs_of_the_determinant_on_a_fine_grid(three_map):
     """The determinant of J is computed by finite differences on a grid. Folds separate regions of different sign."""
-    model = ChargeSpline.of(part_of(film, load_sensor("three-25um-uniaxial"), 5.5, FORCES), spacing=0.4)
+    model = ChargeSpline.of(part_of(three_map, load_sensor("three-25um-uniaxial"), 5.5, FORCES), spacing=0.4)
     steps = 0.1 * np.arange(-38, 39)
     x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
     contact = np.stack([x, y, np.full(x.size, 0.316)], axis=1)

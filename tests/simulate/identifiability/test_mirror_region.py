@@ -8,11 +8,9 @@ import pytest
 
 from function_map import FunctionMap
 from isocharge.common.contact_domain import Domain
-from isocharge.simulate import Circle, ForwardMap, load_sensor, noise_model
-from isocharge.simulate.forward.charge_map import within
+from isocharge.simulate import Circle, load_sensor, noise_model
 from isocharge.simulate.identifiability.mirror_region import MirrorRegion, has_mirror, mirror_region
 from isocharge.simulate.identifiability.nearest_contact import search
-from kept import kept
 from solved_charges import with_film
 from whole_films import whole_film_map_solved_once
 
@@ -62,10 +60,9 @@ def test_an_electrode_at_another_radius_removes_the_mirror_region():
     assert "differ from those of every press in the working area" in region.summary
 
 
-def test_a_press_at_20_mm_on_the_film_has_the_charges_of_one_at_5_mm():
+def test_a_press_at_20_mm_on_the_film_has_the_charges_of_one_at_5_mm(three_map):
     """The mirror image in the circle of 10 mm is at R^2 / r = 5 mm. On the film, it is at 5.2 mm, with 0.24 N."""
-    solved = kept(ForwardMap.build, load_sensor("three-25um-biaxial"), PROBE, 11.5, FORCES)  # of the same film
-    inside = within(replace(solved, sensor=SENSOR), 9.0)
+    inside = replace(three_map, sensor=SENSOR)
     coarse = whole_film_map_solved_once(SENSOR, PROBE, FORCES)
     charge = coarse.charges(np.array([[20.0, 0.0, 0.5], [0.0, -20.0, 0.5], [10.2, 0.0, 0.5]]))
     contact, _ = search(inside, charge[:1], NOISE.sigma(charge[:1]), candidates=512)

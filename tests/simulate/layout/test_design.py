@@ -33,8 +33,8 @@ def _rough(fields):
     """Fewer presses, forces and layouts, and stress fields and a forward map that have already been solved."""
     with pytest.MonkeyPatch.context() as patch:
         for module, name, value in (
-            (case_module, "FINE_PRESSES", 160),
-            (case_module, "SEARCH_PRESSES", 40),
+            (case_module, "FINE_PRESSES", 100),
+            (case_module, "SEARCH_PRESSES", 24),
             (design_module, "STARTS", 2),
             (design_module, "ROUNDS", 2),
             (design_module, "DEFAULT_FORCE_RANGE", FORCES),

@@ -90,7 +90,7 @@ def test_locate_is_the_inverse_of_the_element_map(scene, seed):
     disk = np.sqrt(rng.random(120)) * np.exp(2j * np.pi * rng.random(120))
     near = placement.corners.mean() + 3.0 * probe.reach / RADIUS * disk[:100]
     rim = np.exp(2j * np.pi * rng.random(20))
-    film = np.concatenate([disk, near[np.abs(near) < 1.0], rim, placement.element_points(mesh).ravel()])
+    film = np.concatenate([disk, near[np.abs(near) < 1.0], rim, placement.element_points(mesh).ravel()[::7]])
     if mesh.half:
         film = film.real + 1j * np.abs(film.imag)
     np.testing.assert_array_less(np.abs(found_again(placement, mesh, film) - film), accuracy(film, placement))

@@ -13,7 +13,7 @@ MEMBRANE = Theory(bending=False)
 FULL = Theory(bending=True)
 CIRCLE = Circle(1.0)
 RECTANGLE = Polygon.rectangle(4.0, 2.0, 0.4)
-FAILING = SolveSettings(theory=MEMBRANE, resolution=Resolution(4, 8, 3), tolerance=1e-30)
+FAILING = SolveSettings(theory=MEMBRANE, resolution=Resolution(3, 8, 2), tolerance=1e-30)
 
 
 @pytest.mark.parametrize(
