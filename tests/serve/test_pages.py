@@ -84,7 +84,7 @@ def sensor(film, desks):
 def test_examples_of_the_pages_run(page_example, desks, installed, start_http, run_example, run_commands):
     """In the order of the page, in the install that it names; Python prints what the comments say."""
     text = re.sub("isocharge serve virtual .* --rest 30 &", "sleep 60 &", page_example.text)
-    text = text.replace("--seconds 10", "--seconds 1")
+    text = text.replace("--seconds 10", "--seconds 1").replace("bench --seconds 2", "bench --seconds 0.2")
     folder, environment = desks[page_example.page], installed(*page_example.extras)
     if page_example.language == "python":
         if "127.0.0.1:8000" in text:
