@@ -11,7 +11,6 @@ import subprocess
 import sys
 import time
 from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -27,9 +26,8 @@ from isocharge.common.progress import report, track
 from isocharge.common.toml_text import to_toml
 from isocharge.serve import find_model, load_model
 from isocharge.simulate import ForwardMap, Sweep, load_sensor
-from isocharge.simulate.dataset.sweep import solve_maps
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
-from kept import ROOT, kept
+from kept import ROOT
 from whole_films import build_from_default_map
 
 SENSOR = "three-25um-biaxial"
@@ -75,24 +73,25 @@ def test_simulate_point_reports_the_side_force_and_the_friction_of_a_vertical_st
 SMALL = ["simulate", "sweep", SENSOR, "--radius", "3", "--force", "1", "1"]
 """A sweep of a small family."""
 
-WITH_FEW_SOLVES = """
+WITHOUT_SOLVES = """
 from isocharge.cli.main import main
 from isocharge.simulate.dataset import sweep
-from isocharge.simulate.forward import forward_map
+from whole_films import build_from_default_map
 
-forward_map.CHECK_COUNT = 2
+sweep.ForwardMap.build = build_from_default_map
 sweep.outside_map = sweep.yield_force = lambda *_, **__: None
 sweep._shard_size = lambda *_: 500
 main()
 """
-"""Program of the command, with two direct solves for comparison and without presses outside the radius."""
+"""Program of the command with a solved map, small shards, and no presses outside the radius."""
 
 
 def test_a_stopped_sweep_leaves_no_file_and_no_process(tmp_path):
     """The command and its workers get SIGTERM at the first of many shards, as from a service manager."""
     process = subprocess.Popen(
-        [sys.executable, "-c", WITH_FEW_SOLVES, *SMALL, "--samples", "20000", "--workers", "2", "-o", "presses"],
+        [sys.executable, "-c", WITHOUT_SOLVES, *SMALL, "--samples", "20000", "--workers", "2", "-o", "presses"],
         cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT / "tests")},
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
@@ -272,10 +271,10 @@ def test_bad_input_is_one_clear_line_and_leaves_nothing(refused, tmp_path, monke
 def test_the_demo_end_to_end(capsys, tmp_path, monkeypatch):
     """The sweep, the training and the maps are replaced. The errors are those on the card of the released model."""
     figures, released, out = [], find_model(SENSOR), tmp_path / "first-light"
+    monkeypatch.setattr(ForwardMap, "build", build_from_default_map)
     for name, stub in {
         "Sweep": lambda **_: Sweep(samples=40, outside=40),
         "FOLLOWED_FRAMES": 400,
-        "solve_maps": partial(kept, solve_maps),
         "fit": lambda *_: None,
         "release": lambda _, folder, **__: load_model(shutil.copytree(released, folder / "1")),
         "save_picture": lambda figure, _: figures.append(figure),

@@ -8,7 +8,7 @@ import pytest
 from isocharge.common.errors import SolveError
 from isocharge.simulate import Circle, Polygon, Resolution, SolveSettings, Theory, deflection, press
 
-FORCES = (1e-5, 0.1, 10.0)
+FORCES = (1e-5, 10.0)
 MEMBRANE = Theory(bending=False)
 FULL = Theory(bending=True)
 CIRCLE = Circle(1.0)
