@@ -51,7 +51,7 @@ def _each_press_solved_once(monkeypatch):
 @pytest.fixture(scope="module")
 def solved(problem) -> FilmCharges:
     """The solved film of the sensor file, for presses like those of `CONTACT`."""
-    return solve_even_at(replace(problem, radius=6.0, force_range=(0.2, 1.0)), 3, 4)
+    return solve_even_at(replace(problem, radius=6.0, force_range=(0.2, 1.0)), 2, 4)
 
 
 @pytest.fixture

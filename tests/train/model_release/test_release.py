@@ -61,8 +61,9 @@ def released(fitted, tmp_path_factory):
 
 def _slow_if_solved(name):
     """Mark models whose film or area is not simulated by other tests as slow."""
-    is_solved_for_it = name.endswith("mm") or name.startswith("eight")
-    return pytest.param(name, marks=pytest.mark.slow) if is_solved_for_it else name
+    if name.endswith("mm") or name.startswith(("eight", "four-25um-biaxial")):  # beyond 8 mm
+        return pytest.param(name, marks=pytest.mark.slow)
+    return name
 
 
 @pytest.fixture(scope="module", params=map(_slow_if_solved, model_names(MODELS)))
