@@ -14,7 +14,7 @@ from kept import kept
 QUICK = short_training(32, 24, 150, 200, 2_000)
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def rough_training():
     """Search for folds on few rings, train fewer networks in a cross-validation, and fit the covariance roughly."""
     with pytest.MonkeyPatch.context() as patch:
@@ -46,13 +46,13 @@ def dataset(dataset_folder):
     return read_dataset(dataset_folder)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def split(dataset):
-    """The split of the dataset into presses for training and for the test, with the charge series of all presses."""
+    """The dataset, split into presses for training and for the test, with the charge series of all presses."""
     return kept(Split.by_position, TrainingData.of(dataset), QUICK.training)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def fitted(dataset):
     """A network after a short training, with everything that a release needs."""
     return kept(fit, dataset, QUICK)

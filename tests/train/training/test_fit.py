@@ -84,7 +84,7 @@ def settings(hidden=(16, 16), misfit_hidden=(8, 8), weights="float32", **trainin
 
 @pytest.fixture
 def split_once(split, monkeypatch):
-    """Use the split of the session, which takes longer than these trainings."""
+    """Use the split of the other tests, which takes longer than these trainings."""
     monkeypatch.setattr(Split, "by_position", lambda *_: split)
 
 
