@@ -49,18 +49,19 @@ def test_a_setting_without_effect_on_measured_presses_is_refused(refused, tmp_pa
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("calibrate old/presses.csv -o film --held-out old/presses.csv", "held-out presses that are not among those"),
-        ("calibrate old/presses.csv --from old", "presses that are not among those of the earlier calibration old,"),
-        ("calibrate new.csv --from old -o new --held-out old/presses.csv", "presses that are not among those of the"),
-        ("press -o old/presses.csv --from old --port none", "presses that are not among those of the earlier"),
+        ("calibrate old/1/presses.csv -o film --held-out old/1/presses.csv", "held-out presses that are not among"),
+        ("calibrate old/1/presses.csv --from old", "presses that are not among those of the earlier calibration old/1"),
+        ("calibrate new.csv --from old -o new --held-out old/1/presses.csv", "presses that are not among those of"),
+        ("press -o old/1/presses.csv --from old --port none", "presses that are not among those of the earlier"),
     ],
 )
 def test_presses_that_would_count_twice_are_refused(words, message, refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(calibrate_module, "calibrate", None)  # a call would be an error: the film must not be solved
-    Path("old").mkdir()
-    Path("old/presses.csv").write_text("x_mm,y_mm,force_N,A,B,C,D\n1,2,1,500,500,500,500\n")
-    Path("new.csv").write_text("x_mm,y_mm,force_N,A,B,C,D\n1,2,1,400,500,500,500\n")
     problem = CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))
-    Path("old/calibration.json").write_text(json_text(film_table(problem, problem.film_before)))
+    for version in ("old/1", "old/2"):  # the second calibration continued the first
+        Path(version).mkdir(parents=True)
+        Path(version, "calibration.json").write_text(json_text(film_table(problem, problem.film_before)))
+    Path("old/1/presses.csv").write_text("x_mm,y_mm,force_N,A,B,C,D\n1,2,1,500,500,500,500\n")
+    Path("new.csv").write_text("x_mm,y_mm,force_N,A,B,C,D\n1,2,1,400,500,500,500\n")
     refused("train", *words.split(), "--sensor", "four-25um-biaxial", message=f"line 2: expected {message}")

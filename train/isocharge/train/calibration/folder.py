@@ -396,17 +396,20 @@ def read_earlier(folder: Path, problem: CalibrationProblem, *presses: MeasuredPr
 
     Raises:
         PressError: If the folder contains no calibration, or a calibration of another problem, or if one of the presses
-            belongs to the earlier calibration. It would count twice, and the standard deviations would be too small.
+            belongs to a calibration in the folder. It would count twice, and the standard deviations would be too
+            small.
     """
     calibrated_versions = [version for version in version_folders(folder).values() if (version / RESULT).is_file()]
-    *_, version = folder, *calibrated_versions
-    film = read_film(version / RESULT, problem)
-    learned_path = version / PRESSES
-    if learned_path.is_file():
-        learned = read_presses(learned_path, problem.electrodes)
-        for one in presses:
-            if one is not None:
-                _refuse_learned(one, learned, f"presses that are not among those of the earlier calibration {version}")
+    versions = calibrated_versions or [folder]
+    film = read_film(versions[-1] / RESULT, problem)
+    # The last calibration may have continued the others, so that it has learned from their presses, too.
+    for version in versions:
+        if (version / PRESSES).is_file():
+            learned = read_presses(version / PRESSES, problem.electrodes)
+            for one in presses:
+                if one is not None:
+                    expected = f"presses that are not among those of the earlier calibration {version}"
+                    _refuse_learned(one, learned, expected)
     return film.drifted()
 
 
