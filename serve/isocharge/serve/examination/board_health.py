@@ -218,7 +218,7 @@ def channel_sentences(
         max_hum_pC: Largest harmless amplitude of hum, pC. The default is below the noise of the film.
     """
     rule = device.rule(TareRule) or TareRule()  # the defaults if the device file has no tare
-    if device.front_end == "current":  # a current of any size at rest is an offset
+    if device.has_currents:  # a current of any size at rest is an offset
         rule = structs.replace(rule, offset_limit_pC=math.inf)
     for channel in channels:
         name = f"channel {printable(channel.name)}"
@@ -274,7 +274,7 @@ def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress
             "send the time of a device clock in each frame (t_us, t_ms or t_s): without it the leak is corrected with "
             "the arrival times, which jitter"
         )
-    if not held_press.description and device.rule(LeakRule) is None and device.front_end != "current":
+    if not held_press.description and device.rule(LeakRule) is None and not device.has_currents:
         yield (
             "state the time constants of the amplifiers in a device file ([leak] tau_s): without them the force of a "
             "held press seems to decrease. The time constants follow from the circuit. To measure them instead, listen "

@@ -208,8 +208,9 @@ class PressWatch:
         if SATURATED in frame.flags:
             return WatchResult(Phase.refused, "an amplifier is at its limit: press less hard")
         if self._rest_pC is None:
-            is_short = held_s < self.MIN_HELD_S
-            return WatchResult(Phase.settling) if is_short else WatchResult(Phase.refused, NO_REST_BEFORE_PRESS)
+            if held_s < self.MIN_HELD_S:
+                return WatchResult(Phase.settling)
+            return WatchResult(Phase.refused, NO_REST_BEFORE_PRESS)
         self._store(frame, self.WINDOW_S)
 
         # The window is examined several times within its length, but not in each frame, which would take too long.

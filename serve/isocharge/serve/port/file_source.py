@@ -104,8 +104,7 @@ def foreign_kind(name: str, head: bytes) -> str:
             "beside it with `isocharge serve replay touch.rec`"
         )
     columns = {column.strip(' "') for column in re.split("[,;|\t]", first_line.decode("utf-8", "replace").strip())}
-    is_table = not columns.isdisjoint(PRESS_COLUMNS)
-    if is_table and name != STDIN:
+    if not columns.isdisjoint(PRESS_COLUMNS) and name != STDIN:
         return (
             f"a table of presses; compute its contacts with: isocharge serve predict MODEL {quoted_name}; if a board "
             f"has sent these lines, use: isocharge serve stream MODEL --port - < {quoted_name}"

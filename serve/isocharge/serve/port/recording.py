@@ -283,8 +283,7 @@ class Recording:
         try:
             with self._path.open(encoding="utf-8", errors="replace") as file:
                 for line in bounded_lines(file, LONGEST_ENTRY):
-                    is_complete = line.endswith("\n")
-                    if not is_complete:  # only the last line of the file can be incomplete
+                    if not line.endswith("\n"):  # only the last line of the file can be incomplete
                         return
                     is_header = line_number == 1
                     is_damaged = not line.startswith("{")

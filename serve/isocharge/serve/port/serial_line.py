@@ -92,8 +92,7 @@ class SerialLine:
         Raises:
             OSError, ValueError: If the line cannot be opened, or the URL of a socket has no port.
         """
-        is_socket = url.startswith(SOCKET_SCHEMES)
-        if is_socket and urlsplit(url).port is None:  # raises ValueError for a port that is no number
+        if url.startswith(SOCKET_SCHEMES) and urlsplit(url).port is None:  # ValueError for a wrong port
             raise ValueError(f"expected a port number, as in {url.rstrip('/:')}:7000")
         # pyserial is imported only here, so programs that open no port do not wait for the import.
         serial = importlib.import_module("serial")

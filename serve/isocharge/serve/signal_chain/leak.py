@@ -68,7 +68,8 @@ class Inflow:
 
     Attributes:
         pC_per_s: The inflow, shape (n_electrode,), pC/s.
-        learned_s: Time over which the inflow was averaged, s. It starts at 1 s, with an inflow of 0 as the prior.
+        learned_s: Time over which the inflow was averaged, s. For charges, it starts at 1 s, with an inflow of 0 as the
+            prior.
         hold_s: Remaining time of the pause after a release, s.
     """
 
@@ -276,6 +277,7 @@ class Integrator(Leak):
     def reset(self) -> None:
         """Discard the state."""
         super().reset()
+        self._inflow.learned_s = 0.0  # the tare is the mean of only a few currents, whose error would add up
         self._current_pC = np.zeros(len(self._tau_s))  # current of the previous valid frame
         self._search_s = 0.0  # duration of the search for a tare, from which the sampling interval follows
         self._search_frames = 0
@@ -283,10 +285,10 @@ class Integrator(Leak):
     def step(self, frame: Frame) -> None:
         """Replace the currents by the charges, and the noise of the currents by the noise of the charges at rest.
 
-        The current of a missing frame is assumed to be the mean of the currents before and after the gap. A mean that
-        may be noise counts as 0, because it would be multiplied by the number of missing frames. The touch gets the
-        flag `gap` if the error of this assumption may exceed both the noise and 1 % of the charge. A copy of the
-        previous frame adds no charge, and neither does a frame that arrives late.
+        The current of a missing frame is assumed to be the mean of the currents before and after the gap. If this mean
+        may be noise, the current is assumed to be the inflow, because the noise would be multiplied by the number of
+        missing frames. The touch gets the flag `gap` if the error of this assumption may exceed both the noise and 1 %
+        of the charge. A copy of the previous frame adds no charge, and neither does a frame that arrives late.
 
         At rest, the charges decay with the time constant `relax_s`. The variance of the sum of independent currents is
         then relax_s / (2 dt) times the variance of one current.
@@ -300,12 +302,14 @@ class Integrator(Leak):
         if current_pC is None:
             return
         mean_pC = (current_pC + self._current_pC) / 2.0
-        missing_pC = missing_count * np.where(np.abs(mean_pC) > 3.0 * frame.noise_pC, mean_pC, 0.0)
+        interval_s = max(self._search_s / self._search_frames, SUM_TOLERANCE_s)
+        missing_pC = missing_count * np.where(
+            np.abs(mean_pC) > 3.0 * frame.noise_pC, mean_pC, self._inflow.pC_per_s * interval_s
+        )
         frame.charge_pC = current_pC + missing_pC if frame.intervals > 0 else np.zeros_like(current_pC)
         super().step(frame)
         error_pC = missing_count * np.abs(current_pC - self._current_pC) / 2.0  # if the current rose or fell steadily
         self._current_pC = current_pC
-        interval_s = max(self._search_s / self._search_frames, SUM_TOLERANCE_s)
         frame.noise_pC = frame.noise_pC * math.sqrt(max(1.0, 0.5 * self._rule.relax_s / interval_s))
         limit_pC = np.maximum(frame.noise_pC, 0.01 * np.abs(self._charge_pC))
         if (error_pC > limit_pC).any():

@@ -94,9 +94,9 @@ class Touch(Stage):
     is the largest size that two consecutive frames of the touch have reached. The spike of a single frame is not a
     peak.
 
-    If the mean charges of the last `RISE_S` have already exceeded half of the touch threshold when a touch begins, the
-    charges have risen slowly, and a drift of the charge at rest may have caused the touch. All frames of the touch then
-    have the flag `drift`.
+    If the mean charges of the last `RISE_S` have already exceeded half of the touch threshold when a touch begins, or
+    three quarters of it for currents, the charges have risen slowly, and a drift of the charge at rest may have caused
+    the touch. All frames of the touch then have the flag `drift`.
 
     If charges exceed the touch threshold in the direction opposite to a touch, the frame has the flag `negative`.
     """
@@ -112,7 +112,7 @@ class Touch(Stage):
         rule = setup.device.rule(TouchRule)
         self._rule = None if rule is None else rule.resolved(has_currents=setup.device.has_currents)
         self._noise_pC: Array | None = None  # noise of the latest tare
-        self._threshold_pC = np.zeros(len(setup.electrodes))  # touch thresholds with this noise
+        self._threshold_pC = np.zeros(0)  # touch thresholds of the electrodes with this noise
         self.reset()
 
     def reset(self) -> None:
@@ -202,7 +202,8 @@ class Touch(Stage):
             self._is_contact = True
             self._peak_size = min(size, _norm(self._previous))  # a spike of a single frame is not a peak
             self._touch_direction = charge / max(size, 1.0)
-            self._rose_slowly = _norm(self._idle_mean - self._base) > 0.5
+            # The noise of an integral of currents is slow, so that the mean of the latest charges contains it.
+            self._rose_slowly = _norm(self._idle_mean - self._base) > (0.75 if self._setup.device.has_currents else 0.5)
             return
         elif is_remainder and size < _norm(self._base):
             self._base = charge  # the charge that remains of the latest touch becomes smaller
