@@ -128,6 +128,11 @@ def measured(dataset, forces_N):
 
 UNSUITABLE = {
     "sensor": (lambda d: replace(d, sensor=load_sensor("three-25um-uniaxial")), NAME, "with another piezo"),
+    "order of the electrodes": (
+        lambda d: replace(d, sensor=replace(d.sensor, electrodes=d.sensor.electrodes[::-1])),
+        NAME,
+        "electrodes C, B, A, got a model with another electrodes .A, B, C.;",
+    ),
     "electrodes": (
         lambda d: measured(d, (1.0, 1.0)),
         "four-25um-biaxial",

@@ -354,9 +354,9 @@ def _calibration_charges(model_folder: Path, model: ModelMetadata) -> Array:
 def check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
     """Raise an error if a model was not trained for the sensor of a dataset.
 
-    For measured presses, only the names of the electrodes are compared, because a calibration changes the film. A model
-    of presses alone is refused, because it may have learned from the presses on which it would be tested. For simulated
-    presses, all values of the two sensors must be equal, except the names of the sensors.
+    For measured presses, only the names of the electrodes and their order are compared, because a calibration changes
+    the film. A model of presses alone is refused, because it may have learned from the presses on which it would be
+    tested. For simulated presses, all values of the two sensors must be equal, except the names of the sensors.
 
     Args:
         model: Metadata of the model.
@@ -367,17 +367,16 @@ def check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
             differ.
     """
     names = dataset.sensor.electrode_names
-    if is_measured(dataset):
-        if "film" not in model.sensor:
-            raise ModelError(
-                f"model {model.label}: expected a model of a film, got a model of presses alone, which has learned "
-                "from all presses; its card states its errors on held-out presses"
-            )
-        differences = [] if model.electrodes == names else [f"electrodes ({', '.join(model.electrodes)})"]
-    else:
+    differences = [] if model.electrodes == names else [f"electrodes ({', '.join(model.electrodes)})"]
+    if not is_measured(dataset):
         expected = sensor_to_dict(dataset.sensor)
         keys = (expected.keys() | model.sensor.keys()) - {"name"}
-        differences = sorted(key for key in keys if expected.get(key) != model.sensor.get(key))
+        differences += sorted(key for key in keys if expected.get(key) != model.sensor.get(key))
+    elif "film" not in model.sensor:
+        raise ModelError(
+            f"model {model.label}: expected a model of a film, got a model of presses alone, which has learned from "
+            "all presses; its card states its errors on held-out presses"
+        )
     if differences:
         raise ModelError(
             f"model {model.label}: expected a model of the sensor {dataset.sensor.name!r} with the electrodes "
