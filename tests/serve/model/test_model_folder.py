@@ -123,6 +123,8 @@ def test_version_with_other_electrodes_in_the_same_model_folder_is_refused(film,
     film.write(tmp_path)
     with pytest.raises(ModelError, match=r"config.pbtxt: describes a model other than .*'D'"):
         film.with_electrodes(4).write(tmp_path, version=2)
+    with pytest.raises(ModelError, match=r"expected the electrodes .*'B', 'C'\) of its last version in this order"):
+        film.write(tmp_path, version=2, electrodes=("C", "B", "A"))
     (tmp_path / "linear/config.pbtxt").write_bytes(b"\xff")
     with pytest.raises(ModelError, match=r"config.pbtxt: describes a model other than"):
         film.write(tmp_path, version=2)

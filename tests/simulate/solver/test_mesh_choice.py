@@ -85,7 +85,7 @@ def test_charges_equal_those_of_a_finer_mesh(sensor, probe, at, force, expected,
 
 @pytest.mark.parametrize("wrong", [(1, 8, 4, 0), (4, 3, 4, 0), (4, 8, 0, 0), (4, 8, 4, -1)])
 def test_resolution_rejects_values_out_of_range(wrong):
-    with pytest.raises(ValueError, match=f"got {wrong[0]}, {wrong[1]}, {wrong[2]}, {wrong[3]}"):
+    with pytest.raises(ValueError, match=f"got {str(wrong)[1:-1]}"):
         Resolution(*wrong)
 
 

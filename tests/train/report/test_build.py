@@ -133,11 +133,6 @@ UNSUITABLE = {
         NAME,
         "electrodes C, B, A, got a model with another electrodes .A, B, C.;",
     ),
-    "electrodes": (
-        lambda d: measured(d, (1.0, 1.0)),
-        "four-25um-biaxial",
-        "with the electrodes A, B, C, got a model with another",
-    ),
     "forces": (
         lambda d: with_samples(d, force_N=100.0 * d.samples.force_N),
         NAME,

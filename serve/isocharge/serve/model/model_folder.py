@@ -19,6 +19,7 @@ these repositories.
 
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -383,9 +384,9 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
         OutputExists: If the version exists already, or a file has the folder's name.
         OutputError: If the folder cannot be written.
         ModelError: If the name of the folder is not a valid name of a model, or if the folder contains a model with
-            another number of electrodes. Also if the folder contains other files, and is therefore no folder of one
-            model: it may be a dataset, one version of a model, or the folder in which several models have their
-            folders.
+            other electrodes or another order of them. Also if the folder contains other files, and is therefore no
+            folder of one model: it may be a dataset, one version of a model, or the folder in which several models have
+            their folders.
     """
     target = folder / str(version)
     if folder.exists() and not folder.is_dir():
@@ -405,6 +406,15 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
         raise ModelError(
             f"{config_path}: describes a model other than {name!r} with the electrodes {electrodes}; use another model "
             "name or, if the folder was copied or renamed, its old name"
+        )
+    used_electrodes = electrodes
+    with suppress(ModelError):  # a damaged version does not prevent a new one
+        for existing in version_folders(folder).values():
+            used_electrodes = load_model(existing).metadata.electrodes
+    if used_electrodes != electrodes:
+        raise ModelError(
+            f"{folder}: expected the electrodes {used_electrodes} of its last version in this order, because programs "
+            f"send their charges in it, got {electrodes}; use another model name or this order"
         )
     return target
 
