@@ -15,7 +15,7 @@ from stage_runner import StageRunner, charges_and_contacts
 
 RATE_HZ = 500.0
 T_S = np.arange(0.0, 15.0, 1.0 / RATE_HZ)
-RATIOS = np.array([1.0, -0.6, -0.5, 0.2, -0.7, 0.1, 0.2, -0.1])
+RATIOS = np.linspace(0.9, -1.0, 8)
 """Charges of a press relative to its force. Their sum is negative."""
 
 FORCE = np.interp(T_S, [0.0, 3.0, 3.4, 6.0, 8.0, 8.2, 11.0, 11.1, 14.0, 14.2], [0, 0, 1, 1, 0.6, 0, 0, 0.4, 0.4, 0])
@@ -90,5 +90,3 @@ def test_many_missing_currents_cause_no_touch_and_give_a_touch_the_flag_gap():
 def test_currents_are_refused_in_c():
     with pytest.raises(DeviceError, match="b: front_end: this stage does not exist in the signal chain in C"):
         device_header(device_from_table({"front_end": "current"}, "b"), ("A", "B", "C"))
-    with pytest.raises(DeviceError, match=r"front_end: expected one of .*, got 'voltage'"):
-        device_from_table({"front_end": "voltage"}, "b")

@@ -85,8 +85,8 @@ class Touch(Stage):
     charges that remained after the last release. It follows charges that fall further, and it decays exponentially.
 
     After a long press, an amplifier with a leak shows charges of the opposite sign. A change in the direction opposite
-    to the latest touch is therefore no touch, and the base follows such a change. If all charges of a film are known to
-    be positive, the same rule applies to charges that become negative before the first touch.
+    to the latest touch is therefore no touch, and the base becomes the mean of the latest charges. If all charges of a
+    film are known to be positive, the same rule applies to charges that become negative before the first touch.
 
     A touch ends when the size of the charges falls below the release threshold, or when the charges change their sign
     from one frame to the next, or become negative if the charges of the film are positive. The release threshold is a
@@ -197,7 +197,7 @@ class Touch(Stage):
         change = charge - self._base
         change_size = _norm(change)
         if change @ direction < OPPOSING_COSINE * change_size * _norm(direction):
-            self._base = charge  # a release or a drift
+            self._base = self._idle_mean  # a release or a drift, and not the noise of a single frame
         elif change_size > 1.0:  # a touch begins
             self._is_contact = True
             self._peak_size = min(size, _norm(self._previous))  # a spike of a single frame is not a peak

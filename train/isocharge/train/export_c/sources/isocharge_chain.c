@@ -339,7 +339,7 @@ static void update_contact(isocharge_chain *chain, const real charge_pC[N], real
     }
     change_size = size_of(change);
     if (dot(change, chain->direction) < (real)-0.25 * change_size * size_of(chain->direction)) {
-        copy(chain->base, charge); /* the opposite of a touch, such as the end of a long press */
+        copy(chain->base, chain->mean); /* the opposite of a touch, such as the end of a long press */
     } else if (change_size > 1) {
         chain->contact = 1;
         chain->peak = two_frame_peak;
