@@ -20,9 +20,9 @@ ONE_PC = np.ones(3)
 """Standard deviation of the noise of each electrode, shape (3,), pC."""
 
 
-def rest(n, seed=0, std_pC=1.0):
+def rest(n, std_pC=1.0):
     """Return noisy charges at rest, shape (n, 3), pC."""
-    return OFFSET + std_pC * np.random.default_rng(seed).standard_normal((n, 3))
+    return OFFSET + std_pC * np.random.default_rng(0).standard_normal((n, 3))
 
 
 def contacts_of(readings):
