@@ -136,9 +136,9 @@ def sector_angles(
 
     The sectors divide the rings between the innermost circle and the rim. Their sides begin where rays from the
     centroid of the footprint meet the circle. The last layer of elements inside the circle connects the circle to an
-    inner boundary. Each of the given points on the inner boundary has a ray that passes through it. In other
-    directions, elements at the edges of irregular polygons would fold. All other rays divide the angle between two such
-    rays into equal parts.
+    inner boundary. The directions of the rays are a compromise between evenly spaced directions and the directions of
+    given points on the inner boundary. If the gap between these points and the circle is narrow, the rays must pass
+    close to the points, because elements would fold otherwise.
 
     Args:
         blocks: The elements.
@@ -153,28 +153,23 @@ def sector_angles(
     Returns:
         Angles in the template plane in increasing order, shape (..., n_sector + 1), rad.
     """
-    origin = centroid[..., None] + 0j  # common origin of all rays
-    inner_angle = np.unwrap(np.angle(inner_points - origin), axis=-1)
-    ray_angle = divide_intervals(inner_angle, blocks.n_half_edge)
-    ray = np.exp(1j * ray_angle)  # unit vectors x + iy, shape (..., n_sector + 1)
-    origin_from_centre = np.asarray(origin - centre[..., None], dtype=complex)
-    intersection = _intersections_with_circle(origin_from_centre, ray, radius[..., None])
+    origin, centre, radius = (value[..., None] for value in (centroid, centre, radius))  # `origin` is that of all rays
+    radius_ratio = radius / np.abs(inner_points - centre).max(axis=-1, keepdims=True)
+    ray = np.exp(1j * _ray_angles(blocks, inner_points - origin, radius_ratio))  # shape (..., n_sector + 1)
+    intersection = _intersections_with_circle(origin - centre, ray, radius)
 
-    # Angles of the intersections around the centre of the circle. Each angle is larger than the previous angle, also
-    # where the angle passes pi.
-    first_angle = np.angle(intersection[..., :1])
-    increase = np.mod(np.angle(intersection[..., 1:] / intersection[..., :-1]), 2.0 * np.pi)
-    film_angle = np.concatenate([first_angle, first_angle + np.cumsum(increase, axis=-1)], axis=-1)
+    # Angles of the intersections around the centre of the circle. They also increase where they pass pi.
+    film_angle = np.unwrap(np.angle(intersection))
 
     # Convert the angles on the film into angles in the template plane.
     return stretch_angles(film_angle, stretch)
 
 
-def _intersections_with_circle(origin: Complexes, ray: Complexes, radius: Array) -> Complexes:
+def _intersections_with_circle(origin: Array, ray: Complexes, radius: Array) -> Complexes:
     """Compute the points at which rays from the inside of a circle meet the circle. The centre of the circle is 0.
 
     Args:
-        origin: Origins of the rays, x + iy.
+        origin: Positions of the origins of the rays on the x axis.
         ray: Unit vectors of the rays as complex numbers.
         radius: Radii of the circles.
 
@@ -182,9 +177,46 @@ def _intersections_with_circle(origin: Complexes, ray: Complexes, radius: Array)
         Points x + iy, in the common shape to which the shapes of all arguments are broadcast.
     """
     # The length t of a ray is the positive solution of |origin + t ray|^2 = radius^2.
-    projection = (origin * np.conj(ray)).real
-    length = np.sqrt(projection**2 + radius**2 - np.abs(origin) ** 2) - projection
+    projection = origin * ray.real
+    length = np.sqrt(projection**2 + radius**2 - origin**2) - projection
     return np.asarray(origin + ray * length)
+
+
+def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) -> Array:
+    """Compute the directions of the rays that extend from the centroid of the footprint to the sides of the sectors.
+
+    The last layer of elements inside the innermost circle connects the circle to an inner boundary. Each of the given
+    points on the inner boundary has a ray. The direction of the ray is the direction of the point, rotated by a limited
+    angle towards evenly spaced directions. All other rays divide the angle between two such rays into equal parts.
+
+    Args:
+        blocks: The elements.
+        inner_points: Points x + iy on the inner boundary, relative to the centroid, shape (..., n_point): one point for
+            each corner of the core polygon, and one point half-way between each two corners.
+        radius_ratio: Radius of the innermost circle divided by the largest distance of these points from its centre,
+            shape (..., 1).
+
+    Returns:
+        Angles, shape (..., n_sector + 1), rad.
+    """
+    # Angles with equal differences that have the same mean as the angles of the inner points, shape (..., n_point)
+    inner_angle = np.unwrap(np.angle(inner_points))
+    angle_from_first = np.linspace(0.0, 2.0 * np.pi / blocks.copies, inner_angle.shape[-1])
+    even_angle = angle_from_first + np.mean((inner_angle - angle_from_first)[..., :-1], axis=-1, keepdims=True)
+
+    # Rotate the direction of each inner point towards the even angle. The rotation is small if the circle is close to
+    # the inner points. The function `tanh` limits the rotation. With a larger limit, elements at corners that lie close
+    # together would fold. On an irregular polygon, some rays meet the middle of an edge at a small angle, and elements
+    # would also fold there. The limit decreases with the cosine of the smallest of these angles.
+    middle = inner_points[..., :-1:2]
+    edge = inner_points[..., 1::2] - middle
+    cosine = np.abs(np.cos(np.angle(edge / middle))).max(axis=-1, keepdims=True)
+    max_rotation = 0.2 * (1.0 - cosine)  # rad
+    share = 0.5 * np.minimum((radius_ratio - 1.0) / CLEARANCE, 1.0)  # of the difference, from 0 to 0.5
+    rotation = max_rotation * np.tanh(share * (even_angle - inner_angle) / max_rotation)
+
+    # Add the rays between the rays of the inner points.
+    return divide_intervals(inner_angle + rotation, blocks.n_half_edge)
 
 
 def rim_angles(angle: Array, map_parameter: Array, template_radius: Array) -> Array:
