@@ -195,7 +195,7 @@ def test_level_at_rest_is_proposed_as_offset(gain, levels, has_offset):
     ("names", "channels", "message"),
     [
         ("A_nC B_nC C_nC", "A_nC B_nC C_nC", "the channels seem to be in nC"),
-        ("T A_nC B_nC C_nC", "A_nC B_nC C_nC", "the channels seem to be in nC"),  # a temperature has no unit of charge
+        ("T A_uV B_uV C_uV", "A_uV B_uV C_uV", "the channels seem to be in uV"),  # a temperature has no unit of charge
         ("A B C_nC", "A B C_nC", "their units differ: state pC_per_unit of each electrode"),
         ("c b a", "a b c", ""),
         ("A B z", None, "('A', 'B', 'z')"),

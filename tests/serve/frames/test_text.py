@@ -199,7 +199,7 @@ NAMED_NOTATIONS = [
 NOTATIONS = {
     **dict.fromkeys(UNNAMED_NOTATIONS, ()),
     **dict.fromkeys(NAMED_NOTATIONS, "ABC"),
-    "{a} mV\t{b} mV\t{c} mV": ("ch1_mV", "ch2_mV", "ch3_mV"),
+    "{a} uV\t{b} uV\t{c} uV": ("ch1_uV", "ch2_uV", "ch3_uV"),
     "A: {a} nC, B: {b} nC, C: {c} nC": ("A_nC", "B_nC", "C_nC"),
     "A={a}C B={b}C C={c}C": ("A_coulomb", "B_coulomb", "C_coulomb"),
     "A: {a} C, B: {b} C, C: {c} C": ("A_coulomb", "B_coulomb", "C_coulomb"),

@@ -45,7 +45,7 @@ FLAGS = "flags"
 TIMES_US = {"t_us": 1.0, "t_ms": 1e3, "t_s": 1e6}
 """Unit of the clock of a device, us, by the name of the field that contains the clock."""
 
-OTHER_CHARGE_UNITS = ("fC", "nC", "µC", "μC", "uC", "C", "coulomb", "V", "mV", "volt", "volts")
+OTHER_CHARGE_UNITS = ("fC", "nC", "µC", "μC", "uC", "C", "coulomb", "V", "mV", "uV", "µV", "μV", "volt", "volts")
 """Units other than pC that the names of channels and lines of text may state."""
 
 Raw = TypeVar("Raw")

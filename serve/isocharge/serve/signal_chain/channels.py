@@ -218,7 +218,7 @@ def _words_of(text: str) -> list[str]:
 
     A unit begins after a capital letter or a digit, as in `AnC`.
     """
-    return [word for word in re.split(r"[\W_]+|(?<=[A-Z0-9])(?=(?:[fnpuµμ]C|mV)\b)", text) if word]
+    return [word for word in re.split(r"[\W_]+|(?<=[A-Z0-9])(?=(?:[fnpuµμ]C|[muµμ]V)\b)", text) if word]
 
 
 def _distinctive_parts(names: list[str]) -> list[str]:
