@@ -71,8 +71,8 @@ def unit_of(capture: Capture, positions: Iterable[int], max_noise_V: float = 0.0
     The unit is guessed from the names and the values of the electrodes' channels. Other channels, such as a
     temperature, have units of their own. The first rule that applies determines the unit.
 
-    - If all names of channels with a unit state the same one, such as `A_nC` and `B_nC`, it is this unit.
-    - If some names state different units, the unit is assumed to be pC. The report requests the gains.
+    - If the names of the channels state only one unit, the values are in this unit, such as nC for `A_nC` and `B_nC`.
+    - If the names state different units, the unit is assumed to be pC. The report requests the gains.
     - The unit is pC for binary frames of isocharge.
     - The unit is counts if all values are whole numbers.
     - The unit is volts if all names end in `V`. It is volts, too, if there is noise on some channel, and on no channel

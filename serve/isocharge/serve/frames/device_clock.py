@@ -87,8 +87,9 @@ class DeviceClock:
         """Write into the frames of a chunk the times at which they were taken, and adjust the clock to the chunk.
 
         The clock of the device is converted to the time of the host by a straight line, which is called the fit. If the
-        device sends no clock, the frames of the chunk share the time since the previous chunk evenly, and the last
-        frame has the arrival time of the chunk. Frames of a file are then assumed to be `FILE_INTERVAL_s` apart.
+        device sends no clock, the time since the previous chunk is divided evenly among the frames of the chunk, and
+        the last frame has the arrival time of the chunk. All chunks of a file arrive at the same time. The interval
+        `dt_s` of their frames is then assumed to be `FILE_INTERVAL_s`.
 
         Args:
             chunk: The bytes that contain the ends of the frames.

@@ -308,10 +308,12 @@ class Parser(ABC):
         self._previous_seq = None
 
     def sequence_flags(self, seq: int | None, *, is_clock_reset: bool = False) -> tuple[str, ...]:
-        """Find lost and repeated frames and restarts by the frame counter, add them to `counts`, and return the flags.
+        """Compare the counter of a frame with that of the previous frame, and return the flags of the frame.
+
+        Lost frames, repeated frames and restarts of the device are added to `counts`.
 
         Args:
-            seq: Counter of the next frame; None if the format has no counter.
+            seq: Counter of the frame; None if the format has no counter.
             is_clock_reset: Whether the clock of the device was reset before this frame. If the counter also
                 decreases, or the format has no counter, the device has restarted.
 
@@ -332,24 +334,24 @@ class Parser(ABC):
         if increase == 0:
             self.counts.repeated += 1
             return (REPEAT,)
-        # Modulo `seq_modulus`, a decrease is the same as an increase across the end of the range. A counter that has
-        # exceeded the modulus does not wrap at it, so each decrease is a restart. So is a decrease together with a
-        # reset of the clock.
-        smallest_restart = self.seq_modulus // 2
+        # A small increase means that frames were lost. If the counter is lower than before, it may have wrapped, but a
+        # large increase across the end of its range is more probably a restart. It has not wrapped if the clock was
+        # reset at the same time, or if the counter had exceeded the modulus.
+        increase_limit = self.seq_modulus // 2
         if seq < previous_seq:
-            is_no_wrap = is_clock_reset or previous_seq >= self.seq_modulus
-            smallest_restart = 0 if is_no_wrap else min(smallest_restart, SMALLEST_RESTART)
-        if increase >= smallest_restart:
-            decrease = (previous_seq - seq) % self.seq_modulus
-            # A late frame was overtaken by a few others. A board that has restarted counts from 0 or 1.
-            if decrease <= MAX_LATE_FRAMES < seq and not is_clock_reset:
-                self._previous_seq = previous_seq
-                self.counts.lost = max(0, self.counts.lost - 1)
-                return (GAP,)
-            self.counts.restarts += 1
-            return (RESTART,)
-        self.counts.lost += increase - 1
-        return (GAP,)
+            cannot_wrap = is_clock_reset or previous_seq >= self.seq_modulus
+            increase_limit = 0 if cannot_wrap else min(increase_limit, SMALLEST_RESTART)
+        if increase < increase_limit:
+            self.counts.lost += increase - 1
+            return (GAP,)
+        # A late frame was overtaken by a few others. A device that has restarted counts from 0 or 1.
+        decrease = (previous_seq - seq) % self.seq_modulus
+        if decrease <= MAX_LATE_FRAMES < seq and not is_clock_reset:
+            self._previous_seq = previous_seq
+            self.counts.lost = max(0, self.counts.lost - 1)
+            return (GAP,)
+        self.counts.restarts += 1
+        return (RESTART,)
 
     def _try_decode(self, decode: Callable[[Raw], Frame], raw: Raw, dropped_size: int) -> list[Frame]:
         """Try to decode one frame, and count either an intact frame or rejected bytes.

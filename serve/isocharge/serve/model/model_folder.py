@@ -396,7 +396,8 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
     if not NAME.fullmatch(name):
         raise ModelError(f"model name {name!r}: expected letters, digits, '-', '_' and '.'; rename the folder")
     config_path = folder / "config.pbtxt"
-    is_model_folder = config_path.exists() or version_folders(folder)
+    versions = version_folders(folder)
+    is_model_folder = config_path.exists() or versions
     if any(folder.glob("[!.]*")) and not is_model_folder:
         raise ModelError(
             f"{folder}: expected a new folder or the folder of a model, got one with other files; choose another "
@@ -409,7 +410,7 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
         )
     used_electrodes = electrodes
     with suppress(ModelError):  # a damaged version does not prevent a new one
-        for existing in version_folders(folder).values():
+        for existing in versions.values():
             used_electrodes = load_model(existing).metadata.electrodes
     if used_electrodes != electrodes:
         raise ModelError(

@@ -132,8 +132,8 @@ def _may_be_sync(rows: Bytes) -> Booleans:
 def _fields(parts: Sequence[Part]) -> tuple[Field, ...]:
     """Convert the parts of a frame to fields and padding.
 
-    Channels are called ch1, ch2, and so on. The names of fields must differ. Therefore a second counter
-    becomes padding, and so does a second clock with the same name as the first. Adjacent padding is joined.
+    Channels are called ch1, ch2, and so on. The names of fields must differ. A second counter therefore becomes
+    padding, and so does a second clock with the same name as the first. Adjacent padding is joined.
     """
     fields: list[Field] = []
     channel_numbers = count(1)

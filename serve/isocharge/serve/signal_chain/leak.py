@@ -286,9 +286,10 @@ class Integrator(Leak):
         """Replace the currents by the charges, and the noise of the currents by the noise of the charges at rest.
 
         The current of a missing frame is assumed to be the mean of the currents before and after the gap. If this mean
-        may be noise, the current is assumed to be the inflow, because the noise would be multiplied by the number of
-        missing frames. The touch gets the flag `gap` if the error of this assumption may exceed both the noise and 1 %
-        of the charge. A copy of the previous frame adds no charge, and neither does a frame that arrives late.
+        is so small that it may only be noise, the current is assumed to be the inflow instead, which is the estimated
+        offset. Otherwise, the noise would be multiplied by the number of missing frames. The touch gets the flag `gap`
+        if the error of the assumed current may exceed both the noise and 1 % of the charge. A copy of the previous
+        frame adds no charge, and neither does a frame that arrives late.
 
         At rest, the charges decay with the time constant `relax_s`. The variance of the sum of independent currents is
         then relax_s / (2 dt) times the variance of one current.
@@ -303,9 +304,8 @@ class Integrator(Leak):
             return
         mean_pC = (current_pC + self._current_pC) / 2.0
         interval_s = max(self._search_s / self._search_frames, SUM_TOLERANCE_s)
-        missing_pC = missing_count * np.where(
-            np.abs(mean_pC) > 3.0 * frame.noise_pC, mean_pC, self._inflow.pC_per_s * interval_s
-        )
+        may_be_noise = np.abs(mean_pC) <= 3.0 * frame.noise_pC
+        missing_pC = missing_count * np.where(may_be_noise, self._inflow.pC_per_s * interval_s, mean_pC)
         frame.charge_pC = current_pC + missing_pC if frame.intervals > 0 else np.zeros_like(current_pC)
         super().step(frame)
         error_pC = missing_count * np.abs(current_pC - self._current_pC) / 2.0  # if the current rose or fell steadily

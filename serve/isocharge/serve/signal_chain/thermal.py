@@ -97,9 +97,9 @@ class Warming(Stage):
     def step(self, frame: Frame) -> None:
         """Estimate the warming of a frame in contact, subtract the charge of its change, and add the flags.
 
-        The stage that stores the charge at rest has already subtracted the earlier changes of the warming. It reads the
-        present change from the frame. While an amplifier is saturated, the warming is not estimated, because then the
-        charges fit no contact for any value of the warming.
+        The tare has already subtracted the charge of the earlier changes, and reads the present change from the frame.
+        While an amplifier is saturated, the warming is not estimated, because then the charges fit no contact for any
+        value of the warming.
         """
         if frame.charge_pC is None:
             return

@@ -88,15 +88,14 @@ class Touch(Stage):
     to the latest touch is therefore no touch, and the base becomes the mean of the latest charges. If all charges of a
     film are known to be positive, the same rule applies to charges that become negative before the first touch.
 
-    A touch ends when the size of the charges falls below the release threshold, or when the charges change their sign
-    from one frame to the next, or become negative if the charges of the film are positive. The release threshold is a
-    given share of the peak. It is at least half of the touch threshold. The peak
-    is the largest size that two consecutive frames of the touch have reached. The spike of a single frame is not a
-    peak.
+    A touch ends when the size of the charges falls below the release threshold. It also ends when the charges change
+    their sign from one frame to the next. On a film whose charges are positive, it ends when they become negative. The
+    release threshold is a given share of the peak. It is at least half of the touch threshold. The peak is the largest
+    size that two consecutive frames of the touch have reached. The spike of a single frame is not a peak.
 
-    If the mean charges of the last `RISE_S` have already exceeded half of the touch threshold when a touch begins, or
-    three quarters of it for currents, the charges have risen slowly, and a drift of the charge at rest may have caused
-    the touch. All frames of the touch then have the flag `drift`.
+    If the mean charges of the last `RISE_S` have already exceeded half of the touch threshold when a touch begins, the
+    charges have risen slowly, and a drift of the charge at rest may have caused the touch. All frames of the touch then
+    have the flag `drift`. For a board that sends currents, three quarters of the threshold must be exceeded.
 
     If charges exceed the touch threshold in the direction opposite to a touch, the frame has the flag `negative`.
     """
@@ -179,7 +178,7 @@ class Touch(Stage):
         """Update the base, which contains the charges that belong to no touch, or begin a touch.
 
         A touch begins if the charges above the base exceed the threshold in the expected direction. The base decays to
-        zero, and takes over charges that change against this direction.
+        zero. If the charges change against this direction, the base becomes the mean of the latest charges.
 
         Args:
             frame: The frame.
@@ -202,8 +201,9 @@ class Touch(Stage):
             self._is_contact = True
             self._peak_size = min(size, _norm(self._previous))  # a spike of a single frame is not a peak
             self._touch_direction = charge / max(size, 1.0)
-            # The noise of an integral of currents is slow, so that the mean of the latest charges contains it.
-            self._rose_slowly = _norm(self._idle_mean - self._base) > (0.75 if self._setup.device.has_currents else 0.5)
+            # The sum of the noise of currents changes slowly. The mean of the latest charges still contains it.
+            limit = 0.75 if self._setup.device.has_currents else 0.5
+            self._rose_slowly = _norm(self._idle_mean - self._base) > limit
             return
         elif is_remainder and size < _norm(self._base):
             self._base = charge  # the charge that remains of the latest touch becomes smaller

@@ -321,7 +321,7 @@ def _unit_candidates(count: int) -> tuple[Array, Booleans]:
     radius = np.sqrt(radius_sample)  # uniform over the area of the disk
     radius[::4] = 1.0  # every fourth contact lies on the edge
     angle = 2.0 * np.pi * angle_sample
-    position = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    position = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
     distance = scipy.spatial.distance.cdist(position, position)
     return np.column_stack([position, 2.0 * force_sample - 1.0]), distance < START_SEPARATION
 

@@ -84,7 +84,7 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
     first, second = scaled_jacobian.reshape(*sides.shape[:3], -1, 3)
     products = np.einsum("...ei,...ej->...ij", first, second)
     is_fold = (np.linalg.det(products) < 0.0).any(axis=1)
-    folds: Array = position[is_fold]
+    folds = position[is_fold]
     return folds[np.argsort(np.hypot(*folds.T), kind="stable")], error_on_rings
 
 
@@ -387,4 +387,5 @@ def _round_down(radius: float, step: float = RADIUS_STEP) -> float:
     """Round a radius down to a multiple of a step, mm."""
     # The factor compensates the rounding error of the quotient. The conversion into decimal digits removes the rounding
     # error of the product.
-    return float(f"{np.floor(radius / step * (1.0 + 1e-9)) * step:.12g}")
+    steps = np.floor(radius / step * (1.0 + 1e-9))
+    return float(f"{steps * step:.12g}")

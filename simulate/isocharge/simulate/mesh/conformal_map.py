@@ -153,7 +153,7 @@ def sector_angles(
     Returns:
         Angles in the template plane in increasing order, shape (..., n_sector + 1), rad.
     """
-    origin, centre, radius = (value[..., None] for value in (centroid, centre, radius))  # `origin` is that of all rays
+    origin, centre, radius = (value[..., None] for value in (centroid, centre, radius))  # all rays have this origin
     radius_ratio = radius / np.abs(inner_points - centre).max(axis=-1, keepdims=True)
     ray = np.exp(1j * _ray_angles(blocks, inner_points - origin, radius_ratio))  # shape (..., n_sector + 1)
     intersection = _intersections_with_circle(origin - centre, ray, radius)
@@ -179,7 +179,7 @@ def _intersections_with_circle(origin: Array, ray: Complexes, radius: Array) -> 
     # The length t of a ray is the positive solution of |origin + t ray|^2 = radius^2.
     projection = origin * ray.real
     length = np.sqrt(projection**2 + radius**2 - origin**2) - projection
-    return np.asarray(origin + ray * length)
+    return origin + ray * length
 
 
 def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) -> Array:

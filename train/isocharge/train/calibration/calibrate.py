@@ -219,19 +219,20 @@ def _is_uninformative(presses: MeasuredPresses) -> bool:
 
 
 def _check_placement(film: FilmEstimate) -> None:
-    """Check that the estimated shift and rotation of the electrodes are inside the ranges that the estimator considers.
+    """Check that the estimated shift and rotation of the electrodes are inside the ranges that the estimator searches.
 
     Raises:
         PressError: If one of them is at an end of its range. The true value then probably lies outside the range, so
             that neither the estimate nor its standard deviation is right.
     """
-    for one in film.layout.prior.properties:
-        lowest, highest = one.limits
-        if one.name in PLACEMENT and not lowest < film.value(one.name) < highest:
+    for film_property in film.layout.prior.properties:
+        lowest, highest = film_property.limits
+        value = film.value(film_property.name)
+        if film_property.name in PLACEMENT and not lowest < value < highest:
             raise PressError(
-                f"{one.meaning}: the presses agree best with {film.value(one.name):.3g} {one.unit}, which is "
-                "an end of the considered range: is the origin of the stage the centre of the film, are its axes those "
-                "of the film, and are the electrodes where the sensor file describes them?"
+                f"{film_property.meaning}: the presses agree best with {value:.3g} {film_property.unit}, which is an "
+                "end of the range that is searched: is the origin of the stage the centre of the film, are its axes "
+                "those of the film, and are the electrodes where the sensor file describes them?"
             )
 
 

@@ -167,7 +167,7 @@ def next_presses(
     # Divide the errors of x, y and ln F by those that the noise causes, so that they can be added.
     scale = np.sqrt(np.diagonal(sensitivity.noise_covariance, axis1=1, axis2=2).mean(axis=0))  # shape (3,)
     gain = sensitivity.film_gain / scale[:, None]
-    squared_gain = np.einsum("nij,nik->jk", gain, gain)
+    squared_gain = np.einsum("nij,nik->jk", gain, gain)  # G' G, shape (n_unknown, n_unknown)
     proposed = []
     for _ in range(count):
         # A candidate with the rows H reduces the covariance C by C H' (1 + H C H')^-1 H C.

@@ -406,10 +406,9 @@ def read_earlier(folder: Path, problem: CalibrationProblem, *presses: MeasuredPr
     for version in versions:
         if (version / PRESSES).is_file():
             learned = read_presses(version / PRESSES, problem.electrodes)
-            for one in presses:
-                if one is not None:
-                    expected = f"presses that are not among those of the earlier calibration {version}"
-                    _refuse_learned(one, learned, expected)
+            expected = f"presses that are not among those of the earlier calibration {version}"
+            for new_presses in filter(None, presses):
+                _refuse_learned(new_presses, learned, expected)
     return film.drifted()
 
 
