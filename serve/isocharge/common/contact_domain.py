@@ -132,13 +132,14 @@ def with_log_force(contact: Array) -> Array:
 
 
 def into_unit_domain(unit: Array) -> Array:
-    """Replace each point outside the unit disk times [-1, 1] by the nearest point of this set.
+    """Move each point outside the unit cylinder (the unit disk times [-1, 1]) to the nearest point of the cylinder.
 
     Args:
-        unit: Scaled coordinates, as `Domain.to_unit` returns them, shape (n, 3). The first two belong to the disk.
+        unit: Scaled coordinates, as `Domain.to_unit` returns them, shape (n, 3). The first two coordinates belong to
+            the disk.
 
     Returns:
-        Points in the set, shape (n, 3).
+        Points in the cylinder, shape (n, 3).
     """
     distance = np.hypot(unit[:, 0], unit[:, 1])
     return np.column_stack([unit[:, :2] / np.maximum(distance, 1.0)[:, None], np.clip(unit[:, 2], -1.0, 1.0)])

@@ -23,5 +23,6 @@ MAX_BATCH = 4096
 """Largest number of presses in one request or in a batch of Triton. The graph of a model has no limit."""
 
 FEW_ELECTRODES = 4
-"""Largest number of electrodes for which the smaller default sizes of a training are sufficient. With more electrodes,
-working areas are mostly larger, and the charges have more dimensions."""
+"""Largest number of electrodes for which a small training set and a small network are sufficient. With more electrodes,
+working areas are mostly larger, and the charges have more dimensions.
+"""

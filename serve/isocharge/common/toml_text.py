@@ -75,7 +75,7 @@ def _value(value: object) -> str:
 
 
 def _json(value: bool | str) -> str:
-    """Return a truth value or a text in the notation of JSON, in which TOML also writes them.
+    """Return a truth value or a text in the notation of JSON, which is also valid in TOML.
 
     The only difference is that the character U+007F must be escaped in TOML.
     """

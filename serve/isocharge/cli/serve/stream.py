@@ -77,7 +77,7 @@ OutputOption = Annotated[
 
 
 def write_records(records: Iterable[PredictionRecord], writers: Iterable[Callable[[PredictionRecord], object]]) -> None:
-    """Pass each record to all writers, and print each new tare, or the charges of the last record without a tare.
+    """Pass each record to all writers, and print each new tare, or the last charges if the stream ends without a tare.
 
     Args:
         records: The records.
@@ -109,7 +109,7 @@ def write_records(records: Iterable[PredictionRecord], writers: Iterable[Callabl
 
 
 def _require_time(record: PredictionRecord) -> None:
-    """Raise an error if a record contains no time of the board. A file does not state when the frame arrived, either.
+    """Raise an error if a record contains no time of the board. Bytes from a file have no arrival times.
 
     Raises:
         InputError: If the time is missing.
@@ -123,7 +123,7 @@ def _require_time(record: PredictionRecord) -> None:
 
 
 def _listed(charge_pC: Mapping[str, float | None]) -> str:
-    """Return the charges that are known, with the names of their electrodes, as text."""
+    """Return a text with the name and the charge of each electrode whose charge is known."""
     return ", ".join(f"{electrode} {charge:.2f} pC" for electrode, charge in charge_pC.items() if charge is not None)
 
 
@@ -153,7 +153,7 @@ def say_missing_records(outputs: Outputs, state: str) -> None:
     Args:
         outputs: The outputs. `not_written` contains the number of missing records of each incomplete output by its
             target; None if this number is unknown.
-        state: What is printed about an output if the number is unknown.
+        state: Text that is printed for an output whose number of missing records is unknown.
     """
     for target, missing_records in outputs.not_written.items():
         if missing_records is None:

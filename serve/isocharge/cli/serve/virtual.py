@@ -72,8 +72,8 @@ def virtual_command(
 ) -> None:
     """Play a sensor: simulate presses that wander over the film, and send their charges as frames on a pseudo-terminal.
 
-    Solves the film, prints the path of the port, then plays until Ctrl-C. After the time --rest and a minute of random
-    presses, the same begins again.
+    Solves the film, prints the path of the port, then plays until Ctrl-C. A pause (--rest) and a minute of random
+    presses alternate.
 
     Example: isocharge serve virtual three-25um-biaxial --link /tmp/film
     """

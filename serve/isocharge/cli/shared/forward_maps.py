@@ -1,4 +1,4 @@
-"""Option `--probe`, and functions for workers, radius, stress and simulated presses, of commands with forward maps."""
+"""The option `--probe`, and functions for commands that compute a forward map or simulate presses."""
 
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
@@ -28,7 +28,8 @@ ProbesOption = Annotated[
 
 ROUNDING_MARGIN = 1.0 + 1e-6
 """Factor by which the radius and the largest force of a forward map are increased, because rounding may move the
-outermost presses beyond them."""
+outermost presses beyond these limits.
+"""
 
 
 def executor_for(workers: int | None = None, cluster: str | None = None) -> AbstractContextManager[Executor | None]:
@@ -49,8 +50,8 @@ def executor_for(workers: int | None = None, cluster: str | None = None) -> Abst
 def solving_executor(film: Film) -> AbstractContextManager[Executor | None]:
     """Return a context manager that yields the executor of a command which has no option for the number of workers.
 
-    An axisymmetric film is solved within seconds, for which no processes are started. The other films are solved by one
-    process for each core.
+    An axisymmetric film is solved within seconds, so no processes are started. For any other film, one process is
+    started for each core.
     """
     return executor_for(1 if film.is_axisymmetric else None)
 

@@ -171,7 +171,7 @@ class PageFeed:
         stream: RecordedStream | None = None,
         new_recorder: Callable[[Path, str], Recorder] | None = None,
     ) -> None:
-        """Store the stream and its page. The page may change a stream that is given.
+        """Store the stream and its page, and let the page control the argument `stream` if it is given.
 
         Args:
             page: The page.

@@ -129,7 +129,7 @@ def announce(line: str) -> None:
 
 
 def write_stdout(text: str) -> None:
-    """Write a text to stdout at once, without Python's buffer, in which a thread may hang at exit."""
+    """Write a text to stdout without Python's buffer, because a thread that writes to the buffer may hang at exit."""
     _write_all(STDOUT_FILENO, text.encode())
 
 

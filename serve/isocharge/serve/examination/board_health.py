@@ -109,7 +109,7 @@ def measure_channel_health(
 
 
 LIVE_TIME_s = 0.5
-"""Time that frames of a board need at least to arrive, s. Frames from a file arrive within a shorter time."""
+"""Shortest time in which the frames of a board arrive, s. Frames from a file arrive within a shorter time."""
 
 CLEAN_SHARE = 0.99
 """Smallest share of bytes in good frames with a good cable and the right baud rate, dimensionless."""
@@ -256,12 +256,12 @@ def channel_sentences(
 def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress) -> Iterator[str]:
     """Yield one sentence for each missing setting or property that is needed for the force of a held press.
 
-    Without it, the force seems to change during the press, because the amplifiers leak. Touches are computed in any
-    case.
+    Without the setting, the computed force changes during the press, because the amplifiers leak. Touches are computed
+    in any case.
 
     - If the device file contains time constants of a leak, each frame must contain the time of a clock of the device.
     - If no press was held, the time constants of the amplifiers are requested, unless the device file contains them.
-      If a press was held, it shows whether they are needed, and the description of the press states them.
+      A held press shows whether time constants are needed, and the description of the press states them.
 
     Args:
         capture: The frames, at least one.

@@ -182,8 +182,8 @@ class Capture:
         Frames with another number of channels are left out, because the values form one array.
 
         Returns:
-            Values, shape (n, channels), and times since the first of these frames, shape (n,), s. A value that a model
-            cannot read in single precision is infinite.
+            Values, shape (n, channels), and times since the first of these frames, shape (n,), s. A value whose
+            magnitude is larger than `LARGEST` is replaced by infinity.
         """
         channel_count = len(self.frames[-1].values)
         frames = [frame for frame in self.frames if len(frame.values) == channel_count]
@@ -192,7 +192,7 @@ class Capture:
 
 
 def elapsed_times(frames: Sequence[Frame]) -> Array:
-    """Return the times of frames since the first frame, shape (n,), s. A step back, as after a restart, counts as 0."""
+    """Return the times of frames since the first frame, shape (n,), s. Negative steps (restarts) count as 0 s."""
     clock_s = [frame.clock_s for frame in frames]
     return np.cumsum(np.maximum(np.diff(clock_s, prepend=clock_s[:1]), 0.0))
 

@@ -5,8 +5,8 @@ value does not change the median of a block. A press begins with a large change 
 the slow noise of amplifiers cause slower changes. The stage `isocharge.serve.signal_chain.touch.Touch` finds the
 touches of a film that should be at rest, and the press that is held during the port check.
 
-A press that is held with a constant force during the whole time does not change the values. It cannot be distinguished
-from an amplifier with another rest level.
+A press that is held with a constant force during the whole time does not change the values. Such a press cannot be
+distinguished from an amplifier with another rest level.
 
 The charge of a press that is held shows whether an amplifier leaks or the film creeps. The charge of the press is the
 projection of the channel levels onto the direction of the change at its beginning, minus the mean level before the
@@ -32,10 +32,10 @@ from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.signal_chain.touch import Touch, TouchRule
 
 BLOCK_S = 0.1
-"""Time over which values are averaged, s. It contains whole periods of 50 and of 60 Hz."""
+"""Length of a block, s. A block contains a whole number of mains periods at 50 and at 60 Hz."""
 
 CHANGE_BLOCKS = 5
-"""Number of blocks within which a touch changes the values, which is half a second."""
+"""Number of blocks, which last half a second in total, within which a touch changes the values."""
 
 
 def touched_blocks(values: Array, times_s: Array, min_noise: float = 0.0) -> tuple[Reals, Array, Booleans]:

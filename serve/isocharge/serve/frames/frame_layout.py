@@ -71,7 +71,7 @@ PADDING: Final = "pad"
 """Type of a field whose bytes are not read."""
 
 MAX_PADDING = 4096
-"""Largest number of bytes of padding. The limit prevents that a typing error requests a gigabyte."""
+"""Largest number of bytes of padding. The limit prevents a typing error from requesting a gigabyte."""
 
 ByteOrder = Literal["little", "big"]
 Hexadecimal = Annotated[

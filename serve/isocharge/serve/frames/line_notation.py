@@ -1,6 +1,6 @@
-"""Removal of marks that carry no information from the lines of text that boards send, before their numbers are read.
+"""Removal of meaningless marks from the lines of text that boards send, before the numbers in the lines are read.
 
-These are colours, quotes around numbers, blanks behind signs, checksums, and the marks of Teleplot.
+The marks are colours, quotes around numbers, blanks behind signs, checksums, and the notation of Teleplot.
 """
 
 import re
@@ -69,7 +69,7 @@ def _teleplot_content(text: str) -> str:
     """Return the latest value of a line of Teleplot; empty for a text or a point in a plane.
 
     A Teleplot line has the form `>name:time:value;time:value§unit|flags`. The result has the form
-    `t_ms:1000;"name":801.2§unit`. A line that only begins like one of Teleplot is returned as it is.
+    `t_ms:1000;"name":801.2§unit`. A line that is no Teleplot line is returned unchanged.
     """
     flags = text.rpartition("|")[2].split(",")
     if "t" in flags or "xy" in flags:

@@ -1,7 +1,7 @@
 """Numbers in the lines of text that boards send.
 
-Text is numbers with something between them. The numbers are taken out of a line, and the rest of the line is its
-skeleton. Lines with the same skeleton are frames of one layout, in whatever notation the board writes them:
+A line consists of numbers and of its skeleton, which is the text between the numbers. Lines with the same skeleton are
+frames of one layout, in whatever notation the board writes them:
 
 | line | names | numbers |
 |---|---|---|
@@ -226,9 +226,12 @@ def _is_prose(tokens: list[_Token]) -> bool:
 def _has_decimal_commas(text: str) -> bool:
     """Return whether the commas between digits are decimal commas, as in `3,1;-2,0` and `A: 3,1 pC, B: -2,0 pC`.
 
-    They are separators if a number has a decimal point or two commas, if a comma stands before a sign, beside a blank
-    or before a name, if nothing else separates two numbers, or if the line has brackets and a colon or an equals sign
-    does not stand before each number. In `A:4,3`, the comma is a decimal comma, because a name belongs to one number.
+    The commas are separators in these cases:
+
+    - A number has a decimal point or two commas.
+    - A comma stands before a sign, beside a blank or before a name.
+    - Nothing else separates two numbers. In `A:4,3`, it is a decimal comma, because a name belongs to one number.
+    - The line has brackets, and not every number has a name with a colon or an equals sign before it.
     """
     text = re.sub(_TIME, "", text)
     numbers = re.findall("[0-9]+(?:,[0-9]+)?", text)
@@ -279,7 +282,7 @@ def _index_positions(tokens: list[_Token]) -> list[int]:
     numbers = [position for position, token in enumerate(tokens) if _SHAPES.get(token.kind) == "0"]
 
     def first_numbers(pair: str) -> list[int]:
-        """Return the position of the first number of each pair, for the pairs of a given shape that end the line."""
+        """Find the pairs of the given shape at the end of the line, and return the position of each first number."""
         pairs = re.search(rf"(?:[^0]*{pair})+[^0]*$", shape)
         return [] if pairs is None else numbers[-pairs[0].count("0") :: 2]
 
@@ -301,7 +304,7 @@ def _shape(tokens: list[_Token]) -> str:
 
 
 def _gaps(tokens: list[_Token]) -> list[list[_Token]]:
-    """Divide a line at its numbers, and return the parts before the first number, after it, after the second, etc.
+    """Divide a line at its numbers, and return the parts before the first number and after each number.
 
     Args:
         tokens: Parts of the line.

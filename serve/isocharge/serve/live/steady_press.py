@@ -100,7 +100,7 @@ class PressWatch:
     larger error of the leak correction."""
 
     CHECKS_PER_WINDOW = 10
-    """Number of times that a window is examined within its length. At every frame it would take too long."""
+    """Number of examinations within the length of a window. An examination at every frame would take too long."""
 
     MIN_REST_FRAMES = 3
     """Smallest number of frames at rest that must precede a press."""
@@ -121,7 +121,7 @@ class PressWatch:
     """
 
     DRIFT_SIGMAS = 4.0
-    """Number of standard errors of the drift by which the drift may also exceed this limit."""
+    """Number of standard errors of the drift by which the drift may exceed `MAX_RELATIVE_DRIFT`."""
 
     def __init__(self, electrodes: tuple[str, ...]) -> None:
         """Create a watch that waits for the tare, which is the charge of the untouched film.

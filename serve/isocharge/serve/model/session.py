@@ -205,7 +205,7 @@ FLOORS = {
     # Near zero, the misfit is computed from terms that nearly cancel. Versions of onnxruntime differ by 1e-4.
     "misfit": (20.0,),
 }
-"""Floor for each column of an output, in the unit of the column. Below it, differences are compared absolutely."""
+"""Floor for each column of an output, in the unit of the column. Below the floor, the tolerance is constant."""
 
 RANGE_SHARE = 0.05
 """Floor of x, y and the force relative to the range of the model, if this is more than the floor in `FLOORS`."""

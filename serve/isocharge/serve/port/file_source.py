@@ -30,7 +30,7 @@ RECORD_KEYS = (b'"frame_id"', b'"charge_pC"', b'"tare_pC"')
 MCAP_START = b"\x89MCAP"
 
 PRESS_COLUMNS = {"x_mm", "y_mm", "force_N", "charge_pC.A", "flags"}
-"""Columns that only tables of presses and records have."""
+"""Columns that occur only in tables of presses and in records."""
 
 Moment = Annotated[float, Meta(ge=-1e11, le=1e11, description="a time before the year 5138, unix seconds")]
 

@@ -50,7 +50,7 @@ class Request:
 
 
 MAX_READ_BYTES = 65536
-"""Largest number of bytes that are read at the same time, and after which no waiting bytes are added to a chunk.
+"""Largest number of bytes of one read. No more bytes are added to a chunk that has reached this size.
 
 No datagram is larger.
 """

@@ -23,7 +23,7 @@ CLOCKS = {1.0: ("t_s", 1.0), 1e3: ("t_ms", 1.0), 1e6: ("t_us", 1.0)} | {
     tick_rate_Hz: ("t_us", 1e6 / tick_rate_Hz)
     for tick_rate_Hz in (100.0, 1e4, 1e5, 32768.0, 31250.0, 500e3, 2e6, 4e6, 8e6, 16e6)
 }
-"""Name of the field, and value of one tick in the unit of that name, by the tick rate of a clock, Hz."""
+"""For each tick rate of a clock, Hz: name of the clock field, and duration of one tick in the unit of the name."""
 
 CHANNEL = "channel"
 """Name of all channels during the recognition."""
@@ -202,9 +202,9 @@ def _number_parts(
 def _wraps_early(steps: Array, size: int) -> bool:
     """Return whether a counter or clock wraps although the upper bytes that are read with it do not change.
 
-    The upper bytes then do not belong to it.
+    In this case, the upper bytes do not belong to the counter or clock.
 
-    A damaged byte may cause the same step back, but then also an equal step forwards.
+    A damaged byte may also cause a step back, but causes an equal step forwards, too.
 
     Args:
         steps: Differences of the values of consecutive frames, shape (n,).

@@ -46,7 +46,7 @@ def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
 
 
 def _columns(electrodes: Sequence[str], fields: Sequence[Field]) -> Iterator[tuple[str, str | None]]:
-    """Yield two names for each column: that of its field, and that of the part of the field in this column.
+    """Yield two names for each column: the name of its field, and the name of the part of the field in the column.
 
     The parts of charges are the electrodes, and the parts of an object are its fields. The part is None for a field
     with one column.

@@ -201,7 +201,7 @@ UNKNOWN_CONTACT: dict[str, Any] = dict.fromkeys(Contact._fields)
 """Values of the fields of a contact if nothing was computed."""
 
 NO_CONTACT: dict[str, Any] = UNKNOWN_CONTACT | {"force_N": 0.0}
-"""Values of the fields of a contact if nothing touches."""
+"""Values of the fields of a contact if nothing touches the film."""
 
 
 @cache

@@ -21,13 +21,14 @@ _CHANNEL_NUMBER = re.compile(r"(?:ch)?([1-9][0-9]{0,3})")
 class Channels(Stage):
     """Selects the values in a frame that belong to the electrodes.
 
-    The section `[channels]` of the device file states the name or the number of the channel of each electrode. If the
-    device file has no section `[channels]`, a channel belongs to the electrode whose name is among the words of the
-    channel's name, as in `A_pC`, `charge.A` or `electrode a`, or is the part in which the names of the channels differ,
-    as in `chA`, `chB` and `chC`. If no channel has the name of an electrode, but all names of the electrodes stand in
-    the line of text, as in `C,A,B: 3,1,2`, the channels are assigned by the order of the names. Otherwise the channels
-    are assigned by their order, which requires as many channels as electrodes. If the channels are numbered, the
-    numbers must increase.
+    The section `[channels]` of the device file states the name or the number of the channel of each electrode. Without
+    this section, the first of these rules that applies assigns the channels:
+
+    - A channel belongs to the electrode whose name is among the words of the channel's name, as in `A_pC`, `charge.A`
+      or `electrode a`, or is the part in which the names of the channels differ, as in `chA`, `chB` and `chC`.
+    - If the names of all electrodes stand in the line of text, as in `C,A,B: 3,1,2`, the values have the same order.
+    - If there are as many channels as electrodes, both have the same order. Numbers in the names of the channels must
+      then increase.
     """
 
     is_required = True
@@ -214,7 +215,7 @@ def channel_index(name: str, frame: Frame) -> int | None:
 
 
 def _words_of(text: str) -> list[str]:
-    """Return the words of a text, which all characters except letters and digits separate, as well as a unit.
+    """Divide a text into words at all characters except letters and digits, and before a unit.
 
     A unit begins after a capital letter or a digit, as in `AnC`.
     """
@@ -233,7 +234,7 @@ def _reversed_without_common_start(texts: list[str]) -> list[str]:
 
 
 def _are_in_order(names: tuple[str, ...]) -> bool:
-    """Return whether the numbers in names, such as `ch1_v2` and `ch2_v2`, increase, or some name has no number."""
+    """Return whether the numbers in names increase, as in `ch1_v2` and `ch2_v2`; true if any name has no number."""
     numbers = [[int(digits[-9:]) for digits in re.findall("[0-9]+", name)] for name in names]
     return [] in numbers or numbers == sorted(numbers)
 

@@ -37,7 +37,7 @@ class GainRule(Rule, frozen=True, kw_only=True):
             raise WrongKey("pC_per_unit", "a finite number that is not 0, or one for each electrode", self.pC_per_unit)
 
     def charge_pC(self, electrode: str, values: Array) -> Array:
-        """Convert values of one electrode, of any shape, to charges, pC. Without a number for it, the gain is 1."""
+        """Convert values of one electrode, of any shape, to charges, pC. An unstated gain is 1."""
         gain_pC = self.pC_per_unit.get(electrode, 1.0) if isinstance(self.pC_per_unit, dict) else self.pC_per_unit
         offset = self.offset.get(electrode, 0.0) if isinstance(self.offset, dict) else self.offset
         return (values - offset) * gain_pC
@@ -103,9 +103,9 @@ class SaturationRule(Rule, frozen=True, kw_only=True):
 
 
 class Saturation(Stage):
-    """Adds the flag `saturated` to frames in which an amplifier is or was at its limit in this press.
+    """Adds the flag `saturated` to the frames of a press in which an amplifier is, or has been, at its limit.
 
-    An amplifier is at its limit if the device says so, or if the magnitude of a charge reaches the limit of the
+    An amplifier is at its limit if the device reports this, or if the magnitude of a charge reaches the limit of the
     converter. All later frames of the press keep the flag.
     """
 

@@ -15,7 +15,7 @@ device file states a leak, the sum decays with the time constant tau, q[n] = a q
 While nothing touches the film, any charge is an error or comes from a slow warming of the film. The computed touch
 charge therefore decays exponentially to zero.
 
-Frames of a touch must not change the estimated inflow. Therefore, three rules are applied. Each change is clipped.
+Frames of a touch must not change the estimated inflow. Therefore, three rules are applied. Each innovation is clipped.
 During a touch, the correction uses the inflow that was estimated `look_back_s` before the touch. After a release, the
 estimate of the inflow pauses for the time `hold_off_s`.
 
@@ -64,7 +64,7 @@ class LeakRule(Rule, frozen=True, kw_only=True):
 class Inflow:
     """Estimate of the inflow, which is the slow current into each amplifier.
 
-    During a touch, the correction uses the trusted inflow. It is so old that the touch cannot have affected it.
+    During a touch, the correction uses the trusted inflow, an earlier estimate that the touch cannot have affected.
 
     Attributes:
         pC_per_s: The inflow, shape (n_electrode,), pC/s.
@@ -226,8 +226,9 @@ class Leak(Stage):
     def _has_ended_in_gap(self, frame: Frame, output_pC: Array, surplus_pC: Array) -> bool:
         """Return whether a touch has ended in a gap.
 
-        The outputs must then be almost zero, and the touch charges, too, if the new charges arrived at the beginning of
-        the gap. Up to 5 % of a charge may remain, because the time constant and the inflow have errors.
+        If the touch has ended, the outputs are almost zero. The touch charges are almost zero, too, if they are
+        computed as if the new charges had arrived at the beginning of the gap. Up to 5 % of a charge may remain,
+        because the time constant and the inflow have errors.
 
         Args:
             frame: The frame after the gap.

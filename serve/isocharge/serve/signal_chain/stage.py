@@ -29,7 +29,7 @@ Sums of such charges are exact to 1e-7 pC in double precision.
 """
 
 SUM_TOLERANCE_s = 1e-5
-"""Time by which a sum of sampling intervals may fall short of a limit.
+"""Time by which a sum of sampling intervals may fall short of a limit, s.
 
 The sum then reaches the limit at the same frame in single precision, in which the chain in C can be compiled.
 """

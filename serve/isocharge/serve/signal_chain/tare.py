@@ -106,7 +106,7 @@ class Tare(Stage):
     def step(self, frame: Frame) -> None:
         """Subtract the tare from a frame. While there is no tare, search for it, and remove the charges from the frame.
 
-        If the tare follows, it changes with each frame by the drift that the previous frame shows.
+        If the tare follows a drift, each frame changes the tare by the drift that the previous frame shows.
 
         Raises:
             TareError: If the film is touched during the whole search for a tare.

@@ -24,12 +24,12 @@ charges. The conversion depends on the contact. Both steps are therefore done tw
 the first time.
 
 The estimate is considered wrong if no state explains the latest touches, or if the estimated pretension or offset is at
-the end of its range. The film is then called lost, and contacts are corrected with the last estimate that explained its
-touches, until a new estimate explains the latest ones.
+the end of its range. In this case, the film is called lost. Contacts are corrected with the last estimate that
+explained its touches, until a new estimate explains the latest touches.
 
-One set of charges of each touch is used. A single frame has the noise of one reading. Therefore the charges of several
-frames are averaged, namely of frames whose contact is close to the contact with the largest force. A touch is not used
-if its frames have flags that make the charges unreliable.
+Each touch contributes one set of charges. To reduce the noise of a single reading, this set is the average over the
+frames whose contact is close to the contact with the largest force. A touch is not used if its frames have flags that
+make the charges unreliable.
 """
 
 import math
@@ -113,7 +113,7 @@ class TouchPeak:
 
 
 RELATIVE_OFFSET_STD = 0.1
-"""Standard deviations of the common offset, and of the offset of a touch about it, relative to the largest offset."""
+"""Standard deviation of the common offset, and of a touch's deviation from it, relative to the largest offset."""
 
 SMALLEST_STD = 1e-4
 """Smallest standard deviation of an unknown, in its unit, so that the covariance can be inverted."""
@@ -125,33 +125,35 @@ MAX_MEAN_SQUARE = 3.0
 """Largest mean squared distance of the latest touches from the predicted touches, for a film that is not lost."""
 
 CLEAR_CHANGE = 3.0
-"""Standard deviations by which an unknown has changed clearly. A film that is lost has changed clearly, up to an end.
+"""Number of standard deviations above which the change of an unknown is clear.
 
-The pretension of a nearly slack film is always close to its lower end.
+An unknown at an end of its range is implausible only if its change is clear, because the pretension of a nearly slack
+film is always close to its lower end.
 """
 
 FADING_TOUCHES = 256
 """Number of touches that decides how fast the variance of the pretension increases between touches.
 
-If so many touches showed nothing about the pretension, 63 % of the knowledge from earlier touches would be lost. With a
-larger number, a sudden change of a film that did not change before is hardly noticed. With a smaller one, forces are
-less accurate.
+After this number of touches without information about the pretension, 63 % of the information from earlier touches is
+lost. With a larger number, a sudden change after a long time without changes is hardly noticed. With a smaller number,
+forces are less accurate.
 """
 
 SLOW_FADING_TOUCHES = 2 * FADING_TOUCHES
-"""The same number for the variances of the gains and of the offset, which change more slowly than the pretension."""
+"""Value of `FADING_TOUCHES` for the gains and the offset, which change more slowly than the pretension."""
 
 UNCHANGED_ODDS = 0.5
 """Odds, before the first touch, that the pretension has not changed since the calibration.
 
-With larger odds, the forces on a changed film are less accurate; with smaller odds, those on an unchanged film are.
+Larger odds make forces on a changed film less accurate, and smaller odds make forces on an unchanged film less
+accurate.
 """
 
 MEMORY_TOUCHES = 16
 """Number of touches after which the weight of a touch in the mean squared distance has decreased to 1/e."""
 
 SMALLEST_ERROR_SCALE = 0.1
-"""Smallest scale of the error covariance of touches, dimensionless, in case the latest touches agree by chance."""
+"""Lower limit of the scale of the error covariance, dimensionless, because touches may agree by chance."""
 
 
 class FollowRule(Rule, frozen=True, kw_only=True):

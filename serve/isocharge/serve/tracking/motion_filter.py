@@ -45,7 +45,7 @@ _HELD_RATE_COVARIANCE = np.eye(6) * np.pad((1.0 - IS_MOVING) * INITIAL_RATE_STD*
 """Variances of the rates of held values, shape (4, 6, 6). A held value may begin to change at any time."""
 
 _HAS_EFFECT = np.concatenate([np.ones((4, 3)), IS_MOVING], axis=1)[:, None]
-"""Whether each value and rate has an effect on the next state (1), as all but the rates of held values; (4, 1, 6)."""
+"""Factor of each value and rate in the prediction of the next state: 0 for rates of held values, else 1; (4, 1, 6)."""
 
 _KEPT = np.eye(6) * _HAS_EFFECT
 """Matrices that keep the values, and the rates of values that change, shape (4, 6, 6)."""
@@ -85,8 +85,8 @@ WEAK_VARIANCE_FACTOR = 100.0
 LARGEST_STD = np.array([100.0, 100.0, 3.0])
 """Largest standard deviations of measured x and y (mm) and ln F.
 
-The first frames of a slow press may have much larger ones. They would contain no more information, but the covariance
-of the state would lose its positive eigenvalues because of rounding errors.
+The first frames of a slow press may have much larger standard deviations. Without the limit, rounding errors could make
+eigenvalues of the covariance of the state negative.
 """
 
 CORRELATION_RIDGE = 1e-5
@@ -157,8 +157,8 @@ class NoiseEstimate:
 
         If the contact moves steadily and there is no noise, the values of the latest three frames lie on a straight
         line. The deviation of the middle values from the line between the two others therefore shows the noise. The
-        estimate is the mean of its square over all frames. A contact that starts or stops deviates from a line, too. A
-        deviation of more than three standard deviations therefore counts as three.
+        estimate is the mean square of the deviation over all frames. A contact that starts or stops deviates from a
+        line, too. A deviation of more than three standard deviations therefore counts as three.
 
         Args:
             measured: Measured x, y and ln F, shape (3,).
@@ -266,7 +266,7 @@ class ContactFilter:
     of the gains. Smoothing reduces only the first part. The filter therefore weights the frames by the variance of the
     first part alone, and adds the variance of the second part to that of the smoothed values.
 
-    The noise is estimated from all frames of a touch, also if the touch has several contacts one after the other.
+    The noise is estimated from all frames of a touch, even if the touch consists of several successive contacts.
     """
 
     def __init__(self, constant_variance_share: float) -> None:

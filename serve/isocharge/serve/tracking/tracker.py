@@ -148,7 +148,7 @@ class Tracker(Stage):
             self._mixture.reset()
 
     def continue_touch(self, previous: Stage) -> None:
-        """Continue the touch of the tracker of another model, so that its end is an event."""
+        """Continue the touch of the tracker of another model, so that the end of the touch is reported as an event."""
         assert isinstance(previous, Tracker)
         self._time_s = previous._time_s
         self._latest_clock_s = previous._latest_clock_s

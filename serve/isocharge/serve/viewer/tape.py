@@ -1,10 +1,10 @@
 """Samples of a stream, from which the live page draws, and the tape that stores them under consecutive numbers.
 
-A sample contains the numbers of a prediction record that the page shows. All of them are stored as 64-bit floating
-point numbers: the numbers of the record with the names `RECORD_NUMBERS`, the position of the other contact, the flags
-as a sum of bits, whether there is a contact, the number of coalesced records, and the touch charge of each electrode.
-An unknown number is NaN. If contacts are tracked, a sample contains the tracked contact instead of the contact of the
-frame.
+A sample contains the numbers of a prediction record that the page shows. All numbers are stored in 64-bit
+floating-point format: the numbers of the record with the names `RECORD_NUMBERS`, the position of the other contact, the
+flags as a sum of bits, whether there is a contact, the number of coalesced records, and the touch charge of each
+electrode. An unknown number is NaN. If contacts are tracked, a sample contains the tracked contact instead of the
+contact of the frame.
 """
 
 import tempfile
@@ -117,7 +117,7 @@ The frame rate of the board is computed over the same time span.
 """
 
 MAX_DRAWN_SAMPLES = 600
-"""Largest number of samples that the page draws in a line: of a response to one request, or of an overview."""
+"""Largest number of samples of a line on the page, which shows the response to one request or an overview."""
 
 
 class Tape:

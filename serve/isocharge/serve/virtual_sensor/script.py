@@ -38,8 +38,8 @@ class Script:
     """Presses of a virtual sensor.
 
     Attributes:
-        contact: Contact (x, y, F) in each frame, shape (n, 3), mm and N. While nothing touches, the force is 0 and the
-            position is NaN.
+        contact: Contact (x, y, F) in each frame, shape (n, 3), mm and N. While nothing touches the film, the force is 0
+            and the position is NaN.
         rate_Hz: Number of frames per second, Hz.
     """
 
@@ -80,8 +80,8 @@ class VirtualScript(Settings, frozen=True):
     """Content of a script file for the command `isocharge serve virtual`.
 
     Attributes:
-        presses: Rows (seconds, x_mm, y_mm, force_N), which are interpolated linearly. Nothing touches while the force
-            is 0. Without rows, the presses are random.
+        presses: Rows (seconds, x_mm, y_mm, force_N), which are interpolated linearly. Nothing touches the film while
+            the force is 0. Without rows, the presses are random.
         faults: Faults between the board and the reader.
     """
 

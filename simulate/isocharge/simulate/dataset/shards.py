@@ -6,8 +6,8 @@ README.md, which describes the dataset for human readers. The samples are distri
 such as shard-00000.npz. Each shard contains the columns x_mm, y_mm, force_N, probe, orientation_deg, outside and
 charge_pC. The column charge_pC has the shape (n, n_electrode), and all other columns have the shape (n,).
 
-The column outside marks presses between the working area and the clamp. A network is not expected to answer them, but
-must learn to recognise them. Their charges are less accurate than those of the other presses.
+The column outside marks presses between the working area and the clamp. A network must recognise these presses, but
+need not locate them. Their charges are less accurate than those of the other presses.
 
 A dataset is written into a temporary folder, which is renamed when the dataset is complete. A dataset of measured
 presses has the same format, but its manifest has no entries `solver` and `seed`, and it has no presses outside.
@@ -47,7 +47,7 @@ COLUMNS = {
 """Names of the columns of a shard, and their descriptions in the manifest and in the data card."""
 
 ORIGIN_KEYS = ("probes", "ranges", "sampling", "noise", "seed", "solver", "outside", "yield_force_N")
-"""Entries of the manifest about the origin of the samples that the data card repeats."""
+"""Entries of the manifest that describe the origin of the samples, and that the data card repeats."""
 
 MAX_SHARD_BYTES = 1 << 26
 """Largest size of the file of a shard, bytes."""

@@ -1,9 +1,9 @@
 """Sweeps: the presses of a sweep are sampled, and their charges are computed and written as a dataset.
 
 The presses are scrambled Sobol points, which cover the domain more evenly than independent random numbers (Owen 1998),
-with a separate sequence for each probe. The positions are uniformly distributed over the disk, and so are the
-logarithms of their forces over the range of forces. If a sweep has several probes, successive presses cycle through the
-probes.
+with a separate sequence for each probe. The positions are uniformly distributed over the disk. The logarithms of the
+forces are uniformly distributed over the range of forces. If a sweep has several probes, successive presses cycle
+through the probes.
 
 A forward map is built for every probe and evaluated for every press. For the presses between the radius of the sweep
 and the clamp, a coarse map of the whole film is built, with a round probe. Its error of a few percent is acceptable,

@@ -28,9 +28,9 @@ from isocharge.simulate.sensor.sensor import Sensor
 _log = logging.getLogger(__name__)
 
 DETECTABLE_SIGMAS = 5.0
-"""Difference from the charges of every press in the working area above which a press outside can be noticed.
+"""Smallest distance from the charges of all presses in the working area at which a press outside can be noticed.
 
-The difference is in standard deviations of the noise. It is the smallest limit of the misfit in `isocharge.serve`.
+The distance is in standard deviations of the noise. It equals the smallest limit of the misfit in `isocharge.serve`.
 """
 
 N_FORCES = 5

@@ -61,7 +61,7 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
         return contacts_at(onto_disk(position, radius).reshape(-1, 2), force)
 
     def position_error(position: Array) -> Array:
-        """Return the Cramer-Rao position error, which is infinite at a fold, shape of the positions without (2,)."""
+        """Return the Cramer-Rao position error at positions of shape (..., 2), which is infinite at a fold."""
         return limits_at(charge_map, contacts(position), noise).position.reshape(position.shape[:-1])
 
     # Refine the maxima of the error. In each round, the step is halved, and each position moves to the best of 25
@@ -113,7 +113,7 @@ INDISTINGUISHABLE_SIGMAS = 3.0
 """Difference of the charges below which two contacts are indistinguishable, in standard deviations of the noise."""
 
 MIN_DISTANCE = 1.0
-"""Smallest distance between the contacts of an ambiguous pair, mm. On a small film, `MIN_RELATIVE_DISTANCE` counts."""
+"""Smallest distance between the contacts of an ambiguous pair, mm. On a small film, `MIN_RELATIVE_DISTANCE` applies."""
 
 MIN_RELATIVE_DISTANCE = 0.1
 """Smallest distance between the contacts of an ambiguous pair if the domain is small, in radii of the domain."""
@@ -125,7 +125,7 @@ If the distance is smaller, the two contacts count as a single contact with a la
 """
 
 STARTS = 3
-"""Number of searches for a second contact of each first contact. Most often, one of them finds the first contact."""
+"""Number of searches for a second contact of each first contact. Mostly, one of them finds the first contact itself."""
 
 
 @dataclass(frozen=True)

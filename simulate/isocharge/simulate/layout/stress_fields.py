@@ -36,12 +36,12 @@ and the pretension (pC/MPa).
 """
 
 COLUMN_IS_ODD = np.array([column == "y" for column in COLUMNS])
-"""Whether each column is odd about the direction of the press, shape (6,)."""
+"""Whether a mirror image of the film about the direction of the press inverts each column's sign, shape (6,)."""
 
 STEPS = (0.02, 0.02, 0.05, 0.02, 0.1)
 """Steps of the finite differences of the stress, in the order of the derivatives in `COLUMNS`.
 
-The steps of the position and of the probe radius are in units of the probe radius, and that of the pretension is in
+The steps of the position and of the probe radius are in units of the probe radius. The step of the pretension is in
 MPa.
 """
 

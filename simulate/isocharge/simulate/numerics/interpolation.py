@@ -313,8 +313,8 @@ def _lattice(harmonics: Integers, symmetry_order: int) -> tuple[int, int]:
     At the turn j of n, the angles `direction` and `rotation` of `Turns` are pi s j / n and 2 pi j / n, where s is the
     step. The harmonic (m, k) has the phase 2 pi (m s + k) j / n. Two harmonics therefore have the same values at all
     turns if and only if the remainders of m s + k after the division by n are equal. While the rotation increases by
-    one period of the probe, the direction must increase by the same angle or by half a turn more or less, and so on.
-    The difference s - 2 is therefore a multiple of the symmetry order.
+    one period of the probe, the direction must increase by the same angle plus a multiple of half a turn. The
+    difference s - 2 is therefore a multiple of the symmetry order.
 
     Args:
         harmonics: Pairs (m, k), shape (n_term, 2).

@@ -1,7 +1,7 @@
 """Mechanical properties and piezoelectric coefficients of a film, and their accepted ranges.
 
 The table `FILM_NUMBERS` declares the unit and the range of each mechanical property. The function `check_range` raises
-an error if a quantity is outside its range. Probes, electrodes and layouts use it, too.
+an error if a quantity is outside its range. Probes, electrodes and layouts use this function, too.
 """
 
 import cmath
@@ -182,7 +182,7 @@ class Film:
 PIEZO_LIMITS = (1e-3, 1e5)
 """Smallest accepted magnitude of d31, d32 or d33 if it is not zero, and largest magnitude, pC/N or pC/(mm^2 K).
 
-A smaller coefficient was probably given in C/N. The largest is thirty times that of the strongest crystals.
+A smaller coefficient was probably given in C/N. The largest magnitude is thirty times that of the strongest crystals.
 """
 
 

@@ -74,7 +74,7 @@ class FilmProperty:
 
 
 def _imperfection(name: str, meaning: str, unit: str, std: float, largest: float | None = None) -> FilmProperty:
-    """Declare an imperfection, which hardly drifts, with its largest magnitude if a film may be very imperfect."""
+    """Declare an imperfection, whose drift is small. Without a largest magnitude, its bounds follow from its std."""
     bounds = None if largest is None else (-largest, largest)
     return FilmProperty(name, meaning, unit, std, drift=0.1 * std, bounds=bounds, is_imperfection=True)
 
@@ -111,7 +111,7 @@ FILM_PROPERTIES = (
     _imperfection("d12", "d12, by axes that are rotated", "pC/N", 0.3),
     _imperfection("crosstalk", "share of the charge of each other electrode", "1", 0.01),
 )
-"""Properties of every film. The radius of a circular probe and the gains of the electrodes follow them."""
+"""Properties of every film. In the vector of values, the probe radius and the gains of the electrodes follow."""
 
 
 def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> tuple[Sensor, Probe]:

@@ -50,7 +50,7 @@ A smaller value was probably given in metres.
 """
 
 MAX_PART_SIDE = 3.0
-"""Largest side, along the outline of metal that is not convex, of the triangles into which it is divided, mm.
+"""Largest side along the outline of the triangles into which metal that is not convex is divided, mm.
 
 The layout design keeps its distance from the bounding box of each triangle, so the triangles must be small.
 """

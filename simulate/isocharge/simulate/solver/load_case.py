@@ -25,7 +25,7 @@ The ratio is far below the error of the mesh, and well above rounding errors.
 """
 
 Auto = Literal["auto"]
-"""Value of a setting that is chosen automatically for a press, or for all presses of a forward map."""
+"""Value of a setting if the program chooses the setting for a press, or for all presses of a forward map."""
 
 MAX_AMPLITUDE2 = 0.1
 """Largest squared amplitude A^2 for which Saint-Venant-Kirchhoff elasticity is valid, dimensionless.
@@ -261,7 +261,7 @@ def choose_mesh(case: LoadCase) -> PlacedMesh:
 def needs_second_mesh(case: LoadCase) -> bool:
     """Return whether a press must be solved on two meshes in order to estimate the error of the charges.
 
-    The docstring of the module `equilibrium` states the reasons.
+    The docstring of the module `error_estimate` states the reasons.
 
     Args:
         case: The press and the required accuracy.

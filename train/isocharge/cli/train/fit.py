@@ -135,7 +135,7 @@ def _refuse_options(context: typer.Context, source: str, *used_options: str) -> 
 
     Args:
         context: The command with its arguments.
-        source: What the presses are, for the error message.
+        source: Description of the presses, for the error message.
         *used_options: Parameters of the command that have an effect.
 
     Raises:

@@ -23,7 +23,7 @@ NEIGHBOURS = 16
 """Number of contacts to which a quadratic function is fitted, which has ten coefficients."""
 
 MIN_REPEATED_CONTACTS = 10
-"""Number of repeated contacts from which the noise is estimated from their presses only.
+"""Smallest number of repeated contacts with which the noise is estimated only from the presses at these contacts.
 
 With three presses at each of them, the standard deviation of the noise of a channel is known to about 20 %. A single
 reference contact would not show how the noise depends on the charge."""
@@ -37,8 +37,9 @@ OUTLIER = 3.0
 LEAST_SHARE = 0.01
 """Smallest white noise of a channel, relative to the noise of its gain at a charge of the usual size.
 
-The lower limit is needed because the presses do not determine the white noise if no charge is small. The quantiles at
-this share and at one minus this share show whether the charges of a channel vary, and whether they have both signs.
+The lower limit is needed because the presses do not determine the white noise if no charge is small. The quantiles of
+the charges at `LEAST_SHARE` and at 1 - `LEAST_SHARE` show whether the charges of a channel vary, and whether they have
+both signs.
 """
 
 MIN_TRANSITION_RATIO = 0.5
@@ -84,10 +85,10 @@ class ChannelNoise(GaussianNoise):
 
         Rows that are copies of other rows are left out, because they contain no further noise. If at least
         `MIN_REPEATED_CONTACTS` contacts are repeated, the residuals are the differences between the repeated charges
-        and their means. They contain only noise. Otherwise, the residuals are the differences between the charges of a
-        press and the values of a quadratic function, which is fitted to the neighbours of the press. They contain the
-        noise and the error of the quadratic approximation. The white noise and the noise of the gain are fitted to the
-        residuals. Both kinds of noise have lower limits.
+        and their means. These residuals contain only noise. Otherwise, the residuals are the differences between the
+        charges of a press and the values of a quadratic function, which is fitted to the neighbours of the press. These
+        residuals contain the noise and the error of the quadratic approximation. The white noise and the noise of the
+        gain are fitted to the residuals. Both kinds of noise have lower limits.
 
         Args:
             charge: Measured charges, shape (n, n_electrode), pC.
@@ -138,7 +139,8 @@ class ChannelNoise(GaussianNoise):
 
         The inputs of the network are asinh(Q / transition charge). They are nearly linear in charges Q below the
         transition charge, and nearly logarithmic above it. The transition charge is the charge above which the noise is
-        mostly proportional to the charge. For a channel with charges of both signs, it also has a lower limit.
+        mostly proportional to the charge. For a channel with charges of both signs, the transition charge also has a
+        lower limit.
 
         Args:
             charge: Charges of presses, shape (n, n_electrode), pC.

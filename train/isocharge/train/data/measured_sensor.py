@@ -20,9 +20,8 @@ from isocharge.simulate import Domain
 from isocharge.train.data.channel_noise import LEAST_SHARE
 
 HULL_RATIO = 0.3
-"""Length above which an edge of the outline bends inwards to further places.
-
-It is relative to the range of the distances between neighbouring places, of which the shortest is 0 and the longest 1.
+"""Length above which an edge of the outline bends inwards to further places, dimensionless. The value 0 is the shortest
+distance between neighbouring places, and 1 is the longest distance.
 """
 
 LEAST_RANGE = 1.1

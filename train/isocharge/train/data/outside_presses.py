@@ -24,7 +24,7 @@ N_SECTORS = 24
 """Number of rings into which the area outside the working area is divided, and of sectors of each ring."""
 
 N_NEIGHBOURS = 8
-"""Number of presses of which the share of a sector is the mean. They are the nearest presses to its middle."""
+"""Number of presses from which the share of a sector is computed. They are nearest to the middle of the sector."""
 
 
 @dataclass(frozen=True)

@@ -179,8 +179,8 @@ def place_count(contact: Array) -> int:
 def merged_places(contact: Array, step_mm: float = PLACE_STEP_mm) -> Array:
     """Move the positions of all presses at one place to their mean, and return the contacts (x, y, F), shape (n, 3).
 
-    The encoders of a stage report slightly different positions of one place. Positions belong to one place if short
-    steps connect them, and if their rms distance from their mean is not larger than a step, either.
+    The encoders of a stage report slightly different positions of one place. Positions belong to one place if steps of
+    at most `step_mm` connect them, and if their rms distance from their mean is at most `step_mm`.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.

@@ -165,8 +165,8 @@ def check_graph(
         compute_exact: Function that computes the outputs of the network in double precision.
         presses: Presses of the film.
         noise: Noise of good presses.
-        floors: Values of x and y, mm, and of the force, N. The tolerance is proportional to the value of an output, or
-            to this value if that is larger.
+        floors: Floors of x and y, mm, and of the force, N. The tolerance is proportional to the larger of two numbers:
+            the magnitude of an output and its floor.
 
     Returns:
         Charges for the golden vectors, float32, shape (n, n_electrode) with n up to `N_GOLDEN`, pC.

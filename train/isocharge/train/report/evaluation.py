@@ -220,7 +220,8 @@ def evaluate_dataset(dataset: Dataset, model_folder: Path, settings: Settings) -
     Raises:
         DatasetError: If the methods cannot be fitted to the dataset.
         ModelError: If the model is for another sensor than the dataset.
-        PressError: If there are too few measured presses, or the model was calibrated from all that are held out.
+        PressError: If there are too few measured presses, or the model was calibrated from all presses that are held
+            out.
     """
     predictor = Predictor(model_folder)
     model = predictor.metadata
@@ -300,9 +301,9 @@ def split_presses(
     """Split presses into those to which methods are fitted, and those that are held out for the test.
 
     In a simulated dataset, a tenth of the positions is held out. A training on the same dataset also holds these
-    positions out, or some of them if its configuration states a smaller share. Only the positions that both hold out
-    are used for the test. Measured datasets are smaller. In them, a fifth of the positions is held out, except presses
-    that a calibration of the model has used.
+    positions out, or some of them if its configuration states a smaller share. The test uses only positions that
+    neither the report nor the training uses for fitting. Measured datasets are smaller. In them, a fifth of the
+    positions is held out, except presses that a calibration of the model has used.
 
     Args:
         dataset: The presses of a dataset that the model covers.
@@ -344,7 +345,7 @@ def _calibration_charges(model_folder: Path, model: ModelMetadata) -> Array:
     """Return the charges of all presses from which a model was calibrated, shape (n, n_electrode), pC.
 
     A calibration may continue an earlier one, so the presses of all versions of the model are returned. A model that
-    was not calibrated has none.
+    was not calibrated has no such presses.
     """
     files = model_folder.parent.glob(f"*/{PRESSES}")
     charges = [read_presses(file, model.electrodes).charge_pC for file in files]

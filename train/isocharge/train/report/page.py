@@ -142,8 +142,8 @@ def draw_speed(sections: Sequence[Section]) -> Figure:
 
     Returns:
         Figure with a logarithmic axis of the times. The evaluated model is a star, and the Cramér-Rao limit is a
-        horizontal line. The line lies outside the panel if it is much larger than all errors, which occurs if the
-        presses reach a fold of the charges.
+        horizontal line. The line lies outside the panel if the limit is much larger than all errors, which occurs if
+        the presses reach a fold of the charges.
     """
     figure = new_figure(6.5 * len(sections), 4.5)
     panels = figure.subplots(1, len(sections), squeeze=False)

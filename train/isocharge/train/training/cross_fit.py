@@ -255,7 +255,7 @@ def uncertain_places(presses: MeasuredPresses) -> Array:
 def constant_force_std(presses: MeasuredPresses) -> float | None:
     """Return the relative standard deviation of the force of presses that all have nearly the same force.
 
-    The variance is the sum of that of the forces and of the mean of those that the presses state.
+    The variance is the sum of the variance of the forces and the mean of the variances that the presses state.
 
     Args:
         presses: Presses with known forces.

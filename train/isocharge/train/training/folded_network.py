@@ -308,9 +308,9 @@ def _add_features(builder: GraphBuilder, features: ChargeFeatures) -> str:
 def _add_perceptrons(builder: GraphBuilder, inputs: str, perceptrons: Sequence[Perceptron]) -> str:
     """Add nodes that evaluate several perceptrons with the same inputs as one perceptron.
 
-    The weights of the first layers and of the skip layers stand side by side. Those of the later layers are blocks on
-    the diagonal of a matrix. The operator `Gemm` computes inputs @ weights + bias. The last layer adds the output of
-    the skip layer.
+    The weights of the first layers and of the skip layers stand side by side. The weights of the later layers are
+    blocks on the diagonal of a matrix. The operator `Gemm` computes inputs @ weights + bias. The last layer adds the
+    output of the skip layer.
 
     Args:
         builder: Builder of the graph.

@@ -29,7 +29,8 @@ def draw_charges(rng: np.random.Generator, charge: Array, noise: ChannelNoise, c
 
     Presses are chosen at random, and normally distributed errors are added to the levels of their charges. The level of
     a charge is its value on a scale on which the noise has the standard deviation 1. In each press, a random share of
-    the electrodes has errors whose standard deviation is log-uniform within `LOG_DISTANCES`. The others have noise.
+    the electrodes has errors whose standard deviation is log-uniform within `LOG_DISTANCES`. The other electrodes have
+    noise.
 
     Args:
         rng: Random number generator.

@@ -88,7 +88,7 @@ The inputs of the layer have unit variance.
 """
 
 FORCE_OUTPUTS = [LOG_FORCE.start, LOG_STD.stop - 1, TURN.start + 1, TURN.start + 2]
-"""Outputs of the contact perceptron for ln F, for the logarithm of its standard deviation and for its correlations."""
+"""Columns of the contact perceptron's outputs for ln F, for its log standard deviation and for its correlations."""
 
 
 class Posterior(NamedTuple):

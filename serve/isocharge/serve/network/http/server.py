@@ -59,9 +59,9 @@ class Connection(HttpToolsProtocol):
     def connection_made(self, transport: Any) -> None:
         """Begin the connection. If there are too many connections, end one that waits for a request.
 
-        Of these, the one with the earliest deadline is ended. A connection that has not sent any request has an earlier
-        deadline than one whose requests were answered. If no other connection waits for a request, the new connection
-        is refused.
+        Among the connections that wait for a request, the one with the earliest deadline is ended. A connection that
+        has not sent any request has an earlier deadline than one whose requests were answered. If no other connection
+        waits for a request, the new connection is refused.
         """
         super().connection_made(transport)
         self._allow(self._limits.header_seconds)  # the TLS handshake, which is over, has a limit of its own
@@ -158,7 +158,7 @@ class Connection(HttpToolsProtocol):
         """Let the response to the latest complete request close the connection.
 
         Returns:
-            Whether there is such a request that is not answered yet.
+            Whether a complete request is not answered yet.
         """
         cycle = self.cycle
         is_owed = cycle is not None and not (cycle.response_complete or cycle.more_body or cycle.disconnected)
