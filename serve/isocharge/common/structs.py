@@ -237,7 +237,7 @@ def _describe_mistake(value: Any, expected_type: Any, error: msgspec.ValidationE
     kind, name = wrong_key.groups()
     if kind == "missing required":
         return f"key {_join(path, name)!r} is missing"
-    known_keys = [str(key) for key in item_types]
+    known_keys = list(map(str, item_types))
     similar_keys = difflib.get_close_matches(cut(name), known_keys, n=1)
     advice = f"did you mean {similar_keys[0]!r}? Known are" if similar_keys else "known are"
     return f"unknown key {shown(_join(path, name))}; {advice} {cut(', '.join(known_keys))}"

@@ -122,7 +122,7 @@ def assign_channels(changes: Array, electrodes: Sequence[str], min_advantage: fl
     normalised = np.exp(log_changes)
 
     # The channel of each electrode is the column with the largest change in its row. Check that the choice is clear.
-    columns = [int(column) for column in np.argmax(normalised, axis=1)]
+    columns: list[int] = np.argmax(normalised, axis=1).tolist()
     for row, column in enumerate(columns):
         largest_other_change = np.delete(normalised[row], column).max(initial=0.0)  # 0 if there is only one channel
         if normalised[row, column] < min_advantage * largest_other_change:

@@ -65,9 +65,8 @@ def touched_blocks(values: Array, times_s: Array, min_noise: float = 0.0) -> tup
     channels = tuple(map(str, range(len(noise))))
     detector = Touch(Setup(channels, Device(rules={TouchRule: BLOCK_RULE}), has_any_sign=True))
     is_contact = np.zeros(len(levels), dtype=bool)
-    rest = np.zeros(len(noise))  # replaced in the first block
     for number, level in enumerate(levels):
-        if not is_contact[number - 1]:
+        if not is_contact[number - 1]:  # true for the first block, because the last element is still False
             rest = levels[max(number - CHANGE_BLOCKS, 0)]
         frame = Frame(seq=None, t_us=None, values=(), dt_s=float(steps_s[number]), charge_pC=level - rest)
         frame.noise_pC = noise
@@ -205,6 +204,7 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress:
     if not is_touched.any():
         return HeldPress()
 
+    # Choose the blocks in which the film is at rest before the press, and those in which the press is held.
     begin_block = int(np.argmax(is_touched))
     held_blocks = int(np.argmin([*is_touched[begin_block:], False]))
     end_block = begin_block + held_blocks - 1  # the force may have begun to fall in the block before
@@ -217,10 +217,10 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress:
 
     # Project the levels onto the step. One unit is the charge at the beginning of the press.
     step = levels[settled_block] - levels[rest_blocks - 1]
-    component = levels @ step / (step @ step)
-    rest = component[:rest_blocks]
+    projected_levels = levels @ step / (step @ step)  # shape (blocks,)
+    rest = projected_levels[:rest_blocks]
     drift_per_s = float(np.polyfit(block_times_s[:rest_blocks], rest, deg=1)[0])
-    charge = component[settled_block:end_block] - rest.mean()
+    charge = projected_levels[settled_block:end_block] - rest.mean()
     block_ends_s = (block_times_s[:-1] + block_times_s[1:]) / 2.0
     begin_s = block_ends_s[begin_block - 1]
     tau_s, description = _describe(block_times_s[settled_block:end_block] - begin_s, charge, drift_per_s)

@@ -60,8 +60,11 @@ def propose(
     has_large_offset = any(abs(level) > TareRule().offset_limit_pC for level in offset.values())
     is_in_pC = unit_of(capture, positions.values()) == "pC"
     if gain or has_large_offset or not is_in_pC:
-        known_gain = dict(gain) or ({"pC_per_unit": 1.0} if is_in_pC else {})
-        table["gain"] = ({"offset": offset} if any(offset.values()) else {}) | known_gain
+        table["gain"] = {"offset": offset} if any(offset.values()) else {}
+        if gain:
+            table["gain"] |= gain
+        elif is_in_pC:
+            table["gain"]["pC_per_unit"] = 1.0
     return table
 
 

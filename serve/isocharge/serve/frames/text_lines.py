@@ -175,7 +175,9 @@ def parse_line(text: str, *, has_header: bool = False, counters: Collection[str]
     # A single word and a single number, as in `A,3.5`, are a name and its value even below a header with two columns.
     is_pair = re.fullmatch("[,;]?w[,;|]0w?", _shape(tokens)) is not None
     may_alternate = is_pair or (times.count("") > 1 and not has_header)
-    names = (_alternating_names(times, gaps) if may_alternate else []) or _preceding_names(times, gaps, counters)
+    names = _alternating_names(times, gaps) if may_alternate else []
+    if not names:
+        names = _preceding_names(times, gaps, counters)
     starts = tuple(token.start for token in tokens if token.is_number)
     words = tuple(token.name for gap in gaps for token in gap if token.kind != "mark")
     skeleton = _skeleton(tokens, names, number_kind)
@@ -281,18 +283,20 @@ def _index_positions(tokens: list[_Token]) -> list[int]:
     shape = _shape(tokens)
     numbers = [position for position, token in enumerate(tokens) if _SHAPES.get(token.kind) == "0"]
 
-    def first_numbers(pair: str) -> list[int]:
+    def first_numbers(pair: str) -> list[int]:  # the pattern of a shape, in which 0 is a number and w is a word
         """Find the pairs of the given shape at the end of the line, and return the position of each first number."""
         pairs = re.search(rf"(?:[^0]*{pair})+[^0]*$", shape)
         return [] if pairs is None else numbers[-pairs[0].count("0") :: 2]
 
+    # The first number, a colon or an equals sign, and the second number
     indices = first_numbers(r"0[)\]]?[:=]0")
     if len(indices) > 1 or 2 * len(indices) == len(numbers):
         return indices
 
+    # A word or a mark, the first number, and the second number
     indices = first_numbers(r"[w#(\[=]0[)\]>(\[]?0")
     contents = [tokens[position].content for position in indices]
-    counts = [str(count) for count in range(len(indices) + 1)]
+    counts = list(map(str, range(len(indices) + 1)))
     are_counts = len(indices) > 1 and contents in (counts[:-1], counts[1:])
     previous_contents = {tokens[position - 1].content for position in indices}
     return indices if are_counts and len(previous_contents) == 1 else []
@@ -360,24 +364,31 @@ def _preceding_names(times: list[str], gaps: list[list[_Token]], counters: Colle
         gaps: Parts between the numbers.
         counters: Names of counters and clocks.
     """
-    inner_names = []
-    outer_names = []
+    # Choose the nearest name before each number or, if several numbers have the same nearest name, the second nearest.
+    nearest_names = []
+    second_names = []
     for time, gap in zip(times, gaps[:-1], strict=True):
         parts = takewhile(lambda token: token.content not in _SEPARATORS, reversed(gap))
-        inner_name, outer_name, *_ = *(token.name for token in parts if token.kind in ("word", "key")), "", ""
-        inner_names.append(time or inner_name)
-        outer_names.append(outer_name)
-    names = [inner or outer for inner, outer in zip(_unique(inner_names), _unique(outer_names), strict=True)]
+        candidates = [token.name for token in parts if token.kind in ("word", "key")]
+        nearest_name, second_name, *_ = *candidates, "", ""
+        nearest_names.append(time or nearest_name)
+        second_names.append(second_name)
+    names = [nearest or second for nearest, second in zip(_unique(nearest_names), _unique(second_names), strict=True)]
 
+    # Remove words that are units.
     words = {token.name for gap in gaps for token in gap if token.kind == "word"}
     kinds_behind = [token.kind for token in gaps[-1] if token.kind != "mark"]
     channels = [index for index, name in enumerate(names) if name not in TIMES_US]
     if channels and not names[channels[0]] and kinds_behind[-1:] == ["word"]:
         names = ["" if name in words else name for name in names]
+
+    # Remove the only name if it is the label of the whole line.
     named = [index for index in channels if names[index]]
-    is_single = len(channels) > 1 and len(named) == 1 and names[named[0]] not in counters
-    if is_single and (named[0] == channels[0] or names[named[0]] in words):
-        names[named[0]] = ""
+    if len(channels) > 1 and len(named) == 1:
+        (index,) = named
+        may_be_label = index == channels[0] or names[index] in words
+        if may_be_label and names[index] not in counters:
+            names[index] = ""
     return names
 
 

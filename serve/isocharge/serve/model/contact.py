@@ -127,11 +127,12 @@ def add_covariance(contacts: Singles, covariance: Array) -> Singles:
         covariance: Covariance of the additional error of x, y and the force, shape (n, 3, 3), mm and N.
     """
     total = contacts.astype(float)
-    std = total[:, STD_COLUMNS]
+    std = total[:, STD_COLUMNS]  # of x, y and the force, shape (n, 3)
     total_std = np.sqrt(std**2 + np.diagonal(covariance, axis1=1, axis2=2))
-    i, j = [0, 0, 1], [1, 2, 2]  # the pairs (x, y), (x, F) and (y, F)
-    total_covariance = total[:, CORRELATION_COLUMNS] * std[:, i] * std[:, j] + covariance[:, i, j]
-    total[:, CORRELATION_COLUMNS] = total_covariance / (total_std[:, i] * total_std[:, j])
+    # The covariances of the pairs (x, y), (x, F) and (y, F), shape (n, 3), are correlations times standard deviations.
+    first, second = [0, 0, 1], [1, 2, 2]
+    pair_covariance = total[:, CORRELATION_COLUMNS] * std[:, first] * std[:, second] + covariance[:, first, second]
+    total[:, CORRELATION_COLUMNS] = pair_covariance / (total_std[:, first] * total_std[:, second])
     total[:, STD_COLUMNS] = total_std
     return total.astype(np.float32)
 

@@ -189,7 +189,9 @@ class RobustProblem:
         values = self._model(contacts, state)
         residual = (self._whitening @ (self._charge_pC - values.charge_pC)[:, :, None])[:, :, 0]
         contact_residual = (self._measured - contacts) * self._contact_weight
-        chi2 = (residual**2).sum(axis=1) + (contact_residual**2).sum(axis=1)
+        chi2 = (residual**2).sum(axis=1) + (contact_residual**2).sum(axis=1)  # shape (n,)
+
+        # Weights and costs of a Student t distribution with nu degrees of freedom
         weights = (self._freedom + self._degrees) / (self._freedom + chi2)
         press_cost = 0.5 * (self._freedom + self._degrees) * np.log1p(chi2 / self._freedom)
         deviation = state - self._prior_mean

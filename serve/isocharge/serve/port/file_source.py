@@ -90,7 +90,7 @@ def foreign_kind(name: str, head: bytes) -> str:
     """
     quoted_name = shlex.quote(name)  # for the commands in the advice
     text = head.removeprefix(codecs.BOM_UTF8).lstrip()
-    first_line, _line_feed, _next_lines = text.partition(b"\n")
+    first_line = text.partition(b"\n")[0]
     if first_line.startswith(RECORDING_START):
         return f"a recording; play it with: isocharge serve replay {quoted_name}"
     if first_line.startswith(b"{") and all(key in first_line for key in RECORD_KEYS):

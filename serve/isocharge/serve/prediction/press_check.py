@@ -182,8 +182,9 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     # Exclude the bad presses, and test whether noise and rig explain the errors of the other presses.
     metadata = predictor.metadata
     errors = press_errors(predictor, presses)
+    is_compared = errors.is_compared
     is_bad = _bad_presses(errors)
-    is_selected = errors.is_compared & ~is_bad
+    is_selected = is_compared & ~is_bad
     selected_count = int(is_selected.sum())
     agreement = Agreement.from_errors(errors, is_selected)
     parts = (errors.error[is_selected], errors.noise_std[is_selected], errors.rig_std[is_selected])
@@ -195,8 +196,7 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     if selected_count >= MIN_PRESSES:
         fits = agreement.acceptable and not misfit_text
 
-    std_factor = None  # remains None if too few presses are compared for a guarantee
-    is_compared = errors.is_compared  # a guarantee needs all presses, also the bad ones
+    std_factor = None  # remains None if too few presses are compared for a guarantee, which needs bad presses, too
     if np.count_nonzero(is_compared) >= FEWEST_HELD_OUT:
         std_factor = StdFactor.from_errors(errors.error[is_compared], errors.noise_std[is_compared])
 

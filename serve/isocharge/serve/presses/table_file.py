@@ -358,6 +358,7 @@ def _find_header(lines: list[str], names: Collection[str]) -> tuple[int, str]:
             with suppress(csv.Error):  # the error is raised again when the table is read
                 texts = {cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])}
                 has_number = any(map(_NUMBER.fullmatch, texts.difference(names)))
+                # Number of names, and number of cells. Without a name, only the first line may be the header.
                 score = (0 if has_number else len(texts.intersection(names)), len(texts) if line_index == 0 else 0)
                 if score > best_score:
                     best_score = score

@@ -186,10 +186,13 @@ class Leak(Stage):
             previous: The previous frame with charges.
             output_pC: Output of the amplifiers above the tare, shape (n_electrode,), pC.
         """
+        # Compute the charge that is new since the previous frame.
         dt_s = frame.dt_s
         self._charge_pC = self._charge_pC - previous.warming_pC  # the part that warming, and not a touch, has caused
         innovation_pC = self._innovation_pC(output_pC, np.exp(-dt_s / self._tau_s))
         surplus_pC = innovation_pC - self._inflow.pC_per_s * dt_s  # new touch charge and noise
+
+        # Out of contact, let the touch charge decay, and learn the inflow unless it is paused.
         if previous.is_contact:
             self._inflow.pause()
         else:
@@ -199,6 +202,8 @@ class Leak(Stage):
                 self._inflow.hold_s -= dt_s
             else:
                 self._inflow.learn(surplus_pC, frame.noise_pC, dt_s)
+
+        # After a gap, check whether the touch has ended, or its charge is wrong.
         has_gap = dt_s > 1.5 * previous.dt_s  # frames are missing or were invalid
         if has_gap and previous.is_contact and self._has_ended_in_gap(frame, output_pC, surplus_pC):
             self._is_falsified = False
@@ -303,12 +308,16 @@ class Integrator(Leak):
         current_pC = frame.charge_pC
         if current_pC is None:
             return
+
+        # Add the assumed charges of the missing frames.
         mean_pC = (current_pC + self._current_pC) / 2.0
         interval_s = max(self._search_s / self._search_frames, SUM_TOLERANCE_s)
         may_be_noise = np.abs(mean_pC) <= 3.0 * frame.noise_pC
         missing_pC = missing_count * np.where(may_be_noise, self._inflow.pC_per_s * interval_s, mean_pC)
         frame.charge_pC = current_pC + missing_pC if frame.intervals > 0 else np.zeros_like(current_pC)
         super().step(frame)
+
+        # Mark the touch if the error of the assumed charges may be large.
         error_pC = missing_count * np.abs(current_pC - self._current_pC) / 2.0  # if the current rose or fell steadily
         self._current_pC = current_pC
         frame.noise_pC = frame.noise_pC * math.sqrt(max(1.0, 0.5 * self._rule.relax_s / interval_s))

@@ -172,28 +172,33 @@ def update_components(
     states = prior.mean
     n_component, n_state = states.shape
     for iteration in range(iterations + 1):
+        # Predict the measured charges and their derivatives with respect to the state. A measured charge is the charge
+        # of the film times the gain.
         film_charge_pC, film_jacobian = charges.linearised(contacts_of(states))
         gains = np.exp(states[:, GAINS])
         predicted_pC = film_charge_pC * gains
-        jacobian = np.zeros((n_component, charge_pC.size, n_state))
+        jacobian = np.zeros((n_component, charge_pC.size, n_state))  # J
         jacobian[:, :, VALUES] = film_jacobian * gains[:, :, None]
         jacobian[:, :, GAINS] = predicted_pC[:, :, None] * np.eye(charge_pC.size)
 
-        cross_covariance = jacobian @ prior.covariance
-        charge_covariance = cross_covariance @ jacobian.swapaxes(1, 2)
+        # Compute the innovation v and its covariance S, relative to the charges of the prior mean.
+        cross_covariance = jacobian @ prior.covariance  # J P
+        charge_covariance = cross_covariance @ jacobian.swapaxes(1, 2)  # J P J^T
         innovation_covariance = charge_covariance + np.diag(variance_pC2)
         residual_pC = charge_pC - predicted_pC
         innovation = residual_pC[:, :, None] - jacobian @ (prior.mean - states)[:, :, None]
-        weighted = np.linalg.solve(innovation_covariance, innovation)  # S^-1 v
-        if iteration < iterations:
-            step = prior.mean + (cross_covariance.swapaxes(1, 2) @ weighted)[:, :, 0] - states
+        weighted_innovation = np.linalg.solve(innovation_covariance, innovation)  # S^-1 v
+        if iteration < iterations:  # move the state, unless this is the last evaluation
+            # From the present state to the Kalman update of the prior mean, shape (n_component, n_state)
+            step = prior.mean + (cross_covariance.swapaxes(1, 2) @ weighted_innovation)[:, :, 0] - states
             relative_length = np.abs(step[:, VALUES]) / MAX_ITERATION_STEP
             states = states + step / np.maximum(relative_length.max(axis=1, keepdims=True), 1.0)
 
     squared_misfit = (residual_pC**2 / variance_pC2).sum(axis=1)
-    squared_distance = squared_misfit + (weighted * (charge_covariance @ weighted)).sum(axis=(1, 2))
+    squared_change = (weighted_innovation * (charge_covariance @ weighted_innovation)).sum(axis=(1, 2))
+    squared_distance = squared_misfit + squared_change
     log_weight = prior.log_weight - 0.5 * (squared_distance + np.linalg.slogdet(innovation_covariance).logabsdet)
-    gain = np.linalg.solve(innovation_covariance, cross_covariance).swapaxes(1, 2)
+    gain = np.linalg.solve(innovation_covariance, cross_covariance).swapaxes(1, 2)  # Kalman gain P J^T S^-1
     covariance = prior.covariance - gain @ cross_covariance
     covariance = 0.5 * (covariance + covariance.swapaxes(1, 2))  # removes asymmetric rounding errors
     return UpdatedComponents(Components(states, covariance, log_weight), squared_misfit, squared_distance)
@@ -215,7 +220,7 @@ def prune_components(components: Components, max_count: int = 8, merge_distance:
     motion = components.mean[:, MOTION]
     std = np.sqrt(np.diagonal(components.covariance, axis1=1, axis2=2)[:, MOTION])
     kept: list[int] = []
-    for row in np.argsort(-log_weight, kind="stable").tolist():
+    for row in np.argsort(-log_weight, kind="stable").tolist():  # the most probable component first
         if np.exp(log_weight[row]) < np.finfo(float).tiny:
             break
         is_similar = (np.abs(motion[kept] - motion[row]) < merge_distance * std[row]).all(axis=1)
@@ -367,10 +372,13 @@ class ContactMixture:
         if is_outside[best] or updated.squared_distance[best] > SQUARED_GATE:
             return
         components = prune_components(components._replace(log_weight=log_weight))  # the most probable is now the first
+
+        # Search for folds between the components, and between the most probable component and two states that lie at
+        # the distance `CLEAR_DISTANCE` beyond its ends.
         count = len(components.mean)
         ends = _components_at_ends(components)
-        far = components.mean[0] + CLEAR_DISTANCE / SPLIT_DISTANCE * (ends.mean - components.mean[0])
-        is_across_fold = self._is_across_fold(np.vstack([components.mean, far]))
+        distant_states = components.mean[0] + CLEAR_DISTANCE / SPLIT_DISTANCE * (ends.mean - components.mean[0])
+        is_across_fold = self._is_across_fold(np.vstack([components.mean, distant_states]))
         misfit = math.sqrt(updated.squared_misfit[best])
         self._hypotheses = _hypotheses_of(components, is_across_fold[:count, :count], misfit)
         # A single Gaussian component describes only the contacts on one side of a fold accurately.
@@ -430,17 +438,16 @@ def _hypotheses_of(components: Components, is_across_fold: Booleans, misfit: flo
     remaining = np.ones(len(probability), dtype=bool)
     hypotheses = []
     while remaining.any():
-        first = remaining.argmax()
+        first = remaining.argmax()  # the most probable of the remaining components
         difference_mm = np.abs(components.mean - components.mean[first])[:, POSITION]
         is_near = (difference_mm < CLEAR_DISTANCE * np.sqrt(variance + variance[first])).all(axis=1)
         is_same = remaining & is_near & ~is_across_fold[first]
         is_same[first] = True  # even if rounding errors make it appear to be across a fold
         remaining &= ~is_same
-        total = float(probability[is_same].sum())
-        (mean,), (covariance,) = mixture_moments(
-            probability[None, is_same] / total, components.mean[is_same], components.covariance[is_same]
-        )
-        hypotheses.append(ContactHypothesis(mean, covariance, total, misfit))
+        contact_probability = float(probability[is_same].sum())
+        weights = probability[None, is_same] / contact_probability
+        (mean,), (covariance,) = mixture_moments(weights, components.mean[is_same], components.covariance[is_same])
+        hypotheses.append(ContactHypothesis(mean, covariance, contact_probability, misfit))
     return sorted(hypotheses, key=lambda hypothesis: -hypothesis.probability)
 
 

@@ -306,16 +306,21 @@ class FilmFollower(Stage):
             charge_pC: Average touch charges near the largest force, shape (n_electrode,), pC.
             clock_s: Time of the touch, s.
         """
+        # Increase the variances, because the film may have changed since the previous touch.
         elapsed_hours = max(clock_s - self._latest_touch_s, 0.0) / 3600.0
         self._latest_touch_s = clock_s
         self._covariance[0, 0] += self._rule.drift_MPa_per_root_hour**2 * elapsed_hours
         lost_variance = np.maximum(self._initial_std**2 - self._covariance.diagonal(), 0.0)
         self._covariance += np.diag(lost_variance / self._fading_touches)
+
+        # Compute the covariance of the three errors of the charges.
         touch_offset_pC = self._offset_std_pC * self._offset_ratio
         model_error_pC = self._series.charge_std * charge_pC
         variance_pC2 = self.predictor.noise.variance(charge_pC) + model_error_pC**2
         scale = self._error_scale
         covariance_pC2 = scale * (np.diag(variance_pC2) + np.outer(touch_offset_pC, touch_offset_pC))
+
+        # Estimate the state together with the contact of the touch. The former state is the prior.
         start = self._log_contact(self.follow_contact(self.predictor.predict(charge_pC), charge_pC))
         problem = RobustProblem(
             self._values, charge_pC[np.newaxis], covariance_pC2[np.newaxis], self._state, self._covariance
@@ -330,6 +335,8 @@ class FilmFollower(Stage):
         # Twice the cost is the sum of the squared residuals, in which large residuals have little weight. The residuals
         # are divided by the scaled errors. Multiply by the scale, so that the sum refers to the unscaled errors.
         self._mean_square += (2.0 * scale * estimate.cost - self._mean_square) / MEMORY_TOUCHES
+
+        # Decide whether the film is lost.
         is_changed = np.abs(estimate.state) > CLEAR_CHANGE * np.sqrt(self._covariance.diagonal())
         is_at_bound = is_changed & np.any(estimate.state == self._state_bounds, axis=0)
         has_implausible_state = bool(is_at_bound[0] or is_at_bound[self._offset])  # the pretension or the offset

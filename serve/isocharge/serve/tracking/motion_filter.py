@@ -215,14 +215,17 @@ class MotionFilter:
         Args:
             dt_s: Time until the next frame, s, not negative.
         """
-        # Probability that a value is held or moves (row) after it was held or moved (column). Position and force change
-        # independently.
+        # Probability that a value is held or moves (row) after it was held or moved (column), shape (2, 2). Position
+        # and force change independently, so the probabilities of the modes are products, shape (4, 4).
         change = min(dt_s / MEAN_MODE_TIME_s, 0.5)
-        of_value = np.array([[1.0 - change, change], [change, 1.0 - change]])
-        of_mode = (of_value[:, None, :, None] * of_value[:, None]).reshape(4, 4)
-        joint = of_mode * self.probability  # of each new mode (row) and each previous mode (column)
-        self.probability = joint.sum(axis=1)
-        mean, covariance = mixture_moments(joint / self.probability[:, None], self.mean, self.covariance)
+        value_transition = np.array([[1.0 - change, change], [change, 1.0 - change]])
+        mode_transition = (value_transition[:, None, :, None] * value_transition[:, None]).reshape(4, 4)
+
+        # Mix the states of the previous modes (columns) for each new mode (row).
+        joint_probability = mode_transition * self.probability
+        self.probability = joint_probability.sum(axis=1)
+        mixing_weights = joint_probability / self.probability[:, None]
+        mean, covariance = mixture_moments(mixing_weights, self.mean, self.covariance)
 
         # The rate of a held value is that of a movement that would begin now: zero on average.
         noise = process_noise(mean[:, VELOCITY], FORCE_ACCELERATION_DENSITY, dt_s, IS_MOVING)
@@ -242,16 +245,21 @@ class MotionFilter:
             Whether the frame belongs to the contact. Otherwise nothing is updated. The result is also False if rounding
             errors have made a covariance useless.
         """
-        innovation = (measured - self.mean[:, VALUES])[:, :, None]
-        precision = np.linalg.inv(self.covariance[:, VALUES, VALUES] + covariance)
+        # Mahalanobis distance of the measured values from the prediction of each mode
+        innovation = (measured - self.mean[:, VALUES])[:, :, None]  # shape (4, 3, 1)
+        precision = np.linalg.inv(self.covariance[:, VALUES, VALUES] + covariance)  # shape (4, 3, 3)
         squared_distance = (innovation * (precision @ innovation)).sum(axis=(1, 2))
         smallest = squared_distance.min()
         determinant = np.linalg.det(precision)
         if not (0.0 <= smallest <= SQUARED_GATE and determinant.min() > 0.0):
             return False
+
+        # Apply Bayes' rule to the modes. A common factor of the likelihoods has no effect; it makes the exponents <= 0.
         likelihood = np.exp(0.5 * (smallest - squared_distance)) * np.sqrt(determinant)
         posterior = self.probability * likelihood
         self.probability = np.maximum(posterior / posterior.sum(), np.finfo(float).tiny)
+
+        # Kalman update of each mode
         gain = self.covariance[:, :, VALUES] @ precision
         self.mean = self.mean + (gain @ innovation)[:, :, 0]
         self.covariance = self.covariance - gain @ self.covariance[:, VALUES]
@@ -300,6 +308,7 @@ class ContactFilter:
             t_s: Time of the frame on a clock that is never set back, s.
             flags: Flags of the frame. Frames with flags in `WEAK_FLAGS` have a small weight.
         """
+        # Compute the measured values, and the part of their covariance that changes from frame to frame.
         dt_s = t_s - self._latest_time_s
         if dt_s > MAX_GAP_s:
             self.reset()
@@ -310,6 +319,7 @@ class ContactFilter:
             variance_ratio *= WEAK_VARIANCE_FACTOR
         covariance = variance_ratio * stated_covariance
 
+        # Update the filter, or begin a new contact at the second frame that does not belong to the contact.
         belongs = False
         if self._filter is not None:
             self._filter.predict(dt_s)
@@ -320,6 +330,7 @@ class ContactFilter:
         if not self._is_outlier:
             self._noise.update(measured, covariance, t_s)
 
+        # Combine the modes, and add the constant errors.
         modes = self._filter
         (mean,), (smoothed_covariance,) = mixture_moments(modes.probability[None], modes.mean, modes.covariance)
         variance = smoothed_covariance[VALUES, VALUES] + self._constant_share * stated_covariance

@@ -159,15 +159,16 @@ def write_files(folder: Path, name: str, sensor: Sensor, shards: Iterable[Sample
     for index, samples in enumerate(shards):
         file_name = f"shard-{index:05d}.npz"
         _check_samples(samples, len(sensor.electrodes), file_name)
+        columns = samples.columns()
         buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, **samples.columns())
+        np.savez(buffer, allow_pickle=False, **columns)
         data = buffer.getvalue()
         if len(data) > MAX_SHARD_BYTES:
             raise DatasetError(
                 f"{file_name}: expected at most {MAX_SHARD_BYTES} bytes, got {len(data)}; make smaller shards"
             )
         write_whole(folder / file_name, data)
-        n_outside = int(samples.columns()["outside"].sum())
+        n_outside = int(columns["outside"].sum())
         entries.append({"file": file_name, "samples": len(samples), "outside": n_outside, "sha256": sha256_of(data)})
     manifest = {
         "format_version": FORMAT_VERSION,
@@ -232,23 +233,22 @@ def _check_samples(samples: Samples, n_electrode: int, shard_label: str) -> None
         DatasetError: If there are no samples, or if a column has a wrong shape or type, or contains a number that is
             not finite.
     """
-    shapes = {name: column.shape for name, column in samples.columns().items()}
+    columns = samples.columns()
+    shapes = {name: column.shape for name, column in columns.items()}
     count = samples.x_mm.size
     expected_shapes = dict.fromkeys(COLUMNS, (count,)) | {"charge_pC": (count, n_electrode)}
     if shapes != expected_shapes or count == 0:
         raise DatasetError(
             f"{shard_label}: expected columns of shapes {expected_shapes}, at least one sample, got {shapes}"
         )
-    for name, column in samples.columns().items():
-        # U: text; b: truth values; f, i, u: floats, signed and unsigned integers
-        expected_kinds, expected_content = {"probe": ("U", "text"), "outside": ("b", "truth values")}.get(
-            name, ("fiu", "numbers")
-        )
+    # The kinds of NumPy are U: text; b: truth values; f, i, u: floats, signed and unsigned integers.
+    kinds_and_content = {"probe": ("U", "text"), "outside": ("b", "truth values")}
+    for name, column in columns.items():
+        expected_kinds, expected_content = kinds_and_content.get(name, ("fiu", "numbers"))
         if column.dtype.kind not in expected_kinds:
             raise DatasetError(f"{shard_label}: column {name}: expected {expected_content}, got {column.dtype}")
         if expected_content == "numbers" and not np.isfinite(column).all():
-            first_bad_index = np.argwhere(~np.isfinite(column))[0]
-            row = int(first_bad_index[0])
+            row = int(np.argwhere(~np.isfinite(column))[0, 0])
             raise DatasetError(
                 f"{shard_label}: column {name} holds {column[row]} in row {row}; every number must be finite"
             )

@@ -346,18 +346,18 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     starts = random_layouts(case)
     fields = solve_fields(case.sensor, case.probe, case.force, case.radius, executor)
     search = Search(case, fields)
-    optima = list(track(in_order(executor, search.optimum, starts), "improving", len(starts)))
+    improved_layouts = track(in_order(executor, search.optimum, starts), "improving", len(starts))
     finalists: list[Layout] = []
-    for layout in sorted(optima, key=lambda layout: layout.error):
+    for layout in sorted(improved_layouts, key=lambda layout: layout.error):
         if not finalists or layout.error > finalists[-1].error * (1.0 + MIN_DIFFERENCE):
             finalists.append(layout)
     finalists = finalists[:MAX_FINALISTS]
-    refined_layouts = list(track(in_order(executor, search.refine, finalists), "refining", len(finalists)))
-    refined_layouts.sort(key=lambda layout: layout.error)
+    refined_layouts = track(in_order(executor, search.refine, finalists), "refining", len(finalists))
 
     # Check the layouts in the order of their errors, up to the first layout that is not ambiguous. No layout can be
     # checked if some presses cannot be solved, or if the forward map is not accurate.
-    sensors = [case.layout(np.round(layout.positions, DECIMALS)) for layout in refined_layouts]
+    layouts_by_error = sorted(refined_layouts, key=lambda layout: layout.error)
+    sensors = [case.layout(np.round(layout.positions, DECIMALS)) for layout in layouts_by_error]
     summaries = []
     try:
         forward_map = _solve_forward_map(case, executor)

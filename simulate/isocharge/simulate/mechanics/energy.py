@@ -380,12 +380,14 @@ class Bending:
         """
         mesh = self.mesh
         mass = np.eye(mesh.mass.shape[1]) * mesh.mass[:, None]  # M
-        coupling = np.sqrt(self.stiffness) * (self._laplace - BENDING_SHIFT * mass)  # symmetric
+        coupling = np.sqrt(self.stiffness) * (self._laplace - BENDING_SHIFT * mass)  # sqrt(beta) (L - s M), symmetric
+
+        # Eliminate the unknowns mu of interior nodes. Their block -M is diagonal.
         interior = mesh.template.is_interior
         interior_coupling = coupling[:, interior]  # shape (n_element, n_interior, n_local)
         schur_complement = interior_coupling.transpose(0, 2, 1) @ (interior_coupling / mesh.mass[:, interior, None])
-        shifted_laplace = 2.0 * BENDING_SHIFT * self._laplace - BENDING_SHIFT**2 * mass
         coupling[:, interior] = 0.0
+        shifted_laplace = 2.0 * BENDING_SHIFT * self._laplace - BENDING_SHIFT**2 * mass  # 2 s L - s^2 M
         return self.stiffness * shifted_laplace + schur_complement, coupling.transpose(0, 2, 1), -mass
 
     def laplacian(self, deflection: Array) -> Array:

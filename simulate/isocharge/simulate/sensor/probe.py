@@ -394,7 +394,7 @@ def parse_probe(text: str) -> Probe:
         pattern = re.sub("[A-Z]+", lambda _: NUMBER_PATTERN, with_corners)
         match = re.fullmatch(f"({pattern})(?:@({NUMBER_PATTERN}))?", text.strip())
         if match is not None:
-            lengths = [float(number) for number in re.findall(NUMBER_PATTERN, match[1])]
+            lengths = list(map(float, re.findall(NUMBER_PATTERN, match[1])))
             degrees = float(match[2] or 0.0)
             return create(*lengths).rotated(float(np.deg2rad(degrees)))
     forms = [f"'{notation}'" for notation in PROBE_SHAPES]

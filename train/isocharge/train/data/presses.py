@@ -186,8 +186,9 @@ def merged_places(contact: Array, step_mm: float = PLACE_STEP_mm) -> Array:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         step_mm: Largest step, mm.
     """
+    # Connect positions whose distance is at most a step. The connected positions form a place. A coarse grid of cells
+    # limits the number of pairs if many presses are at one place.
     position = contact[:, :2]
-    # A coarse grid limits the number of pairs if many presses are at one place.
     grid_mm = 0.25 * step_mm
     cells, cell_of_press = np.unique(np.round(position / grid_mm), axis=0, return_inverse=True)
     pairs = cKDTree(cells * grid_mm).query_pairs(step_mm, output_type="ndarray")
@@ -195,9 +196,11 @@ def merged_places(contact: Array, step_mm: float = PLACE_STEP_mm) -> Array:
     place_of_press = connected_components(steps, directed=False)[1][cell_of_press.ravel()]
 
     def mean_of_place(values: Array) -> Array:
+        """Return for each press the mean of the values, shape (n,), over all presses at its place."""
         mean = np.bincount(place_of_press, values) / np.bincount(place_of_press)
         return np.asarray(mean[place_of_press])
 
+    # Keep the original positions of places that are too large.
     merged_position = np.column_stack([mean_of_place(coordinate) for coordinate in position.T])
     mean_square = mean_of_place(((position - merged_position) ** 2).sum(axis=1))
     is_place = mean_square <= step_mm**2

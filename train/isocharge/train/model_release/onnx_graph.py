@@ -94,10 +94,11 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     is_signed = operators[0] == "Max"  # the first node of a graph for charges of both signs
 
     constants = (np.asarray_chkfinite(numpy_helper.to_array(tensor), dtype=float) for tensor in graph.initializer)
-    low = next(constants)
-    high = next(constants)
-    typical = 1.0 / next(constants)
-    features = ChargeFeatures(typical, low, high, next(constants) if is_signed else None)
+    low_pC = next(constants)
+    high_pC = next(constants)
+    typical_pC = 1.0 / next(constants)
+    mean = next(constants) if is_signed else None
+    features = ChargeFeatures(typical_pC, low_pC, high_pC, mean)
     hidden = [Layer(weight=next(constants), bias=next(constants)) for _ in range(n_hidden)]
     skip = next(constants)
     bias = next(constants)
@@ -110,19 +111,20 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     # Each matrix contains the weights of the contact perceptron in its first rows and columns, and those of the misfit
     # perceptron in the others. Find the first column of the misfit perceptron in each layer, from the last layer to the
     # first. In a hidden layer, it is the first row of the next layer with a weight for the misfit perceptron.
-    starts = [ANGLES.stop]
+    misfit_starts = [ANGLES.stop]
     for weight, _ in (last, *hidden[:0:-1]):
-        starts.append(int(weight[:, starts[-1] :].any(axis=1).argmax()))
+        misfit_starts.insert(0, int(weight[:, misfit_starts[0] :].any(axis=1).argmax()))
 
-    def perceptron(*columns: slice) -> Perceptron:
-        """Return the perceptron to which some outputs of each layer belong, from the first layer to the last."""
-        rows = (slice(None), *columns)  # both perceptrons have the same inputs
+    def perceptron(columns: list[slice]) -> Perceptron:
+        """Return the perceptron to which the given columns of each layer belong, from the first layer to the last."""
+        rows = [slice(None), *columns]  # all inputs in the first layer, and then the columns of the previous layer
         parts = zip((*hidden, last), rows, columns, strict=False)
         *hidden_parts, last_part = (Layer(weight[row, column], bias[column]) for (weight, bias), row, column in parts)
         return Perceptron(tuple(hidden_parts), last_part, skip[:, columns[-1]])
 
-    contact = perceptron(*(slice(start) for start in reversed(starts)))
-    return FoldedNetwork(features, contact, perceptron(*(slice(start, None) for start in reversed(starts))))
+    contact = perceptron([slice(start) for start in misfit_starts])
+    misfit = perceptron([slice(start, None) for start in misfit_starts])
+    return FoldedNetwork(features, contact, misfit)
 
 
 OutputFunction = Callable[[Array], tuple[Array, ...]]
