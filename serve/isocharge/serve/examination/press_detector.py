@@ -138,6 +138,8 @@ def block_medians(values: Array, times_s: Array) -> Array:
     """
     block_numbers = np.floor(times_s / BLOCK_S + 1e-6).astype(int)  # a rounding error must not move a frame
     first_rows = np.flatnonzero(np.diff(block_numbers, prepend=-1))  # first frame of each block; the first has number 0
+
+    # Divide the values at the first rows of all blocks except the first block, and leave out the last block.
     finite_values = np.where(np.isfinite(values), values, np.nan)
     complete_blocks = np.split(finite_values, first_rows[1:])[:-1]
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of a block without finite values
@@ -163,8 +165,8 @@ def estimate_noise(values: Array) -> Array:
     for column, channel_values in enumerate(values.T):
         differences = np.abs(np.diff(channel_values[np.isfinite(channel_values)]))
         if len(differences) > 0:
-            by_median = np.median(differences) / (0.6745 * math.sqrt(2.0))
-            noise[column] = by_median or differences.mean() * math.sqrt(math.pi) / 2.0
+            median_estimate = np.median(differences) / (0.6745 * math.sqrt(2.0))
+            noise[column] = median_estimate or differences.mean() * math.sqrt(math.pi) / 2.0
     return noise
 
 

@@ -428,7 +428,7 @@ def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
     ]
 
     def order(first: int) -> tuple[float, bool, str]:
-        """Return a key by which the lines are sorted. The key of the first line of a frame is the smallest."""
+        """Return the key of the frame that begins with a line. The frame with the smallest key is chosen."""
         frame = fields_of_lines[first : first + cycle_length]
         clocks = [fields[name] for fields in frame for name in TIMES_US if name in fields]
         duration = clocks[-1] - clocks[0] if len(clocks) == cycle_length else 0.0

@@ -237,11 +237,11 @@ def _has_decimal_commas(text: str) -> bool:
     """
     text = re.sub(_TIME, "", text)
     numbers = re.findall("[0-9]+(?:,[0-9]+)?", text)
-    commas = sum("," in number for number in numbers)
-    are_named = 1 < commas == len(re.findall(r"[:=]\s*[-+]?[0-9]+,", text))
+    comma_count = sum("," in number for number in numbers)
+    are_named = 1 < comma_count == len(re.findall(r"[:=]\s*[-+]?[0-9]+,", text))
     has_one_name = re.fullmatch(r"[^:=]+[:=]\s*[-+]?[0-9]+,[0-9]+\D*", text) is not None
     return (
-        commas > 0
+        comma_count > 0
         and (len(numbers) > 1 or has_one_name)
         and (are_named or re.search(r"[\[({]", text) is None)
         and re.search(_SEPARATING_COMMA, text) is None
@@ -443,11 +443,11 @@ def line_values(pattern: re.Pattern[str], text: str) -> tuple[float, ...] | None
 
 def _value(number: str) -> float:
     """Return the value of a number, or the seconds from midnight to a time of day. The value of `ovf` is NaN."""
-    if ":" in number:
+    if ":" in number:  # a time of day
         hours, minutes, seconds = number.split(":")
         whole_seconds, *fractions = re.split("[.,]", seconds)
         return 3600.0 * int(hours) + 60.0 * int(minutes) + float(f"{whole_seconds}.{''.join(fractions)}")
-    if "x" in number.lower():
+    if "x" in number.lower():  # a hexadecimal number
         return float(int(number, 16))
     if number[-3:].lower() == "ovf":
         return math.nan

@@ -268,12 +268,12 @@ class TouchStream(ReadingStream):
             ModelError: If the model has other electrodes or another order of the electrodes, or if a stage cannot use
                 the model. The present model then remains in use.
         """
-        present = self.predictor.metadata
-        new = predictor.metadata
-        if new.electrodes != present.electrodes:
+        present_metadata = self.predictor.metadata
+        new_metadata = predictor.metadata
+        if new_metadata.electrodes != present_metadata.electrodes:
             raise ModelError(
-                f"model {new.label}: expected the electrodes {present.electrodes} of {present.label}, got "
-                f"{new.electrodes}; start another stream for it"
+                f"model {new_metadata.label}: expected the electrodes {present_metadata.electrodes} of "
+                f"{present_metadata.label}, got {new_metadata.electrodes}; start another stream for it"
             )
         self._set_model(predictor)
 

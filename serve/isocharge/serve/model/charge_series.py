@@ -250,22 +250,22 @@ class ChargeSeries:
 
         # Evaluate v at the nodes, and d and d' of each direction. The axis of length 4 contains the value and its
         # derivatives with respect to the three coordinates of the contact.
-        at_nodes = self._node_series.values_and_derivatives(nearest, excess).reshape(n_contact, 4, -1, n_electrode)
+        node_values = self._node_series.values_and_derivatives(nearest, excess).reshape(n_contact, 4, -1, n_electrode)
         direction_values = self._direction_series.values_and_derivatives(nearest, excess)
         direction_values = direction_values.reshape(n_contact, 4, 2, self.direction_count, n_electrode)
-        at_calibration, by_tension = direction_values[:, :, 0], direction_values[:, :, 1]  # d and d'
-        by_directions = at_calibration + pretension[:, None, None, None] * by_tension  # d + t d'
+        change, change_per_MPa = direction_values[:, :, 0], direction_values[:, :, 1]  # d and d'
+        total_change = change + pretension[:, None, None, None] * change_per_MPa  # d + t d'
 
         # Interpolate between the nodes (index k), and add the changes by the directions (index d). The other indices
         # are the press (n), the value or one of its derivatives (s) and the electrode (e).
         weights, weight_slopes = interpolation_weights(self.node_MPa, pretension)  # shape (n, n_node)
-        value = np.einsum("nk,nske->nse", weights, at_nodes) + np.einsum("nd,nsde->nse", directions, by_directions)
-        by_pretension = np.einsum("nk,nke->ne", weight_slopes, at_nodes[:, 0])
-        by_pretension += np.einsum("nd,nde->ne", directions, by_tension[:, 0])
-        value_by_state = np.stack([by_pretension, *by_directions[:, 0].swapaxes(0, 1)], axis=2)
+        value = np.einsum("nk,nske->nse", weights, node_values) + np.einsum("nd,nsde->nse", directions, total_change)
+        value_per_MPa = np.einsum("nk,nke->ne", weight_slopes, node_values[:, 0])
+        value_per_MPa += np.einsum("nd,nde->ne", directions, change_per_MPa[:, 0])
+        value_per_state = np.stack([value_per_MPa, *total_change[:, 0].swapaxes(0, 1)], axis=2)
 
         charge_pC, charge_per_value, by_contact = self._charges(value, nearest, excess)
-        return ModelValues(charge_pC + self.offset_pC, by_contact, charge_per_value[:, :, None] * value_by_state)
+        return ModelValues(charge_pC + self.offset_pC, by_contact, charge_per_value[:, :, None] * value_per_state)
 
     @cached_property
     def _calibrated(self) -> Series:
@@ -275,8 +275,8 @@ class ChargeSeries:
     @cached_property
     def _node_series(self) -> Series:
         """Series of v at every node. Nodes and electrodes share the last axis."""
-        by_term = np.moveaxis(self.coefficients, 0, 3)
-        return Series(by_term.reshape(*by_term.shape[:3], -1))
+        term_coefficients = np.moveaxis(self.coefficients, 0, 3)
+        return Series(term_coefficients.reshape(*term_coefficients.shape[:3], -1))
 
     @cached_property
     def _direction_series(self) -> Series:

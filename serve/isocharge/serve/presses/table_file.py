@@ -375,7 +375,7 @@ def _spellings(name: str) -> set[str]:
     gives `xmm` and `x`, and `X (cm)` gives `xcm` and `x`.
     """
     text = name.casefold()
-    return {re.sub(r"[\W_]+", "", one) for one in (text, _UNIT_AT_END.sub("", text))}
+    return {re.sub(r"[\W_]+", "", spelling) for spelling in (text, _UNIT_AT_END.sub("", text))}
 
 
 @contextmanager

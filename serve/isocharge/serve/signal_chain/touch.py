@@ -160,10 +160,13 @@ class Touch(Stage):
             charge: Charges relative to the touch thresholds, shape (n_electrode,), dimensionless.
             direction: Sum of the directions of the earlier frames of the touch, shape (n_electrode,), dimensionless.
         """
+        # Update the peak, from which the release threshold follows.
         size = _norm(charge)
         held_size = min(size, _norm(self._previous))  # a spike of a single frame is not a peak
         self._peak_size = max(self._peak_size, held_size)
         release_size = max((rule.release_share or 0.0) * self._peak_size, 0.5)
+
+        # End the touch if the charges are small, or have changed their sign.
         reference = self._previous if self._setup.has_any_sign else self._rest_direction
         is_reversed = charge @ reference < 0.0
         if size < release_size or is_reversed:

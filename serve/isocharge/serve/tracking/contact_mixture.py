@@ -341,16 +341,20 @@ class ContactMixture:
             grid_points: Number of components along each axis of the film.
         """
         domain = self.charges.domain
+
+        # Choose the points of a square grid that lie on the film, shape (n, 2).
         coordinates = np.linspace(-domain.radius, domain.radius, grid_points)
         grid = np.stack(np.meshgrid(coordinates, coordinates), axis=-1).reshape(-1, 2)
         grid = grid[np.hypot(*grid.T) <= domain.radius]
+
+        # The rates and the logarithms of the gains have the mean 0.
         mean = np.zeros((len(grid), MOTION.stop + len(self.charges.electrodes)))
         mean[:, POSITION] = grid
-        mean[:, 2] = domain.centre[2]
+        mean[:, 2] = domain.centre[2]  # ln F
 
         std = np.full(mean.shape[1], GAIN_STD)
         std[POSITION] = coordinates[1] - coordinates[0]
-        std[2] = domain.scale[2]
+        std[2] = domain.scale[2]  # of ln F
         std[RATES] = INITIAL_RATE_STD
         return Components(mean, np.tile(np.diag(std**2), (len(mean), 1, 1)), np.zeros(len(mean)))
 

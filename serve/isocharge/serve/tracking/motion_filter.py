@@ -117,7 +117,8 @@ def process_noise(velocity_mm_per_s: Array, force_density: float, dt_s: float, i
     density = np.full((len(velocity_mm_per_s), 3), force_density)
     squared_speed = (velocity_mm_per_s**2).sum(axis=1)
     density[:, POSITION] = (ACCELERATION_DENSITY + SPEED_CHANGE_RATE * squared_speed)[:, None]
-    # Covariance of a value and its rate for a unit density
+    # Covariance of a value and its rate for a unit density. Values that are held get no covariance. In the sum, a and b
+    # select the value or its rate, k and l select x, y or ln F, and n selects the state.
     unit_covariance = np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
     blocks: Array = np.einsum("ab,nk,kl->nakbl", unit_covariance, is_moving * density, _IDENTITY)
     return blocks.reshape(-1, 6, 6)
@@ -171,11 +172,14 @@ class NoiseEstimate:
         self._latest = [*self._latest[-2:], np.append(measured, t_s)]
         if len(self._latest) < 3:
             return
+        # Compare the middle values with the line between the first and the last values. The last entry is the time.
         first, middle, last = self._latest
-        share = (middle[-1] - first[-1]) / (last[-1] - first[-1])
-        deviation = (middle - (1.0 - share) * first - share * last)[:-1]
-        variance_factor = (1.0 + (1.0 - share) ** 2 + share**2) * deviation.size
+        time_share = (middle[-1] - first[-1]) / (last[-1] - first[-1])
+        deviation = (middle - (1.0 - time_share) * first - time_share * last)[:-1]
+        variance_factor = (1.0 + (1.0 - time_share) ** 2 + time_share**2) * deviation.size
         relative_square = deviation @ np.linalg.solve(covariance, deviation) / variance_factor
+
+        # Update the mean over all frames.
         self._frames += 1
         limited_square = min(relative_square, 3.0**2 * self.relative_variance)
         self.relative_variance += (limited_square - self.relative_variance) / self._frames
@@ -197,6 +201,7 @@ class MotionFilter:
             measured: Measured x, y and ln F, shape (3,), mm, mm and dimensionless.
             covariance: Covariance of the measured values, shape (3, 3).
         """
+        # All modes start with the measured values and with unknown rates.
         self.mean = np.zeros((4, 6))
         self.mean[:, VALUES] = measured
         self.covariance = np.zeros((4, 6, 6))

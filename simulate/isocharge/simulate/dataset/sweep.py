@@ -152,10 +152,10 @@ class Sweep:
         contact = np.empty((self.samples, 3))
         rotation = np.zeros(self.samples)
         for index in range(len(probes)):
-            own = np.flatnonzero(probe == index)
-            contact[own], turn_fraction = self._draw(own.size, (index,), 0.0, self.radius)
+            rows = np.flatnonzero(probe == index)
+            contact[rows], turn_fraction = self._draw(rows.size, (index,), 0.0, self.radius)
             if self.orientation == "random":
-                rotation[own] = math.tau * turn_fraction
+                rotation[rows] = math.tau * turn_fraction
         return SweepPresses(probe, contact, rotation)
 
     def _draw(
@@ -236,7 +236,7 @@ def run_sweep(
     folder = Path(folder)
     probes = tuple(probes)
     check_new_output(folder)
-    if maps and [(one.sensor, one.probe) for one in maps] != [(sensor, probe) for probe in probes]:
+    if maps and [(each_map.sensor, each_map.probe) for each_map in maps] != [(sensor, probe) for probe in probes]:
         raise SceneError("maps: expected one forward map of this sensor for each probe, in the order of the probes")
 
     # The presses are computed before files are written, because SciPy ignores an interrupt during this computation.

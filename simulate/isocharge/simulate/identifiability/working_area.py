@@ -106,7 +106,8 @@ def _starting_points(rings: Rings, precision: Array) -> tuple[Array, Array]:
     is_chosen[1:-1] |= 3.0 * precision[1:-1] <= precision[:-2] + precision[2:]
     ring, _ = np.nonzero(is_chosen)
     spacing_on_ring = rings.distance * 2.0 * np.pi / precision.shape[1]
-    return rings.position[is_chosen], np.maximum(rings.distance[0], spacing_on_ring)[ring]
+    neighbour_distance = np.maximum(rings.distance[0], spacing_on_ring)  # shape (n_ring,)
+    return rings.position[is_chosen], neighbour_distance[ring]
 
 
 INDISTINGUISHABLE_SIGMAS = 3.0

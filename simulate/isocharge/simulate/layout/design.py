@@ -220,7 +220,7 @@ class Search:
             rows = square_rows(positions)
             value = log_mean(rows)
             gradient = np.empty(coordinates.size)
-            for index, moved_rows in enumerate(square_rows(moved_positions).swapaxes(0, 1)):
+            for index, moved_rows in enumerate(square_rows(moved_positions).swapaxes(0, 1)):  # one coordinate moves
                 changed_rows = rows.copy()
                 changed_rows[:, index // 2] = moved_rows
                 gradient[index] = (log_mean(changed_rows) - value) / DIFFERENCE_STEP

@@ -229,11 +229,11 @@ class FilmPrior:
             "oval_xy": largest_oval,
         }
         film_properties = []
-        for one in FILM_PROPERTIES:
-            largest = largest_of.get(one.name, math.inf)
-            if largest < one.limits[1]:
-                one = replace(one, bounds=(-largest, largest))
-            film_properties.append(one)
+        for film_property in FILM_PROPERTIES:
+            largest = largest_of.get(film_property.name, math.inf)
+            if largest < film_property.limits[1]:
+                film_property = replace(film_property, bounds=(-largest, largest))
+            film_properties.append(film_property)
 
         probe_properties = []
         if isinstance(self.probe, Circle):
@@ -298,6 +298,7 @@ class FilmPrior:
         Args:
             values: Values, shape (n_property,).
         """
+        # Collect the imperfections of the described film, in the units of the properties.
         film = self.sensor.film
         described = dict.fromkeys(self.names, 0.0)
         pretension = values[self.index(PRETENSION.name)]
@@ -305,8 +306,13 @@ class FilmPrior:
             described |= dict(zip(UNEVEN_TENSIONS, np.divide(film.deviator, pretension), strict=True))
         stiffness = cmath.rect(math.log(film.young_ratio), 2.0 * film.axis)
         oval = cmath.rect(film.oval, 2.0 * film.oval_axis)
-        described |= {"stiffness_x": stiffness.real, "stiffness_xy": stiffness.imag}
-        described |= {"oval_x": oval.real, "oval_xy": oval.imag}
+        described |= {
+            "stiffness_x": stiffness.real,
+            "stiffness_xy": stiffness.imag,
+            "oval_x": oval.real,
+            "oval_xy": oval.imag,
+        }
+        # A deviation of the opposite size cancels an imperfection that the sensor file describes.
         return np.where(self.is_imperfection, [-described[name] for name in self.names], values)
 
     def film(self, values: Array) -> tuple[Sensor, Probe]:

@@ -268,9 +268,12 @@ def _average_repeated(unit_contact: Array, values: Array) -> tuple[Array, Array,
         Different contacts, shape (m, 3). Their mean values, shape (m, k). Their numbers of presses, shape (m,). Index
         of the contact of each press, shape (n,).
     """
+    # Number the different contacts, and count their presses.
     rounded_contact = np.round(unit_contact, SAME_CONTACT_DECIMALS)
     _, contact_of_press, press_count = np.unique(rounded_contact, axis=0, return_inverse=True, return_counts=True)
     contact_of_press = contact_of_press.ravel()  # some versions of NumPy return two axes
+
+    # Compute the mean of each coordinate and of each value over the presses of each contact.
     table = np.column_stack([unit_contact, values])
     sums = np.stack([np.bincount(contact_of_press, column) for column in table.T], axis=1)
     contact, mean_value = np.split(sums / press_count[:, None], [unit_contact.shape[1]], axis=1)
@@ -318,14 +321,15 @@ def _fit_noise(charge: Array, residual: Array) -> Array:
     Returns:
         The standard deviation of the white noise, pC, and the relative standard deviation of the gain.
     """
-    # Both are divided by the values that explain the residuals alone, because charges may be very large or small.
+    # Each unknown is divided by the value with which it alone explains the residuals, because charges may be very large
+    # or small.
     units = np.full(2, np.finfo(float).tiny) + np.sqrt(np.mean(residual**2)) / [1.0, np.sqrt(np.mean(charge**2))]
 
     def loss(log_std: Array) -> float:
         """Return the mean negative logarithm of the likelihood, without a constant."""
         white, gain = units * np.exp(log_std)
         variance = np.maximum(white**2 + (gain * charge) ** 2, np.finfo(float).tiny)
-        square = residual**2 / variance
+        square = residual**2 / variance  # in squared standard deviations
         tail = OUTLIER**2 * np.log(np.maximum(square / OUTLIER**2, 1.0))
         return float(np.mean(np.log(variance) + np.minimum(square, OUTLIER**2) + tail))
 

@@ -146,8 +146,8 @@ def fit_film_series(
     names = electrodes * node_MPa.size
     is_validation = np.arange(len(contact)) % 10 == 0
     all_nodes = fit_charge_series(domain, names, presses[~is_validation], presses[is_validation])
-    by_node = all_nodes.coefficients[0].reshape(*all_nodes.coefficients.shape[1:4], node_MPa.size, len(electrodes))
-    return replace(all_nodes, electrodes=electrodes, coefficients=np.moveaxis(by_node, 3, 0), node_MPa=node_MPa)
+    coefficients = all_nodes.coefficients[0].reshape(*all_nodes.coefficients.shape[1:4], node_MPa.size, len(electrodes))
+    return replace(all_nodes, electrodes=electrodes, coefficients=np.moveaxis(coefficients, 3, 0), node_MPa=node_MPa)
 
 
 def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
