@@ -154,6 +154,7 @@ def live_page(
     page = LivePage(describe_film(name, metadata), access, is_recording=is_recording)
 
     def show_warning(record: logging.LogRecord) -> None:
+        """Show a warning on the page."""
         page.update(note={"text": record.getMessage(), "at": time.time()})
 
     with serve_page(page, address, tls) as url, warnings_passed_to(show_warning, "isocharge.serve"):

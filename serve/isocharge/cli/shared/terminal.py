@@ -284,6 +284,7 @@ def shown_progress() -> Iterator[None]:
 
         @cache
         def bar_of(title: str) -> TaskID:
+            """Return the bar with the given title, which the first call creates."""
             return bars.add_task(title, total=None, note="")
 
         def update_bar(title: str, done: int, total: int, note: str) -> None:

@@ -312,8 +312,8 @@ class TextParser(DelimitedParser):
         self._cycle = []
 
     def _update_seq_modulus(self, seq: int) -> None:
-        """Determine the value at which the counter wraps from its next value."""
-        largest_seq = self._last_seq
+        """Use the next value of the counter to determine the value at which the counter wraps."""
+        largest_seq = self._last_seq  # if the counter has wrapped
         self._last_seq = seq
         if seq < largest_seq and largest_seq + 1 in SEQ_MODULI:
             self.seq_modulus = largest_seq + 1

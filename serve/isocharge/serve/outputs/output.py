@@ -148,10 +148,14 @@ class WriterQueue(Generic[T]):
             Exception: The exception that `write` has raised in the thread, unless `put` has raised it already.
         """
         self._items.put(None)
+
+        # Wait as long as the thread completes at least one item within each timeout.
         earlier_count = 0
         while self._thread.is_alive() and self._items.unfinished_tasks != earlier_count:
             earlier_count = self._items.unfinished_tasks
             self._thread.join(CLOSE_TIMEOUT_s)
+
+        # End the thread, and count the remaining items as lost.
         self._is_abandoned = True
         self._thread.join(CLOSE_TIMEOUT_s)
         if self._items.unfinished_tasks > 0:

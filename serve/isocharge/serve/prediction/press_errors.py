@@ -222,13 +222,18 @@ def common_error(error: Array, variance: Array, rig_std: Array) -> CommonError:
         variance: Expected variance of each error, shape (n, 3).
         rig_std: Part of the standard deviation of each error that the rig causes, shape (n, 3).
     """
+    # Weighted means of the known errors of x, y and the force, each of shape (3,)
     is_known = ~np.isnan(error)
     weight = np.where(is_known, 1.0 / variance, 0.0)
     total_weight = weight.sum(axis=0)
     mean = np.nansum(weight * error, axis=0) / total_weight
+
+    # Standard errors of the means, which are increased if the errors scatter more than expected
     chi_squared = np.nansum(weight * (error - mean) ** 2, axis=0)
     chi_squared_per_degree = chi_squared / np.maximum(is_known.sum(axis=0) - 1, 1)  # the mean uses one degree
     std = np.sqrt(np.maximum(chi_squared_per_degree, 1.0) / total_weight)
+
+    # Significance of the means in view of an error of the rig that is equal in all presses
     common_rig_std = COMMON_RATIO * np.nansum(weight * rig_std, axis=0) / total_weight
     return CommonError(mean, std, mean / np.hypot(std, common_rig_std))
 

@@ -151,8 +151,8 @@ class MeasuredPresses:
         Raises:
             PressError: If an array has another shape.
         """
-        n = len(self.lines)
-        expected = ((n, len(CONTACT)), (n, len(self.electrodes)), (n,), (n,))
+        count = len(self.lines)
+        expected = ((count, len(CONTACT)), (count, len(self.electrodes)), (count,), (count,))
         shapes = tuple(array.shape for array in (self.contact, self.charge_pC, self.position_std_mm, self.force_std))
         if shapes != expected:
             raise PressError(

@@ -134,9 +134,9 @@ def mixture_moments(weight: Array, mean: Array, covariance: Array) -> tuple[Arra
     """
     mixed_mean = weight @ mean
     deviation = mean - mixed_mean[:, None]  # shape (m, n, k)
-    spread = (weight[:, :, None] * deviation).swapaxes(1, 2) @ deviation
-    within = (weight @ covariance.reshape(len(mean), -1)).reshape(spread.shape)
-    return mixed_mean, within + spread
+    spread = (weight[:, :, None] * deviation).swapaxes(1, 2) @ deviation  # covariance of the means of the components
+    mean_covariance = (weight @ covariance.reshape(len(mean), -1)).reshape(spread.shape)
+    return mixed_mean, mean_covariance + spread
 
 
 class NoiseEstimate:

@@ -92,11 +92,14 @@ def coalesce(samples: Samples, max_samples: int) -> Samples:
 
 def _coalesced_run(run: Samples) -> Samples:
     """Return the sample that replaces a run of neighbouring samples, as `coalesce` describes, shape (1,)."""
+    # Choose the latest sample, unless only earlier samples are contacts.
     is_contact = run["contact"] == 1.0
     chosen_index = len(run) - 1
     if is_contact.any() and not is_contact[-1]:
         force_N = np.where(is_contact, run["force_N"], -np.inf)
         chosen_index = int(force_N.argmax())
+
+    # Combine the flags, the numbers of records and the latencies of all samples.
     chosen = run[[chosen_index]]  # a copy
     chosen["flags"] = np.bitwise_or.reduce(run["flags"].astype(np.int64))
     chosen["records"] = run["records"].sum()

@@ -305,7 +305,7 @@ def starting_contacts(
 
 @cache
 def _unit_candidates(count: int) -> tuple[Array, Booleans]:
-    """Return contacts that are evenly distributed over a domain (Sobol sequence), and which lie close together.
+    """Return contacts that are evenly distributed over a domain (Sobol sequence), and which pairs are close together.
 
     A quarter of the contacts lie on the edge of the disk.
 
