@@ -2,5 +2,5 @@
 
 For example, the modules handle errors, files and progress.
 
-These modules do not import any other package of isocharge.
+The modules do not import any other package of isocharge.
 """

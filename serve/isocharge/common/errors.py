@@ -298,7 +298,7 @@ def lazy_names(package: str, *extras: str) -> tuple[Callable[[str], Any], Callab
 
     A public name is imported when it is used for the first time. Python calls `__getattr__` for each attribute that the
     package does not contain. The public names and their modules are stated once, as imports that only type checkers
-    execute. Their repetition after `as` shows type checkers that the names are public:
+    execute. A repeated name after `as` shows type checkers that the name is public:
 
         if TYPE_CHECKING:
             from isocharge.simulate.solver.press import press as press

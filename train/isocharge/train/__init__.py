@@ -1,8 +1,8 @@
 """Training of small networks that compute contacts from charges, and calibration of films with measured presses.
 
-A network is trained on a dataset. It is then released as a folder that contains an ONNX model and a model card. Each
-function in the example can be used on its own. The public names are imported when they are first used, because the
-import of PyTorch takes long.
+A network is trained on a dataset. A trained network is released as a folder that contains an ONNX model and a model
+card. Each function in the example can be used on its own. The public names are imported when they are first used,
+because the import of PyTorch takes long.
 
 Example:
 

@@ -128,7 +128,8 @@ def _listed(charge_pC: Mapping[str, float | None]) -> str:
 
 
 def command_outputs(targets: Sequence[str] | None, touch: TouchStream, *, is_live: bool) -> Outputs:
-    """Return the outputs for the targets of `--output`. They are opened when their context is entered.
+    """Return the outputs for the targets of `--output`. The outputs are opened when the context of `Outputs` is
+    entered.
 
     Args:
         targets: Values of the option; None or empty for JSON on standard output.

@@ -207,8 +207,8 @@ def channel_sentences(
 ) -> Iterator[str]:
     """Yield a sentence for each problem of a channel that prevents a tare or makes contacts inaccurate.
 
-    A tare is the measurement of the charges at rest. It requires a small noise and a small offset of each channel. The
-    limits of offset, noise, drift and hum are in pC.
+    A tare is the measurement of the charges at rest. A tare requires that the noise and the offset of each channel are
+    small. The limits of offset, noise, drift and hum are in pC.
 
     Args:
         channels: Offset, noise, drift and hum of each channel.

@@ -1,7 +1,7 @@
 """Reception of bytes from a port, at a baud rate that is found by trial, and parsing of the frames in these bytes.
 
 The class `ReceivedData` contains the bytes, which do not depend on the format of the frames. The class `Capture`
-contains the frames that a parser of one format has found in the bytes. The same bytes can therefore be parsed in
+contains the frames that a parser of one format has found in the bytes. The received bytes can therefore be parsed in
 several formats.
 """
 

@@ -5,15 +5,16 @@ value does not change the median of a block. A press begins with a large change 
 the slow noise of amplifiers cause slower changes. The stage `isocharge.serve.signal_chain.touch.Touch` finds the
 touches of a film that should be at rest, and the press that is held during the port check.
 
-A press that is held with a constant force during the whole time does not change the values. Such a press cannot be
-distinguished from an amplifier with another rest level.
+A press that is held with a constant force during the whole time does not change the values. A press without a beginning
+and an end cannot be distinguished from an amplifier with another rest level.
 
 The charge of a press that is held shows whether an amplifier leaks or the film creeps. The charge of the press is the
 projection of the channel levels onto the direction of the change at its beginning, minus the mean level before the
 press. A leak removes the same share of the charge in every second. The logarithm of the charge Q is then a linear
 function of the time t since the touch, ln Q = a - t / tau. Creep removes the same share of the charge in every decade
-of time. The logarithm of the charge Q is then a linear function of ln t, ln Q = a + b ln t. Both functions are fitted
-to the charges of a press. A cause is only stated if the other function has a much larger sum of squared residuals.
+of time. The logarithm of the charge Q is then a linear function of ln t, ln Q = a + b ln t. The functions of a leak and
+of creep are fitted to the charges of a press. A cause is only stated if the other function has a much larger sum of
+squared residuals.
 
 The section `[leak]` of a device file corrects a leak. Creep is not corrected. If the section `[leak]` is used for a
 film that creeps, the error of the charges increases with time.
@@ -41,8 +42,9 @@ CHANGE_BLOCKS = 5
 def touched_blocks(values: Array, times_s: Array, min_noise: float = 0.0) -> tuple[Reals, Array, Booleans]:
     """Return the time of each block, the median of each channel in it, and whether something touches the film in it.
 
-    The stage `Touch` of a stream detects the touches. Its charges are the differences from the levels `CHANGE_BLOCKS`
-    earlier, so that a slow change is no touch. During a touch, the earlier levels are those before its beginning.
+    The stage `Touch` of a stream detects the touches. The charges of this stage are the differences from the levels
+    `CHANGE_BLOCKS` earlier, so that a slow change is no touch. During a touch, the earlier levels are those before its
+    beginning.
 
     Args:
         values: Values of the channels, shape (n, channels), in any unit.

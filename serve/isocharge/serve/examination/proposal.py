@@ -78,8 +78,8 @@ def unit_of(capture: Capture, positions: Iterable[int], max_noise_V: float = 0.0
     - If the names state different units, the unit is assumed to be pC. The report requests the gains.
     - The unit is pC for binary frames of isocharge.
     - The unit is counts if all values are whole numbers.
-    - The unit is volts if all names end in `V`. It is volts, too, if there is noise on some channel, and on no channel
-      more than `max_noise_V`.
+    - The unit is volts if all names end in `V`. The unit is also volts if some channel has noise, but no channel has
+      more noise than `max_noise_V`.
     - The unit of all other values is assumed to be pC.
 
     Args:

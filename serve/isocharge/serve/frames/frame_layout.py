@@ -24,10 +24,10 @@ name `t_us`, `t_ms` or `t_s` is the clock. The field `flags` contains bits such 
 (`isocharge.serve.frames.frame`). All other fields are channels.
 
 If a frame with a sync pattern is damaged, the parser searches for the next sync pattern, beginning one byte later. The
-parser does not skip the length of a frame, because an intact frame may begin only a few bytes later. This happens if
-the pattern has occurred by chance inside another frame. In a stream with byte stuffing, all bytes between two
-delimiters are dropped if they are not an intact frame. In a datagram, only the damaged frames are dropped, unless the
-length of the datagram is wrong.
+parser does not skip the length of a frame, because an intact frame may begin only a few bytes later. An intact frame
+begins there if the pattern has occurred by chance inside another frame. In a stream with byte stuffing, all bytes
+between two delimiters are dropped if they are not an intact frame. In a datagram, only the damaged frames are dropped,
+unless the length of the datagram is wrong.
 """
 
 import re
@@ -149,7 +149,7 @@ Framing = Literal["sync", "cobs", "slip", "hdlc", "datagram"]
 
 
 class FrameSection(Settings, frozen=True, tag_field="format"):
-    """Keys of the section `[frames]` that every format has. These keys describe how to request frames from the board.
+    """Keys of the section `[frames]` that every format has. The keys describe how to request frames from the board.
 
     Attributes:
         request: Bytes that request one frame, in hexadecimal; None for a board that sends frames without a request.
@@ -300,7 +300,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
     @property
     def t_us_modulus(self) -> int:
-        """Time at which the clock wraps to 0, us. It has no meaning for frames without a clock."""
+        """Time at which the clock wraps to 0, us. The value has no meaning for frames without a clock."""
         return round(self.fields[self.columns.clock_column or 0].modulus * self.columns.clock_unit_us)
 
     def parser(self) -> Parser:

@@ -8,16 +8,16 @@ must occur ten times, because a board that starts often sends several similar me
 with another layout are dropped and counted.
 
 In lines such as `1000,0,3.2` and `1000,1,4.1`, the second column is the number of a channel, and the third column is
-its charge. Such lines are not recognised, because they could be mistaken for frames with three values. A frame counter
-without a name may look like the number of a channel during the first eight lines.
+its charge. Lines with the number of a channel are not recognised, because they could be mistaken for frames with three
+values. A frame counter without a name may look like the number of a channel during the first eight lines.
 
 Reading may start in the middle of a cycle. A cycle therefore begins with the line whose name is that of the frame
 counter, or else comes first in the order of names.
 
 Reading may also start in the middle of a line. If the first line begins with a number, it is therefore dropped and
-counted as malformed. This also applies to files and pipes, because their bytes usually come from a port, for example
-from `cat /dev/ttyACM0`. A program that begins with a complete line can send a header, a comment or a blank line first.
-No frame is then dropped.
+counted as malformed. The first line of a file or a pipe is dropped, too, because its bytes usually come from a port,
+for example from `cat /dev/ttyACM0`. A program that begins with a complete line can send a header, a comment or a blank
+line first. No frame is then dropped.
 
 Text has no checksum, except for sentences in the style of NMEA 0183. The parser therefore cannot detect a damaged digit
 in an otherwise intact line. Lines between the frames that never change, such as the echo of a request, do not prevent
@@ -339,9 +339,9 @@ def _decoded(line: bytes) -> str:
 def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
     """Return the lines of one frame; empty if the lines do not repeat, or if it is not clear which lines are frames.
 
-    A cycle is a sequence of lines that repeats. It is recognised if the last lines consist of several equal cycles.
-    Lines are equal if their skeletons are equal. A cycle contains the lines after the previous occurrence of the last
-    line, up to the last line itself.
+    A cycle is a sequence of lines that repeats. A cycle is recognised if the last lines consist of several equal
+    cycles. Lines are equal if their skeletons are equal. A cycle contains the lines after the previous occurrence of
+    the last line, up to the last line itself.
 
     If lines occur several times in a cycle, the most frequent line is a frame. Otherwise, if every value has a name, a
     frame consists of all lines of a cycle. Otherwise, a frame is a single line, and the other lines of the cycle never

@@ -349,15 +349,15 @@ def _alternating_names(times: list[str], gaps: list[list[_Token]]) -> list[str]:
 def _preceding_names(times: list[str], gaps: list[list[_Token]], counters: Collection[str]) -> list[str]:
     """Return the names of the numbers. A number without a name has an empty text.
 
-    The name of a number is the nearest word or key before the number, as in `A: 3.5`, `A -> 3.5` and `<A>3.5</A>`. It
-    must stand behind the previous number and behind the previous separator. If several numbers have the same nearest
-    word, as in `{"A": {"pC": 3.5}, "B": {"pC": 4.1}}`, the word before it is the name. A name that still occurs several
-    times is removed. In these cases, words are not names, either:
+    The name of a number is the nearest word or key before the number, as in `A: 3.5`, `A -> 3.5` and `<A>3.5</A>`. The
+    name must stand behind the previous number and behind the previous separator. If several numbers have the same
+    nearest word, as in `{"A": {"pC": 3.5}, "B": {"pC": 4.1}}`, the word before it is the name. A name that still occurs
+    several times is removed. In these cases, words are not names, either:
 
     - If no word stands before the first number, but one stands behind the last number, the words are units.
     - If only one of several numbers would have a name, as in `Data: 3.5, 4.1`, the word is taken for a label of the
-      whole line. This applies if it is no key, or if it stands before the first number. Counters and clocks keep their
-      names.
+      whole line. A word is a label if it is no key, or if it stands before the first number. Counters and clocks keep
+      their names.
 
     Args:
         times: Name of each number that is a time; empty for the other numbers.

@@ -66,8 +66,8 @@ class RecordedStream:
 
         The file of the recording is created at once. When a recording begins, the stream is restarted and the tare is
         measured again. A replay can therefore compute the same records from the bytes of the recording alone. The
-        recording begins with all bytes that the stream had received when its first frame was complete. They contain the
-        names of the channels if the board sends these names only at its start.
+        recording begins with all bytes that the stream had received when its first frame was complete. The first bytes
+        contain the names of the channels if the board sends the names only at its start.
 
         Args:
             recorder: Recorder of the next recording, which this object opens and closes. None to record nothing.

@@ -200,8 +200,8 @@ class PressWatch:
     def _process_press(self, frame: Frame) -> WatchResult:
         """Add the next frame to the window, and accept or refuse the press if this can be decided.
 
-        The press is accepted if it is steady. It is refused if an amplifier is saturated, if the film was not at rest
-        before the press, or if the press is not steady within `MAX_HELD_S`.
+        The press is accepted if it is steady. The press is refused if an amplifier is saturated, if the film was not at
+        rest before the press, or if the press is not steady within `MAX_HELD_S`.
         """
         self._end_s = frame.clock_s
         held_s = self._end_s - self._begin_s

@@ -198,7 +198,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
     def has_any_sign(self) -> bool:
         """Whether the charges of a touch may have any sign.
 
-        They are mostly positive if the sensor describes a film on which tension causes no negative charge.
+        The charges are mostly positive if the sensor describes a film on which tension causes no negative charge.
         """
         match self.sensor:
             case {"film": _, "piezo": {"d31": int() | float() as d31, "d32": int() | float() as d32}}:

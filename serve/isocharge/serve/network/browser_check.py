@@ -1,7 +1,7 @@
 """Check of the access to a server: its token, and protection against requests from web pages of other sites.
 
-The class `AccessCheck` refuses a request if the server has a token and the request does not contain it. It also refuses
-requests from web pages of other sites.
+The class `AccessCheck` refuses a request if the server has a token and the request does not contain it. The class also
+refuses requests from web pages of other sites.
 
 A page in a browser can send requests to every address that the browser can reach, including the loopback address. If
 the page sends a form, or a `fetch` with `mode: "no-cors"`, it cannot read the response, but the server executes the

@@ -1,7 +1,7 @@
 """Metrics and log of the HTTP server and of the gRPC server.
 
-The objects of the package `prometheus_client` are the only counters. A request updates them in a few microseconds. They
-are read by Prometheus, and by the statistics of Triton's protocol.
+The objects of the package `prometheus_client` are the only counters. A request updates them in a few microseconds.
+Prometheus reads the counters, and so do the statistics of Triton's protocol.
 
 The log line of a request contains no text that a client has sent. The names of routes, models, statuses and errors are
 defined by this server, and the address of the client comes from the operating system. A client therefore cannot forge a
@@ -68,7 +68,7 @@ class ModelMetrics:
         }
 
     def of(self, name: str, version: int) -> "Statistics":
-        """Return the metrics of a version. Their values continue if the version has been loaded before."""
+        """Return the metrics of a version. The metrics keep their values if the version has been loaded before."""
         return Statistics(**{field: metric.labels(name, version) for field, metric in self._metrics.items()})
 
     def remove(self, name: str, version: int) -> None:

@@ -4,8 +4,8 @@ Every output implements the interface `Output`. An `OutputKind` declares which t
 class `WriterQueue` keeps a slow output from delaying a live stream. `FileOutput` is the base class of outputs that
 write files.
 
-Other packages can add kinds of outputs. Such a package must declare an entry point in the group "isocharge.outputs".
-The entry point must refer to an `OutputKind`.
+Other packages can add kinds of outputs. A package that adds a kind must declare an entry point in the group
+"isocharge.outputs". The entry point must refer to an `OutputKind`.
 
 Example of such an entry point in pyproject.toml:
 

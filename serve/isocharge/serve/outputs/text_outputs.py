@@ -1,9 +1,9 @@
 """Outputs of records as lines of JSON or CSV, to standard output or to a new file, and as JSON in UDP datagrams.
 
 The UDP server of PlotJuggler can receive the records if the protocol of the server is set to JSON. PlotJuggler expects
-one JSON object in each datagram. It uses the number `timestamp` as the time, ignores values that are null, and shows
-every other number as a time series. The name of a time series is the path of the number in the JSON object, such as
-`charge_pC/A`.
+one JSON object in each datagram. PlotJuggler uses the number `timestamp` as the time, ignores values that are null, and
+shows every other number as a time series. The name of a time series is the path of the number in the JSON object, such
+as `charge_pC/A`.
 """
 
 import socket

@@ -52,7 +52,7 @@ class Chunk(NamedTuple):
     outage_s: Annotated[float, Meta(ge=0.0)] = 0.0
 
     def elapsed_since(self, previous: "Chunk") -> float:
-        """Return the time since an earlier chunk of the same source, s. It does not depend on the wall clock.
+        """Return the time since an earlier chunk of the same source, s. The result does not depend on the wall clock.
 
         All chunks of a file have the same time of arrival, so the result is 0. If the caller that created the chunks
         states no monotonic time, so that `clock_ns` is constant, the times of arrival are used.
@@ -129,7 +129,8 @@ class FileSource:
     def __init__(self, descriptor: int, name: str) -> None:
         """Store the file descriptor and the name, and check the first bytes of a file on a disk.
 
-        The first bytes of a pipe cannot be read twice. They are checked when the first chunk is read.
+        The first bytes of a pipe cannot be read twice. The first bytes of a pipe are checked when the first chunk is
+        read.
 
         Raises:
             InputError: If the file on the disk does not come from a board.

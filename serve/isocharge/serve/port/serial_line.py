@@ -168,7 +168,7 @@ class SerialLine:
 
 
 class Requester:
-    """Line to a board that sends a frame only on request. It sends the requests, and removes their echoes.
+    """Line to a board that sends a frame only on request. The line sends the requests, and removes their echoes.
 
     Attributes:
         is_stream: Always False, because such a board sends nothing more before the next request.

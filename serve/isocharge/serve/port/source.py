@@ -7,9 +7,10 @@ A port is a device path or a URL that pyserial accepts, such as `/dev/ttyACM0`, 
 `rfc2217://host:port` or `loop://`. In addition, `tcp://host:port` means the same as `socket://host:port`, and
 `udp://host:port` receives datagrams.
 
-Other packages can add sources. Such a package must declare an entry point in the group "isocharge.sources", whose name
-is the scheme of its URLs. The entry point must refer to a function that accepts a URL and returns a context manager of
-a `Source`. For example, this entry point in pyproject.toml adds URLs such as `can://vcan0`:
+Other packages can add sources. A package that adds a source must declare an entry point in the group
+"isocharge.sources", whose name is the scheme of its URLs. The entry point must refer to a function that accepts a URL
+and returns a context manager of a `Source`. For example, this entry point in pyproject.toml adds URLs such as
+`can://vcan0`:
 
     [project.entry-points."isocharge.sources"]
     can = "my_package:open_bus"

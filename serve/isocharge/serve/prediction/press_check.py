@@ -318,9 +318,9 @@ def _remedies(
 ) -> Iterator[str]:
     """Yield notes about possible remedies for a model that does not fit.
 
-    The first note states how large the uncertainty of the rig would have to be to explain the errors. It is omitted if
-    no uncertainty of the rig explains the errors, for example if all positions are shifted equally, or if the charges
-    fit no press. The second note recommends a calibration, or training with the measured presses.
+    The first note states how large the uncertainty of the rig would have to be to explain the errors. The first note is
+    omitted if no uncertainty of the rig explains the errors, for example if all positions are shifted equally, or if
+    the charges fit no press. The second note recommends a calibration, or training with the measured presses.
 
     Args:
         errors: Errors of all presses.

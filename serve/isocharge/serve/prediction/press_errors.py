@@ -261,8 +261,8 @@ class Agreement:
         """Test whether noise and rig explain the errors of the selected presses.
 
         The statistic of the first test is the sum of all squared errors divided by their expected variances. The
-        statistic of the second test is the sum of the squared significances of the common errors. Both statistics have
-        a chi-squared distribution if noise and rig explain the errors.
+        statistic of the second test is the sum of the squared significances of the common errors. If noise and rig
+        explain the errors, each statistic has a chi-squared distribution.
 
         Args:
             errors: Errors of all presses; NaN where a measured value is unknown.

@@ -2,7 +2,7 @@
 
 The factor is an order statistic of held-out presses (split conformal prediction, Vovk 2012, proposition 2a). With n
 presses that were not used for the training or the calibration, the share of future contacts whose score is at most the
-k-th smallest score has the distribution Beta(k, n + 1 - k). This holds for any distribution of the errors.
+k-th smallest score has the distribution Beta(k, n + 1 - k). The errors may have any distribution.
 """
 
 import math

@@ -371,8 +371,8 @@ def _find_header(lines: list[str], names: Collection[str]) -> tuple[int, str]:
 def _spellings(name: str) -> set[str]:
     """Return spellings of the name of a column, two of which are equal if the names are similar.
 
-    They are the letters and digits of the name in lower case, with and without a unit at the end. For example, `x_mm`
-    gives `xmm` and `x`, and `X (cm)` gives `xcm` and `x`.
+    A spelling consists of the letters and digits of the name in lower case, with or without a unit at the end. For
+    example, `x_mm` gives `xmm` and `x`, and `X (cm)` gives `xcm` and `x`.
     """
     text = name.casefold()
     return {re.sub(r"[\W_]+", "", spelling) for spelling in (text, _UNIT_AT_END.sub("", text))}

@@ -161,7 +161,7 @@ def _stuffed_frames(name: Framing, stuffing: Stuffing, data: bytes) -> Iterator[
 def _most_common_length(frames: Sequence[bytes]) -> tuple[int, int]:
     """Return the most frequent length of the frames, and the number of frames with this length.
 
-    Both numbers are 0 if there are no frames.
+    The length and the number are 0 if there are no frames.
     """
     if not frames:
         return 0, 0

@@ -122,7 +122,7 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
 def _may_be_sync(rows: Bytes) -> Booleans:
     """Return whether each byte of the frames may belong to a sync pattern, shape (length,).
 
-    Such a byte is constant and not 0, because zeros are mostly the high bytes of numbers.
+    A byte of a sync pattern is constant and not 0, because zeros are mostly the high bytes of numbers.
     """
     usual, is_constant = usual_bytes(rows)
     may_be_sync: Booleans = is_constant & (usual != 0)
@@ -200,9 +200,9 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
     """Return the keys that describe the counter, the clock and the columns of lines of text in a device file.
 
     A counter increases by 1 from frame to frame, and a clock increases at one of the usual rates. A clock in ms that
-    increases by about 1 could be a counter. It is recognised by its name, or because it repeats some values. If the
-    parser has already recognised a counter, the function does not search for another counter. The same applies to the
-    clock.
+    increases by about 1 could be a counter. The clock is recognised by its name, or because it repeats some values. If
+    the parser has already recognised a counter, the function does not search for another counter. The same applies to
+    the clock.
 
     For values with names in each line, the keys `seq`, `t_us`, `t_ms` and `t_s` state the names that the board uses for
     its counter and its clock. For the other values, the key `columns` lists the names, which are copied from a header,

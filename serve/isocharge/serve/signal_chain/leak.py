@@ -9,8 +9,8 @@ where i is the innovation and b is the inflow (pC/s), a slow current into the am
 warming. A charge that arrives between two frames has decayed by (1 + a) / 2 on average. The inflow is estimated from
 the innovation, because an estimate from the output v would diverge.
 
-A board that sends currents sends the innovation itself, i[n] = v[n]. Its charge is the sum of the currents. If the
-device file states a leak, the sum decays with the time constant tau, q[n] = a q[n-1] + i[n] - b dt.
+A board that sends currents sends the innovation itself, i[n] = v[n]. The charge of such a board is the sum of the
+currents. If the device file states a leak, the sum decays with the time constant tau, q[n] = a q[n-1] + i[n] - b dt.
 
 While nothing touches the film, any charge is an error or comes from a slow warming of the film. The computed touch
 charge therefore decays exponentially to zero.

@@ -177,8 +177,8 @@ class Setup:
 class Stage(ABC):
     """One step on the way of a frame from its values to its record.
 
-    The object contains the settings and the state of the stage. A stage must be used in one thread only. The same
-    sequence of frames always gives the same results.
+    The object contains the settings and the state of the stage. A stage must be used in one thread only. Equal
+    sequences of frames always give equal results.
 
     Attributes:
         section: Name of the section of the device file with the settings; empty if the stage has no settings.

@@ -77,10 +77,10 @@ class TareRule(Rule, frozen=True, kw_only=True):
 class Tare(Stage):
     """Measures the charge at rest in quiet frames, and subtracts this charge from all later frames.
 
-    Without a later stage that estimates the drift, the tare follows a slow drift while nothing touches the film. It
-    approaches the charge of each frame exponentially. Its rate is limited, so that a finger that rests lightly on the
-    film or is just arriving hardly changes it. The tare follows a frame only after the later stages have found that the
-    frame has no contact. The first frame of a touch therefore does not change the tare.
+    Without a later stage that estimates the drift, the tare follows a slow drift while nothing touches the film. The
+    tare approaches the charge of each frame exponentially. The rate is limited, so that a finger that rests lightly on
+    the film or is just arriving hardly changes the tare. The tare follows a frame only after the later stages have
+    found that the frame has no contact. The first frame of a touch therefore does not change the tare.
     """
 
     section = "tare"

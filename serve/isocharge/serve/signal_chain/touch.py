@@ -82,16 +82,17 @@ class Touch(Stage):
     """Determines whether something touches the film.
 
     A touch begins when the charges differ from the base by more than the touch threshold. The base consists of the
-    charges that remained after the last release. It follows charges that fall further, and it decays exponentially.
+    charges that remained after the last release. The base follows charges that fall further, and decays exponentially.
 
     After a long press, an amplifier with a leak shows charges of the opposite sign. A change in the direction opposite
     to the latest touch is therefore no touch, and the base becomes the mean of the latest charges. If all charges of a
     film are known to be positive, the same rule applies to charges that become negative before the first touch.
 
-    A touch ends when the size of the charges falls below the release threshold. It also ends when the charges change
-    their sign from one frame to the next. On a film whose charges are positive, it ends when they become negative. The
-    release threshold is a given share of the peak. It is at least half of the touch threshold. The peak is the largest
-    size that two consecutive frames of the touch have reached. The spike of a single frame is not a peak.
+    A touch ends when the size of the charges falls below the release threshold. A touch also ends when the charges
+    change their sign from one frame to the next. On a film whose charges are positive, it ends when they become
+    negative. The release threshold is a given share of the peak. The release threshold is at least half of the touch
+    threshold. The peak is the largest size that two consecutive frames of the touch have reached. The spike of a single
+    frame is not a peak.
 
     If the mean charges of the last `RISE_S` have already exceeded half of the touch threshold when a touch begins, the
     charges have risen slowly, and a drift of the charge at rest may have caused the touch. All frames of the touch then

@@ -265,7 +265,7 @@ INITIAL_ITERATIONS = 20
 class ContactMixture:
     """Gaussian mixture that estimates the position and the force of one contact from the charges of each frame.
 
-    The methods must be called from one thread. The same sequence of frames always gives bitwise equal results.
+    The methods must be called from one thread. Equal sequences of frames always give bitwise equal results.
 
     Attributes:
         charges: Charges of every contact on the film.

@@ -5,7 +5,7 @@ The state of the film is a vector of these unknowns:
 - the change t of the mean pretension, MPa, and the changes z along the uncertain directions of the film
   (`isocharge.serve.model.charge_series`),
 - the logarithm of the change of the gain of each electrode,
-- a common offset, pC. This charge is added to all electrodes during a touch, for example by a warm finger.
+- a common offset, pC, which is the charge that is added to all electrodes during a touch, for example by a warm finger.
 
 The charges of four electrodes have one degree of freedom more than a contact (x, y, force). If the pretension of a film
 changes, for example because the room becomes warmer by 1 K, no contact explains the charges of touches exactly. Each
@@ -20,8 +20,8 @@ decrease.
 
 The network was trained for the film as it was calibrated. The charges of a frame are therefore converted into charges
 that the same contact would cause on the calibrated film, and the network computes the contact from the converted
-charges. The conversion depends on the contact. Both steps are therefore done twice, the second time with the contact of
-the first time.
+charges. The conversion depends on the contact. The charges are therefore converted twice, the second time for the
+contact that the network computes after the first conversion.
 
 The estimate is considered wrong if no state explains the latest touches, or if the estimated pretension or offset is at
 the end of its range. In this case, the film is called lost. Contacts are corrected with the last estimate that
@@ -363,8 +363,8 @@ class FilmFollower(Stage):
         changed (t = 0). The state is the mean over both cases, weighted by their probabilities.
 
         Before the first touch, the odds of no change are `UNCHANGED_ODDS`. The touches multiply these odds by the
-        Savage-Dickey ratio (Dickey 1971). It is the probability density of t = 0 after the touches, divided by the
-        probability density of t = 0 before the first touch.
+        Savage-Dickey ratio (Dickey 1971). This ratio is the probability density of t = 0 after the touches, divided by
+        the probability density of t = 0 before the first touch.
 
         The covariance is not a mean over both cases, but that of the first case, because hardly any film keeps its
         pretension exactly. The mean state differs from the states of both cases. Therefore, the covariance is

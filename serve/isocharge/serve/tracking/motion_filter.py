@@ -1,7 +1,7 @@
 """Filter that smooths the predicted contacts of successive frames: an interacting multiple model.
 
 The state of a contact consists of x, y and ln F, and the rates of these three values. The position is either held or
-moves, and the force is either held or changes. These four modes have one Kalman filter each (Blom and Bar-Shalom 1988).
+moves, and the force is either held or changes. Each of these four modes has a Kalman filter (Blom and Bar-Shalom 1988).
 Before each frame, the estimates of the modes are mixed, because the mode may have changed. After each frame, the
 innovation of each mode determines its new probability. The velocity of a held position is zero. When a movement begins,
 its velocity is unknown. A white acceleration changes the velocity later.
@@ -274,10 +274,10 @@ class MotionFilter:
 class ContactFilter:
     """Filter that smooths the position and the force of one contact over successive frames.
 
-    The errors of a model have two parts. One part changes from frame to frame, such as the noise of the charges. The
-    other part is the same in every frame of a held contact, such as the approximation error of the model and the errors
-    of the gains. Smoothing reduces only the first part. The filter therefore weights the frames by the variance of the
-    first part alone, and adds the variance of the second part to that of the smoothed values.
+    The errors of a model have two parts. The first part of the errors changes from frame to frame, such as the noise of
+    the charges. The second part is the same in every frame of a held contact, such as the approximation error of the
+    model and the errors of the gains. Smoothing reduces only the first part. The filter therefore weights the frames by
+    the variance of the first part alone, and adds the variance of the second part to that of the smoothed values.
 
     The noise is estimated from all frames of a touch, even if the touch consists of several successive contacts.
     """

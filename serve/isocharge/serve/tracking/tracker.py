@@ -53,8 +53,8 @@ class TouchEvents:
         """Return the event that begins with the next frame of a touch, or None if no event begins.
 
         A slide begins when the contact moves and is away from the position at which it last rested. A hold begins when
-        the contact has rested at one position for `HOLD_TIME_s`. The same event does not occur twice in succession. If
-        it is uncertain whether the contact moves or rests, no event begins.
+        the contact has rested at one position for `HOLD_TIME_s`. No event occurs twice in succession. If it is
+        uncertain whether the contact moves or rests, no event begins.
 
         Args:
             tracked: Tracked contact of the frame. Its attribute `moving` is the probability that the contact moves.

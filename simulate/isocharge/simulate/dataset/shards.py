@@ -1,13 +1,13 @@
 """Reader and writer of datasets. A dataset is a folder with shards, a manifest and a data card.
 
 The manifest is the file manifest.json. The manifest contains the version of the format and the checksum of each shard.
-It also describes the sensor, the probes, the ranges, the seed, the solver and the columns. The data card is the file
-README.md, which describes the dataset for human readers. The samples are distributed over the shards, which are files
-such as shard-00000.npz. Each shard contains the columns x_mm, y_mm, force_N, probe, orientation_deg, outside and
-charge_pC. The column charge_pC has the shape (n, n_electrode), and all other columns have the shape (n,).
+The manifest also describes the sensor, the probes, the ranges, the seed, the solver and the columns. The data card is
+the file README.md, which describes the dataset for human readers. The samples are distributed over the shards, which
+are files such as shard-00000.npz. Each shard contains the columns x_mm, y_mm, force_N, probe, orientation_deg, outside
+and charge_pC. The column charge_pC has the shape (n, n_electrode), and all other columns have the shape (n,).
 
 The column outside marks presses between the working area and the clamp. A network must recognise these presses, but
-need not locate them. Their charges are less accurate than those of the other presses.
+need not locate them. The charges of presses near the clamp are less accurate than those of the other presses.
 
 A dataset is written into a temporary folder, which is renamed when the dataset is complete. A dataset of measured
 presses has the same format, but its manifest has no entries `solver` and `seed`, and it has no presses outside.

@@ -6,8 +6,8 @@ forces are uniformly distributed over the range of forces. If a sweep has severa
 through the probes.
 
 A forward map is built for every probe and evaluated for every press. For the presses between the radius of the sweep
-and the clamp, a coarse map of the whole film is built, with a round probe. Its error of a few percent is acceptable,
-because a network only learns from these presses which charges belong to no contact in its working area.
+and the clamp, a coarse map of the whole film is built, with a round probe. An error of a few percent is acceptable in
+the coarse map, because a network only learns from these presses which charges belong to no contact in its working area.
 
 A task of the executor computes the charges of one shard, which is one file of the dataset. The files are therefore the
 same for every executor. The dataset is written completely or not at all.

@@ -85,9 +85,9 @@ def _invert(information: Array) -> Array:
     """Invert information matrices, and regularise singular matrices.
 
     Each matrix is first scaled such that its diagonal elements are 1, because the units of the parameters differ. Then
-    its eigenvalues are increased by eight times the precision of a floating-point number, which is more than their
-    rounding errors. The limits of parameters that the charges do not determine are therefore very large instead of
-    infinite, and all other limits hardly change.
+    the eigenvalues of the matrix are increased by eight times the precision of a floating-point number, which is more
+    than their rounding errors. The limits of parameters that the charges do not determine are therefore very large
+    instead of infinite, and all other limits hardly change.
 
     Args:
         information: Symmetric matrices, shape (n, p, p).

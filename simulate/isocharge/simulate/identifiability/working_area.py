@@ -315,9 +315,9 @@ def working_area(
 ) -> WorkingArea:
     """Find the working area within the domain of a charge map.
 
-    The radius of the working area is the smallest of four radii. Two of them are the distance from the centre at which
-    the position error first exceeds its limit, and the distance of the nearest fold. The other two are the radius of
-    the nearest ambiguous pair, and the radius of the domain.
+    The radius of the working area is the smallest of four radii: the distance from the centre at which the position
+    error first exceeds its limit, the distance of the nearest fold, the radius of the nearest ambiguous pair, and the
+    radius of the domain.
 
     The error and the folds are computed at several forces, each at most 1.7 times the previous one. On a taut film, the
     charges change their sign with increasing force, and a fold may lie near the centre at a single one of these forces.

@@ -125,7 +125,8 @@ def electrode_rows(pressed: PressedFilm, electrodes: Sequence[Electrode]) -> Arr
 def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
     """Compute the stress under a press and its derivatives at the nodes of the mesh, in the frame of the press.
 
-    The derivatives refer to fixed points of the film. They are computed by finite differences between solved presses.
+    The derivatives refer to fixed points of the film. The derivatives are computed by finite differences between solved
+    presses.
 
     Args:
         solved: Equilibrium of the film under a press on the positive x axis.

@@ -4,10 +4,10 @@ The potential energy of the film is
 
     Pi = stretching energy + bending energy + pressure energy - load * mean(W) - dot(side load, mean(U1, U2)).
 
-Here, W is the deflection, and U1 and U2 are the displacements in the plane. Their means are taken over the footprint of
-the probe and weighted with the pressure of the probe. The class
-`ElasticFilm` computes the potential energy. It adds the energies that the classes `Membrane`, `Bending` and
-`BackPressure` compute. The pressure energy is the energy of a static pressure and of trapped air.
+Here, W is the deflection, and U1 and U2 are the displacements in the plane. The means are taken over the footprint of
+the probe and weighted with the pressure of the probe. The class `ElasticFilm` computes the potential energy. This class
+adds the energies that the classes `Membrane`, `Bending` and `BackPressure` compute. The pressure energy is the energy
+of a static pressure and of trapped air.
 
 The energy is a function of the scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3). Lengths are in units
 of the film radius a. The displacements w and u, and the Green-Lagrange strain E, are
@@ -439,9 +439,9 @@ class Bending:
             [ sqrt(beta) (L - s M)        -M                     ] [mu] = [0],
 
         where r is the right-hand side for W, beta is the bending stiffness, L is the matrix of the weak Laplacian, and
-        M is the diagonal mass matrix. The solution W does not depend on the constant s, which is `BENDING_SHIFT`. It is
-        chosen so that the matrix can be factorised without pivoting. The unknowns mu of the interior nodes of each
-        element have been eliminated from the blocks that this method adds.
+        M is the diagonal mass matrix. The solution W does not depend on the constant s, which is `BENDING_SHIFT`. The
+        value of s is chosen so that the matrix can be factorised without pivoting. The unknowns mu of the interior
+        nodes of each element have been eliminated from the blocks that this method adds.
 
         Args:
             tangent: Matrices for (U1, U2, W, mu), shape (n_element, 4, n_local, 4, n_local). The entries of mu are

@@ -134,11 +134,11 @@ def sector_angles(
 ) -> Array:
     """Compute the angles at which the sides of the sectors meet the innermost circle.
 
-    The sectors divide the rings between the innermost circle and the rim. Their sides begin where rays from the
-    centroid of the footprint meet the circle. The last layer of elements inside the circle connects the circle to an
-    inner boundary. The directions of the rays are a compromise between evenly spaced directions and the directions of
-    given points on the inner boundary. If the gap between these points and the circle is narrow, the rays must pass
-    close to the points, because elements would fold otherwise.
+    The sectors divide the rings between the innermost circle and the rim. The sides of the sectors begin where rays
+    from the centroid of the footprint meet the circle. The last layer of elements inside the circle connects the circle
+    to an inner boundary. The directions of the rays are a compromise between evenly spaced directions and the
+    directions of given points on the inner boundary. If the gap between these points and the circle is narrow, the rays
+    must pass close to the points, because elements would fold otherwise.
 
     Args:
         blocks: The elements.

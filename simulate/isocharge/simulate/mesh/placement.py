@@ -75,8 +75,8 @@ class Placement:
     ) -> Self:
         """Place a template under a press on the positive x axis.
 
-        The method determines the innermost circle of the mesh and the conformal map for this circle. It also determines
-        the angles and depths of the elements between the circle and the rim.
+        The method determines the innermost circle of the mesh and the conformal map for this circle. The method also
+        determines the angles and depths of the elements between the circle and the rim.
 
         Args:
             blocks: The elements. Their topology must be the topology of the probe.

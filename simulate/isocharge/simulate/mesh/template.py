@@ -246,7 +246,7 @@ def _local_coordinates(
     """Compute the local coordinates of points in given elements inside the innermost circle by Newton's method.
 
     A point with the radial coordinate r lies on the straight line between two points with the same angular coordinate:
-    the point I of the inner side and the point O of the outer side. Its position is (1 - r) I + r O.
+    the point I of the inner side and the point O of the outer side. The position of the point is (1 - r) I + r O.
 
     Args:
         placement: n placements, one for each point.

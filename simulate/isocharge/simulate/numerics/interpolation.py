@@ -88,8 +88,8 @@ def divide_intervals(ends: Array, count: int) -> Array:
 def lagrange_values(nodes: Array, points: Array) -> Array:
     """Evaluate the Lagrange polynomials of given nodes.
 
-    The polynomial of a node is 1 at this node and 0 at all other nodes. It is the product of (x - y) / (node - y) over
-    all other nodes y.
+    The polynomial of a node is 1 at this node and 0 at all other nodes. The polynomial is the product of (x - y) /
+    (node - y) over all other nodes y.
 
     Args:
         nodes: Interpolation nodes, shape (n,).

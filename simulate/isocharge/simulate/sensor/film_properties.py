@@ -74,7 +74,7 @@ class FilmProperty:
 
 
 def _imperfection(name: str, meaning: str, unit: str, std: float, largest: float | None = None) -> FilmProperty:
-    """Declare an imperfection, whose drift is small. Without a largest magnitude, its bounds follow from its std."""
+    """Declare an imperfection with a small drift. If no largest magnitude is given, the bounds follow from `std`."""
     bounds = None if largest is None else (-largest, largest)
     return FilmProperty(name, meaning, unit, std, drift=0.1 * std, bounds=bounds, is_imperfection=True)
 
@@ -281,7 +281,7 @@ class FilmPrior:
     def changes_stress(self) -> Booleans:
         """Whether each property changes the stress of the film, shape (n_property,).
 
-        The other properties are those of the electrodes and of the piezoelectric coefficients.
+        Properties of the electrodes and of the piezoelectric coefficients do not change the stress.
         """
         mean_sensor, mean_probe = self.film(self.mean)
         changes = []
@@ -293,7 +293,7 @@ class FilmPrior:
     def even(self, values: Array) -> Array:
         """Return the values of the film with the same mean properties and no imperfections, shape (n_property,).
 
-        These values also remove the imperfections that the sensor file describes, except for a described shear modulus.
+        The values also remove the imperfections that the sensor file describes, except for a described shear modulus.
 
         Args:
             values: Values, shape (n_property,).

@@ -224,7 +224,7 @@ class Electrode:
 
     @property
     def centre(self) -> tuple[float, float]:
-        """Centre (x, y) of the electrode, mm. It is the mean of the corners of the pad."""
+        """Centre (x, y) of the electrode, mm. The centre is the mean of the corners of the pad."""
         x, y = np.mean(self.corners, axis=0)
         return float(x), float(y)
 

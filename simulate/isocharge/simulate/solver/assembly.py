@@ -4,7 +4,8 @@ A node in the interior of an element belongs to no other element. The unknowns o
 eliminated separately for each element, with dense matrices. The nodes on the sides of all elements form the skeleton of
 the mesh. Only the matrix of the skeleton unknowns is factorised as a whole. For elements of order 4, the elimination of
 the interior nodes reduces the number of unknowns by a factor of 2.3. The numbering of the unknowns and the sparsity
-pattern of the matrix depend only on the template. Both are therefore computed once for each template.
+pattern of the matrix depend only on the template. The numbering and the pattern are therefore computed once for each
+template.
 
 The unknowns of a node are U1, U2 and W. If the theory includes bending, each node also has an auxiliary unknown, which
 the class `mechanics.energy.Bending` describes. On the rim, U1, U2 and W are zero. On the line of symmetry of a half
@@ -133,8 +134,8 @@ class Assembly:
     def factor(self, matrix: Array) -> SolveTangent:
         """Factorise the matrix of the mesh, which is the sum of the matrices of its elements.
 
-        The unknowns in the interior of an element belong to this element only. They are eliminated element by element,
-        so that a sparse matrix of the other unknowns remains, the skeleton matrix.
+        The unknowns in the interior of an element belong to this element only. Interior unknowns are eliminated element
+        by element, so that a sparse matrix of the other unknowns remains, the skeleton matrix.
 
         Args:
             matrix: Symmetric element matrices, shape (n_element, unknowns_per_node, n_local, unknowns_per_node,
@@ -299,7 +300,7 @@ def single_threaded_blas() -> AbstractContextManager[object]:
     """Return a context manager within which BLAS uses only one thread.
 
     Operations on many small matrices are faster with one thread. Several threads would often wait for each other in
-    busy loops. Such waits are long if other processes use the remaining cores.
+    busy loops. The waits are long if other processes use the remaining cores.
     """
     limiter: AbstractContextManager[object] = _blas_libraries().limit(limits=1, user_api="blas")
     return limiter

@@ -238,10 +238,10 @@ def node_slopes(equilibrium: Equilibrium) -> Array:
 def _continuous_slope(equilibrium: Equilibrium) -> Array:
     """Compute a slope of the deflection that is continuous from element to element.
 
-    The slope that follows from the solved deflection has small jumps between the elements. Its derivatives within the
-    elements do not contain these jumps. The mean bending stress of an electrode would therefore be wrong near the edge
-    of the footprint. Therefore, the slope at a node is the mean of the slopes of all elements that share the node. The
-    slope is zero at the clamped rim.
+    The slope that follows from the solved deflection has small jumps between the elements. The derivatives of the slope
+    within the elements do not contain these jumps. The mean bending stress of an electrode would therefore be wrong
+    near the edge of the footprint. Therefore, the slope at a node is the mean of the slopes of all elements that share
+    the node. The slope is zero at the clamped rim.
 
     Args:
         equilibrium: The solved press.

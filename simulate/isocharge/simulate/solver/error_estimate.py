@@ -3,12 +3,12 @@
 In the inner part of the film, two quantities indicate the error that the mesh causes: the shapes of the elements, and
 the contribution of the highest polynomial modes to the slopes of the deflection. The estimate is not reliable for
 presses near the rim or for large footprints that are not circular. Under such presses, elements that are too coarse may
-lie far from the elements with the largest stress. The same holds for a pressure on the whole film, which also bends the
-large elements far from the probe. The module `press` therefore solves these presses on meshes of increasing polynomial
-order, until two successive meshes result in nearly the same charges. The module also does so if the required accuracy
-is better than the default accuracy. If the polynomial order of the elements increases by one, the error decreases by a
-factor of three to ten. The difference between the charges of two successive meshes is therefore an upper bound of the
-error on the finer mesh.
+lie far from the elements with the largest stress. The estimate is not reliable for a pressure on the whole film,
+either, because the pressure also bends the large elements far from the probe. The module `press` therefore solves these
+presses on meshes of increasing polynomial order, until two successive meshes result in nearly the same charges. The
+module also does so if the required accuracy is better than the default accuracy. If the polynomial order of the
+elements increases by one, the error decreases by a factor of three to ten. The difference between the charges of two
+successive meshes is therefore an upper bound of the error on the finer mesh.
 """
 
 from typing import Any
@@ -91,8 +91,8 @@ def mesh_error(equilibrium: Equilibrium) -> float:
     """Estimate the relative error that the mesh causes in a charge.
 
     If the press was solved on two meshes, the estimate is the relative difference between the results on both meshes.
-    If the press was solved on one mesh, the estimate is the larger of two predictions. One is made from the shapes of
-    the elements, and the other from the share of the highest polynomial modes in the slopes.
+    If the press was solved on one mesh, the estimate is the larger of two predictions: that from the shapes of the
+    elements, and that from the share of the highest polynomial modes in the slopes.
 
     Args:
         equilibrium: The solved press.

@@ -66,10 +66,10 @@ def first_iterate(elastic: ElasticFilm) -> Array:
     """Compute the first iterate of Newton's method: an approximate deflection under the probe and the static pressure.
 
     Schwerin's deflection of a membrane is W = (3 / pi)^(1/3) (1 - r^(2/3)), where r is the distance from the origin of
-    the template plane. This deflection is exact for a membrane without pretension under a point load if Poisson's ratio
-    is 1/3 (Schwerin 1929). In the first iterate, the estimated height of the film under the probe replaces the factor
-    (3 / pi)^(1/3). The deflection under the static pressure is a paraboloid, which is added. The deflection of a load
-    that is missing has the height zero. The in-plane displacements are zero.
+    the template plane. Schwerin's deflection is exact for a membrane without pretension under a point load if Poisson's
+    ratio is 1/3 (Schwerin 1929). In the first iterate, the estimated height of the film under the probe replaces the
+    factor (3 / pi)^(1/3). The deflection under the static pressure is a paraboloid, which is added. The deflection of a
+    load that is missing has the height zero. The in-plane displacements are zero.
 
     Args:
         elastic: Discrete model of the film.

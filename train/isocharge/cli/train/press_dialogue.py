@@ -100,8 +100,8 @@ class PressEvents:
     def _read(self, items: Iterable[Frame | str]) -> None:
         """Put readings or typed lines into the queue until they end.
 
-        The method runs in its own thread. An error is put into the queue, too. It is raised again by `next`, in the
-        thread that waits for events.
+        The method runs in its own thread. An error is put into the queue, too. The method `next` raises the error again
+        in the thread that waits for events.
         """
         try:
             for item in items:

@@ -137,7 +137,7 @@ class ChannelNoise(GaussianNoise):
     def transition_charge(self, charge: Array) -> Array:
         """Return the transition charge of each channel, shape (n_electrode,), pC.
 
-        The inputs of the network are asinh(Q / transition charge). They are nearly linear in charges Q below the
+        The inputs of the network are asinh(Q / transition charge). The inputs are nearly linear in charges Q below the
         transition charge, and nearly logarithmic above it. The transition charge is the charge above which the noise is
         mostly proportional to the charge. For a channel with charges of both signs, the transition charge also has a
         lower limit.
@@ -223,9 +223,9 @@ class LocalPlanes:
     def residuals(self, values: Array) -> Array:
         """Compute the difference between each set of k values and the nearest point of all planes.
 
-        A plane is a linear function from contacts to values. Its points are the values of the contacts around its
-        press, up to the distance of the farthest neighbour of the press. Only the `CANDIDATES` planes whose values at
-        their own press are nearest to the set are searched.
+        A plane is a linear function from contacts to values. The points of a plane are the values of the contacts
+        around its press, up to the distance of the farthest neighbour of the press. Only the `CANDIDATES` planes whose
+        values at their own press are nearest to the set are searched.
 
         Args:
             values: m sets of values, shape (m, k).

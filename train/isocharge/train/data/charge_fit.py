@@ -173,8 +173,8 @@ def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
 def determined_degree(coordinate: Array, largest: int) -> int:
     """Return the largest degree of a polynomial that values at the given coordinates determine.
 
-    For example, values at three coordinates, or close to them, determine a polynomial of the degree 2. They do not
-    determine the values of a polynomial of a higher degree between these coordinates.
+    For example, values at three coordinates, or close to them, determine a polynomial of the degree 2. Values at three
+    coordinates do not determine the values of a polynomial of a higher degree between these coordinates.
 
     Args:
         coordinate: Coordinates, scaled to [-1, 1], shape (n,).

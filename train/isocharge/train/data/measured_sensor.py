@@ -98,8 +98,8 @@ class PressedArea(Domain):
 def outline(places: Array) -> Array:
     """Compute the outline of the area that places cover.
 
-    The outline is the concave hull of the places. It is moved outwards by half the median distance between neighbouring
-    places.
+    The outline is the concave hull of the places. The hull is moved outwards by half the median distance between
+    neighbouring places.
 
     Args:
         places: Positions (x, y), all different, shape (m, 2), mm.

@@ -210,8 +210,8 @@ def merged_places(contact: Array, step_mm: float = PLACE_STEP_mm) -> Array:
 def position_ranks(contact: Array) -> Array:
     """Order the positions of presses, and return the rank of the position of each press.
 
-    The order is that of the checksums of the coordinates. It is random but the same in every run, and the order of two
-    positions does not depend on the other positions.
+    The order is that of the checksums of the coordinates. The order is random but the same in every run, and the order
+    of two positions does not depend on the other positions.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.

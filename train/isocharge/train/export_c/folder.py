@@ -26,8 +26,8 @@ def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: 
     """Return the text of `isocharge_device.h`.
 
     Each stage of the signal chain whose section the C sources contain states its settings for C. The macro
-    `ISOCHARGE_<SECTION>_ON` is 1 if the stage is switched on. The other macros have the names of the settings in
-    capital letters.
+    `ISOCHARGE_<SECTION>_ON` is 1 if the stage is switched on. All other macros of a stage have the names of its
+    settings in capital letters.
 
     Args:
         device: The board.

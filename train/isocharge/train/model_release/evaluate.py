@@ -34,8 +34,8 @@ HELD_PRESSES = "measured_presses"
 def evaluate(fitted: Fitted) -> dict[str, float]:
     """Measure the errors of a trained network on presses that were not used in its training.
 
-    The errors of a network of measured presses are those of the cross-validation. They contain the errors of the
-    measured places and forces.
+    The errors of a network of measured presses are those of the cross-validation. The errors of a cross-validation
+    contain the errors of the measured places and forces.
 
     Args:
         fitted: The network, with its noise and its presses for the test.

@@ -31,7 +31,7 @@ def mean_loss(posterior: Posterior, target: Tensor) -> Tensor:
 
     The gradient of a Gaussian likelihood with respect to the mean is divided by the variance. Therefore, a network
     learns the mean slowly where it overestimates the standard deviation (Seitzer et al., 2022, arXiv 2203.09168). In
-    this loss, the squared errors of a Gaussian likelihood are multiplied by the estimated standard deviation. These
+    this loss, the squared errors of a Gaussian likelihood are multiplied by the estimated standard deviation. The
     factors are scaled so that their mean over the presses is 1.
 
     Args:
@@ -47,9 +47,9 @@ def covariance_loss(posterior: Posterior, error: Tensor) -> Tensor:
     """Compute the negative logarithm of the likelihood of the errors of each press, without constants, shape (n,).
 
     The errors are divided by the standard deviations, and their correlations are removed. The three results are
-    independent. Their distribution has longer tails than a normal distribution: where the map from contacts to charges
-    nearly folds, a few errors are large, and a Gaussian likelihood would enlarge the intervals of all contacts because
-    of these errors.
+    independent. The assumed distribution of each result has longer tails than a normal distribution: where the map from
+    contacts to charges nearly folds, a few errors are large, and a Gaussian likelihood would enlarge the intervals of
+    all contacts because of these errors.
 
     Args:
         posterior: Standard deviations and angles of the correlations (`isocharge.train.training.folded_network`).

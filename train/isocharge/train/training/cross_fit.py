@@ -2,11 +2,11 @@
 
 For a cross-validation, five networks are trained, each without the presses at a fifth of the places. Each network then
 estimates the contacts of the presses that were left out of its training. The errors of the model are computed from
-these answers. The same answers determine factors by which the standard deviations are multiplied. With these factors,
-the confidence intervals contain the true values as often as they should (split conformal prediction, Papadopoulos et
-al., 2002). The mean answer of the five networks has smaller errors than the answer of a single network. One further
-network learns this mean answer (Hinton et al., 2015). Only this last network is released, so the model is as small and
-fast as the models of simulated sensors.
+these answers. The answers to held-out presses also determine factors by which the standard deviations are multiplied.
+With these factors, the confidence intervals contain the true values as often as they should (split conformal
+prediction, Papadopoulos et al., 2002). The mean answer of the five networks has smaller errors than the answer of a
+single network. One further network learns this mean answer (Hinton et al., 2015). Only this last network is released,
+so the model is as small and fast as the models of simulated sensors.
 
 The noise of the charges is estimated from the presses themselves (`isocharge.train.data.channel_noise`). In every
 training step, random noise with half of the estimated size is added to the charges as a regularisation.

@@ -68,7 +68,7 @@ def misfit_examples(
     """Draw the examples from which the misfit network learns, for a model of simulated presses.
 
     An example consists of charges, and of their residual: the difference from the charges of the nearest contact. Most
-    charges are drawn at random (`draw_charges`). The others are those of presses outside the working area.
+    charges are drawn at random (`draw_charges`). All other charges are those of presses outside the working area.
 
     Args:
         split: Presses for training, and the charge field in which the search finds the nearest contacts.

@@ -157,7 +157,7 @@ class Service:
         self._traffic.open.labels("grpc").set_function(lambda: self._open_count)
 
     async def handle(self, name: str, _messages: object, context: grpc.aio.ServicerContext) -> None:
-        """Answer a call. Then count the call by its status, and log the call if there is a log.
+        """Answer a call, count the call by its status, and log the call if there is a log.
 
         If an error has occurred, the call is ended with the status and the message of the error.
 

@@ -1,8 +1,8 @@
 """HTTP server on uvicorn that limits the size and the duration of requests, and that other code can stop.
 
 uvicorn limits neither the size of headers and trailers, nor the time in which a request must arrive, nor the time in
-which a client must read its response. It also queues any number of requests that a client sends without waiting for
-responses. `Connection` closes connections that exceed such a limit. The server regularly calls `close_if_overdue`,
+which a client must read its response. uvicorn also queues any number of requests that a client sends without waiting
+for responses. `Connection` closes connections that exceed such a limit. The server regularly calls `close_if_overdue`,
 which compares the deadlines with the present time, because a timer for each request would take more time.
 
 The signals of the process are left to the program that runs the server.
@@ -100,8 +100,8 @@ class Connection(HttpToolsProtocol):
     def eof_received(self) -> bool:  # type: ignore[override]
         """Return whether to keep the connection open after the client has stopped sending.
 
-        It is kept open over HTTP until all complete requests are answered. With TLS, both directions can only be closed
-        together.
+        An HTTP connection is kept open until all complete requests are answered. With TLS, both directions can only be
+        closed together.
         """
         has_open_requests = self._close_after_responses()
         return has_open_requests and self.scheme == "http"

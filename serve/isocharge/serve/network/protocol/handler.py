@@ -1,14 +1,14 @@
 """ASGI applications: their base class, and the handler of the requests of the Open Inference Protocol.
 
-The class `Handler` answers the requests of the protocol. It does not depend on the server that receives the requests.
-The function `asgi_app` creates a handler that another program can mount. A request consists of method, path, headers
-and body. A response consists of status, headers and body. Any thread may answer requests. Most responses take
+The class `Handler` answers the requests of the protocol. The handler does not depend on the server that receives the
+requests. The function `asgi_app` creates a handler that another program can mount. A request consists of method, path,
+headers and body. A response consists of status, headers and body. Any thread may answer requests. Most responses take
 microseconds to compute, and a response to the largest batch takes milliseconds. Some responses take longer, for example
 because a model is loaded. The attribute `blocking_paths` lists the paths of such requests.
 
-The base class `Application` is a bare ASGI callable without a framework. It is also the base class of the live page.
-The handler needs no router of a framework, because the table `ROUTES` already selects the function for a request and
-the name of its counter.
+The base class `Application` is a bare ASGI callable without a framework. `Application` is also the base class of the
+live page. The handler needs no router of a framework, because the table `ROUTES` already selects the function for a
+request and the name of its counter.
 """
 
 import asyncio
@@ -36,7 +36,8 @@ Message = MutableMapping[str, Any]
 
 
 class Application(ABC):
-    """ASGI application: the handler of models or the live page. It can be mounted under any path of another program.
+    """ASGI application: the handler of models or the live page. An application can be mounted under any path of another
+    program.
 
     Attributes:
         limits: Limits of the requests.
