@@ -207,7 +207,7 @@ def _describe_mistake(value: Any, expected_type: Any, error: msgspec.ValidationE
     """Return a description of a mistake, with the names of the keys that lead to the wrong value.
 
     The items of a table or of a list are converted separately. If an item cannot be converted, the mistake is in this
-    item. Otherwise, the table or the list itself is wrong, for example because a key is missing.
+    item. If all items can be converted, the table or the list itself is wrong, for example because a key is missing.
 
     Args:
         value: Value from TOML or JSON.

@@ -168,15 +168,15 @@ def _abandon(pool: ProcessPoolExecutor) -> None:
     """End the workers of a process pool although they are still computing, and wait until the pool has ended.
 
     The method `ProcessPoolExecutor.shutdown` is not sufficient, because it waits until the running jobs are completed.
-    This function ends the workers. A thread of this process, the manager, then notices that they have ended, and closes
-    the pool. Three precautions are necessary.
+    This function ends the workers. A thread of this process, the manager, then notices that the workers have ended, and
+    closes the pool. Three precautions are necessary.
 
     First, all futures are cancelled, and the workers may end only after the manager has discarded the cancelled
-    futures. Otherwise the manager fails with an InvalidStateError. Second, a worker may end while it sends a result.
-    The manager would wait forever for the rest of the result, unless this process closes its own writing end of the
-    pipe. Third, a job that is larger than the buffer of a pipe may still be on its way to the workers. The thread that
-    sends the job would wait forever, unless this process closes its own reading end of the pipe
-    (https://github.com/python/cpython/issues/94777).
+    futures. If the workers ended earlier, the manager would fail with an InvalidStateError. Second, a worker may end
+    while it sends a result. The manager would wait forever for the rest of the result, unless this process closes its
+    own writing end of the pipe. Third, a job that is larger than the buffer of a pipe may still be on its way to the
+    workers. The thread that sends the job would wait forever, unless this process closes its own reading end of the
+    pipe (https://github.com/python/cpython/issues/94777).
 
     Args:
         pool: Process pool whose results are no longer needed.

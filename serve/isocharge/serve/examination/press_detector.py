@@ -153,8 +153,8 @@ def estimate_noise(values: Array) -> Array:
     """Estimate the noise of each channel from the differences between consecutive values.
 
     Presses have little effect on these differences. If the noise is normally distributed, the median magnitude of a
-    difference is 0.6745 * sqrt(2) standard deviations. For coarse counts, most differences may be 0. In this case, the
-    mean magnitude of a difference is used, which is 2 / sqrt(pi) standard deviations.
+    difference is 0.6745 * sqrt(2) standard deviations. For coarse counts, most differences may be 0. If most
+    differences are 0, the mean magnitude of a difference is used, which is 2 / sqrt(pi) standard deviations.
 
     Args:
         values: Values of the channels, shape (n, channels), any unit. Values that are not finite are left out.

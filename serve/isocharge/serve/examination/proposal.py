@@ -109,9 +109,9 @@ def _choose_channels(
     """Choose the channel of each electrode.
 
     If there are channels with the names of the electrodes, or as many channels as electrodes, the channels are chosen
-    as in a stream. Otherwise the electrodes are assigned, in their order, to the channels whose values vary. If there
-    are more such channels, the adjacent channels with the most similar noise are chosen. Without a model, each varying
-    channel is an electrode.
+    as in a stream. Otherwise, the electrodes are assigned, in their order, to the channels whose values vary. If more
+    channels vary than there are electrodes, the adjacent channels with the most similar noise are chosen. Without a
+    model, each varying channel is an electrode.
 
     Args:
         capture: The frames.

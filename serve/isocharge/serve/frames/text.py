@@ -343,9 +343,9 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
     cycles. Lines are equal if their skeletons are equal. A cycle contains the lines after the previous occurrence of
     the last line, up to the last line itself.
 
-    If lines occur several times in a cycle, the most frequent line is a frame. Otherwise, if every value has a name, a
-    frame consists of all lines of a cycle. Otherwise, a frame is a single line, and the other lines of the cycle never
-    change.
+    If lines occur several times in a cycle, the most frequent line is a frame. If all lines of a cycle differ and every
+    value has a name, a frame consists of all lines of a cycle. If all lines differ and some value has no name, a frame
+    is a single line, and the other lines of the cycle never change.
 
     Args:
         lines: The lines since the beginning.
@@ -416,8 +416,9 @@ def _has_channel_number(layout: Layout, lines: Sequence[Line]) -> bool:
 def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
     """Return the index of the line with which a frame begins in repeated cycles of lines.
 
-    If every line has a clock, the lines whose clocks differ least form a frame. Otherwise, a frame begins with the line
-    of the counter, or else with a line that only contains the clock, or else with the first name in alphabetical order.
+    If every line has a clock, the lines whose clocks differ least form a frame. If some line has no clock, a frame
+    begins with the line of the counter, or else with a line that only contains the clock, or else with the first name
+    in alphabetical order.
 
     Args:
         lines: Lines of whole cycles, in which every value has a name.

@@ -268,12 +268,12 @@ def _tokens(text: str, number_kind: str) -> list[_Token]:
 
 
 def _index_positions(tokens: list[_Token]) -> list[int]:
-    """Return the positions of the numbers that are indices of channels, and therefore names.
+    """Return the positions of the numbers that are not values but indices of channels. An index is the name of a value.
 
     If a line ends with pairs of numbers, the first number of each pair is an index in these cases:
 
-    - A colon or an equals sign follows it, as in `1:801,2:799` and `ch 1 = 801 pC`. There are several pairs, or no
-      other numbers.
+    - A colon or an equals sign follows the number, as in `1:801,2:799` and `ch 1 = 801 pC`. There are several pairs, or
+      no other numbers.
     - In several pairs, the first numbers count from 0 or 1, and follow the same word or mark, as in `pad #1 801 pad #2
       799` and `[1] 801 [2] 799`.
 
@@ -329,8 +329,9 @@ def _alternating_names(times: list[str], gaps: list[list[_Token]]) -> list[str]:
     """Return the names of the numbers in a line in which names and numbers alternate; empty for another line.
 
     The name of a number is the word that is next to the number, either before each number, as in `C,7,A,3` and
-    `C[7] A[3]`, or behind each number, as in `7 C, 3 A`. All names are different, because words that repeat are units
-    or states. Words of another meaning that alternate with the numbers are taken for names, too.
+    `C[7] A[3]`, or behind each number, as in `7 C, 3 A`. If two of the words are equal, no word is a name, because
+    words that repeat are units or states. Words of another meaning that alternate with the numbers are taken for names,
+    too.
 
     Args:
         times: Name of each number that is a time; empty for the other numbers.

@@ -103,7 +103,7 @@ class ReadingStream:
     def restart(self) -> None:
         """Return to the state of a new stream, so that all later results depend only on later bytes.
 
-        Only the counts that `totals` returns include the time before the restart.
+        Only the counts that `totals` returns also include the frames before the restart.
         """
         self.counts_before_restart = self.totals()
         self._begin()

@@ -6,8 +6,8 @@ which is a Chebyshev series in the contact:
     v_e = sum c_ijm T_i(x / r) T_j(y / r) T_m(l),   i + j <= degree, m <= force_degree,
 
 where T_i are Chebyshev polynomials, r is the radius of the domain, and l is the logarithm of the force, scaled to
-[-1, 1]. If all charges are positive, the charge is Q = exp(v). Otherwise, the charge is Q = S(l) v, and the logarithm
-of the typical size S of the charges is a polynomial in l.
+[-1, 1]. If all charges are positive, the charge is Q = exp(v). If some charges are not positive, the charge is Q = S(l)
+v, and the logarithm of the typical size S of the charges is a polynomial in l.
 
 Without pretension, the charge is nearly F^(2/3) g(x, y), with the force F and a smooth function g of the position. The
 value v is therefore smooth, and few terms suffice. For a contact outside the domain, v and ln S are extrapolated
@@ -21,7 +21,7 @@ A calibrated film may change. The map then also depends on the state of the film
   whose pretension cannot be followed has the single node 0.
 - z_k is the change of the film along direction k, in standard deviations. A direction is a linear combination of
   properties of the film that remained uncertain after the calibration. A change adds z_k (d_ke + t d'_ke) to v_e, where
-  d_ke(x, y, F) and d'_ke(x, y, F) are further Chebyshev series. The second one is needed because some combinations of
+  d_ke(x, y, F) and d'_ke(x, y, F) are further Chebyshev series. The series d' is needed because some combinations of
   properties hardly change the charges at the pretension of the calibration, but do so at another pretension.
 """
 
@@ -300,8 +300,8 @@ class ChargeSeries:
     def _charges(self, value: Array, nearest: Array, excess: Array) -> tuple[Array, Array, Array]:
         """Convert values v of the series into charges without the offset.
 
-        If all charges are positive, v is the logarithm of the charge. Otherwise, v is the charge divided by the typical
-        size S of charges at the force, whose scaled logarithm is l.
+        If all charges are positive, v is the logarithm of the charge. If some charges are not positive, v is the charge
+        divided by the typical size S of charges at the force, whose scaled logarithm is l.
 
         Args:
             value: v and its derivatives with respect to the unit coordinates, shape (n, 4, n_electrode).

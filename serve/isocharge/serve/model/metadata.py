@@ -110,7 +110,7 @@ class UnnoticedPresses(Struct, frozen=True, kw_only=True):
     def summary(self) -> str:
         """Sentence that states the share of unnoticed presses between the two circles.
 
-        The share is in percent. Only values below 9.5 % have a decimal.
+        The share is in percent. The share has one decimal if it is below 9.5 %, and no decimals otherwise.
         """
         min_force_N, max_force_N = self.force_N
         percent = 100.0 * self.total_share

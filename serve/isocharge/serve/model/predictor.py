@@ -108,7 +108,8 @@ class Predictor:
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how `copy` and `pickle` create the predictor again, because the onnxruntime session has no copy.
 
-        The predictor is loaded again from its folder. A stated noise is then restored with its limits of a touch.
+        The predictor is loaded again from its folder. If the noise was stated with `with_noise`, this noise and its
+        limits for touches are restored.
         """
         is_stated = self.noise is not self.metadata.noise
         state = {"noise": self.noise, "validity": self.validity} if is_stated else None

@@ -11,7 +11,8 @@ minimises
 The first term is the negative logarithm of a Student's t distribution with nu degrees of freedom, so that presses that
 no contact explains (such as a touch with two fingers) hardly change the state. m_i is the number of charges and of
 measured coordinates of the press minus the three coordinates of its contact. v_ik and w_ik are a measured coordinate
-and its standard deviation. The last term is a Gaussian prior with the mean s0 and the precision P.
+and its standard deviation. The last term is the negative logarithm of a Gaussian prior of the state with the mean s0
+and the precision P.
 
 The minimum is found by damped Gauss-Newton steps with weights that follow from chi2_i (iteratively reweighted least
 squares; Holland and Welsch 1977). The three coordinates of each contact are eliminated by their Schur complement, so

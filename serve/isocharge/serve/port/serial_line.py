@@ -4,9 +4,9 @@ A connection is called a line. A line is either a serial port, which pyserial op
 file descriptors for serial ports, each read from a serial port needs only two system calls. Each datagram of a socket
 is one chunk.
 
-Some boards send a text without a line feed at the end in each datagram. In this case, a line feed is added to each
-datagram, because text parsers need the line feed. If a datagram of the board has ended with a line feed, nothing is
-added to later datagrams.
+Some boards send a text without a line feed at the end in each datagram. A line feed is added to each datagram of such a
+board, because text parsers need the line feed. If a datagram of the board has ended with a line feed, nothing is added
+to later datagrams.
 
 On a connection with only two wires, each end also receives the bytes that it sends itself. On such a connection, the
 received bytes begin with an echo of the request, and the echo must be removed. The next request is sent only after the

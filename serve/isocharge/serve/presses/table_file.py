@@ -342,7 +342,8 @@ def _find_header(lines: list[str], names: Collection[str]) -> tuple[int, str]:
     """Find the header at the beginning of a text, and the separator of the columns.
 
     The header is the first line that contains a name and no number. If there is no such line, the result is the first
-    line. The separator is the one with which the header has most names, and then most cells.
+    line. The function chooses the separator with which the header has the most names. Among separators with equally
+    many names, the function chooses the separator with the most cells.
 
     Args:
         lines: First lines of the text.

@@ -202,7 +202,7 @@ def _number_parts(
 def _wraps_early(steps: Array, size: int) -> bool:
     """Return whether a counter or clock wraps although the upper bytes that are read with it do not change.
 
-    In this case, the upper bytes do not belong to the counter or clock.
+    If the counter or clock wraps early, the upper bytes do not belong to it.
 
     A damaged byte may also cause a step back, but causes an equal step forwards, too.
 

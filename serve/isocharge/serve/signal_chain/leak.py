@@ -293,9 +293,9 @@ class Integrator(Leak):
 
         The current of a missing frame is assumed to be the mean of the currents before and after the gap. If this mean
         is so small that it may only be noise, the current is assumed to be the inflow instead, which is the estimated
-        offset. Otherwise, the noise would be multiplied by the number of missing frames. The touch gets the flag `gap`
-        if the error of the assumed current may exceed both the noise and 1 % of the charge. A copy of the previous
-        frame adds no charge, and neither does a frame that arrives late.
+        offset. The mean of two noisy currents would multiply the noise by the number of missing frames. The touch gets
+        the flag `gap` if the error of the assumed current may exceed both the noise and 1 % of the charge. A copy of
+        the previous frame adds no charge, and neither does a frame that arrives late.
 
         At rest, the charges decay with the time constant `relax_s`. The variance of the sum of independent currents is
         then relax_s / (2 dt) times the variance of one current.

@@ -191,8 +191,8 @@ class Tare(Stage):
     def _search_error(self, reason: str, frame: Frame) -> TareError:
         """Return the error for a search without a result, with the present values of the board as settings.
 
-        The search may have failed because the film is touched, or because the board has large offsets. In the second
-        case, the present values are the offsets.
+        The search may have failed because the film is touched, or because the board has large offsets. If the board has
+        large offsets, the present values are the offsets.
 
         Args:
             reason: Reason why the last frames were not quiet.

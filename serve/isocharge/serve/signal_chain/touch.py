@@ -118,10 +118,11 @@ class Touch(Stage):
     def reset(self) -> None:
         """Discard the touch."""
         n_electrode = len(self._setup.electrodes)
+        # Charges and sizes are relative to the touch thresholds. The size of charges is the norm of their vector.
         self._touch_direction: Array | None = None  # sum of the directions of the frames of the latest touch
-        self._base = np.zeros(n_electrode)  # charges that are no touch
-        self._previous = np.zeros(n_electrode)  # charges of the previous frame
-        self._idle_mean = np.zeros(n_electrode)  # exponential mean of the charges out of contact
+        self._base_charge = np.zeros(n_electrode)  # charges that are no touch
+        self._previous_charge = np.zeros(n_electrode)  # charges of the previous frame
+        self._idle_mean_charge = np.zeros(n_electrode)  # exponential mean of the charges out of contact
         self._rose_slowly = False  # whether the charges rose too slowly at the beginning of this touch
         self._is_contact = False
         self._peak_size = 0.0  # largest size in this touch
@@ -148,7 +149,7 @@ class Touch(Stage):
                 self._continue(self._rule, charge, direction)
             else:
                 self._await(frame, charge, direction)
-            self._previous = charge
+            self._previous_charge = charge
         frame.is_contact = self._is_contact
         if self._is_contact and self._rose_slowly:
             frame.flags.append(DRIFT)
@@ -163,17 +164,17 @@ class Touch(Stage):
         """
         # Update the peak, from which the release threshold follows.
         size = _norm(charge)
-        held_size = min(size, _norm(self._previous))  # a spike of a single frame is not a peak
+        held_size = min(size, _norm(self._previous_charge))  # a spike of a single frame is not a peak
         self._peak_size = max(self._peak_size, held_size)
         release_size = max((rule.release_share or 0.0) * self._peak_size, 0.5)
 
         # End the touch if the charges are small, or have changed their sign.
-        reference = self._previous if self._setup.has_any_sign else self._rest_direction
+        reference = self._previous_charge if self._setup.has_any_sign else self._rest_direction
         is_reversed = charge @ reference < 0.0
         if size < release_size or is_reversed:
             self._is_contact = False
-            self._base = charge
-            self._idle_mean = charge
+            self._base_charge = charge
+            self._idle_mean_charge = charge
             self._rest_s = 0.0
         else:
             self._touch_direction = direction + charge / size
@@ -187,32 +188,32 @@ class Touch(Stage):
         Args:
             frame: The frame.
             charge: Charges relative to the touch thresholds, shape (n_electrode,), dimensionless.
-            direction: Expected direction of a touch, shape (n_electrode,), dimensionless. It is the direction of the
-                latest touch while the charges of that touch may remain, and later the direction that all touches share.
-                It is zero if a touch may have any direction.
+            direction: Expected direction of a touch, shape (n_electrode,), dimensionless. While charges of the latest
+                touch may remain, the direction is that of the latest touch. Later, the direction is the one that all
+                touches share, or zero if a touch may have any direction.
         """
         # After a touch, the base is the charge that remains of it. While the finger leaves the film, the charge at rest
         # is held, and the base must not decay, because the finger still causes this charge.
-        is_remainder = self._base @ direction > 0.0
+        is_remainder = self._base_charge @ direction > 0.0
         if not (frame.is_base_held and is_remainder):
-            self._base = self._base * math.exp(-frame.dt_s / frame.base_relax_s)
+            self._base_charge = self._base_charge * math.exp(-frame.dt_s / frame.base_relax_s)
         size = _norm(charge)
-        change = charge - self._base
+        change = charge - self._base_charge
         change_size = _norm(change)
         if change @ direction < OPPOSING_COSINE * change_size * _norm(direction):
-            self._base = self._idle_mean  # a release or a drift, and not the noise of a single frame
+            self._base_charge = self._idle_mean_charge  # a release or a drift, and not the noise of a single frame
         elif change_size > 1.0:  # a touch begins
             self._is_contact = True
-            self._peak_size = min(size, _norm(self._previous))  # a spike of a single frame is not a peak
+            self._peak_size = min(size, _norm(self._previous_charge))  # a spike of a single frame is not a peak
             self._touch_direction = charge / max(size, 1.0)
             # The sum of the noise of currents changes slowly. The mean of the latest charges still contains it.
             limit = 0.75 if self._setup.device.has_currents else 0.5
-            self._rose_slowly = _norm(self._idle_mean - self._base) > limit
+            self._rose_slowly = _norm(self._idle_mean_charge - self._base_charge) > limit
             return
-        elif is_remainder and size < _norm(self._base):
-            self._base = charge  # the charge that remains of the latest touch becomes smaller
+        elif is_remainder and size < _norm(self._base_charge):
+            self._base_charge = charge  # the charge that remains of the latest touch becomes smaller
 
-        self._idle_mean = charge + math.exp(-frame.dt_s / RISE_S) * (self._idle_mean - charge)
+        self._idle_mean_charge = charge + math.exp(-frame.dt_s / RISE_S) * (self._idle_mean_charge - charge)
         if size > 1.0 and charge @ direction < 0.0:
             frame.flags.append(NEGATIVE)
         self._rest_s = 0.0 if size > 1.0 else self._rest_s + frame.dt_s

@@ -6,8 +6,8 @@ absolute times, so the frame rate does not drift. If the computer is too busy to
 are postponed, as if the board had paused. If the later frames were not postponed, the late frames would be sent in one
 burst. A burst would overflow the buffer of the port and look like a higher frame rate.
 
-The sensor never waits for a reader. A frame that does not fit into the buffer of the port is discarded and counted. In
-this case, the reader receives frames with a gap in the frame numbers.
+The sensor never waits for a reader. A frame that does not fit into the buffer of the port is discarded and counted.
+After a discarded frame, the reader receives frames with a gap in the frame numbers.
 """
 
 import array

@@ -99,7 +99,7 @@ def _layouts_within(radius: float, case: DesignCase) -> list[Array]:
     """Choose random layouts whose centres all lie within a radius, mm.
 
     Random points are added to each layout if they satisfy the distance rules. The list of the layouts is empty if one
-    of them remains incomplete.
+    layout remains incomplete.
     """
     grid = radius * sunflower(1000)
     grid = grid[case.clearance(grid) >= 0.0]

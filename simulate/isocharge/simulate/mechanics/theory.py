@@ -10,7 +10,7 @@ amplitude. With Young's modulus E and the thickness h of the film, the dimension
 (Schwerin 1929; Timoshenko and Woinowsky-Krieger 1959, art. 19). The amplitude A is the solution of a cubic equation, in
 which the sum of the three terms equals F / (E h a). Between the three limiting cases, the cubic equation is a good
 approximation. The in-plane displacement is proportional to A^2. If the deflection is divided by a A, the scaled
-deflection is of order one. Only the ratios of the three terms then remain as parameters of the press.
+deflection is of order one. In the scaled equations, the only parameters of a press are the ratios of the three terms.
 
 Stretching is always geometrically nonlinear and includes the pretension. *Bending* is the resistance of the film to a
 change of its curvature, and a theory may omit it. Bending is important near the rim and near the probe, and for the

@@ -100,9 +100,9 @@ class Assembly:
         """Determine which entries of the skeleton matrix may be nonzero, and where the element matrices are added.
 
         The skeleton matrix is the matrix of the unknowns on the sides of the elements, and is the sum of the matrices
-        of all elements. Only its nonzero entries are stored, in an array that is ordered column by column (compressed
-        sparse column format). The method stores the position of each entry of each element matrix in this array.
-        Entries that belong to a fixed unknown get the position after the last nonzero entry.
+        of all elements. Only the nonzero entries of the skeleton matrix are stored, in an array that is ordered column
+        by column (compressed sparse column format). The method stores the position of each entry of each element matrix
+        in this array. Entries that belong to a fixed unknown get the position after the last nonzero entry.
         """
         # Row and column of each entry of the element matrices in the skeleton matrix. Fixed unknowns have the number
         # -1.
@@ -308,5 +308,5 @@ def single_threaded_blas() -> AbstractContextManager[object]:
 
 @lru_cache
 def _blas_libraries() -> ThreadpoolController:
-    """Return the controller of the BLAS libraries. The first call finds those that NumPy and SciPy have loaded."""
+    """Return the controller of the BLAS libraries that NumPy and SciPy have loaded before the first call."""
     return ThreadpoolController()

@@ -310,8 +310,8 @@ def _first_field(start: Equilibrium | None, elastic: ElasticFilm) -> Array:
     """Return the first iterate of Newton's method, shape (n_node, 3).
 
     If the mesh of the starting equilibrium has the same elements, which may have another polynomial order, the first
-    iterate is interpolated from the field of the starting equilibrium. Otherwise it is an approximate deflection under
-    the probe and the static pressure.
+    iterate is interpolated from the field of the starting equilibrium. Without such a mesh, the first iterate is an
+    approximate deflection under the probe and the static pressure.
 
     Args:
         start: Equilibrium of a similar press; None if there is no such equilibrium.

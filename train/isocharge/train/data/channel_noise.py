@@ -85,10 +85,11 @@ class ChannelNoise(GaussianNoise):
 
         Rows that are copies of other rows are left out, because they contain no further noise. If at least
         `MIN_REPEATED_CONTACTS` contacts are repeated, the residuals are the differences between the repeated charges
-        and their means. These residuals contain only noise. Otherwise, the residuals are the differences between the
-        charges of a press and the values of a quadratic function, which is fitted to the neighbours of the press. These
-        residuals contain the noise and the error of the quadratic approximation. The white noise and the noise of the
-        gain are fitted to the residuals. Both kinds of noise have lower limits.
+        and their means. Differences of repeated charges contain only noise. If fewer contacts are repeated, the
+        residuals are the differences between the charges of a press and the values of a quadratic function, which is
+        fitted to the neighbours of the press. Differences from the function contain the noise and the error of the
+        quadratic approximation. The white noise and the noise of the gain are fitted to the residuals. Both kinds of
+        noise have lower limits.
 
         Args:
             charge: Measured charges, shape (n, n_electrode), pC.

@@ -12,9 +12,9 @@ this layer nearly cancel:
     sum_k w_k ln q_k = (sum_k w_k) ln q_0 + sum_k w_k ln(q_k / q_0).
 
 On the right-hand side, the charges are subtracted before a logarithm is computed, because ln(q_k / q_0) is computed as
-log1p((q_k - q_0) / q_0). The difference of two charges is exact if their ratio is at most two (Sterbenz 1974). All
-digits of the logarithm are then correct. On the left-hand side, the logarithms are larger, and their last digits are
-lost in the sums.
+log1p((q_k - q_0) / q_0). The difference of two charges is exact if their ratio is at most two (Sterbenz 1974). If the
+difference is exact, all digits of the logarithm are correct. On the left-hand side, the logarithms are larger, and
+their last digits are lost in the sums.
 
 Layers
 ------

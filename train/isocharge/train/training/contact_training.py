@@ -48,8 +48,8 @@ def covariance_loss(posterior: Posterior, error: Tensor) -> Tensor:
 
     The errors are divided by the standard deviations, and their correlations are removed. The three results are
     independent. The assumed distribution of each result has longer tails than a normal distribution: where the map from
-    contacts to charges nearly folds, a few errors are large, and a Gaussian likelihood would enlarge the intervals of
-    all contacts because of these errors.
+    contacts to charges nearly folds, a few errors are large. Because of these few errors, a Gaussian likelihood would
+    enlarge the intervals of all contacts.
 
     Args:
         posterior: Standard deviations and angles of the correlations (`isocharge.train.training.folded_network`).

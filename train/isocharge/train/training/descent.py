@@ -59,8 +59,8 @@ class Soap:
         the step.
 
         With equal decay rates, the ratio is at most 1, except where an update of the eigenvectors has moved a part of
-        the averaged gradient to an entry whose mean square is nearly zero. There, the ratio is limited to 1, because
-        the step would be arbitrarily long without a limit.
+        the averaged gradient to an entry whose mean square is nearly zero. The ratio of such an entry is limited to 1,
+        because the step would be arbitrarily long without a limit.
 
         Args:
             rate: Learning rate, which is approximately the change of each entry.

@@ -283,8 +283,8 @@ def _add_features(builder: GraphBuilder, features: ChargeFeatures) -> str:
 
     The charges Q are first limited to a range. If all charges are positive, the features are ln(Q / typical charge),
     and the operator `Clip` applies the same limits to all electrodes. If charges may be negative, the features are
-    asinh(Q / typical charge) - mean. In this case, the operators `Max` and `Min` apply separate limits to each
-    electrode.
+    asinh(Q / typical charge) - mean. For charges that may be negative, the operators `Max` and `Min` apply separate
+    limits to each electrode.
 
     Args:
         builder: Builder of the graph.

@@ -115,7 +115,7 @@ def invertible_domain(
 
     At a fold, the map from contacts to charges turns back, so that contacts on both sides of the fold have the same
     charges. If an accurate fit shows a fold, the disk is reduced to the radius of the fold, and a sentence states this.
-    Otherwise, the disk is the domain of the field. A sentence also states a probable fold of a poor fit.
+    If there is no such fold, the disk is the domain of the field. A sentence also states a probable fold of a poor fit.
 
     Args:
         field: Charge field that was fitted to the presses.
@@ -208,8 +208,9 @@ class Split:
     def features(self, noise: NoiseModel) -> ChargeFeatures:
         """Choose the features of the charges for the training presses.
 
-        The features are logarithms of the charges if all charges are positive. Otherwise, they are inverse hyperbolic
-        sines of charge / typical charge, which are linear for small charges and logarithmic for large charges.
+        The features are logarithms of the charges if all charges are positive. If some charges are not positive, the
+        features are inverse hyperbolic sines of charge / typical charge, which are linear for small charges and
+        logarithmic for large charges.
 
         Args:
             noise: Noise of the charges, which determines the typical charges or the lower limit of the charges.

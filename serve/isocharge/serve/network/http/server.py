@@ -57,11 +57,11 @@ class Connection(HttpToolsProtocol):
         self.deadline = self.loop.time() + seconds
 
     def connection_made(self, transport: Any) -> None:
-        """Begin the connection. If there are too many connections, end one that waits for a request.
+        """Begin the connection. If there are too many connections, end a connection that waits for a request.
 
-        Among the connections that wait for a request, the one with the earliest deadline is ended. A connection that
-        has not sent any request has an earlier deadline than one whose requests were answered. If no other connection
-        waits for a request, the new connection is refused.
+        Among the connections that wait for a request, the connection with the earliest deadline is ended. A connection
+        that has not sent any request has an earlier deadline than a connection whose requests were answered. If no
+        other connection waits for a request, the new connection is refused.
         """
         super().connection_made(transport)
         self._allow(self._limits.header_seconds)  # the TLS handshake, which is over, has a limit of its own
