@@ -256,6 +256,7 @@ def _item_types(value: Any, expected_type: Any) -> dict[str | int, Any]:
     members = list(_union_members(expected_type))
     types: dict[str | int, Any] = {}
     if isinstance(value, Mapping):
+        # The items of a struct are its fields, and the tag if there is one.
         structs = [member for member in members if isinstance(member, type) and issubclass(member, Struct)]
         tags = tuple(struct.__struct_config__.tag for struct in structs)
         for struct in structs:
@@ -264,7 +265,7 @@ def _item_types(value: Any, expected_type: Any) -> dict[str | int, Any]:
                 types[config.tag_field] = Literal[tags]
             if value.get(config.tag_field) == config.tag:  # both are None if the struct has no tag
                 types |= {field.encode_name: field.type for field in msgspec.structs.fields(struct)}
-    for member in members:
+    for member in members:  # the items of dictionaries and lists
         arguments = get_args(member)
         if isinstance(value, Mapping) and get_origin(member) is dict:
             types |= dict.fromkeys(value, arguments[1])

@@ -19,6 +19,7 @@ from isocharge.serve.examination.board_health import (
     held_press_sentences,
     measure_channel_health,
     transmission_sentences,
+    unit_sentences,
 )
 from isocharge.serve.examination.listening import BAUDS, Capture, ReceivedData, listen, read_frames
 from isocharge.serve.examination.press_detector import find_held_press, find_touch
@@ -176,7 +177,7 @@ def examine_received(
     held_press = find_held_press(values, times_s)
     is_rest = times_s < held_press.rest_end_s
 
-    # If no gain is stated, the values remain as the board sends them. With a gain, they are converted to pC.
+    # Find the channel of each electrode. Without a device file, the settings of the board are proposed first.
     table = dict(device.table)
     if is_proposed:
         table = propose(capture, values[is_rest], device.table["frames"], electrodes, gain or {})
@@ -185,6 +186,9 @@ def examine_received(
         Gain(Setup(electrodes, device))  # raises an error for the numbers of other electrodes
     electrode_at_position = electrodes_by_position(capture, device, electrodes)
     unit = unit_of(capture, electrode_at_position)
+
+    # Measure the channels at rest. If no gain is stated, the values remain as the board sends them. With a gain, the
+    # values are converted to pC.
     charges = values[is_rest][:, list(electrode_at_position)]  # shape (n, n_electrode)
     gain_rule = device.rule(GainRule)
     if gain_rule is not None:
@@ -197,6 +201,7 @@ def examine_received(
         for position, charge in zip(electrode_at_position, charges.T, strict=True)
     )
 
+    # A touch of the film would falsify the measurement at rest.
     touch = ""
     found = find_touch(charges, times_s[is_rest], unit_is_pC=unit == "pC") if channels else None
     if found is not None:
@@ -208,15 +213,10 @@ def examine_received(
         missing.insert(0, touch)
     if held_press.tau_s is not None:
         table = {"leak": {"tau_s": held_press.tau_s}} | table  # keeps a section that the device file already has
+
+    # State what the board still needs before it can provide contacts.
     missing += channel_count_sentences(capture, device, len(channels), electrodes)
-    if unit != "pC":
-        product = (
-            "it is the product of the volts of one unit and the feedback capacitance in pF; " if unit == "V" else ""
-        )
-        missing.append(
-            f"the channels seem to be in {unit}: state the charge of one unit in pC with --pc-per-unit NUMBER; "
-            f"{product}the number is negative if the amplifier inverts, and 1 if the channels are already in pC"
-        )
+    missing += unit_sentences(unit)
     if not touch:  # the offset, the noise and the drift of a pressed film say nothing about the board
         missing += channel_sentences(channels, unit, device)
     first_frame = capture.frames[0]
@@ -259,12 +259,11 @@ def electrodes_by_position(capture: Capture, device: Device, electrodes: tuple[s
     rule = device.rule(GainRule)
     gain_settings = () if rule is None else (rule.offset, rule.pC_per_unit)
     names = electrodes or next((tuple(numbers) for numbers in gain_settings if isinstance(numbers, dict)), ())
-    positions = None
     with suppress(ChargeError):  # a stream reports this error when it begins
         positions = Channels(Setup(names), any_unit=True).indices_by_name_or_order(last_frame)
-    if not names or positions is None:
-        return dict(enumerate(capture.names))
-    return dict(zip(positions, names, strict=True))
+        if positions:  # empty without names, and None if the numbers of channels and names differ
+            return dict(zip(positions, names, strict=True))
+    return dict(enumerate(capture.names))
 
 
 def port_lines() -> Iterator[str]:

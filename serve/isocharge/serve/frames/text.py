@@ -370,6 +370,7 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
     if all(all(line.names) for line in cycle):
         first = _first_line(lines, cycle_length)
         return lines[first : first + cycle_length]
+    # Some value has no name. The frame is the line of the cycle whose text varies, if there is exactly one such line.
     texts = [{line.text for line in lines[position::cycle_length]} for position in range(cycle_length)]
     varying = [line for line, texts_of_line in zip(cycle, texts, strict=True) if len(texts_of_line) > 1]
     return varying if len(varying) == 1 else []
@@ -398,10 +399,10 @@ def _has_channel_number(layout: Layout, lines: Sequence[Line]) -> bool:
         return False
     rows = [row for line in lines[-MAX_CYCLE_LINES:] if (row := line_values(layout.patterns[0], line.text))]
     columns = np.array(rows).T  # shape (columns, lines)
-    decreases = np.any(columns != np.sort(columns), axis=1)
+    decreases = np.any(columns != np.sort(columns), axis=1)  # whether each column decreases at least once
     varies = np.ptp(columns, axis=1) > 0.0
     for name, column, column_decreases in zip(layout.names, columns, decreases, strict=True):
-        numbers, ranks = np.unique(column, return_inverse=True)
+        numbers, ranks = np.unique(column, return_inverse=True)  # the different numbers, and the index of each line's
         leads_to_next = np.diff(ranks) % len(numbers) == 1
         are_consecutive = np.diff(numbers) == 1.0
         are_channels = 3 <= len(numbers) <= 8 and numbers[0] in range(100) and are_consecutive.all()

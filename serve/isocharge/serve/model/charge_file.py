@@ -92,7 +92,7 @@ def read_charge_map(version_folder: Path, electrodes: tuple[str, ...]) -> Charge
             electrodes=electrodes,
             coefficients=coefficients.astype(float),
             node_MPa=arrays["node_MPa"],
-            directions=arrays.get("directions", np.zeros((1, 1, 1, 2, 0, 1))).astype(float),
+            directions=arrays.get("directions", np.zeros((1, 1, 1, 2, 0, 1))).astype(float),  # by default none
             log_size=arrays.get("log_size"),
             is_folded=bool(arrays["is_folded"]),
             **{name: float(arrays[name]) for name in NUMBERS},

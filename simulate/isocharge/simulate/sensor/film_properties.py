@@ -128,6 +128,8 @@ def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> t
     Raises:
         SensorError: If no such sensor can exist, for example because an electrode lies over the rim.
     """
+    # A value is a change, either an addition or the logarithm of a factor, so that a missing value, 0, changes nothing.
+    # Only the value of the pretension replaces the present value.
     value = defaultdict(float, {PRETENSION.name: sensor.film.pretension, **values})
     piezo = sensor.piezo
     calibration = sensor.calibration

@@ -206,7 +206,7 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
             "of the file"
         )
 
-    is_any_force_known = bool(np.isfinite(presses.contact[:, 2]).any())
+    is_any_force_known = np.isfinite(presses.contact[:, 2]).any()
     if not is_any_force_known:
         assumed_contact = presses.contact.copy()
         assumed_contact[:, 2] = UNKNOWN_FORCE_N
