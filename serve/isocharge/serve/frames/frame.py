@@ -150,8 +150,8 @@ class FrameCounts:
         lost: Number of frames that are missing between received frames.
         repeated: Number of frames with the same counter as the previous frame.
         restarts: Number of times that the counter decreased without a wrap, for example after a reset of the device.
-            If the format has no counter, the clock of the device is used instead.
-            Frames that were lost during a restart are not counted.
+            If the format has no counter, the clock of the device is used instead. Frames that were lost during a
+            restart are not counted.
         crc_errors: Number of pieces with a wrong checksum.
         malformed: Number of pieces that were rejected for another reason, such as a wrong length.
         bytes_dropped: Number of bytes in the rejected pieces, including their delimiters.

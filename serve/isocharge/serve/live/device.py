@@ -22,9 +22,9 @@
     tau_s = {A = 10.0, B = 10.2, C = 9.9}
 
 The sections that are not shown contain the settings of the other stages. `STAGES` lists the stages, and each stage
-states its section and the class of its settings. The key `on = false` switches off the stage to which the
-section belongs. The stages of the sections `[tare]` and `[touch]` are switched on, with their default settings, even if
-the file has no such section. An unknown key causes an error.
+states its section and the class of its settings. The key `on = false` switches off the stage to which the section
+belongs. The stages of the sections `[tare]` and `[touch]` are switched on, with their default settings, even if the
+file has no such section. An unknown key causes an error.
 """
 
 from collections.abc import Mapping

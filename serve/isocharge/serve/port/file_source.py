@@ -1,7 +1,7 @@
 """Chunks of bytes, and files, pipes and the standard input as sources of chunks.
 
-A user may give a file as a port by mistake, for example a recording, records, a table of presses or an MCAP
-file. The parsers of text would misread the numbers in such files as charges from a board, so these files are refused.
+A user may give a file as a port by mistake, for example a recording, records, a table of presses or an MCAP file. The
+parsers of text would misread the numbers in such files as charges from a board, so these files are refused.
 """
 
 import codecs

@@ -188,8 +188,8 @@ NO_PAIRS = AmbiguousPairs(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
 def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float, places: int = 1000) -> AmbiguousPairs:
     """Find pairs of distant contacts whose charges cannot be distinguished because of the noise.
 
-    The first contact of a pair is a press with the given force at one of several positions. For each first
-    contact, the search for the nearest contact starts at distant contacts with similar charges.
+    The first contact of a pair is a press with the given force at one of several positions. For each first contact, the
+    search for the nearest contact starts at distant contacts with similar charges.
 
     Args:
         charge_map: Map that computes the charges of contacts.
@@ -242,9 +242,8 @@ MAX_RINGS = 200
 Bound = Literal["fold", "twins", "error", "searched"]
 """Reason for the radius of a working area.
 
-"twins" are an ambiguous pair, and "searched" means that only the radius of the search bounds the area.
-The error grows without limit towards a fold. An area that ends just before a fold therefore mostly has the bound
-"error".
+"twins" are an ambiguous pair, and "searched" means that only the radius of the search bounds the area. The error grows
+without limit towards a fold. An area that ends just before a fold therefore mostly has the bound "error".
 """
 
 

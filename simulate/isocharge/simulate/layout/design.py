@@ -5,9 +5,9 @@ errors of many presses: the p-th root of the mean of the p-th powers of the erro
 square. For the largest error, a large exponent makes the power mean a smooth approximation of the maximum.
 
 Sequential quadratic programming (SLSQP) minimises the logarithm of the power mean from several random layouts, for
-a few presses, under the distance rules. The largest error mostly occurs near the edge of an electrode,
-between these presses. The best layouts are therefore improved further. Each improvement reduces the errors of the worst
-of many presses, and the worst presses are then selected again.
+a few presses, under the distance rules. The largest error mostly occurs near the edge of an electrode, between these
+presses. The best layouts are therefore improved further. Each improvement reduces the errors of the worst of many
+presses, and the worst presses are then selected again.
 """
 
 from concurrent.futures import Executor
@@ -326,9 +326,9 @@ class Design:
 def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     """Find the layout that has the smallest position errors among the layouts without folds and ambiguous pairs.
 
-    Random layouts are improved, and the best ones are refined. The refined layouts are searched for folds and ambiguous
-    pairs in ascending order of their errors. The first layout without folds and ambiguous pairs is
-    returned. If every layout has folds or ambiguous pairs, the layout with the smallest error is returned.
+    Random layouts are improved, and the best layouts are refined. The refined layouts are searched for folds and
+    ambiguous pairs in ascending order of their errors. The first layout without folds and ambiguous pairs is returned.
+    If every layout has folds or ambiguous pairs, the layout with the smallest error is returned.
 
     Args:
         case: Requirements of the layout.
@@ -342,7 +342,7 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
         InputError: If the electrodes do not fit on the film.
         SolveError: If a press has no equilibrium.
     """
-    # Improve random layouts, and refine the best ones that are not rotations of each other.
+    # Improve random layouts, and refine the best layouts that are not rotations of each other.
     starts = random_layouts(case)
     fields = solve_fields(case.sensor, case.probe, case.force, case.radius, executor)
     search = Search(case, fields)

@@ -120,16 +120,16 @@ class ElasticFilm:
     def tangent(self, field: Array, added_tension: float = 0.0) -> Array:
         """Compute the tangent matrix of each element, without the stiffness of trapped air.
 
-        The stiffness of trapped air couples all nodes of the mesh. Therefore `solver.assembly` adds this
-        stiffness separately.
+        The stiffness of trapped air couples all nodes of the mesh. Therefore `solver.assembly` adds this stiffness
+        separately.
 
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
             added_tension: Tension that is added to the pretension, in units of E_young A^2.
 
         Returns:
-            Element matrices, shape (n_element, n_unknown, n_local, n_unknown, n_local), where
-            n_unknown is `unknowns_per_node`.
+            Element matrices, shape (n_element, n_unknown, n_local, n_unknown, n_local), where n_unknown is
+            `unknowns_per_node`.
         """
         tangent = self.membrane.tangent(field, added_tension, self.unknowns_per_node)
         if self.bending is not None:

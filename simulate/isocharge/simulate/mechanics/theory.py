@@ -273,8 +273,8 @@ class DimensionlessGroups:
     def height(self) -> float:
         """Approximate scaled deflection of the centre of the film under the force of the probe, dimensionless.
 
-        The unit is the product of the radius a of the film and the amplitude A.
-        The value is 1 if the back of the film is vented and the theory includes bending.
+        The unit is the product of the radius a of the film and the amplitude A. The value is 1 if the back of the film
+        is vented and the theory includes bending.
         """
         film_stiffness = MEMBRANE_STIFFNESS * max(self.tension, 0.0) + PLATE_STIFFNESS * self.bending
         air_stiffness = AIR_SHAPE * self.ambient_pressure * self.compression

@@ -71,8 +71,8 @@ def from_oval(points: Complexes, oval: complex | Complexes) -> Complexes:
 def _displacement_ratio(radius: Array) -> Array:
     """Compute the relative displacement at a radius, divided by the relative displacement of the rim.
 
-    A relative displacement is a displacement divided by the radius of the displaced point.
-    The ratio increases with the third power of the distance from `UNDEFORMED_RADIUS`, and is 1 at the rim.
+    A relative displacement is a displacement divided by the radius of the displaced point. The ratio increases with the
+    third power of the distance from `UNDEFORMED_RADIUS`, and is 1 at the rim.
 
     Args:
         radius: Radii of at least `UNDEFORMED_RADIUS`, any shape, in film radii.

@@ -164,8 +164,7 @@ def _locate_in_intervals(edges: Array, values: Array) -> tuple[Integers, Array]:
     """Find the intervals that contain values. Values outside all intervals belong to the first or the last interval.
 
     Args:
-        edges: Edges of adjacent intervals in increasing order, shape (n_interval + 1, k, n) or
-            (n_interval + 1, k, 1).
+        edges: Edges of adjacent intervals in increasing order, shape (n_interval + 1, k, n) or (n_interval + 1, k, 1).
         values: The values, shape (k, n).
 
     Returns:

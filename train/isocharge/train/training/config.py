@@ -105,8 +105,7 @@ class TrainingConfig(Settings, frozen=True):
     Attributes:
         steps: Number of optimiser steps of the contact network; None for the default.
         misfit_steps: Number of optimiser steps of the misfit network; None for the default.
-        misfit_charges: Number of sets of charges from which the misfit network learns; None for the
-            default.
+        misfit_charges: Number of sets of charges from which the misfit network learns; None for the default.
         batch: Number of presses in a batch.
         learning_rate: Largest learning rate of the optimiser SOAP.
         hold_out: Fraction of the positions that are used for testing.

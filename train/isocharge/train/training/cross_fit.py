@@ -95,8 +95,7 @@ def fit_presses(
         presses: At least 500 presses at 50 places. Presses with an unknown place or charge are left out, and presses
             with an unknown force, unless all forces are unknown.
         name: Name of the sensor.
-        config: Settings. The settings `noise` and `hold_out` are
-            not used.
+        config: Settings. The settings `noise` and `hold_out` are not used.
         probes: Notations of the probes.
 
     Returns:

@@ -2,8 +2,7 @@
 
 The inputs are whitened logarithms of the charges. A larger force increases all charges by nearly the same factor.
 Therefore, the common factor of the charges depends mostly on the force, and the ratios of the charges depend mostly on
-the position. A first perceptron estimates the means of x, y and ln F and the
-logarithms of their standard deviations.
+the position. A first perceptron estimates the means of x, y and ln F and the logarithms of their standard deviations.
 
 A second perceptron estimates the misfit vector (Q - Q(c)) / sigma. Here, Q are the measured charges, sigma are the
 standard deviations of their noise, and Q(c) are the charges of a contact c. The contact c is chosen so that the vector
