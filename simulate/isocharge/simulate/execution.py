@@ -190,7 +190,8 @@ def _abandon(pool: ProcessPoolExecutor) -> None:
     if manager is None:
         return  # no job was submitted, so there are no workers
 
-    # Wait until the manager has discarded the cancelled futures. It then resets the flag `_cancel_pending_futures`.
+    # Wait until the manager has discarded the cancelled futures. The manager then resets the flag
+    # `_cancel_pending_futures`.
     _wait_until(lambda: not internals._cancel_pending_futures or not manager.is_alive())
 
     # End the workers, and wait until the manager has noticed that they ended.

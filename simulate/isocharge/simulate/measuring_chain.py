@@ -260,8 +260,8 @@ class Measurement:
         bias_charge = self.bias / self.rate  # charge of the bias current between two readings, shape (n_electrode,)
         inputs = self.gain * changes + bias_charge
 
-        # Each channel has its own time constant. Its filter is output[n] = decay * output[n - 1] + inputs[n]. A charge
-        # that arrives between two readings has decayed by (1 + decay) / 2 on average.
+        # Each channel has its own time constant. The filter of a channel is output[n] = decay * output[n - 1] +
+        # inputs[n]. A charge that arrives between two readings has decayed by (1 + decay) / 2 on average.
         decays = np.exp(-1.0 / (self.rate * self.leak_time))
         inputs *= 0.5 * (1.0 + decays)
         channels = zip(decays.tolist(), inputs.T, self._output.tolist(), strict=True)

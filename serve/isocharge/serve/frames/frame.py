@@ -335,8 +335,8 @@ class Parser(ABC):
             self.counts.repeated += 1
             return (REPEAT,)
         # A small increase means that frames were lost. If the counter is lower than before, it may have wrapped, but a
-        # large increase across the end of its range is more probably a restart. It has not wrapped if the clock was
-        # reset at the same time, or if the counter had exceeded the modulus.
+        # large increase across the end of its range is more probably a restart. The counter has not wrapped if the
+        # clock was reset at the same time, or if the counter had exceeded the modulus.
         increase_limit = self.seq_modulus // 2
         if seq < previous_seq:
             cannot_wrap = is_clock_reset or previous_seq >= self.seq_modulus

@@ -88,7 +88,7 @@ class ModelStore:
         self._roots = roots if models is None else roots[:1]
         self._change_lock = threading.Lock()
         self.metrics = ModelMetrics()
-        # The list is sorted. It is replaced as a whole, so that no thread reads half of a change.
+        # The list is sorted, and is replaced as a whole, so that no thread reads half of a change.
         self._versions: list[Version] = []
         for name, folder in self._folders().items():
             self._load_versions(name, folder)

@@ -184,8 +184,9 @@ def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDiv
     single_bytes = stream.astype(int)
     pairs = 256 * single_bytes[:-1] + single_bytes[1:]
 
-    # For each length of a frame, the positions at which frames of this length begin. The byte or pair with the most
-    # positions is chosen, and a pair if a byte has equally many.
+    # A code is the number of a byte or of a pair. The dictionary contains, for each length of a frame, the positions at
+    # which frames of this length begin. The byte or pair with the most positions is chosen, and a pair if a byte has
+    # equally many.
     best_starts: dict[int, NDArray[np.int64]] = {}
     for codes in (pairs, single_bytes):
         positions = np.argsort(codes, kind="stable")  # first all positions of the smallest code

@@ -48,8 +48,8 @@ class PseudoPort:
 
     def __init__(self) -> None:
         """Open a pseudo-terminal."""
-        # The file descriptor of the reader's end also stays open here. Otherwise the operating system would hang up the
-        # port when a reader closes it.
+        # The file descriptor of the reader's end also stays open here. If the descriptor were closed here, the
+        # operating system would hang up the port when a reader closes it.
         self._writer, self._reader = os.openpty()
         tty.setraw(self._reader)  # in raw mode, the operating system passes all bytes on unchanged
         os.set_blocking(self._writer, False)  # a full buffer raises BlockingIOError instead of delaying the sensor

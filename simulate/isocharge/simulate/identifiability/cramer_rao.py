@@ -96,8 +96,8 @@ def _invert(information: Array) -> Array:
         Inverse matrices, shape (n, p, p).
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
-    # The lower bound avoids a division by zero if there is no information about a parameter. It is the root of the
-    # smallest number, because the products of two bounds must not underflow.
+    # The lower bound avoids a division by zero if there is no information about a parameter. The bound is the root of
+    # the smallest number, because the products of two bounds must not underflow.
     smallest_information = np.sqrt(np.finfo(float).tiny)
     parameter_scale = np.sqrt(np.maximum(diagonal, smallest_information))  # shape (n, p)
     matrix_scale = parameter_scale[:, :, None] * parameter_scale[:, None, :]

@@ -126,7 +126,7 @@ def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -
     outward = -np.einsum("nbi,ni->nb", normals, gradient)
     normals = normals * (outward > 0.0)[..., None]
 
-    # A step along the tangent of the circle must also turn with the circle. This adds the outward component to the
+    # A step along the tangent of the circle must also turn with the circle. The turn adds the outward component to the
     # second derivative along the tangent.
     tangent = normals[:, 0, [1, 0, 2]] * np.array([-1.0, 1.0, 0.0])
     matrix = matrix + outward[:, 0, None, None] * tangent[:, :, None] * tangent[:, None, :]

@@ -98,8 +98,8 @@ def _starting_points(rings: Rings, precision: Array) -> tuple[Array, Array]:
     Returns:
         Positions (x, y), shape (n, 2), and the distance to the farthest neighbour of each, shape (n,), mm.
     """
-    # A position is chosen if none of its eight neighbours has a smaller precision. It is also chosen if a line of
-    # neighbours has a kink, as at a fold line: the precision then decreases to zero and increases again.
+    # A position is chosen if none of its eight neighbours has a smaller precision. A position is also chosen if a line
+    # of neighbours has a kink, as at a fold line: the precision then decreases to zero and increases again.
     is_chosen = precision == scipy.ndimage.minimum_filter(precision, 3, mode=("nearest", "wrap"))
     along_ring = np.roll(precision, 1, axis=1) + np.roll(precision, -1, axis=1)
     is_chosen |= 3.0 * precision <= along_ring

@@ -220,7 +220,7 @@ class DesignCase:
         for electrode in self.kept_electrodes:
             for part in electrode.metal:
                 # Compute the gaps along x and y, shape (n, 2). A gap is negative if the square and the part overlap
-                # along this axis. It is sufficient if one gap is large enough, so the larger gap counts.
+                # along this axis. One large gap is sufficient, so the larger gap counts.
                 axis_gaps = np.maximum(part.min(axis=0) - positions, positions - part.max(axis=0)) - half_side
                 clearances.append(axis_gaps.max(axis=1) - GAP)
         return np.asarray(np.min(clearances, axis=0))

@@ -238,7 +238,7 @@ class Membrane:
         elastic_stress = scaled_strain @ self.groups.elasticity
 
         # The traction is the derivative of the energy density with respect to the slopes, shape (n_element, n_point, 2,
-        # 3). Its terms belong to the elastic stress and to the pretension.
+        # 3). The terms of the traction belong to the elastic stress and to the pretension.
         traction = _symmetric_matrix(elastic_stress) @ self._deformation_gradient(slopes)
         traction += self._slope_weights * (self._pretension_matrix @ slopes)
 
@@ -266,8 +266,8 @@ class Membrane:
         slopes = self._slopes(field)
         deformation = self._deformation_gradient(slopes)
 
-        # The total stress (S11, S22, S12) is the sum of the elastic stress and the pretension. It is multiplied by the
-        # integration weights.
+        # The total stress (S11, S22, S12) is the sum of the elastic stress and the pretension. The total stress is
+        # multiplied by the integration weights.
         elastic_stress = strain(slopes, self.groups.squared_amplitude) @ self.groups.elasticity
         total_stress = elastic_stress + self._pretension + added_tension * EQUAL_TENSION
         weighted_stress = _symmetric_matrix(total_stress * mesh.weights[..., None])

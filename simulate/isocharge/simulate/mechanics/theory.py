@@ -89,8 +89,8 @@ def rotate_stress(rotated_frame_stress: Array, angle: float | Array) -> Array:
     """
     s11, s22, s12 = np.moveaxis(rotated_frame_stress, -1, 0)
 
-    # In Mohr's circle, the mean of s11 and s22 does not change. The deviator consists of half of their difference and
-    # the shear stress. It is rotated as a complex number by twice the angle.
+    # In Mohr's circle, the mean of s11 and s22 does not change. The deviator consists of half of the difference of s11
+    # and s22, and of the shear stress. The deviator is rotated as a complex number by twice the angle.
     mean = 0.5 * (s11 + s22)
     deviator = (0.5 * (s11 - s22) + 1j * s12) * np.exp(2j * np.asarray(angle))
     return np.stack([mean + deviator.real, mean - deviator.real, deviator.imag], axis=-1)

@@ -158,7 +158,7 @@ def sector_angles(
     ray = np.exp(1j * _ray_angles(blocks, inner_points - origin, radius_ratio))  # shape (..., n_sector + 1)
     intersection = _intersections_with_circle(origin - centre, ray, radius)
 
-    # Angles of the intersections around the centre of the circle. They also increase where they pass pi.
+    # Angles of the intersections around the centre of the circle. The angles also increase where they pass pi.
     film_angle = np.unwrap(np.angle(intersection))
 
     # Convert the angles on the film into angles in the template plane.

@@ -112,8 +112,8 @@ class ChannelNoise(GaussianNoise):
             ]
         ).T  # each of shape (n_electrode,)
         gain = np.maximum(gain_std, LEAST_GAIN)
-        # The presses do not determine the white noise if all charges are large. Its lower limit is a small fraction of
-        # the noise of the gain at the usual charge.
+        # The presses do not determine the white noise if all charges are large. The lower limit of the white noise is a
+        # small fraction of the noise of the gain at the usual charge.
         smallest_white = LEAST_SHARE * gain * usual_size(charge)
         white = np.maximum(white_std, smallest_white)
         return cls(white, gain)

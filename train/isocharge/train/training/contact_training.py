@@ -58,8 +58,8 @@ def covariance_loss(posterior: Posterior, error: Tensor) -> Tensor:
     x_deviation, y_deviation, force_deviation = (error.detach() * torch.exp(-posterior.log_std)).unbind(dim=1)
 
     # The Cholesky factor of the correlations has the rows (1, 0, 0), (cos a, sin a, 0) and (cos b, sin b cos c,
-    # sin b sin c), where the angles a, b and c are pi / 2 + turn. It is inverted row by row, which gives errors with
-    # unit covariance.
+    # sin b sin c), where the angles a, b and c are pi / 2 + turn. The factor is inverted row by row, which gives errors
+    # with unit covariance.
     sin_a, sin_b, sin_c = torch.cos(posterior.turn).clamp(min=MIN_SINE).unbind(dim=1)
     cos_a, cos_b, cos_c = torch.sin(-posterior.turn).unbind(dim=1)
     white_y = (y_deviation - cos_a * x_deviation) / sin_a

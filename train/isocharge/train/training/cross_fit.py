@@ -126,7 +126,8 @@ def fit_presses(
     level = noise.level(labelled.charge)  # charges on a scale on which the noise has the standard deviation 1
     with threads_and_seed(training.threads, training.seed):
         features = signed_features(labelled.charge, noise.transition_charge(labelled.charge))
-        # The first network is returned. It learns from the other networks, which are those of the cross-validation.
+        # The first network is returned. This network learns from the other networks, which are those of the
+        # cross-validation.
         network, *fold_networks = (
             InverseNetwork(domain, features, labelled.charge, settings.network, force_std)
             for _ in range(1 + HELD_PARTS)

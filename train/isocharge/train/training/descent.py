@@ -78,7 +78,8 @@ class Soap:
         self.mean_gradient.lerp_(gradient, new_weight)
         self.mean_square.lerp_(_rotate(gradient, self.bases) ** 2, new_weight)
 
-        # The moving averages begin at zero. They are therefore divided by the total weight of all gradients so far.
+        # The moving averages begin at zero. The averages are therefore divided by the total weight of all gradients so
+        # far.
         total_weight = 1.0 - DECAY**self.step_count
         root_mean_square = torch.sqrt(self.mean_square / total_weight) + torch.finfo(gradient.dtype).tiny  # never zero
         ratio = _rotate(self.mean_gradient, self.bases) / (total_weight * root_mean_square)
