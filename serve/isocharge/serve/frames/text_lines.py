@@ -35,7 +35,9 @@ _DATE = r"[0-9]{1,4}[-/.][0-9]{1,2}[-/.][0-9]{1,4}[T ,;]+"
 
 _SECONDS = r"[0-9]{2}(?:\.[0-9]+(?:,[0-9]{3}(?=\]))?|,[0-9]{3}(?=\s))?"  # 56, 56.789, 56.789,012] or 56,789
 
-_TIME = rf"(?:{_DATE})?([0-9]{{1,2}}:[0-9]{{2}}:{_SECONDS})(?:Z|[-+][0-9]{{2}}:?[0-9]{{2}}(?![\w.]))?"
+_ZONE = r"(?:Z|[-+][0-9]{2}:?[0-9]{2}(?![\w.]))?"
+
+_TIME = rf"(?:{_DATE})?([0-9]{{1,2}}:[0-9]{{2}}:{_SECONDS}){_ZONE}"
 
 
 def _number_pattern(decimal_marks: str) -> str:
@@ -46,6 +48,7 @@ def _number_pattern(decimal_marks: str) -> str:
 
 _PATTERNS = {
     "time": _TIME,
+    "whole seconds": rf"(?:{_DATE})?[0-9:]{{7,8}}{_ZONE}",
     "uptime": "([0-9]+)",
     "hexadecimal": "([-+]?0[xX][0-9A-Fa-f]{1,16})",
     "number": _number_pattern("."),
@@ -105,7 +108,16 @@ _TOKENS = {kind: _token_pattern(_PATTERNS[kind]) for kind in ("number", "number 
 _SEPARATORS = ",;|[("
 """Marks that separate columns or begin a list. A word before such a mark does not name the number after the mark."""
 
-_SHAPES = {"number": "0", "hexadecimal": "0", "time": "", "uptime": "", "word": "w", "key": "k", "quoted": "k"}
+_SHAPES = {
+    "number": "0",
+    "hexadecimal": "0",
+    "time": "",
+    "whole seconds": "",
+    "uptime": "",
+    "word": "w",
+    "key": "k",
+    "quoted": "k",
+}
 """Character that stands for a part of a line in its shape, by the kind of the part. A mark stands for itself."""
 
 
@@ -258,9 +270,11 @@ def _tokens(text: str, number_kind: str) -> list[_Token]:
     tokens = []
     for match in _TOKENS[number_kind].finditer(text):
         kind = str(match.lastgroup)
-        content = match[2] if kind == "time" else match[0]  # the second group is a time without its date
-        is_after_blank = text[match.start() - 1 : match.start()].isspace()
-        tokens.append(_Token(kind, content.strip(), match.start(), is_after_blank))
+        content = match[2] or match[0]  # the second group is a time without its date
+        if kind == "time" and content[-3] == ":":  # such a time is too coarse for a clock
+            kind = "whole seconds"
+        start = match.start()
+        tokens.append(_Token(kind, content.strip(), start, text[start - 1 : start].isspace()))
 
     for position in _index_positions(tokens):
         tokens[position] = tokens[position]._replace(kind="key")
