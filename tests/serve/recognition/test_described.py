@@ -26,9 +26,11 @@ TYPES = (
 
 SYNCS = ("AA 55", "A5 5A", "EB 90", "7E", "FF FE", "24 50 5A")
 HEAD_FIELDS = (
-    *({"name": "seq", "type": type_name} for type_name in ("u8", "u16", "u32")),
-    *({"name": "t_ms", "type": type_name} for type_name in ("u16", "u32")),
-    {"name": "t_us", "type": "u32"},
+    *(
+        {"name": name, "type": type_name}
+        for name, *types in (("seq", "u8", "u16", "u32"), ("t_ms", "u16", "u32"), ("t_us", "u32", "i64"))
+        for type_name in types
+    ),
     *({"type": "pad", "value": value} for value in ("00", "03")),
 )
 CRCS = ("crc-8/maxim", "crc-16/modbus", "crc-16/x-25", "crc-16/ccitt-false", "crc-32")
@@ -109,8 +111,8 @@ class RandomBoard:
 
 def parsed_values(table, data):
     """Return the values of the frames that a description finds in data, shape (n, channels)."""
-    parser = device_from_table({"frames": table}, "test").parser()
-    return np.array([frame.values for frame in parser.feed(data)], ndmin=2)
+    frames = device_from_table({"frames": table}, "test").parser().feed(data)
+    return np.array([frame.values for frame in frames], ndmin=2)
 
 
 def test_frames_of_random_boards_are_recognised():
@@ -136,8 +138,8 @@ def test_frames_are_recognised_in_a_damaged_stream():
 def recognised_fields(number_formats, head, values, rate_Hz=RATE_HZ):
     """Return the recognised fields of frames that begin with AA 55, followed by a number and the values of channels."""
     rows = np.column_stack([head, values]).round().astype(int).tolist()
-    data = b"".join(b"\xaa\x55" + struct.pack(number_formats, *numbers) for numbers in rows)
-    return recognise([data], FRAMES / rate_Hz)["fields"]
+    frames = [b"\xaa\x55" + struct.pack(number_formats, *numbers) for numbers in rows]
+    return recognise(frames, FRAMES / rate_Hz)["fields"]
 
 
 VALUES = np.random.default_rng(0).normal(0.0, 300.0, (FRAMES, 4)).round()
@@ -155,10 +157,10 @@ def test_channel_that_never_changes_is_kept_beside_the_others(channel, constant)
 
 def test_checksum_covers_at_least_two_bytes():
     """Every byte would be its own sum of 16 bits."""
-    rows = [(value, value, 0) for value in range(100)]
-    assert list(find_checks(np.array(rows, np.uint8))) == []
-    rows = [(value, 2 * value, *divmod(3 * value, 256)[::-1]) for value in range(100)]
-    assert next(find_checks(np.array(rows, np.uint8))).name == "sum-16"
+    values = np.arange(100)
+    assert not [*find_checks(np.array([values, values, 0 * values], np.uint8).T)]
+    rows = np.array([values, 2 * values, 3 * values, 3 * values // 256], np.uint8).T
+    assert next(find_checks(rows)).name == "sum-16"
 
 
 PATTERN = np.random.default_rng(0).bytes(98)
@@ -200,6 +202,7 @@ NUMBERS = np.arange(FRAMES)
     [
         ("B", NUMBERS % 256, RATE_HZ, {"name": "seq", "type": "u8"}),  # counter that wraps
         ("I", NUMBERS + (NUMBERS % 10 == 3), 1000.0, {"name": "t_ms", "type": "u32"}),  # repeats milliseconds
+        ("d", 3.8e9 + 2 * NUMBERS, 0.5, {"name": "t_s", "type": "f64"}),  # seconds since 1904, as in LabVIEW
         ("I", 31250.0 / RATE_HZ * NUMBERS, RATE_HZ, {"name": "t_us", "type": "u32", "scale": 32.0}),
         ("I", 32768.0 / RATE_HZ * NUMBERS, RATE_HZ, {"name": "t_us", "type": "u32", "scale": 1e6 / 32768.0}),
     ],
@@ -237,8 +240,8 @@ def test_constant_bytes_before_a_counter_or_clock_do_not_belong_to_it(size, star
 def test_number_does_not_begin_before_the_bytes_that_a_checksum_covers():
     """The third byte is constant and could be the high byte of the counter."""
     bodies = [struct.pack(">B4h", number, *row) for number, row in enumerate(VALUES[:200].astype(int).tolist())]
-    data = b"".join(b"\xaa\x55\x03" + body + bytes([sum(body) % 256]) for body in bodies)
-    section = recognise([data], len(bodies) / RATE_HZ)
+    frames = [b"\xaa\x55\x03" + body + bytes([sum(body) % 256]) for body in bodies]
+    section = recognise(frames, len(bodies) / RATE_HZ)
     assert (section["checksum"], section["checksum_from"]) == ("sum-8", 3)
     assert section["fields"][0] == {"name": "seq", "type": "u8"}
 

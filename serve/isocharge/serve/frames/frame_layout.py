@@ -17,7 +17,7 @@ the device file contains the following keys.
         {name = "Fy", type = "i16", scale = 0.01},
     ]
 
-The types of the fields are u8, u16, u24, u32, i8, i16, i24, i32, f32, f64 and `pad`. Padding (`pad`) has either a
+The types of the fields are u8, u16, u24, u32, i8, i16, i24, i32, i64, f32, f64 and `pad`. Padding (`pad`) has either a
 `count` or a `value`. The `count` is a number of bytes without a meaning. The `value` is a constant in hexadecimal that
 every frame must contain, for example the length of the frame. The field `seq` is the frame counter. A field with the
 name `t_us`, `t_ms` or `t_s` is the clock. The field `flags` contains bits such as `SATURATED_BIT`
@@ -48,7 +48,7 @@ from isocharge.serve.frames.frame import (
 )
 from isocharge.serve.frames.transmission import CHECKSUMS, STUFFINGS, SUMS, Checksum
 
-FieldType = Literal["pad", "u8", "u16", "u24", "u32", "i8", "i16", "i24", "i32", "f32", "f64"]
+FieldType = Literal["pad", "u8", "u16", "u24", "u32", "i8", "i16", "i24", "i32", "i64", "f32", "f64"]
 
 STRUCT_FORMATS: dict[FieldType, str] = {
     "u8": "B",
@@ -59,6 +59,7 @@ STRUCT_FORMATS: dict[FieldType, str] = {
     "i24": "3s",
     "u32": "I",
     "i32": "i",
+    "i64": "q",
     "f32": "f",
     "f64": "d",
 }

@@ -19,17 +19,14 @@ from isocharge.serve.frames.frame import SEQ
 from isocharge.serve.frames.frame_layout import PADDING, STRUCT_FORMATS, ByteOrder, FieldType
 from isocharge.serve.recognition.framing import INTACT_SHARE, Bytes, usual_bytes
 
-CLOCKS = {1.0: ("t_s", 1.0), 1e3: ("t_ms", 1.0), 1e6: ("t_us", 1.0)} | {
+CLOCKS = {1.0: ("t_s", 1.0), 1e3: ("t_ms", 1.0)} | {
     tick_rate_Hz: ("t_us", 1e6 / tick_rate_Hz)
-    for tick_rate_Hz in (100.0, 1e4, 1e5, 32768.0, 31250.0, 500e3, 2e6, 4e6, 8e6, 16e6)
+    for tick_rate_Hz in (1e6, 100.0, 1e4, 1e5, 32768.0, 31250.0, 500e3, 2e6, 4e6, 8e6, 16e6, 1e9)
 }
 """For each tick rate of a clock, Hz: name of the clock field, and duration of one tick in the unit of the name."""
 
 CHANNEL = "channel"
 """Name of all channels during the recognition."""
-
-PLAUSIBLE_MAGNITUDES = (1e-7, 1e8)
-"""Smallest and largest typical magnitude of a floating-point channel."""
 
 
 def identify(steps: Array, frame_rate_Hz: float, tolerance: float = 0.06) -> tuple[bool, tuple[str, float] | None]:
@@ -130,17 +127,16 @@ def possible_parts(rows: Bytes, order: ByteOrder, checksum_start: int, frame_rat
     byte_step = 1 if order == "little" else -1
     parts_at_each_byte: list[list[Part]] = []
     for position in range(length):
-        pad_score = Weights.constant if is_constant[position] else Weights.noise
-        parts = [Part("", PADDING, 1, pad_score)]  # one byte of padding
+        # One byte of padding
+        parts = [Part("", PADDING, 1, Weights.constant if is_constant[position] else Weights.noise)]
         for type_name in STRUCT_FORMATS:  # such as "u16", whose size is 16 bits
             end = position + int(type_name[1:]) // 8
-            is_covered_in_part = position < checksum_start < end  # a checksum covers all bytes of a number or none
-            if end > length or is_covered_in_part:
+            if end > length or position < checksum_start < end:  # a checksum covers all bytes of a number or none
                 continue
             if all(is_constant[position:end]):
                 parts.append(Part(CHANNEL, type_name, end - position, Weights.constant, is_constant=True))
                 continue
-            lowest_first = list(range(position, end)[::byte_step])
+            lowest_first = range(position, end)[::byte_step]
             parts += _number_parts(
                 rows[:, lowest_first], is_constant[lowest_first], is_zero[lowest_first], type_name, frame_rate_Hz
             )
@@ -168,52 +164,44 @@ def _number_parts(
     values = _values(number_bytes, type_name)
     steps = np.diff(values)
     counter_steps = steps  # steps if the number is a counter or a clock, which may overflow
-    magnitude = float(np.median(np.abs(values)))
+    magnitude = np.median(np.abs(values))
     unit = 1.0  # smallest step that the number can represent
     if type_name[0] == "f":
-        min_magnitude, max_magnitude = PLAUSIBLE_MAGNITUDES
-        if not min_magnitude < magnitude < max_magnitude:
+        if not 1e-7 < magnitude < 1e10:  # a Unix time is the largest of the usual numbers
             return
         # Only the share `Weights.fraction` of the bytes contains the digits of the number. Low bytes that are always 0
         # contain no digits.
         low_zero_byte_count = np.argmin(is_zero)  # index of the lowest byte that is not always 0
-        digit_byte_count = Weights.fraction * size - low_zero_byte_count
+        # The four bytes behind four zeros may be an `f32`. An `f64` must not have a lower score than such a number.
+        digit_byte_count = (
+            Weights.fraction * (size - 4)
+            if low_zero_byte_count == 4
+            else (Weights.fraction * size - low_zero_byte_count)
+        )
         unit = magnitude * 256.0**-digit_byte_count
     if type_name[0] == "u":
         half_range = 1 << (8 * size - 1)
         counter_steps = (steps + half_range) % (2 * half_range) - half_range  # a counter that overflows restarts at 0
 
     is_counter, clock = identify(counter_steps, frame_rate_Hz)
-    if (is_counter or clock is not None) and not _wraps_early(counter_steps, size):
+    # Upper bytes that do not change while the number wraps do not belong to it. A damaged byte may also cause
+    # a step back, but causes a step forwards, too.
+    large_step = 20.0 * np.median(counter_steps)
+    wraps_early = (counter_steps < -large_step).sum() > (counter_steps > large_step).sum()
+    if not wraps_early:
         score = Weights.constant_high * (is_constant & ~is_zero).sum() if size == 3 else 0.0
         if is_counter:
             yield Part(SEQ, type_name, size, score)  # the values of a counter need no bits
-        elif clock is not None:
+        elif clock is not None and (size < 8 or clock[1] in (1.0, 1e-3)):  # 8 bytes count s, ms, us or ns
             name, tick_duration = clock
             score += _bits(counter_steps - np.median(counter_steps), unit, size)
             yield Part(name, type_name, size, score, scale=tick_duration)
 
     # The magnitude is added to the steps, so that a type has a lower score if its values are close to 0 or, for an
     # unsigned type, close to the middle of its range.
-    channel_score = Weights.channel + _bits(np.append(steps, magnitude), unit, size)
-    yield Part(CHANNEL, type_name, size, channel_score)
-
-
-def _wraps_early(steps: Array, size: int) -> bool:
-    """Return whether a counter or clock wraps although the upper bytes that are read with it do not change.
-
-    If the counter or clock wraps early, the upper bytes do not belong to it.
-
-    A damaged byte may also cause a step back, but causes an equal step forwards, too.
-
-    Args:
-        steps: Differences of the values of consecutive frames, shape (n,).
-        size: Number of bytes that are read.
-    """
-    deviations = steps - np.median(steps)
-    ranges = 256.0 ** np.arange(1, size)  # of numbers with fewer bytes
-    is_wrap = np.isin(deviations, -ranges) & (steps < 0.0)
-    return bool(is_wrap.sum() > np.isin(deviations, ranges).sum())
+    if type_name == "i64":  # times only
+        return
+    yield Part(CHANNEL, type_name, size, Weights.channel + _bits(np.append(steps, magnitude), unit, size))
 
 
 def split_frame(
@@ -277,14 +265,14 @@ def _values(number_bytes: Bytes, type_name: str) -> Array:
         type_name: Type of the number: "f" for floating-point, "u" for unsigned or "i" for signed, and the size in bits.
     """
     size = number_bytes.shape[1]
+    number_bytes = np.ascontiguousarray(number_bytes)
     if type_name[0] == "f":
-        floats = np.ascontiguousarray(number_bytes).view(f"<f{size}")  # shape (n, 1)
-        return floats[:, 0].astype(float)
-    half_range = 0.5 * 256.0**size
-    values: Array = number_bytes @ 256.0 ** np.arange(size)
-    if type_name[0] == "i":  # in two's complement, the upper half of the unsigned values stands for the negative values
-        values = (values + half_range) % (2.0 * half_range)
-    values -= half_range
+        return number_bytes.view(f"<f{size}")[:, 0].astype(float)
+    # The bytes become the high bytes of a signed number of 64 bits.
+    highest_bytes = np.pad(number_bytes, [(0, 0), (8 - size, 0)])
+    if type_name[0] == "u":
+        highest_bytes[:, -1] ^= 0x80  # subtracts half of the range
+    values: Array = highest_bytes.view(np.int64)[:, 0] / 256.0 ** (8 - size)
     return values
 
 
@@ -299,6 +287,4 @@ def _bits(steps: Array, unit: float, size: int) -> float:
         size: Size of the number, bytes.
     """
     step_bits = np.log2(1.0 + np.abs(steps) / unit)
-    number_bits = 8 * size
-    limited_bits = np.fmin(step_bits, number_bits)  # `fmin` also replaces NaN by `number_bits`
-    return float(limited_bits.mean())
+    return float(np.fmin(step_bits, 8 * size).mean())  # `fmin` also replaces NaN
