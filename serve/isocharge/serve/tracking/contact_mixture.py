@@ -217,6 +217,7 @@ def prune_components(components: Components, max_count: int = 8, merge_distance:
             deviations of the entry.
     """
     log_weight = components.log_weight - components.log_weight.max()
+    # Motion of each component and its standard deviations, shape (n_component, number of entries of MOTION)
     motion = components.mean[:, MOTION]
     std = np.sqrt(np.diagonal(components.covariance, axis1=1, axis2=2)[:, MOTION])
     kept: list[int] = []
@@ -413,7 +414,7 @@ def _components_at_ends(components: Components, variance_ratio: float = 0.25) ->
         variance_ratio: Variance of an end along the axis, relative to the most probable component.
     """
     covariance = components.covariance[0]
-    variances, axes = np.linalg.eigh(covariance[POSITION, POSITION])  # in ascending order
+    variances, axes = np.linalg.eigh(covariance[POSITION, POSITION])  # ascending; each column is the axis of a variance
     # Expected change of the whole state if the position changes by one standard deviation along the axis
     change = covariance[:, POSITION] @ axes[:, 1] / math.sqrt(variances[1])
     mean = components.mean[0] + SPLIT_DISTANCE * np.array([change, -change])

@@ -432,7 +432,7 @@ def _samples_of_shard(maps: Sequence[ForwardMap], presses: SweepPresses) -> Samp
         presses: Presses of the shard.
     """
     charge = np.empty((len(presses), len(maps[0].electrodes)))
-    for probe in np.unique(presses.probe).tolist():
+    for probe in np.unique(presses.probe).tolist():  # index of the map; `OUTSIDE_PROBE` is that of the last map
         rows = np.flatnonzero(presses.probe == probe)
         charge[rows] = maps[probe].charges(presses.contact[rows], presses.rotation[rows])
 

@@ -71,7 +71,7 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
     neighbours = np.stack(np.meshgrid(range(-2, 3), range(-2, 3)), axis=-1).reshape(-1, 2)
     while step.max() > 0.05 * FOLD_WIDTH:
         step *= 0.5
-        trial = onto_disk(position[:, None] + step[:, None, None] * neighbours, radius)
+        trial = onto_disk(position[:, None] + step[:, None, None] * neighbours, radius)  # shape (n, 25, 2)
         position = trial[np.arange(len(trial)), position_error(trial).argmax(axis=1)]
 
     # A position is on a fold if the charge map reverses its orientation between two opposite points of a circle around
@@ -351,7 +351,7 @@ def working_area(
     )
     folds = np.concatenate(folds_of_forces)
     fold_radius = float(np.hypot(*folds.T).min(initial=np.inf))
-    errors = np.max(errors_of_forces, axis=2)
+    errors = np.max(errors_of_forces, axis=2)  # largest error on each ring for each force, shape (n_force, n_ring)
     is_within_limit = (errors <= error).all(axis=0)
     first_exceeding = is_within_limit.argmin()
     error_radius = search_radius

@@ -112,7 +112,7 @@ def electrode_rows(pressed: PressedFilm, electrodes: Sequence[Electrode]) -> Arr
     """Compute the charges of electrodes and their derivatives for several presses; see `rows_of`."""
     if not electrodes:
         return np.empty((pressed.position.size, 0, len(COLUMNS)))
-    rows = pressed.charges(ElectrodePieces.covering(electrodes))
+    rows = pressed.charges(ElectrodePieces.covering(electrodes))  # shape (n_press, n_electrode, 6)
     # Rotate the derivatives along and across the direction of each press into derivatives with respect to x and y.
     x_column = COLUMNS.index("x")
     y_column = COLUMNS.index("y")

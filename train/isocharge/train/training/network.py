@@ -297,7 +297,7 @@ def fold_network(network: InverseNetwork) -> FoldedNetwork:
     matrix = _to_numpy(network.whitening)
     factor = _to_numpy(network.output_factor)
     answer_map = linear_answer_map(network.domain)
-    # (outputs * factor + offset) @ weight + bias
+    # The answers are (outputs * factor + offset) @ weight + bias, which is one linear map of the outputs.
     offset_answers = _to_numpy(network.output_offset) @ answer_map.weight + answer_map.bias
     contact_map = Layer(factor[:, None] * answer_map.weight, offset_answers)
     n_electrode = network.features.n_electrode
