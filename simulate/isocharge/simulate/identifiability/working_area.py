@@ -74,14 +74,15 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
         trial = onto_disk(position[:, None] + step[:, None, None] * neighbours, radius)  # shape (n, 25, 2)
         position = trial[np.arange(len(trial)), position_error(trial).argmax(axis=1)]
 
-    # A position is on a fold if the charge map reverses its orientation between two opposite points of a circle around
-    # it. With the derivatives J1 and J2 at these points, the orientation is reversed if det(J1' J2) is negative.
+    # A position is on a fold if the charge map reverses its orientation between two opposite points of a small circle
+    # around the position. Four pairs of points are tried. With the derivatives J1 and J2 at the points of a pair, the
+    # orientation is reversed if det(J1' J2) is negative.
     angle = np.pi * np.arange(4) / 4.0
     half_width = 0.5 * FOLD_WIDTH * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    sides = np.stack([position[:, None] + half_width, position[:, None] - half_width])
+    sides = np.stack([position[:, None] + half_width, position[:, None] - half_width])  # shape (2, n, 4, 2)
     charge, jacobian = charge_map.linearised(contacts(sides))
     scaled_jacobian = jacobian / noise.sigma(charge)[..., None]
-    first, second = scaled_jacobian.reshape(*sides.shape[:3], -1, 3)
+    first, second = scaled_jacobian.reshape(*sides.shape[:3], -1, 3)  # each of shape (n, 4, n_electrode, 3)
     products = np.einsum("...ei,...ej->...ij", first, second)
     is_fold = (np.linalg.det(products) < 0.0).any(axis=1)
     folds = position[is_fold]
