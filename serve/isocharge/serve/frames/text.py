@@ -235,7 +235,7 @@ class TextParser(DelimitedParser):
         self.format = f"text: {printable(', '.join(names))}"
 
     def _recognise_layout(self, line: Line, size: int) -> list[Frame]:
-        """Add a line to the collected lines. If their layout can now be recognised, return their frames.
+        """Add a line to the collected lines. If the layout can now be recognised, return the frames in the lines.
 
         Args:
             line: The next line.
@@ -383,11 +383,12 @@ def _has_channel_number(layout: Layout, lines: Sequence[Line]) -> bool:
     `1000,0,3.2`, `1000,1,4.1`, `1000,2,3.7` and `1005,0,3.3`. A column is taken for such numbers if it fulfils these
     conditions:
 
-    - It contains three to eight different numbers, which are consecutive whole numbers. The smallest is below 100.
+    - The column contains three to eight different numbers, which are consecutive whole numbers. The smallest number is
+      below 100.
     - At least half of the steps from line to line lead to the next number. Other steps may be due to missing lines.
-    - It does not have the name of a frame counter or of an electrode, such as A.
-    - The other columns cannot be the charges of a film: fewer than three of them sometimes decrease. Three or more
-      columns that are all constant may be charges, too.
+    - The column does not have the name of a frame counter or of an electrode, such as A.
+    - The other columns cannot be the charges of a film: fewer than three of the other columns sometimes decrease. Three
+      or more columns that are all constant may be charges, too.
 
     The result is also true for a frame counter without a name in its first eight lines.
 

@@ -184,7 +184,7 @@ class RequestLog(logging.Handler):
         self.setFormatter(logging.Formatter())  # otherwise, `basicConfig` sets a format that repeats level and logger
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a line with a message of the module `logging`. The message contains its traceback if it has one."""
+        """Write a line with a message of the module `logging`. The line also contains the traceback, if any."""
         properties = {"logger": record.name, "message": self.format(record)}
         self.write_line(record.levelname.lower(), "message", properties)
 

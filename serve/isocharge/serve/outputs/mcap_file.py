@@ -108,6 +108,6 @@ class McapFile(FileOutput):
             self._flush_time_s = time.monotonic()
 
     def close(self) -> None:
-        """Write the index of the messages, and close the file. In a replay, also rename it to its final name."""
+        """Write the index of the messages, and close the file. In a replay, also rename the file."""
         with self._stack:  # in a replay, it removes the file after an error
             self._writer.finish()  # type: ignore[no-untyped-call]

@@ -255,8 +255,8 @@ class Port:
     def _read(self) -> bytes:
         """Wait for a byte, and return all bytes that have arrived.
 
-        If the program did not read the port for some time, many bytes wait. Up to `MAX_READ_BYTES` of them form one
-        chunk, so that the time since the previous chunk is divided among all their frames.
+        If the program did not read the port for some time, many bytes wait. Up to `MAX_READ_BYTES` bytes form one
+        chunk, so that the time since the previous chunk is divided among all frames of these bytes.
 
         Raises:
             PortLost: If the port disappears, or no byte arrives in time.

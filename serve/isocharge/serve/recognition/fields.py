@@ -258,7 +258,7 @@ def split_frame(
 def _values(number_bytes: Bytes, type_name: str) -> Array:
     """Decode one number in all frames, and return its values, shape (n,).
 
-    Unsigned values are counted from the middle of their range, which does not change the differences between them.
+    Unsigned values are counted from the middle of their range, which does not change the differences between values.
 
     Args:
         number_bytes: Bytes of the number, the lowest first, shape (n, size).

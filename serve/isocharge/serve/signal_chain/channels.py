@@ -79,8 +79,8 @@ class Channels(Stage):
     def channel_indices(self, frame: Frame) -> tuple[int, ...]:
         """Return, for each electrode, the index of its channel in `frame.values`.
 
-        The section `[channels]` of the device file assigns the channels. Without this section, they are assigned by
-        their names, and otherwise by their order.
+        The section `[channels]` of the device file assigns the channels. Without this section, the channels are
+        assigned by their names. If no channel has the name of an electrode, the channels are assigned by their order.
 
         Raises:
             ChargeError: If the frame lacks a channel that the device file names, if two electrodes have the same

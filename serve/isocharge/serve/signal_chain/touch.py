@@ -89,10 +89,10 @@ class Touch(Stage):
     film are known to be positive, the same rule applies to charges that become negative before the first touch.
 
     A touch ends when the size of the charges falls below the release threshold. A touch also ends when the charges
-    change their sign from one frame to the next. On a film whose charges are positive, it ends when they become
-    negative. The release threshold is a given share of the peak. The release threshold is at least half of the touch
-    threshold. The peak is the largest size that two consecutive frames of the touch have reached. The spike of a single
-    frame is not a peak.
+    change their sign from one frame to the next. On a film whose charges are positive, a touch ends when the charges
+    become negative. The release threshold is a given share of the peak. The release threshold is at least half of the
+    touch threshold. The peak is the largest size that two consecutive frames of the touch have reached. The spike of a
+    single frame is not a peak.
 
     If the mean charges of the last `RISE_S` have already exceeded half of the touch threshold when a touch begins, the
     charges have risen slowly, and a drift of the charge at rest may have caused the touch. All frames of the touch then

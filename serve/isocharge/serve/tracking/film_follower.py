@@ -300,7 +300,7 @@ class FilmFollower(Stage):
         The charges of a touch have three errors: their noise, the part of the charges that the charge map does not
         describe, and the deviation of the offset of the touch from the common offset. The noise of the average charges
         is assumed to be that of a single frame, because a board may filter its signals over the whole touch. If the
-        latest touches show that these errors are smaller, their covariance is scaled (`_error_scale`).
+        latest touches show that these errors are smaller, the covariance of the errors is scaled (`_error_scale`).
 
         Args:
             charge_pC: Average touch charges near the largest force, shape (n_electrode,), pC.

@@ -6,11 +6,12 @@ the file README.md, which describes the dataset for human readers. The samples a
 are files such as shard-00000.npz. Each shard contains the columns x_mm, y_mm, force_N, probe, orientation_deg, outside
 and charge_pC. The column charge_pC has the shape (n, n_electrode), and all other columns have the shape (n,).
 
-The column outside marks presses between the working area and the clamp. A network must recognise these presses, but
-need not locate them. The charges of presses near the clamp are less accurate than those of the other presses.
+The column outside marks presses between the working area and the clamp. A network must recognise that such a press is
+outside, but need not locate the press. The charges of presses near the clamp are less accurate than those of the other
+presses.
 
 A dataset is written into a temporary folder, which is renamed when the dataset is complete. A dataset of measured
-presses has the same format, but its manifest has no entries `solver` and `seed`, and it has no presses outside.
+presses has the same format, but the manifest has no entries `solver` and `seed`, and no press is marked as outside.
 """
 
 import io

@@ -218,9 +218,9 @@ class Turns:
     """Directions of presses and rotations of a probe at which presses are solved.
 
     On a film that is not axisymmetric, the stress depends on the direction from the centre of the film to the press.
-    Under a probe that is not axisymmetric, it also depends on the rotation of the probe relative to this direction. A
-    turn is a pair of these two angles. In a frame that rotates with the probe, the stress at a node of the mesh is the
-    Fourier series
+    Under a probe that is not axisymmetric, the stress also depends on the rotation of the probe relative to this
+    direction. A turn is a pair of these two angles. In a frame that rotates with the probe, the stress at a node of the
+    mesh is the Fourier series
 
         sum c_mk exp(i (2 m d + k r)),
 

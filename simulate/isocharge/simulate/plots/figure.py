@@ -1,6 +1,7 @@
 """Functions that create matplotlib figures and write them to files. All pictures of isocharge use this module.
 
-The figures are not shown in a window. This module imports matplotlib, so only modules that draw pictures import it.
+The figures are not shown in a window. Only modules that draw pictures import this module, because it imports
+matplotlib.
 """
 
 from io import BytesIO

@@ -1,10 +1,10 @@
 """Unknown properties of a real film, and their prior distribution.
 
-A sensor file describes a film. The real film differs from it: the properties of the film and its piezoelectric
-coefficients are known only to within some percent, the positions of the electrodes to within tenths of a millimetre,
-and the pretension is almost unknown. `FILM_PROPERTIES` declares these properties, each with its name, its unit and its
-prior distribution, and `changed_film` changes a sensor by their values. A calibration estimates the properties, and
-virtual films are drawn from their prior distribution.
+A sensor file describes a film. The real film differs from the described film: the properties of the film and its
+piezoelectric coefficients are known only to within some percent, the positions of the electrodes to within tenths of a
+millimetre, and the pretension is almost unknown. `FILM_PROPERTIES` declares these properties, each with its name, its
+unit and its prior distribution, and `changed_film` changes a sensor by their values. A calibration estimates the
+properties, and virtual films are drawn from their prior distribution.
 
 A value of a property is its deviation from the sensor file. The pretension is an exception: its value is the pretension
 itself. A property that depends on the direction has two components, the size of the property times the cosine and the

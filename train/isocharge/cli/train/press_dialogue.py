@@ -144,7 +144,7 @@ class Dialogue:
         self._shown_phase = ""  # instruction that was printed last for the present press
 
     def _say_phase(self, watched: WatchResult) -> None:
-        """Print the instruction of the present phase and the reason for it, unless they have just been printed.
+        """Print the instruction of the present phase and its reason, unless this instruction was the last one printed.
 
         In a phase without an instruction, for example the phase of a steady press, nothing is printed.
         """

@@ -1,8 +1,8 @@
 """Presses for training and presses for measuring errors, split by position.
 
 All presses at one position belong to the same part. If a test contained positions of the training, the measured errors
-would be too small. Measured presses are always split in the same way, because their coordinates determine which fifth
-of them is held out. Every command therefore measures errors on the same presses of a file.
+would be too small. Measured presses are always split in the same way, because the coordinates of the presses determine
+which fifth of the presses is held out. Every command therefore measures errors on the same presses of a file.
 """
 
 from collections.abc import Sequence

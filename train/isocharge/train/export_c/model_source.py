@@ -21,10 +21,10 @@ Layers
 
 A layer computes its outputs y = f(x W + c) from its inputs x. W are the weights, shape (inputs, outputs), c is the
 bias, and f is the hyperbolic tangent or the identity. The C function processes a few inputs at a time. Each input is
-multiplied by its row of W, which gives one product for each output, to which it is added. The inner loop of the C
-function runs over neighbouring outputs, and its number of iterations is constant. With -O2 or a higher level of
-optimisation, compilers therefore vectorise the loop without changing the order of any sum. Each weight that the
-training rounded to 8 bits is stored in one byte.
+multiplied by its row of W, which gives one product for each output. The product is added to the sum of this output. The
+inner loop of the C function runs over neighbouring outputs, and its number of iterations is constant. With -O2 or a
+higher level of optimisation, compilers therefore vectorise the loop without changing the order of any sum. Each weight
+that the training rounded to 8 bits is stored in one byte.
 """
 
 import math

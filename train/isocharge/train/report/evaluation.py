@@ -301,9 +301,9 @@ def split_presses(
     """Split presses into those to which methods are fitted, and those that are held out for the test.
 
     In a simulated dataset, a tenth of the positions is held out. A training on the same dataset also holds these
-    positions out, or some of them if its configuration states a smaller share. The test uses only positions that
-    neither the report nor the training uses for fitting. Measured datasets are smaller. In them, a fifth of the
-    positions is held out, except presses that a calibration of the model has used.
+    positions out, or only some of the positions if the configuration of the training states a smaller share. The test
+    uses only positions that neither the report nor the training uses for fitting. Measured datasets are smaller. In a
+    measured dataset, a fifth of the positions is held out, except presses that a calibration of the model has used.
 
     Args:
         dataset: The presses of a dataset that the model covers.

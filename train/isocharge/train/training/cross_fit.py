@@ -352,7 +352,7 @@ def _misfit_examples(charge: Array, unit_contact: Array, noise: ChannelNoise, co
 def _cross_validated_answers(
     fold_networks: list[InverseNetwork], charge: Array, unit_contact: Array, level: Array, fold_of_press: Integers
 ) -> Answers:
-    """Estimate the contact and the misfit of each press without this press and all others of its fold.
+    """Estimate the contact and the misfit of each press without using the presses of its fold.
 
     The contact is the answer of a network that was not trained on the press. The misfit is the length of the difference
     between the level of the press and the level of the most similar contact. Near each press of the other folds, the
