@@ -129,9 +129,8 @@ def test_frames_of_random_boards_are_recognised():
 def test_frames_are_recognised_in_a_damaged_stream():
     """About 0.3 % of the bytes are wrong."""
     board = RandomBoard(3)
-    rng = np.random.default_rng(0)
     stream = np.frombuffer(board.data, np.uint8).copy()
-    stream[rng.random(len(stream)) < 0.003] ^= 0x5A
+    stream[np.random.default_rng(0).random(len(stream)) < 0.003] ^= 0x5A
     assert board.is_read_by(recognise([stream.tobytes()], FRAMES / RATE_HZ))
 
 
@@ -173,7 +172,7 @@ PATTERN = np.random.default_rng(0).bytes(98)
         b"\xaa" * 1000,
         b"\xaa\x55\x01\x02\x03\x04" * 100,
         (PATTERN + PATTERN[::-1] + PATTERN[:54]) * 100,  # constant frames with many repeated pairs
-        *(np.random.default_rng(seed).bytes(20_000) for seed in (0, 1)),
+        np.random.default_rng(0).bytes(40_000),
     ],
 )
 def test_noise_and_constant_bytes_are_not_recognised(data):
@@ -203,6 +202,7 @@ NUMBERS = np.arange(FRAMES)
         ("B", NUMBERS % 256, RATE_HZ, {"name": "seq", "type": "u8"}),  # counter that wraps
         ("I", NUMBERS + (NUMBERS % 10 == 3), 1000.0, {"name": "t_ms", "type": "u32"}),  # repeats milliseconds
         ("d", 3.8e9 + 2 * NUMBERS, 0.5, {"name": "t_s", "type": "f64"}),  # seconds since 1904, as in LabVIEW
+        ("I", 2.0**21 / RATE_HZ * NUMBERS, RATE_HZ, {"name": "ch1", "type": "i16"}),  # low bytes of a Unix time
         ("I", 31250.0 / RATE_HZ * NUMBERS, RATE_HZ, {"name": "t_us", "type": "u32", "scale": 32.0}),
         ("I", 32768.0 / RATE_HZ * NUMBERS, RATE_HZ, {"name": "t_us", "type": "u32", "scale": 1e6 / 32768.0}),
     ],
@@ -300,6 +300,5 @@ def test_notations_of_public_firmware_are_text(path):
     "line", ["G1 X{:.1f}Y2Z3 ;layer", "no numbers {:.0f}x", "v1.2.{:.0f} <- ok", "1.5,{:.0f}\x1f2.5,3.5,4.5"]
 )
 def test_printable_bytes_are_never_a_binary_format(line):
-    rng = np.random.default_rng(0)
-    data = "".join(line.format(value) + "\r\n" for value in rng.normal(500, 100, 400)).encode()
-    assert (recognise([data], 1.0) or {"format": "text"})["format"] == "text"
+    lines = [f"{line}\r\n".format(value).encode() for value in np.random.default_rng(0).normal(500, 100, 400)]
+    assert (recognise(lines, 1.0) or {"format": "text"})["format"] == "text"

@@ -29,7 +29,7 @@ CHANNEL = "channel"
 """Name of all channels during the recognition."""
 
 
-def identify(steps: Array, frame_rate_Hz: float, tolerance: float = 0.06) -> tuple[bool, tuple[str, float] | None]:
+def identify(steps: Array, frame_rate_Hz: float, tolerance: float = 0.04) -> tuple[bool, tuple[str, float] | None]:
     """Determine whether the values of consecutive frames are those of a frame counter or of a clock.
 
     A counter increases by 1. A clock has one of the usual tick rates of boards. At about 1000 frames per second, a
