@@ -41,17 +41,18 @@ which needs a higher degree."""
 SIGNED_CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = (
     (6, 1),
     (6, 4),
-    (8, 8),
-    (12, 8),
+    (12, 3),
+    (16, 4),
     (16, 8),
     (20, 8),
     (24, 6),
     (24, 8),
 )
-"""Degrees in the position and in the force that are tried, in this order, for charges of both signs.
+"""Degrees in the position and in the force that are tried, in this order, for charges that are not all positive.
 
 The degrees in the force are higher than for positive charges. Charges of both signs occur on taut films, on which the
-exponent of the force changes with the force."""
+exponent of the force changes with the force. The first steps increase the degree in the position, because charges
+change more with the position than their logarithms, and the few presses of a calibration determine few terms."""
 
 SIZE_DEGREE = 4
 """Degree of the polynomial that approximates the logarithm of the size S of the charges as a function of l."""
