@@ -29,7 +29,7 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 MAX_PENDING = 64
-"""Default value of the largest number of submitted jobs whose results have not been returned yet.
+"""Largest number of submitted jobs whose results have not been returned yet.
 
 The value suffices for about thirty workers. It limits the memory that finished results occupy.
 """
@@ -44,9 +44,7 @@ POLL_INTERVAL_s = 0.005
 """Time between two checks of the manager thread of an abandoned process pool, s."""
 
 
-def in_order(
-    executor: Executor | None, function: Callable[[Job], Result], jobs: Iterable[Job], *, max_pending: int = MAX_PENDING
-) -> Iterator[Result]:
+def in_order(executor: Executor | None, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
     """Call a function with every job, and yield the results in the order of the jobs.
 
     A job is requested from the iterable only when it can be submitted to the executor.
@@ -56,7 +54,6 @@ def in_order(
             `Client.get_executor()` of Dask. If it is None, each job runs in this process when its result is requested.
         function: Function that is called with each job. Worker processes must be able to import it.
         jobs: Argument of each call.
-        max_pending: Largest number of submitted jobs whose results have not been returned yet.
 
     Raises:
         WorkersLost: If a worker process ends unexpectedly, or runs a different version of isocharge.
@@ -74,7 +71,7 @@ def in_order(
                 pending.append(executor.submit(task, job))
                 # Yield the oldest result if too many jobs are pending, or if all pending jobs are done. In the second
                 # case, the results are available without waiting.
-                while pending and (len(pending) >= max_pending or all(future.done() for future in pending)):
+                while pending and (len(pending) >= MAX_PENDING or all(future.done() for future in pending)):
                     yield pending.popleft().result()
             while pending:
                 yield pending.popleft().result()

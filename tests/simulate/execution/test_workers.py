@@ -100,7 +100,8 @@ def interrupt_after_cancelling_futures() -> None:
         raise KeyboardInterrupt
 
 
-def test_in_order_returns_results_in_order_and_consumes_jobs_as_needed():
+def test_in_order_returns_results_in_order_and_consumes_jobs_as_needed(monkeypatch):
+    monkeypatch.setattr(module, "MAX_PENDING", 5)
     drawn = []
 
     def jobs() -> Iterator[float]:
@@ -109,7 +110,7 @@ def test_in_order_returns_results_in_order_and_consumes_jobs_as_needed():
             yield 0.002 * (number % 3)
 
     with ThreadPoolExecutor(4) as pool:
-        results = in_order(pool, waited, jobs(), max_pending=5)
+        results = in_order(pool, waited, jobs())
         assert next(results) == 0.0
         assert len(drawn) <= 5
         assert [0.0, *results] == [0.002 * (number % 3) for number in range(20)]

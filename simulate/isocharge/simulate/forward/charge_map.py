@@ -81,7 +81,9 @@ def within(charge_map: ChargeMap, radius: float) -> ChargeMap:
     return _RestrictedMap(charge_map, charge_map.domain.within(radius))
 
 
-def differences(function: Callable[[Array], Array], contact: Array, steps: ArrayLike = STEPS) -> Array:
+def differences(
+    function: Callable[[Array], Array], contact: Array, steps: ArrayLike = STEPS, variables: slice = slice(None)
+) -> Array:
     """Compute the derivatives of a function of contacts by central differences.
 
     Args:
@@ -89,18 +91,22 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: Array
             function is called once with all stepped contacts, because one call is faster than six.
         contact: Contacts (x, y, F) at which the derivatives are computed, shape (n, 3), mm and N.
         steps: Steps in x and y, mm, and in ln F.
+        variables: Which of x, y and ln F the derivatives refer to, by default all.
 
     Returns:
-        Derivatives with respect to (x, y, ln F), shape (n, k, 3), in the unit of the values per mm, per mm and per 1.
+        Derivatives with respect to (x, y, ln F), shape (n, k, 3), in the unit of the values per mm, per mm and per 1;
+        fewer along the last axis if `variables` selects fewer.
     """
     # Step each variable up and down, and evaluate the function once. The axes are direction, variable and contact.
     variable_steps = np.array(steps)
-    changes = np.stack([np.diag(variable_steps), -np.diag(variable_steps)])[:, :, None]
+    changes = np.stack([np.diag(variable_steps), -np.diag(variable_steps)])[:, variables, None]
     stepped = with_log_force(contact) + changes
     stepped[..., 2] = np.exp(stepped[..., 2])
     stepped_values = function(stepped.reshape(-1, 3))
-    values_up, values_down = stepped_values.reshape(2, 3, len(contact), stepped_values.shape[1])
-    derivatives = (values_up - values_down) / (2.0 * variable_steps)[:, None, None]  # shape (3, n, k)
+    values_up, values_down = stepped_values.reshape(*stepped.shape[:-1], stepped_values.shape[1])
+    derivatives = (values_up - values_down) / (2.0 * variable_steps[variables])[
+        :, None, None
+    ]  # shape (n_variable, n, k)
     return np.moveaxis(derivatives, 0, 2)
 
 

@@ -44,15 +44,16 @@ from isocharge.simulate.solver.sensitivity import (
 def few_nodes(film: Film, domain: Domain) -> NodeCount:
     """Return the numbers of distances and forces that suffice for derivatives and for approximate charges.
 
-    The errors are a few thousandths of the largest value. They depend mainly on the number of forces. Only for presses
-    near the clamp, where the distance coordinate is large, more distances are needed.
+    The errors of the charges are below 0.05 % (root mean square), and those of the derivatives are a few thousandths of
+    the largest value. Only for presses near the clamp, where the distance coordinate is large, more distances are
+    needed.
 
     Args:
         film: The film.
         domain: Presses for which the derivatives or the charges are needed.
     """
     largest_coordinate = float(distance_coordinate(domain.radius / film.radius))
-    return NodeCount(distances=3 + math.ceil(2.0 * largest_coordinate), forces=8)
+    return NodeCount(distances=2 + math.ceil(3.0 * largest_coordinate), forces=8)
 
 
 @dataclass(frozen=True)

@@ -260,7 +260,7 @@ class ForwardMap:
         checked_contact = self.domain.check(np.where(has_force, contact, valid_contact), "forward map")
         return np.where(has_force, self._unchecked_charges(checked_contact, orientation), 0.0)
 
-    def derivatives(self, contact: Array) -> Array:
+    def derivatives(self, contact: Array, variables: slice = slice(None)) -> Array:
         """Compute the derivatives of the charges with respect to x, y and ln F by central differences.
 
         The probe keeps its own orientation. At the edge of the domain, the central differences also evaluate presses
@@ -268,9 +268,11 @@ class ForwardMap:
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
+            variables: Which of x, y and ln F the derivatives refer to, by default all.
 
         Returns:
-            Derivatives, shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
+            Derivatives, shape (n, n_electrode, 3), pC/mm, pC/mm and pC; fewer along the last axis if `variables`
+            selects fewer.
 
         Raises:
             SceneError: If a press lies outside the domain, or the domain has a single force, so that the derivative
@@ -287,7 +289,7 @@ class ForwardMap:
         # proportion to the width of a narrow footprint, the error of the readout would dominate the differences.
         footprint_scale = min(1.0, self.probe.under(min_force).reach)
         steps = np.multiply(STEPS, [footprint_scale, footprint_scale, 1.0])
-        return differences(self._unchecked_charges, contact, steps)
+        return differences(self._unchecked_charges, contact, steps, variables)
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Compute the charges of presses, and their derivatives with respect to x, y and ln F; see `derivatives`.

@@ -330,8 +330,8 @@ class FilmPrior:
             raise SceneError(f"expected {len(self.properties)} values ({', '.join(self.names)}), got {len(values)}")
         return changed_film(self.sensor, self.probe, dict(zip(self.names, np.asarray(values).tolist(), strict=True)))
 
-    def draw(self, rng: np.random.Generator, count: int, *, imperfect: bool = False) -> Array:
-        """Draw films from the prior distribution.
+    def draw(self, rng: np.random.Generator, count: int) -> Array:
+        """Draw films without imperfections from the prior distribution.
 
         The pretension is distributed uniformly. All other properties are distributed normally, and values that deviate
         by more than `MAX_DRAWN_DEVIATION` standard deviations are drawn again.
@@ -339,8 +339,6 @@ class FilmPrior:
         Args:
             rng: Random number generator.
             count: Number of films.
-            imperfect: Whether the films have imperfections. Films without them are axisymmetric if the described film
-                is.
 
         Returns:
             Values, shape (count, n_property).
@@ -348,8 +346,7 @@ class FilmPrior:
         deviation = rng.standard_normal((count, len(self.properties)))
         while (is_far := np.abs(deviation) > MAX_DRAWN_DEVIATION).any():
             deviation = np.where(is_far, rng.standard_normal(deviation.shape), deviation)
-        if not imperfect:
-            deviation[:, self.is_imperfection] = 0.0
+        deviation[:, self.is_imperfection] = 0.0
         values = self.mean + self.std * deviation
         values[:, self.index(PRETENSION.name)] = LARGEST_PRETENSION * rng.random(count)
         low, high = self.bounds

@@ -54,7 +54,6 @@ def press(
     *,
     side_force: tuple[float, float] = (0.0, 0.0),
     start: Equilibrium | None = None,
-    throw: bool = True,
 ) -> Equilibrium:
     """Solve the equilibrium of the film under a press.
 
@@ -70,14 +69,13 @@ def press(
             computes the side force of a probe with friction.
         start: Equilibrium of a similar press on the same mesh, whose field is the first iterate; None if there is no
             such equilibrium.
-        throw: Whether to raise an error if the solve fails. Otherwise the `status` of the result is "failed".
 
     Returns:
         The equilibrium.
 
     Raises:
         SceneError: If the press cannot exist, or if the mesh is too distorted.
-        SolveError: If the solve fails and `throw` is True.
+        SolveError: If the solve fails.
     """
     case = LoadCase(film, probe.under(force), at, force, settings, side_force)
     with single_threaded_blas():
@@ -87,7 +85,7 @@ def press(
             solved = _solve_until_meshes_agree(case, start)
         else:
             solved = _solve(case, choose_mesh(case), start)
-    if throw and solved.status != "converged":
+    if solved.status != "converged":
         raise SolveError(_failure_reason(solved, settings.tolerance))
     return solved
 

@@ -28,11 +28,11 @@ from isocharge.simulate.sensor.film_properties import PRETENSION, UNEVEN_TENSION
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import FilmEstimate, discrepancy_jacobian
 from isocharge.train.data.charge_fit import fit_film_series, fit_series
-from isocharge.train.data.presses import draw_contacts
+from isocharge.train.data.presses import LOWEST_CHARGE, draw_contacts
 
 log = logging.getLogger(__name__)
 
-SERIES_CONTACTS = 4000
+SERIES_CONTACTS = 3600
 """Number of contacts to which the series of the charges are fitted."""
 
 DIRECTION_CONTACTS = 1200
@@ -255,7 +255,7 @@ def _directions(
     neighbours = [] if lower is upper else [lower, upper]
     changes_of_films = []  # changes of v by one standard deviation of each unknown, shape (n, n_electrode, n_unknown)
     for film_charge, jacobian in in_order(executor, methodcaller("linearised", contact), [calibrated, *neighbours]):
-        charge_per_value = np.where(film_charge > 0.0, film_charge, charge) if size is None else size
+        charge_per_value = np.maximum(film_charge, LOWEST_CHARGE) if size is None else size
         changes_of_films.append((jacobian / charge_per_value[:, :, None]) @ covariance_root)
     changes, *neighbour_changes = changes_of_films
     slopes = np.zeros_like(changes)  # derivatives of the changes with respect to the pretension, 1/MPa

@@ -22,6 +22,9 @@ from isocharge.simulate.solver.press import needed_resolution
 STEP = 1.0 / 3.0
 """Step of the difference quotients, in prior standard deviations of the property."""
 
+LOG_FORCE = slice(2, None)
+"""Logarithm of the force among the variables (x, y, ln F) of a contact."""
+
 MAX_LOG_CHANGE = 1.0
 """Largest change of the logarithm of a charge to which a first-order change is applied."""
 
@@ -103,11 +106,13 @@ class FilmCharges:
         sensor = self._electrodes(values)
         film = _read(self.film, sensor)
         solved_charge = film.charges(contact)
-        # The derivatives with respect to the force take most of the time. Only those with respect to Young's modulus
-        # and to the thickness follow from them.
+        # Only the derivatives with respect to Young's modulus and to the thickness follow from those with respect to
+        # the force.
         changes = self._property_changes(values)
-        needs_force_slope = changes["young"] != 0.0 or changes["thickness"] != 0.0
-        force_slope = film.derivatives(contact)[:, :, 2] if needs_force_slope else np.zeros_like(solved_charge)
+        needs_force_slope = changes["young"] or changes["thickness"]
+        force_slope = (
+            film.derivatives(contact, LOG_FORCE)[:, :, 0] if needs_force_slope else np.zeros_like(solved_charge)
+        )
         derivatives = self._stress_derivatives(sensor, contact, solved_charge, force_slope)
         charge, _ = _with_other_stress(solved_charge, changes, derivatives)
         return charge
