@@ -331,7 +331,10 @@ def test_a_slow_reader_stops_neither_chain_nor_recording(film, tmp_path, start_s
     assert [after - before for before, after in pairwise(recorded)] == [1] * (count - 1)
     lines = [json.loads(line) for line in [*lines, *out.splitlines()]]
     lost = int(re.search(r"json: (\d+) records not written, the oldest", err)[1])
-    assert len(lines) + lost == count
+    assert len(lines) + lost - count in (
+        0,
+        1,
+    )  # a record whose write is pending at the end may arrive, but counts as lost
     assert lost > 0
     assert lines[-1]["seq"] == recorded[-1]  # the newest are there, the oldest are not
 
