@@ -172,12 +172,7 @@ def _number_parts(
         # Only the share `Weights.fraction` of the bytes contains the digits of the number. Low bytes that are always 0
         # contain no digits.
         low_zero_byte_count = np.argmin(is_zero)  # index of the lowest byte that is not always 0
-        # The four bytes behind four zeros may be an `f32`. An `f64` must not have a lower score than such a number.
-        digit_byte_count = (
-            Weights.fraction * (size - 4)
-            if low_zero_byte_count == 4
-            else (Weights.fraction * size - low_zero_byte_count)
-        )
+        digit_byte_count = Weights.fraction * size - low_zero_byte_count
         unit = magnitude * 256.0**-digit_byte_count
     if type_name[0] == "u":
         half_range = 1 << (8 * size - 1)
@@ -194,7 +189,8 @@ def _number_parts(
             yield Part(SEQ, type_name, size, score)  # the values of a counter need no bits
         elif clock is not None and (size < 8 or clock[1] in (1.0, 1e-3)):  # 8 bytes count s, ms, us or ns
             name, tick_duration = clock
-            score += _bits(counter_steps - np.median(counter_steps), unit, size)
+            # The high bytes of eight would otherwise be taken for the low bytes of an `f64`, whose digits are few.
+            score += _bits(counter_steps - np.median(counter_steps), unit, size) - size // 8 * Weights.noise
             yield Part(name, type_name, size, score, scale=tick_duration)
 
     # The magnitude is added to the steps, so that a type has a lower score if its values are close to 0 or, for an
