@@ -362,4 +362,5 @@ def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: st
 def is_one_place(presses: MeasuredPresses) -> bool:
     """Return whether the presses have known positions, which are the same within their errors."""
     position = presses.contact[np.isfinite(presses.contact[:, 0]), :2]
-    return len(position) > 0 and float(np.ptp(position, axis=0).max()) <= 6.0 * float(presses.position_std_mm.max())
+    # One press may be much less accurate than the others, so the median of the standard deviations counts.
+    return position.size > 0 and float(np.ptp(position, 0).max()) <= 6.0 * float(np.median(presses.position_std_mm))
