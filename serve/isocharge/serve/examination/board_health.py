@@ -277,7 +277,7 @@ def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress
 
     - If the device file contains time constants of a leak, each frame must contain the time of a clock of the device.
     - If no press was held, the time constants of the amplifiers are requested, unless the device file contains them.
-      A held press shows whether time constants are needed, and the description of the press states them.
+      If a press was held, the result of the port check already states its time constants.
 
     Args:
         capture: The frames, at least one.

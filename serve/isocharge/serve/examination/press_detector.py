@@ -8,13 +8,13 @@ touches of a film that should be at rest, and the press that is held during the 
 A press that is held with a constant force during the whole time does not change the values. A press without a beginning
 and an end cannot be distinguished from an amplifier with another rest level.
 
-The charge of a press that is held shows whether an amplifier leaks or the film creeps. The charge of the press is the
-projection of the channel levels onto the direction of the change at its beginning, minus the mean level before the
-press. A leak removes the same share of the charge in every second. The logarithm of the charge Q is then a linear
-function of the time t since the touch, ln Q = a - t / tau. Creep removes the same share of the charge in every decade
-of time. The logarithm of the charge Q is then a linear function of ln t, ln Q = a + b ln t. The functions of a leak and
-of creep are fitted to the charges of a press. A cause is only stated if the other function has a much larger sum of
-squared residuals.
+The charge of a press that is held shows whether an amplifier leaks or the film creeps. At the beginning of the press,
+the channel levels change in some direction. The charge of the press is the component of the levels in this direction,
+minus its mean before the press. A leak removes the same share of the charge in every second. The logarithm of the
+charge Q is then a linear function of the time t since the touch, ln Q = a - t / tau. Creep removes the same share of
+the charge in every decade of time. The logarithm of the charge Q is then a linear function of ln t, ln Q = a + b ln t.
+The functions of a leak and of creep are fitted to the charges of a press. A cause is only stated if the other function
+has a much larger sum of squared residuals.
 
 The section `[leak]` of a device file corrects a leak. Creep is not corrected. If the section `[leak]` is used for a
 film that creeps, the error of the charges increases with time.

@@ -142,8 +142,8 @@ class AccessCheck:
         A page belongs to this server in two cases:
 
         - Its origin contains the same host and the same port as the header `Host`.
-        - Its host name is one of `allowed_hosts`, and the header `Host` contains another name, or the same name without
-          the port. A reverse proxy has then replaced the header `Host`, or removed the port.
+        - Its host name is one of `allowed_hosts`, and a reverse proxy has changed the header `Host`: the header
+          contains another name, or the same name without the port.
 
         Args:
             origin: Value of the header `Origin`, which is the origin of the page, such as b"http://localhost:8000".

@@ -333,7 +333,7 @@ def csv_text(columns: Mapping[str, Array]) -> str:
 
 
 def _is_row_of_units(cells: list[str]) -> bool:
-    """Return whether cells are the units of charges and other known columns, with or without brackets."""
+    """Return whether all cells are units of known columns, such as pC, mm or [N], and at least one is pC."""
     units = {cell.strip().strip("[]()") for cell in cells}
     return "pC" in units and units <= _UNITS
 

@@ -215,7 +215,7 @@ def channel_index(name: str, frame: Frame) -> int | None:
 
 
 def _words_of(text: str) -> list[str]:
-    """Divide a text into words at all characters except letters and digits, and before a unit.
+    """Divide a text into words: before each unit, and at each character that is neither a letter nor a digit.
 
     A unit begins after a capital letter or a digit, as in `AnC`.
     """

@@ -177,9 +177,9 @@ class Leak(Stage):
         """Add the charge that is new since the previous frame to the touch charge.
 
         The new charge is the output, minus the part of the previous output that the leak has left, minus the inflow
-        (pC/s) times the time since the previous frame. Out of contact, the touch charge should be zero. Therefore, it
-        is made to decay to zero, and the inflow is learned from the new charge, except during a pause after a release.
-        If frames are missing, the touch may have ended meanwhile, or its charge may have become wrong.
+        (pC/s) times the time since the previous frame. Out of contact, the touch charge should be zero. Except during a
+        pause after a release, the method then lets it decay to zero, and learns the inflow from the new charge. If
+        frames are missing, the touch may have ended meanwhile, or its charge may have become wrong.
 
         Args:
             frame: The frame.

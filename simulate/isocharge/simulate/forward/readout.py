@@ -290,7 +290,8 @@ def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[tuple[Array, 
     """Yield the lines of the edge readout (Mirbagheri et al., 2007, equation 3).
 
     The stress s11 is averaged over the left and right edges of the rotated electrode, and the stress s22 over its lower
-    and upper edges. Each edge is divided into two lines, because the number of integration points is that of a line.
+    and upper edges. A line has a fixed number of integration points. Each edge is divided into two lines, so that it
+    has twice as many.
 
     Args:
         electrode: A square electrode.

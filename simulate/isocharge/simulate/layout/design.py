@@ -4,10 +4,10 @@ A layout is described by the coordinates of its new squares. The minimised quant
 errors of many presses: the p-th root of the mean of the p-th powers of the errors. The exponent is 2 for the root mean
 square. For the largest error, a large exponent makes the power mean a smooth approximation of the maximum.
 
-Sequential quadratic programming (SLSQP) minimises the logarithm of the power mean from several random layouts, for
-a few presses, under the distance rules. The largest error mostly occurs near the edge of an electrode, between these
-presses. The best layouts are therefore improved further. Each improvement reduces the errors of the worst of many
-presses, and the worst presses are then selected again.
+Sequential quadratic programming (SLSQP) minimises the logarithm of the power mean over a few presses, and respects the
+smallest allowed distances. It starts at several random layouts. The largest error mostly occurs near the edge of an
+electrode, between these presses. The best layouts are therefore improved further. Each improvement reduces the errors
+of the worst of many presses, and the worst presses are then selected again.
 """
 
 from concurrent.futures import Executor

@@ -272,7 +272,7 @@ def check_range(what: str, value: float, allowed: tuple[float, float], unit: str
 
 
 def increased(size: float, axis: float, addition: complex) -> tuple[float, float]:
-    """Add to a quantity size * exp(2 i axis), and return its new size and axis. The new size is not negative.
+    """Add a complex number to size * exp(2 i axis), and return the new size and axis. The size is not negative.
 
     The axis does not change if the addition is zero, or if the new size is zero within the rounding errors.
     """

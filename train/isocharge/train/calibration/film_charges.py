@@ -214,7 +214,7 @@ class FilmCharges:
 def _with_other_stress(
     solved_charge: Array, changes: dict[str, float], derivatives: dict[str, Array]
 ) -> tuple[Array, Array]:
-    """Add to charges the first-order effect of the properties that change the stress.
+    """Change charges to first order, as the properties that change the stress require.
 
     The change is applied to the logarithm of a charge, unless the charge is negative, or the change is larger than the
     charge.

@@ -293,7 +293,7 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
 
 
 def have_charges_of(charge: Array, others: Array) -> Booleans:
-    """Return whether each press has the same charges as one of other presses, shape (n,).
+    """Return whether each press has the same charges as another given press, shape (n,).
 
     Args:
         charge: Charges of the presses, shape (n, n_electrode), pC.

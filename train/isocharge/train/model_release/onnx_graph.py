@@ -75,7 +75,7 @@ def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:
 
 
 def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
-    """Return the network that a graph of `write_graph` evaluates.
+    """Return the network from which `write_graph` made a graph.
 
     The constants have the order in which `FoldedNetwork.onnx_model` adds them: those of the features, those of the
     hidden layers, the weights of the skip layer, and the bias and the weights of the last layer.
