@@ -72,7 +72,7 @@ def test_charges_of_a_similar_film_agree_with_direct_solves(solved):
 
 
 def test_negative_charges_agree_with_direct_solves(problem, solved):
-    """If the wires are swapped, all charges are negative. They have no logarithm, so they change linearly."""
+    """If the wires are swapped, all charges are negative. The logarithms of their magnitudes change linearly."""
     piezo = problem.sensor.piezo
     swapped = with_piezo(problem.sensor, d31=-piezo.d31, d32=-piezo.d32)
     charges = replace(solved, prior=FilmPrior(swapped, problem.probe))
@@ -81,7 +81,7 @@ def test_negative_charges_agree_with_direct_solves(problem, solved):
     expected = solved_charges(*prior.film(values), CONTACT)
     change = expected - charges.charges(prior.mean, CONTACT)
     assert expected.max() < 0.0 < np.abs(change).min()
-    np.testing.assert_allclose(charges.charges(values, CONTACT), expected, atol=0.1 * np.abs(change).max())
+    np.testing.assert_allclose(charges.charges(values, CONTACT), expected, atol=0.03 * np.abs(change).max())
 
 
 def test_imperfections_of_the_sensor_file_are_changes_of_the_even_film(narrow_problem):

@@ -216,8 +216,7 @@ def _with_other_stress(
 ) -> tuple[Array, Array]:
     """Change charges to first order, as the properties that change the stress require.
 
-    The change is applied to the logarithm of a charge, unless the charge is negative, or the change is larger than the
-    charge.
+    The change is applied to the logarithm of the magnitude of a charge, unless the change is larger than the charge.
 
     Args:
         solved_charge: Charges of the solved film, shape (n, n_electrode), pC.
@@ -231,7 +230,7 @@ def _with_other_stress(
     addition = np.zeros_like(solved_charge)
     for name, derivative in derivatives.items():
         addition += changes[name] * derivative
-    relative = np.divide(addition, solved_charge, out=np.full_like(addition, np.inf), where=solved_charge > 0.0)
+    relative = np.divide(addition, solved_charge, out=np.full_like(addition, np.inf), where=solved_charge != 0.0)
     is_logarithmic = np.abs(relative) < MAX_LOG_CHANGE
     factor = np.exp(relative, out=np.ones_like(relative), where=is_logarithmic)
     charge = np.where(is_logarithmic, solved_charge * factor, solved_charge + addition)
