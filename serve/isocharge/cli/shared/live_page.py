@@ -172,15 +172,15 @@ class PageFeed:
         stream: RecordedStream | None = None,
         new_recorder: Callable[[Path, str], Recorder] | None = None,
     ) -> None:
-        """Store the stream and its page, and let the page control the argument `stream` if it is given.
+        """Store the page and the stream. If `stream` is given, the buttons of the page control it.
 
         Args:
             page: The page.
-            touch: The stream whose records are passed on.
-            stream: The same stream with its recording, which carries out the requests of the page; None for a replay.
-            new_recorder: Function that creates the recorder of a recording that the page begins, from its path and the
-                label of the model. If it is None, because the command itself records the stream, requests for
-                recordings are refused.
+            touch: The stream whose records are passed to the page.
+            stream: The same stream together with its recording, which the page can, for example, tare; None for a
+                replay, which cannot be controlled.
+            new_recorder: Function that creates a recorder from the path of the recording and the label of the model,
+                when the page begins a recording. If it is None, the page cannot begin a recording.
         """
         self._page = page
         self._touch = touch

@@ -430,15 +430,15 @@ def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
         dict(zip(line.names, line_values(skeleton_pattern(line), line.text) or (), strict=False)) for line in lines
     ]
 
-    def order(first: int) -> tuple[float, bool, str]:
-        """Return the key of the frame that begins with a line. The frame with the smallest key is chosen."""
+    def sort_key(first: int) -> tuple[float, bool, str]:
+        """Return the sort key of the line with index `first`. A frame begins with the line with the smallest key."""
         frame = fields_of_lines[first : first + cycle_length]
         clocks = [fields[name] for fields in frame for name in TIMES_US if name in fields]
         duration = clocks[-1] - clocks[0] if len(clocks) == cycle_length else 0.0
-        first_name = next((name for name in frame[0] if name not in TIMES_US), "")
+        first_name = next((name for name in frame[0] if name not in TIMES_US), "")  # "" if the line has only a clock
         return duration, first_name != SEQ, first_name  # False is smaller than True
 
-    return min(range(cycle_length), key=order)
+    return min(range(cycle_length), key=sort_key)
 
 
 def encode_text(frame: Frame, notation: Literal["csv", "json"]) -> bytes:

@@ -108,16 +108,9 @@ _TOKENS = {kind: _token_pattern(_PATTERNS[kind]) for kind in ("number", "number 
 _SEPARATORS = ",;|[("
 """Marks that separate columns or begin a list. A word before such a mark does not name the number after the mark."""
 
-_SHAPES = {
-    "number": "0",
-    "hexadecimal": "0",
-    "time": "",
-    "whole seconds": "",
-    "uptime": "",
-    "word": "w",
-    "key": "k",
-    "quoted": "k",
-}
+_SHAPES = {"number": "0", "hexadecimal": "0", "word": "w", "key": "k", "quoted": "k"} | dict.fromkeys(
+    ("time", "whole seconds", "uptime"), ""
+)
 """Character that stands for a part of a line in its shape, by the kind of the part. A mark stands for itself."""
 
 

@@ -189,14 +189,15 @@ def _number_parts(
             yield Part(SEQ, type_name, size, score)  # the values of a counter need no bits
         elif clock is not None and (size < 8 or clock[1] in (1.0, 1e-3)):  # 8 bytes count s, ms, us or ns
             name, tick_duration = clock
-            # The high bytes of eight would otherwise be taken for the low bytes of an `f64`, whose digits are few.
+            # A bonus for clocks of eight bytes: without it, an `f64` with few digits could score better that consists
+            # of the high bytes of the clock and of the first bytes behind them.
             score += _bits(counter_steps - np.median(counter_steps), unit, size) - size // 8 * Weights.noise
             yield Part(name, type_name, size, score, scale=tick_duration)
 
-    # The magnitude is added to the steps, so that a type has a lower score if its values are close to 0 or, for an
-    # unsigned type, close to the middle of its range.
     if type_name == "i64":  # times only
         return
+    # The magnitude is added to the steps, so that a type has a lower score if its values are close to 0 or, for an
+    # unsigned type, close to the middle of its range.
     yield Part(CHANNEL, type_name, size, Weights.channel + _bits(np.append(steps, magnitude), unit, size))
 
 

@@ -200,9 +200,8 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
     """Return the keys that describe the counter, the clock and the columns of lines of text in a device file.
 
     A counter increases by 1 from frame to frame, and a clock increases at one of the usual rates. A clock in ms that
-    increases by about 1 could be a counter. The clock is recognised by its name, or because it repeats some values. If
-    the parser has already recognised a counter, the function does not search for another counter. If the parser has
-    already recognised a clock, the function does not search for another clock, either.
+    increases by about 1 could also be a counter. Its name, or values that occur twice, show that it is a clock. If the
+    parser has already recognised a counter or a clock, the function does not search for another one.
 
     For values with names in each line, the keys `seq`, `t_us`, `t_ms` and `t_s` state the names that the board uses for
     its counter and its clock. For the other values, the key `columns` lists the names, which are copied from a header,

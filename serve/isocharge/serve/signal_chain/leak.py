@@ -229,11 +229,13 @@ class Leak(Stage):
         return np.exp(np.minimum(frame.dt_s / self._tau_s, 60.0))
 
     def _has_ended_in_gap(self, frame: Frame, output_pC: Array, surplus_pC: Array) -> bool:
-        """Return whether a touch has ended in a gap.
+        """Return whether a touch has ended in a gap, during which frames were missing.
 
-        If the touch has ended, the outputs are almost zero. The touch charges are almost zero, too, if they are
-        computed as if the new charges had arrived at the beginning of the gap. Up to 5 % of a charge may remain,
-        because the time constant and the inflow have errors.
+        When a touch ends, a charge arrives that cancels the charge of the touch. It is not known when it arrived. If
+        it arrived early, most of it has leaked since, so the output shows only a small part of it. The touch may have
+        ended if both are true: the outputs are almost zero, and the touch charges would be almost zero if the new
+        charge had arrived at the beginning of the gap. Up to 5 % of a charge may remain, because the time constant and
+        the inflow have errors.
 
         Args:
             frame: The frame after the gap.
@@ -243,6 +245,7 @@ class Leak(Stage):
         growth = self._growth(frame)
         sign = np.sign(self._charge_pC)
         margin_pC = np.maximum(4.0 * frame.noise_pC, 0.05 * np.abs(self._charge_pC))
+        # An even arrival needs on average half of the correction for the leak that an arrival at the beginning needs.
         smallest_pC = self._charge_pC + surplus_pC * (1.0 + growth) / 2.0
         return bool(((sign * output_pC <= margin_pC) & (sign * smallest_pC <= growth * margin_pC)).all())
 

@@ -104,9 +104,8 @@ def differences(
     stepped[..., 2] = np.exp(stepped[..., 2])
     stepped_values = function(stepped.reshape(-1, 3))
     values_up, values_down = stepped_values.reshape(*stepped.shape[:-1], stepped_values.shape[1])
-    derivatives = (values_up - values_down) / (2.0 * variable_steps[variables])[
-        :, None, None
-    ]  # shape (n_variable, n, k)
+    distance = 2.0 * variable_steps[variables]
+    derivatives = (values_up - values_down) / distance[:, None, None]  # shape (n_variable, n, k)
     return np.moveaxis(derivatives, 0, 2)
 
 

@@ -115,12 +115,14 @@ FILM_PROPERTIES = (
 
 
 def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> tuple[Sensor, Probe]:
-    """Return a sensor and a probe that have the given values of film properties.
+    """Return a sensor and a probe whose film has other properties.
 
     Args:
         sensor: Sensor that is changed.
         probe: Probe, which must be circular if its radius is changed.
-        values: Value of each property by its name. Properties without a value remain unchanged.
+        values: Value of each property by its name. The value of the pretension is the new pretension. Any other value
+            is a change: a number that is added, or the logarithm of a factor. Properties without a value remain
+            unchanged.
 
     Returns:
         The changed sensor and the changed probe.
@@ -128,8 +130,7 @@ def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> t
     Raises:
         SensorError: If no such sensor can exist, for example because an electrode lies over the rim.
     """
-    # A value is a change, either an addition or the logarithm of a factor, so that a missing value, 0, changes nothing.
-    # Only the value of the pretension replaces the present value.
+    # A missing value is 0, which changes nothing.
     value = defaultdict(float, {PRETENSION.name: sensor.film.pretension, **values})
     piezo = sensor.piezo
     calibration = sensor.calibration
