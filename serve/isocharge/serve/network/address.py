@@ -11,6 +11,7 @@ import resource
 import socket
 import ssl
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 from isocharge.common.defaults import MAX_BATCH
@@ -113,9 +114,9 @@ class Tls:
             # With the empty password, an encrypted key causes an error. Without a password, OpenSSL would ask the user.
             context.load_cert_chain(self.certificate, self.key, password=lambda: "")
         except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
-            names = " and ".join(map(str, paths))
             raise InputError(
-                f"{names}: not a certificate and its unencrypted private key in PEM files that can be read ({error})"
+                f"{' and '.join(map(str, paths))}: not a certificate and its unencrypted private key in PEM files that "
+                f"can be read ({error})"
             ) from error
         return context
 
@@ -158,6 +159,7 @@ def url_host(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
+@lru_cache
 def ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
     """Parse the text of an IP address, and return None if the text is not an IP address."""
     try:
