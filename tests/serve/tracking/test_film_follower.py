@@ -13,11 +13,11 @@ from isocharge.serve import Contact, Frame
 from isocharge.serve.model.charge_file import FILE, charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.signal_chain.stage import Device, Setup
+from isocharge.serve.tracking.contact_mixture import contacts_of
 from isocharge.serve.tracking.film_follower import FilmFollower, TouchPeak
 from isocharge.simulate import NoiseModel, noise_model
 
 NOISE = noise_model("reference")
-ELECTRODES = ("A", "B", "C", "D")
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def series():
     nodes = np.array([-0.7, 0.0, 0.7])
     return ChargeSeries(
         domain=Domain(8.0, (0.05, 2.0)),
-        electrodes=ELECTRODES,
+        electrodes=tuple("ABCD"),
         coefficients=np.stack([base + node * tension for node in nodes]),
         node_MPa=nodes,
         directions=direction,
@@ -43,6 +43,12 @@ def series():
         pretension_MPa=1.0,
         tension_std_MPa=0.35,
     )
+
+
+def with_electrodes(series, count):
+    """Return a charge map with another number of electrodes. The fifth electrode equals the first, and so on."""
+    coefficients, directions = (array[..., np.arange(count) % 4] for array in (series.coefficients, series.directions))
+    return replace(series, electrodes=tuple("ABCDEFGH"[:count]), coefficients=coefficients, directions=directions)
 
 
 def model_in(folder, series, noise=NOISE):
@@ -58,19 +64,19 @@ def model_in(folder, series, noise=NOISE):
     def predict(charge_pC):
         contact = np.array([0.0, 0.0, np.log(0.5)])
         for _ in range(4):
-            charge, slopes = series.linearised(np.array([[contact[0], contact[1], np.exp(contact[2])]]))
-            std = NOISE.sigma(charge[0])
-            slopes = slopes[0] / std[:, None]
+            (charge,), (slopes,) = series.linearised(contacts_of(contact[None]))
+            std = NOISE.sigma(charge)
+            slopes = slopes / std[:, None]
             covariance = np.linalg.inv(slopes.T @ slopes)
-            step = covariance @ slopes.T @ ((charge_pC - charge[0]) / std)
+            step = covariance @ slopes.T @ ((charge_pC - charge) / std)
             contact = np.clip(contact + step, [-9.0, -9.0, -4.0], [9.0, 9.0, 2.0])
-        std = np.sqrt(np.diag(covariance))
-        force = float(np.exp(contact[2]))
-        return Contact(float(contact[0]), float(contact[1]), force, std[0], std[1], std[2] * force, 0.0)
+        x_mm, y_mm, log_force = contact.tolist()
+        std = np.sqrt(np.diag(covariance)) * [1.0, 1.0, np.exp(log_force)]
+        return Contact(x_mm, y_mm, np.exp(log_force), *std, misfit=0.0)
 
     return SimpleNamespace(
         folder=folder,
-        metadata=SimpleNamespace(electrodes=series.electrodes, noise=NOISE),
+        metadata=SimpleNamespace(electrodes=series.electrodes),
         noise=noise,
         predict=predict,
         validity=SimpleNamespace(flags=lambda _: ()),
@@ -86,7 +92,7 @@ def model(tmp_path, series):
 def touches(series, state, rng, count):
     """Contacts and charges of a changed film."""
     contact = draw_contacts(rng, count, 6.5, (0.1, 1.5))
-    return contact, series.in_state(contact, np.array(state)).charge_pC
+    return contact, series.in_state(contact, state).charge_pC
 
 
 def new_follower(model):
@@ -104,9 +110,9 @@ def followed(model, charge, rng, frames=2, noise=NOISE):
     follower = new_follower(model)
     was_lost = []
     for number, row in enumerate(charge):
-        mean_charge = noise.add(np.repeat(row[None], frames, axis=0), rng).mean(axis=0)
+        mean_charge = noise.add(np.tile(row, (frames, 1)), rng).mean(axis=0)
         contact = model.predict(mean_charge)
-        follower.step(Frame(None, None, (), clock_s=float(number), charge_pC=mean_charge, contact=contact))
+        follower.step(Frame(None, None, (), clock_s=number, charge_pC=mean_charge, contact=contact))
         follower.step(Frame(None, None, (), clock_s=number + 0.04))
         was_lost.append(follower.is_lost)
     return follower, was_lost
@@ -135,13 +141,16 @@ def test_changes_of_the_film_and_of_a_gain_are_followed(series, model, change_MP
     assert covered_share > 0.85
 
 
-def test_film_is_followed_with_the_noise_that_the_device_file_states(series, tmp_path):
+@pytest.mark.parametrize("n_electrode", [4, 8])
+def test_film_is_followed_with_the_noise_that_the_device_file_states(series, tmp_path, n_electrode):
     """With the noise of the training, the film would be lost, or its pretension wrong by many standard deviations.
 
-    All frames of a touch have the same noise, because the board filters its signals.
+    All frames of a touch have the same noise, because the board filters its signals. Eight electrodes have five
+    independent residuals instead of one.
     """
     rng = np.random.default_rng(4)
     noise = NoiseModel("bench", 5.0, 0.02)
+    series = with_electrodes(series, n_electrode)
     model = model_in(tmp_path, series, noise)
     _, charge = touches(series, [0.3, 0.7, -0.8], rng, 60)
     follower, was_lost = followed(model, charge, rng, 1, noise)
@@ -260,14 +269,8 @@ def test_models_that_cannot_be_followed_are_refused(series, tmp_path):
     single = replace(series, coefficients=series.coefficients[:1], node_MPa=np.zeros(1))
     with pytest.raises(ModelError, match="calibrate"):
         new_follower(model_in(tmp_path, single))
-    three = replace(
-        series,
-        electrodes=ELECTRODES[:3],
-        coefficients=series.coefficients[..., :3],
-        directions=series.directions[..., :3],
-    )
     with pytest.raises(ModelError, match="four electrodes"):
-        new_follower(model_in(tmp_path, three))
+        new_follower(model_in(tmp_path, with_electrodes(series, 3)))
 
 
 def test_a_bad_first_touch_does_not_mean_that_the_film_is_lost(series, model):

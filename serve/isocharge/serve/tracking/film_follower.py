@@ -108,7 +108,7 @@ class TouchPeak:
 
         The average is None if no frame was averaged, or if a flag of the touch is not harmless.
         """
-        is_usable = self._is_reliable and self._averaged_count > 0
+        is_usable = self._is_reliable and self._averaged_count
         return self._charge_sum_pC / self._averaged_count if is_usable else None
 
 
@@ -122,7 +122,10 @@ MAX_DEVIATION = 20.0
 """Largest magnitude of an unknown, in standard deviations before the first touch."""
 
 MAX_MEAN_SQUARE = 3.0
-"""Largest mean squared distance of the latest touches from the predicted touches, for a film that is not lost."""
+"""Largest mean squared distance of the latest touches from the predicted touches, for a film that is not lost.
+
+A squared distance is divided by the number of independent residuals of a touch.
+"""
 
 CLEAR_CHANGE = 3.0
 """Number of standard deviations above which the change of an unknown is clear.
@@ -231,7 +234,7 @@ class FilmFollower(Stage):
         film_size = 1 + series.direction_count
         self._film = slice(0, film_size)
         self._gains = slice(film_size, film_size + len(electrodes))
-        self._offset = film_size + len(electrodes)
+        self._offset = self._gains.stop
         std = np.ones(self._offset + 1)
         std[0] = series.tension_std_MPa
         std[self._gains] = GAIN_STD
@@ -333,15 +336,17 @@ class FilmFollower(Stage):
         self._touch_count += 1
 
         # Twice the cost is the sum of the squared residuals, in which large residuals have little weight. The residuals
-        # are divided by the scaled errors. Multiply by the scale, so that the sum refers to the unscaled errors.
-        self._mean_square += (2.0 * scale * estimate.cost - self._mean_square) / MEMORY_TOUCHES
+        # are divided by the scaled errors. Multiply by the scale, so that the sum refers to the unscaled errors. A
+        # touch has three independent residuals fewer than charges, because its contact is unknown.
+        mean_square = 2.0 * scale * estimate.cost / (charge_pC.size - 3)
+        self._mean_square += (mean_square - self._mean_square) / MEMORY_TOUCHES
 
         # Decide whether the film is lost.
         is_changed = np.abs(estimate.state) > CLEAR_CHANGE * np.sqrt(self._covariance.diagonal())
         is_at_bound = is_changed & np.any(estimate.state == self._state_bounds, axis=0)
-        has_implausible_state = bool(is_at_bound[0] or is_at_bound[self._offset])  # the pretension or the offset
         was_lost = self.is_lost
-        self.is_lost = self._mean_square > MAX_MEAN_SQUARE or has_implausible_state
+        # The second condition concerns the pretension and the offset.
+        self.is_lost = self._mean_square > MAX_MEAN_SQUARE or bool(is_at_bound[[0, self._offset]].any())
         if self.is_lost and not was_lost:
             self._start_estimate()  # the film may have changed suddenly, so earlier touches do not help
         elif not self.is_lost:
