@@ -41,9 +41,12 @@ class StageRunner:
         frame.flags = in_order(frame.flags)
         return frame
 
-    def run(self, rows, rate_Hz):
-        """Process rows of charges, shape (n, n_electrode), pC, that arrive at a rate, and return the frames."""
-        return [self.advance(row, number / rate_Hz, 1.0 / rate_Hz) for number, row in enumerate(rows)]
+    def run(self, rows, rate_Hz, together=0):
+        """Process rows of charges, shape (n, n_electrode), pC, that arrive at a rate, and return the frames.
+
+        The times between the first `together` frames are not known.
+        """
+        return [self.advance(row, i / rate_Hz, (i >= together) / rate_Hz) for i, row in enumerate(rows)]
 
     def reset_tare(self):
         """Measure the tare again."""

@@ -121,7 +121,8 @@ class Inflow:
         # averaging time is at least `dt_s`, so that the corrected inflow explains at most the whole surplus.
         self.learned_s += dt_s
         averaging_s = max(min(rule.settle_s, self.learned_s), dt_s)
-        self.pC_per_s = self.pC_per_s + clipped_surplus_pC / averaging_s
+        if averaging_s > 0.0:  # the first frames may have arrived together, or within one count of a slow clock
+            self.pC_per_s = self.pC_per_s + clipped_surplus_pC / averaging_s
 
         # Replace the trusted inflow and the candidate if the candidate is old enough.
         self._candidate_age_s += dt_s
@@ -288,8 +289,8 @@ class Integrator(Leak):
         super().reset()
         self._inflow.learned_s = 0.0  # the tare is the mean of only a few currents, whose error would add up
         self._current_pC = np.zeros(len(self._tau_s))  # current of the previous valid frame
-        self._search_s = 0.0  # duration of the search for a tare, from which the sampling interval follows
-        self._search_frames = 0
+        self._elapsed_s = 0.0  # time over which the mean sampling interval is computed
+        self._interval_count = 1  # sampling intervals in this time, and one more, which avoids a division by 0
 
     def step(self, frame: Frame) -> None:
         """Replace the currents by the charges, and the noise of the currents by the noise of the charges at rest.
@@ -303,18 +304,16 @@ class Integrator(Leak):
         At rest, the charges decay with the time constant `relax_s`. The variance of the sum of independent currents is
         then relax_s / (2 dt) times the variance of one current.
         """
-        missing_count = frame.intervals - 1
-        if self._previous is None:
-            missing_count = 0
-            self._search_s += frame.dt_s
-            self._search_frames += 1
+        self._elapsed_s += frame.dt_s
+        self._interval_count += frame.intervals
+        missing_count = 0 if self._previous is None else frame.intervals - 1
         current_pC = frame.charge_pC
         if current_pC is None:
             return
 
         # Add the assumed charges of the missing frames.
         mean_pC = (current_pC + self._current_pC) / 2.0
-        interval_s = max(self._search_s / self._search_frames, SUM_TOLERANCE_s)
+        interval_s = max(self._elapsed_s / self._interval_count, SUM_TOLERANCE_s)
         may_be_noise = np.abs(mean_pC) <= 3.0 * frame.noise_pC
         missing_pC = missing_count * np.where(may_be_noise, self._inflow.pC_per_s * interval_s, mean_pC)
         frame.charge_pC = current_pC + missing_pC if frame.intervals > 0 else np.zeros_like(current_pC)

@@ -184,7 +184,6 @@ class Tare(Stage):
         if not reason:
             self._tare_pC = mean_pC
             self._noise_pC = noise_pC
-            self._latest_pC = self._latest_pC[:0]  # the frames are not needed any more
         elif self._remaining_frames <= 0:
             raise self._search_error(reason, frame)
 
