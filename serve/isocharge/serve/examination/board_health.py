@@ -170,7 +170,7 @@ def channel_count_sentences(
 ) -> Iterator[str]:
     """Yield a sentence if the channels of the board do not fit the device file or the model.
 
-    The sentence states that the board does not send a channel to which the device file refers, or that it has more or
+    The sentence names a channel of the device file that the board does not send, or states that the board sends more or
     fewer channels than the model has electrodes. If the names of the channels are nearly those of the electrodes, the
     sentence names the difference. The channels are not compared with the model if there is none, or if the device file
     assigns a channel to every electrode.

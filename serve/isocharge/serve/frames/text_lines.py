@@ -233,7 +233,7 @@ def _is_prose(tokens: list[_Token]) -> bool:
 def _has_decimal_commas(text: str) -> bool:
     """Return whether the commas between digits are decimal commas, as in `3,1;-2,0` and `A: 3,1 pC, B: -2,0 pC`.
 
-    The commas are separators in these cases:
+    Commas are separators in a line to which one of these statements applies:
 
     - A number has a decimal point or two commas.
     - A comma stands before a sign, beside a blank or before a name.
@@ -281,8 +281,8 @@ def _index_positions(tokens: list[_Token]) -> list[int]:
 
     - A colon or an equals sign follows the number, as in `1:801,2:799` and `ch 1 = 801 pC`. There are several pairs, or
       no other numbers.
-    - In several pairs, the first numbers count from 0 or 1, and follow the same word or mark, as in `pad #1 801 pad #2
-      799` and `[1] 801 [2] 799`.
+    - There are several pairs. Their first numbers count up from 0 or 1, and the same word or mark precedes each,
+      as in `pad #1 801 pad #2 799` and `[1] 801 [2] 799`.
 
     Args:
         tokens: Parts of the line.

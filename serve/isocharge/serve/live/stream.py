@@ -188,7 +188,7 @@ class ReadingStream:
         during the outage. The next frame gets the flag `reconnected`.
 
         Args:
-            outage_s: Length of the outage, s. If it only states that a recording has begun, it is not counted.
+            outage_s: Length of the outage, s. An outage that only marks the beginning of a recording is not counted.
         """
         if outage_s > RESTART_OUTAGE_s:
             self.parser.counts.reconnects += 1

@@ -280,7 +280,7 @@ class ChargeSeries:
 
     @cached_property
     def _direction_series(self) -> Series:
-        """Series of d and d' of all directions at all electrodes, which share the last axis."""
+        """Series of d and d'. The last axis contains all pairs of a direction and an electrode."""
         return Series(self.directions.reshape(*self.directions.shape[:3], -1))
 
     def _nearest_in_domain(self, contact: Array) -> tuple[Array, Array]:

@@ -139,8 +139,8 @@ class Recorder:
     def _write(self, lines: str) -> None:
         """Append complete lines to the file.
 
-        If an interruption has left an incomplete line, this line is overwritten. If the disk is full, an error is
-        logged, and all later calls write nothing.
+        If an interrupted call has left an incomplete line, the new lines are written over it. If the disk is full, an
+        error is logged, and all later calls write nothing.
 
         Args:
             lines: One or more lines, without the line feed after the last line.
@@ -148,7 +148,7 @@ class Recorder:
         if self.failed:
             return
         try:
-            self._file.write(f"{lines}\n".encode())  # overwrites the rest of an interrupted call
+            self._file.write(f"{lines}\n".encode())
         except OSError as error:
             self.failed = True
             log.error("%s: recording stopped (%s); what was written until now is whole", self.path, error.strerror)

@@ -62,8 +62,8 @@ class StdFactor(NamedTuple):
         degrees = is_known.sum(axis=1)
         squared_size = np.sum(np.where(is_known, error / std, 0.0) ** 2, axis=1)[degrees > 0]
         scores = np.sort(np.sqrt(squared_size / np.take(REGION_QUANTILES, degrees[degrees > 0] - 1)))
-        # The k-th smallest score covers at least the share p of all contacts if at most k - 1 of n independent scores
-        # lie below the quantile p.
+        # The k-th smallest score is at least the quantile p of all scores if at most k - 1 of the n scores lie below
+        # this quantile. The scores are independent, so the number below the quantile has a binomial distribution.
         rank = np.argmax(binomial_distribution(len(scores), COVERAGE) >= CONFIDENCE)
         return cls(float(scores[rank]), len(scores))
 

@@ -52,7 +52,7 @@ class Channels(Stage):
             if key not in setup.electrodes:  # TOML adds a key at the end of the file to the last section
                 raise DeviceError(
                     f"{setup.device.where}: channels.{cut(key)}: expected one of the electrodes {setup.electrodes}; "
-                    "correct or remove the key, or write a key that belongs to no section above the first section"
+                    "correct or remove the key; a key outside of all sections belongs above the first section"
                 )
         self._setup = setup
         # Names and number of values of the previous frame, and its channel indices. `step` uses the indices again.

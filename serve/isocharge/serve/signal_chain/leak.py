@@ -6,8 +6,8 @@ frame by frame,
     q[n] = q[n-1] + i[n] - b dt,        i[n] = (v[n] - a v[n-1]) 2 / (1 + a),        a = exp(-dt / tau),
 
 where i is the innovation and b is the inflow (pC/s), a slow current into the amplifier because of offset, bias and slow
-warming. A charge that arrives between two frames has decayed by (1 + a) / 2 on average. The inflow is estimated from
-the innovation, because an estimate from the output v would diverge.
+warming. Of a charge that arrives between two frames, the share (1 + a) / 2 remains on average. The inflow is estimated
+from the innovation, because an estimate from the output v would diverge.
 
 A board that sends currents sends the innovation itself, i[n] = v[n]. The charge of such a board is the sum of the
 currents. If the device file states a leak, the sum decays with the time constant tau, q[n] = a q[n-1] + i[n] - b dt.

@@ -66,7 +66,7 @@ class ThermalRule(Rule, frozen=True, kw_only=True):
 class Warming(Stage):
     """Estimates the charge p that a warming of the film adds to all electrodes, and subtracts this charge.
 
-    After each time interval `every_s`, a change of the charge p is estimated. Several trial values of the change are
+    After each time interval `every_s`, the change of p is estimated. Several trial values of the change are
     subtracted from the charges. The misfit of a trial value is the distance of the remaining charges from the nearest
     single contact. A parabola is fitted to the squared misfits. The minimum of the parabola is the estimate. A Kalman
     filter weights this estimate by its variance and by the predicted variance of p.

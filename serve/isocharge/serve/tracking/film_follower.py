@@ -313,6 +313,7 @@ class FilmFollower(Stage):
         elapsed_hours = max(clock_s - self._latest_touch_s, 0.0) / 3600.0
         self._latest_touch_s = clock_s
         self._covariance[0, 0] += self._rule.drift_MPa_per_root_hour**2 * elapsed_hours
+        # Each touch also restores a small part of the variance that earlier touches have removed.
         lost_variance = np.maximum(self._initial_std**2 - self._covariance.diagonal(), 0.0)
         self._covariance += np.diag(lost_variance / self._fading_touches)
 

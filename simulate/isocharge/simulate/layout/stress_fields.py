@@ -161,7 +161,7 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
 
 
 def _changed_press(solved: Equilibrium, changes: Array) -> Equilibrium:
-    """Solve a press that differs from a solved press.
+    """Solve a press that differs slightly from a press that is already solved.
 
     Args:
         solved: Equilibrium of the film under a press on the positive x axis, from which the solver starts.

@@ -198,7 +198,8 @@ def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
     with single_threaded_blas():
         elastic = solved.elastic
         solves = [factor_tangent(elastic, solved.field, odd=odd) for odd in (False, True)]
-        # An odd change does not displace any air on the whole film, so the pressure of trapped air remains constant.
+        # The two halves of the film displace opposite amounts of air in an odd change, so the pressure of trapped air
+        # remains constant.
         solved_for_odd = solved
         if elastic.back is not None:
             groups = elastic.back.at_constant_pressure(solved.field[:, 2])

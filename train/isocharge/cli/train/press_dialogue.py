@@ -264,8 +264,8 @@ class Dialogue:
     def _handle_line(self, line: str, press: SteadyPress | None, proposed: Array) -> bool:
         """Carry out the command that a person typed, or print why it cannot be carried out.
 
-        A press can only be recorded while a question about it is open. The remaining command removes the last press:
-        the steady press if a question about it is open, or otherwise the press that was recorded last.
+        A press can only be recorded while a question about it is open. The command to remove a press concerns the
+        steady press if a question about it is open, or otherwise the press that was recorded last.
 
         Args:
             line: The typed line.

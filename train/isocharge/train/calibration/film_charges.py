@@ -126,7 +126,7 @@ class FilmCharges:
 
         Returns:
             Charges and their derivatives. The derivatives with respect to the contact are those of the solved film. The
-            derivatives with respect to the state are those with respect to the properties.
+            properties of the film take the place of the state.
         """
         sensor = self._electrodes(values)
         solved_charge, contact_slopes = _read(self.film, sensor).linearised(contact)

@@ -90,7 +90,7 @@ class CalibrationProblem:
 
     @property
     def solved_domain(self) -> Domain:
-        """Contacts for which the film is solved."""
+        """Contacts for which the film is solved. They extend beyond `domain`, because measured presses have errors."""
         low, high = self.force_range
         probe = self.probe.under(high * FORCE_MARGIN)
         reach = max(probe.reach, round_probe(probe).reach)

@@ -44,7 +44,7 @@ def mean_loss(posterior: Posterior, target: Tensor) -> Tensor:
 
 
 def covariance_loss(posterior: Posterior, error: Tensor) -> Tensor:
-    """Compute the negative logarithm of the likelihood of the errors of each press, without constants, shape (n,).
+    """Compute the negative log-likelihood of the errors of each press without its constant terms, shape (n,).
 
     The errors are divided by the standard deviations, and their correlations are removed. The three results are
     independent. The assumed distribution of each result has longer tails than a normal distribution: where the map from
@@ -123,7 +123,7 @@ LOSS_TOLERANCE = 1e-5
 def refit_covariance(network: InverseNetwork, train: LabelledPresses, noise: Noise) -> None:
     """Fit the last layer for the standard deviations and the correlations to the errors of the trained mean.
 
-    During the training, the errors of the mean decrease until the last step. The covariance therefore belongs partly to
+    During the training, the errors of the mean decrease until the last step. The covariance is therefore partly that of
     the larger errors of earlier steps. This function minimises the loss of the covariance on a large sample of presses
     by the method L-BFGS. The loss does not change the mean.
 

@@ -115,7 +115,8 @@ def invertible_domain(
 
     At a fold, the map from contacts to charges turns back, so that contacts on both sides of the fold have the same
     charges. If an accurate fit shows a fold, the disk is reduced to the radius of the fold, and a sentence states this.
-    If there is no such fold, the disk is the domain of the field. A sentence also states a probable fold of a poor fit.
+    If there is no such fold, the disk is the domain of the field. If a poor fit shows a probable fold, a sentence
+    states this, too.
 
     Args:
         field: Charge field that was fitted to the presses.
