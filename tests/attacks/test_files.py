@@ -99,7 +99,7 @@ def _read_charges(path):
 KINDS = {
     "sensor": ("sensor.toml", load_sensor),
     "device": ("device.toml", _load_device),
-    "noise": ("noise.toml", lambda path: load_amplifier(str(path))),
+    "noise": ("noise.toml", load_amplifier),
     "configuration": ("config.toml", load_config),
     "script": ("script.toml", load_script),
     "charges": ("charges.csv", _read_charges),

@@ -16,6 +16,9 @@ from typing import TextIO
 
 from isocharge.common.errors import IsochargeError, OutputError, OutputExists
 
+StrPath = str | Path
+"""Path of a file or a folder, as a text or as a `Path`."""
+
 MAX_FILE_BYTES = 64 << 20
 """Largest size of a file that is read by `read_whole`, and of the unpacked arrays of an npz file, bytes."""
 

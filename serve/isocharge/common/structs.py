@@ -33,7 +33,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from isocharge.common.errors import InputError, cut, shown
-from isocharge.common.files import read_needed
+from isocharge.common.files import StrPath, read_needed
 
 T = TypeVar("T")
 
@@ -81,7 +81,7 @@ class WrongKey(ValueError):
         self.key = key
 
 
-def read_toml(path: Path, description: str, error_class: type[InputError], target_type: type[T]) -> T:
+def read_toml(path: StrPath, description: str, error_class: type[InputError], target_type: type[T]) -> T:
     """Read a TOML file, and convert its content to a type.
 
     Args:
@@ -93,7 +93,7 @@ def read_toml(path: Path, description: str, error_class: type[InputError], targe
     Raises:
         error_class: If the file cannot be read or its content is wrong.
     """
-    data = read_needed(path, error_class, f"expected {description} in TOML", MAX_TOML_BYTES)
+    data = read_needed(Path(path), error_class, f"expected {description} in TOML", MAX_TOML_BYTES)
     return parse_toml(data, str(path), error_class, target_type)
 
 

@@ -28,6 +28,7 @@ from msgspec import Meta, defstruct, structs
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import InputError, error_prefix
+from isocharge.common.files import StrPath
 from isocharge.common.structs import Finite, NotNegative, Positive, Settings, read_toml
 from isocharge.simulate.noise import NOISE_LEVELS, NoiseModel
 
@@ -370,7 +371,7 @@ is used.
 """
 
 
-def load_amplifier(level: str) -> Amplifier:
+def load_amplifier(level: StrPath) -> Amplifier:
     """Return the built-in amplifier of a noise level, or an amplifier that is described in a TOML file.
 
     Example of a file:
@@ -391,9 +392,9 @@ def load_amplifier(level: str) -> Amplifier:
     """
     if level in AMPLIFIER_LEVELS:
         return AMPLIFIER_LEVELS[level]
-    if not level.endswith(".toml"):
+    if Path(level).suffix != ".toml":
         raise InputError(f"noise level: expected one of {', '.join(AMPLIFIER_LEVELS)}, or a TOML file, got {level!r}")
-    file = read_toml(Path(level), "the description of noise", InputError, AmplifierFile)
+    file = read_toml(level, "the description of noise", InputError, AmplifierFile)
     changes = {name: value for name, value in structs.asdict(file).items() if value is not None}
 
     # Remove the level and the parameters of the noise, because the remaining keys must be attributes of the amplifier.
@@ -407,7 +408,7 @@ def load_amplifier(level: str) -> Amplifier:
         return replace(similar_amplifier, noise=noise, **changes)
 
 
-def noise_model(level: str) -> NoiseModel:
+def noise_model(level: StrPath) -> NoiseModel:
     """Return the built-in noise model of a level, or a noise model that is described in a TOML file.
 
     If the file describes a complete measuring chain, only the noise that does not depend on earlier readings is

@@ -21,7 +21,7 @@ CHUNKS = [
 def recorded(tmp_path):
     """Return a recording of five chunks with 0 to 4 records. Before the third chunk, a new tare is requested."""
     path = tmp_path / "touch.rec"
-    with Recorder(path, "linear/1", {"tare": {"frames": 10}}) as recorder:
+    with Recorder(str(path), "linear/1", {"tare": {"frames": 10}}) as recorder:
         for number, chunk in enumerate(CHUNKS):
             if number == 2:
                 recorder.event(tare=True)
@@ -32,10 +32,12 @@ def recorded(tmp_path):
 
 @pytest.mark.parametrize("cut", [1, 10, 30])
 def test_unfinished_line_is_ignored(recorded, cut):
-    *events, last_event = Recording(recorded).events()
+    *events, last_event = Recording(str(recorded)).events()
     recorded.write_bytes(recorded.read_bytes()[:-cut])
-    expected = Event(chunk=last_event.chunk, latencies_us=last_event.latencies_us[:-1])
-    assert [*Recording(recorded).events()] == [*events, expected]
+    assert [*Recording(recorded).events()] == [
+        *events,
+        Event(chunk=last_event.chunk, latencies_us=last_event.latencies_us[:-1]),
+    ]
 
 
 def test_recorder_refuses_a_file_that_exists_a_missing_folder_and_a_name_that_could_not_be_read(tmp_path):

@@ -58,7 +58,7 @@ def test_covariance_for_a_stated_noise_is_that_of_the_linearised_problem(release
     steps = 2.0 * np.eye(4)
     charge_pC = np.concatenate([[PRESS_pC], PRESS_pC + steps, PRESS_pC - steps])
     plain, *stepped = np.asarray(released.predict_batch(charge_pC), float)
-    stated = np.asarray(released.with_noise([2.0] * 4, 0.005).predict_batch([PRESS_pC]), float)[0]
+    stated = np.asarray(released.with_noise(np.full(4, 2.0), 0.005).predict_batch([PRESS_pC]), float)[0]
     up, down = np.split(np.array(stepped)[:, :3], 2)
     jacobian = (up - down).T / 4.0
     extra = 4.0 - 1.0 + (0.005**2 - 0.002**2) * PRESS_pC**2

@@ -103,7 +103,7 @@ def test_rows_of_a_table_become_csv_and_records(film, predictor):
         assert row.split(",") == [*(f"{value:.6f}" for value in values[:7]), words]
     assert untouched == ",,0.000000,,,,,"
 
-    records = [json.loads(record.to_json()) for record in table_records(charge_pC, predictor)]
+    records = [json.loads(record.to_json()) for record in table_records(charge_pC.tolist(), predictor)]
     assert [record["contact"] for record in records] == [True, True, True, False]
     assert [" ".join(record["flags"]) for record in records] == flags
     assert records[1]["charge_pC"] == pytest.approx(dict(zip("ABC", charge_pC[1], strict=True)), abs=1e-6)

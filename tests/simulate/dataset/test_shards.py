@@ -5,7 +5,6 @@ import hashlib
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,12 +31,12 @@ ABOUT = {"probes": ["circle:1.0"], "ranges": {"radius_mm": 8.0}, "seed": 3, "sol
 
 
 @pytest.fixture
-def dataset(tmp_path) -> Path:
+def dataset(tmp_path):
     """A dataset with two shards, which contain 5 and 3 samples."""
-    return write_dataset(tmp_path / "presses", SENSOR, [samples(5, 0), samples(3, 1)], ABOUT)
+    return write_dataset(str(tmp_path / "presses"), SENSOR, [samples(5, 0), samples(3, 1)], ABOUT)
 
 
-def edit(folder: Path, change) -> None:
+def edit(folder, change):
     path = folder / "manifest.json"
     manifest = json.loads(path.read_text())
     change(manifest)
@@ -89,7 +88,7 @@ def test_read_dataset_of_another_folder_raises_dataset_error(tmp_path):
             read_dataset(path)
 
 
-def write_shard(folder: Path, data: bytes) -> None:
+def write_shard(folder, data):
     """Replace the bytes of the first shard, and write the correct checksum into the manifest."""
     (folder / "shard-00000.npz").write_bytes(data)
     edit(folder, lambda manifest: manifest["shards"][0].update(sha256=hashlib.sha256(data).hexdigest()))
@@ -98,7 +97,7 @@ def write_shard(folder: Path, data: bytes) -> None:
 def shard(**columns):
     """Return a function that replaces columns of the first shard of a dataset, or removes them if they are None."""
 
-    def replace_columns(folder: Path) -> None:
+    def replace_columns(folder):
         path = folder / "shard-00000.npz"
         arrays = dict(np.load(path)) | columns
         np.savez(path, allow_pickle=True, **{name: array for name, array in arrays.items() if array is not None})

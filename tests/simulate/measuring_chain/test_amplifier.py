@@ -102,7 +102,7 @@ def test_mismatch_is_drawn_once_for_each_channel():
 def test_amplifier_file_changes_the_given_values(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('like = "bench"\nwhite_pC = 0.5\ntau_s = 1\ngain_mismatch = 0.002\nbits = 12\npyro_pC_per_K = 90\n')
-    part = load_amplifier(str(path))
+    part = load_amplifier(path)
     assert (part.noise.name, part.noise.white, part.tau) == ("mine", 0.5, 1.0)
     assert (part.gain_mismatch, part.bits, part.hum, part.limit, part.pyro) == (0.002, 12, 1.0, 1500.0, 90.0)
 
@@ -123,7 +123,7 @@ def test_wrong_amplifier_file_raises_input_error(tmp_path, text, message):
     path = tmp_path / "mine.toml"
     path.write_text(text)
     with pytest.raises(InputError, match=message):
-        load_amplifier(str(path))
+        load_amplifier(path)
 
 
 def test_unknown_noise_level_raises_input_error():

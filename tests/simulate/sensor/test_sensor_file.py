@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from isocharge.common.errors import OutputExists, SensorError
+from isocharge.common.errors import OutputError, OutputExists, SensorError
 from isocharge.simulate import (
     Calibration,
     Electrode,
@@ -187,11 +187,9 @@ def test_polygon_that_does_not_touch_its_pad_logs_a_warning(tmp_path, caplog, mo
 @pytest.mark.parametrize("name", built_in_sensors())
 def test_written_sensor_file_reads_as_the_built_in_sensor(name, tmp_path):
     path = tmp_path / "mine.toml"
-    write_sensor(load_sensor(name), path, ["as delivered", "", "pretension\nunknown"])
+    write_sensor(load_sensor(name), str(path), ["as delivered", "", "pretension\nunknown"])
     assert path.read_text("utf-8").startswith("# as delivered\n#\n# pretension\n# unknown\n\nname = ")
     assert load_sensor(path) == load_sensor(name)
-    with pytest.raises(OutputExists, match="is already there"):
-        write_sensor(load_sensor(name), path)
 
 
 def test_every_property_of_a_film_is_written_in_the_unit_of_its_key():
@@ -240,11 +238,19 @@ def test_squares_of_a_second_size_are_written_as_polygons():
         sensor_to_dict(replace(SENSOR, electrodes=squares, readout="edge"))
 
 
-@pytest.mark.parametrize(("name", "message"), [("", "name: expected a text"), ("\ud800", "cannot be encoded in UTF-8")])
-def test_sensor_that_cannot_be_written_raises_error(tmp_path, name, message):
-    with pytest.raises(SensorError, match=message):
-        write_sensor(replace(SENSOR, name=name), tmp_path / "mine.toml")
-    assert list(tmp_path.iterdir()) == []
+@pytest.mark.parametrize(
+    ("name", "file", "error", "message"),
+    [
+        ("", "mine.toml", SensorError, "name: expected a text"),
+        ("\ud800", "mine.toml", SensorError, "cannot be encoded in UTF-8"),
+        ("mine", "none/mine.toml", OutputError, "none/mine.toml cannot be written: No such file or directory"),
+        ("mine", ".", OutputExists, "is already there"),
+    ],
+)
+def test_sensor_that_cannot_be_written_raises_error(tmp_path, name, file, error, message):
+    with pytest.raises(error, match=message):
+        write_sensor(replace(SENSOR, name=name), tmp_path / file)
+    assert not any(tmp_path.iterdir())
 
 
 def test_write_and_load_round_trip(tmp_path):

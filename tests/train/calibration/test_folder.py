@@ -38,7 +38,7 @@ def written(problem, synthetic, tmp_path_factory):
         values, _, presses = rig(problem, synthetic, 20, seed=31)
         result = calibrate(presses, problem, start=synthetic, accurate=False)
         path = tmp_path_factory.mktemp("calibrated") / "film"
-        write_calibration(result, path, "make it", config=QUICK)
+        write_calibration(result, str(path), "make it", config=QUICK)
         yield SimpleNamespace(path=path, result=result, values=values)
 
 
@@ -59,7 +59,7 @@ def test_folder_contains_the_presses_the_sensor_and_the_estimate(written, proble
     assert load_sensor(version / "sensor.toml").film.pretension == pytest.approx(
         written.result.film.value("pretension")
     )
-    film = read_earlier(written.path, problem)
+    film = read_earlier(str(written.path), problem)
     drifted = written.result.film.drifted()
     np.testing.assert_array_equal(film.values, drifted.values)
     std = np.sqrt(np.diag(drifted.covariance))

@@ -56,7 +56,7 @@ ELLIPSE_TOLERANCES = {
 
 @pytest.fixture(scope="module")
 def released(fitted, tmp_path_factory):
-    return release(fitted, tmp_path_factory.mktemp("models") / "mine", command="make it")
+    return release(fitted, str(tmp_path_factory.mktemp("models") / "mine"), command="make it")
 
 
 def _slow_if_solved(name):

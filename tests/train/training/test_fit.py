@@ -287,8 +287,8 @@ def test_focused_distance_is_a_mean_with_smaller_weights_for_long_targets(monkey
     ],
 )
 def test_wrong_files_are_refused_with_file_and_key(tmp_path, text, message):
-    path = write(tmp_path, text)
+    path = str(write(tmp_path, text))
     with pytest.raises(ConfigError) as caught:
         load_config(path)
-    assert str(path) in str(caught.value)
+    assert path in str(caught.value)
     assert message in str(caught.value)

@@ -28,12 +28,12 @@ file has no such section. An unknown key causes an error.
 """
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from msgspec import defstruct, structs
 
 from isocharge.common.errors import DeviceError
+from isocharge.common.files import StrPath
 from isocharge.common.structs import convert, read_toml
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.predictor import Predictor
@@ -136,7 +136,7 @@ def create_stages(setup: Setup, *, needs_contact: bool = False) -> list[Stage]:
     return [stage(setup) for stage in STAGES if stage.needs_contact is needs_contact and stage.is_used(setup)]
 
 
-def load_device(path: str | Path | None) -> Device:
+def load_device(path: StrPath | None) -> Device:
     """Read a device file and return its settings, or return `ANY_BOARD` if the path is None.
 
     Raises:
@@ -144,7 +144,7 @@ def load_device(path: str | Path | None) -> Device:
     """
     if path is None:
         return ANY_BOARD
-    return device_from_table(read_toml(Path(path), "a device file", DeviceError, dict[str, Any]), str(path))
+    return device_from_table(read_toml(path, "a device file", DeviceError, dict[str, Any]), str(path))
 
 
 def device_from_table(table: Mapping[str, Any], where: str) -> Device:

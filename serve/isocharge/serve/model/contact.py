@@ -10,7 +10,7 @@ subset of the flags `outside`, `beyond`, `misfit` and `stress`.
 
 import math
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -137,7 +137,7 @@ def add_covariance(contacts: Singles, covariance: Array) -> Singles:
     return total.astype(np.float32)
 
 
-def write_finite(write: Callable[..., object], values: Iterable[float]) -> bool:
+def write_finite(write: Callable[..., object], values: Any) -> bool:
     """Write the charges of one press as float32 numbers, and check that they are finite.
 
     Args:

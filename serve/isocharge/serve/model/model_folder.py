@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 
 from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import ModelError, OutputExists, error_prefix, shown
-from isocharge.common.files import check_new_output, new_folder, read_needed, sha256_of, write_whole
+from isocharge.common.files import StrPath, check_new_output, new_folder, read_needed, sha256_of, write_whole
 from isocharge.serve.model.contact import as_charges
 from isocharge.serve.model.metadata import LABEL, NAME, VERSION, ModelMetadata
 from isocharge.serve.model.session import (
@@ -47,7 +47,7 @@ from isocharge.serve.model.session import (
 )
 
 
-def find_model(model: str | Path, models: str | Path | None = None) -> Path:
+def find_model(model: StrPath, models: StrPath | None = None) -> Path:
     """Find the version folder of a model by its name or path.
 
     Args:
@@ -66,7 +66,7 @@ def find_model(model: str | Path, models: str | Path | None = None) -> Path:
     return _first_model([*candidates, Path(model)], model, roots, is_path)
 
 
-def find_labelled_model(label: str, models: Path | None = None) -> Path:
+def find_labelled_model(label: str, models: StrPath | None = None) -> Path:
     """Find the version folder of a model by a label `NAME/VERSION` that was read from a file.
 
     Unlike `find_model`, this function searches only the repositories. The label is never used as a path, because the
@@ -85,7 +85,7 @@ def find_labelled_model(label: str, models: Path | None = None) -> Path:
     return _first_model([root / label for root in roots], label, roots, is_path=False)
 
 
-def repositories(models: str | Path | None = None) -> list[Path]:
+def repositories(models: StrPath | None = None) -> list[Path]:
     """Return the repositories in which the name of a model is looked up, in the order of the search.
 
     Args:
@@ -172,7 +172,7 @@ def _subfolders(folder: Path) -> list[Path]:
         raise ModelError(f"{folder}: cannot be listed ({error.strerror}); try again, or correct its rights") from error
 
 
-def _first_model(candidates: list[Path], model: str | Path, roots: list[Path], is_path: bool) -> Path:
+def _first_model(candidates: list[Path], model: StrPath, roots: list[Path], is_path: bool) -> Path:
     """Return the version folder of the first path at which there is a model.
 
     Args:
@@ -316,7 +316,7 @@ def load_checked_model(folder: Path) -> Model:
 
 
 def write_model(
-    folder: Path,
+    folder: StrPath,
     onnx_model: bytes,
     metadata: ModelMetadata,
     golden_charge_pC: ArrayLike,
@@ -344,6 +344,7 @@ def write_model(
         ModelError: If a reader would refuse the model, or its metadata differ from `metadata`. After any error no file
             of the version remains.
     """
+    folder = Path(folder)
     target = check_target(folder, metadata.version, metadata.electrodes)
     if folder.resolve().name != metadata.name:
         raise ModelError(f"{folder}: expected a folder named {metadata.name!r}, as the metadata names the model")

@@ -10,17 +10,16 @@ and writes the contact into an existing array, which is faster in a loop.
 
 import logging
 import threading
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from msgspec import structs
 from numpy.typing import ArrayLike
 
-from isocharge.common.arrays import Array, Singles
+from isocharge.common.arrays import Singles
 from isocharge.common.errors import ChargeError, shown
+from isocharge.common.files import StrPath
 from isocharge.common.structs import WrongKey, convert
 from isocharge.serve.flags import BEYOND
 from isocharge.serve.model.contact import Contact, Contacts, Validity, add_covariance, as_charges, write_finite
@@ -56,7 +55,7 @@ class Predictor:
         ()
     """
 
-    def __init__(self, model: str | Path, *, models: str | Path | None = None) -> None:
+    def __init__(self, model: StrPath, *, models: StrPath | None = None) -> None:
         """Load a model.
 
         Args:
@@ -76,7 +75,7 @@ class Predictor:
         self._has_warned = False
         self.noise = loaded.metadata.noise
 
-    def with_noise(self, white_pC: float | Sequence[float], gain: float | Sequence[float]) -> "Predictor":
+    def with_noise(self, white_pC: ArrayLike, gain: ArrayLike) -> "Predictor":
         """Return a predictor of the same model for charges with another noise.
 
         The predicted contacts are the same. Noise beyond that of the training increases the covariance of a contact.
@@ -86,14 +85,14 @@ class Predictor:
 
         Args:
             white_pC: Standard deviation of the part of the noise that does not depend on the charge, pC. It is one
-                number for all electrodes, or a list with one number for each electrode.
+                number for all electrodes, or one number for each electrode, as a list or an array.
             gain: Standard deviation of the part that is proportional to the charge, relative to the charge, as one
-                number or as a list.
+                number or as one number for each electrode.
 
         Raises:
             ChargeError: If a standard deviation is not a finite number of at least 0, or if a list has another length.
         """
-        stated = {"name": "stated", "white_pC": white_pC, "gain": gain}
+        stated = {"name": "stated", "white_pC": np.asarray(white_pC).tolist(), "gain": np.asarray(gain).tolist()}
         noise = convert(stated, ModelNoise, "noise", ChargeError)
         try:
             structs.replace(self.metadata, noise=noise)  # runs the checks of the metadata
@@ -115,7 +114,7 @@ class Predictor:
         state = {"noise": self.noise, "validity": self.validity} if is_stated else None
         return type(self), (self.folder,), state
 
-    def predict(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
+    def predict(self, charge_pC: ArrayLike) -> Contact:
         """Compute the contact of one press. Call `flags` to find out whether the contact is valid.
 
         If the position or the force is too large to be a measurement, a warning is logged. Only the first warning of a
@@ -147,7 +146,7 @@ class Predictor:
             )
         return contact
 
-    def _predict_one(self, charge_pC: Sequence[float] | Array | Singles) -> Contact:
+    def _predict_one(self, charge_pC: ArrayLike) -> Contact:
         """Compute the contact of one press, with the standard deviations for the noise of the training.
 
         Args:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from isocharge.common.errors import ModelError, ModelNotFound
+from isocharge.common.files import StrPath
 from isocharge.serve.model.contact import Validity
 from isocharge.serve.model.model_folder import Model, load_checked_model, model_names, repositories, version_folders
 from isocharge.serve.network.metrics import ModelMetrics, Statistics
@@ -72,7 +73,7 @@ class ModelStore:
         metrics: Metrics of the requests to each version. They also contain versions that were refused or unloaded.
     """
 
-    def __init__(self, models: str | Path | None = None) -> None:
+    def __init__(self, models: StrPath | None = None) -> None:
         """Load all versions of all models in one repository, or in all repositories that `find_model` searches.
 
         If several repositories contain a model, the model in the first of them is used. The methods `load` and `index`

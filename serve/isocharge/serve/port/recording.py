@@ -25,7 +25,7 @@ from msgspec import Meta, Struct, field
 from msgspec.json import encode
 
 from isocharge.common.errors import RecordingError, cut, is_printable
-from isocharge.common.files import AtomicWriter, as_output_errors, bounded_lines
+from isocharge.common.files import AtomicWriter, StrPath, as_output_errors, bounded_lines
 from isocharge.common.progress import report
 from isocharge.common.structs import WrongKey, parse_json
 from isocharge.serve.model.metadata import ModelLabel
@@ -73,7 +73,7 @@ class Recorder:
             were written before the error are complete.
     """
 
-    def __init__(self, path: Path, model: str, device: Mapping[str, Any], name: str | None = None) -> None:
+    def __init__(self, path: StrPath, model: str, device: Mapping[str, Any], name: str | None = None) -> None:
         """Store the description of a recording. The file is created when the context is entered.
 
         Args:
@@ -85,7 +85,7 @@ class Recorder:
         Raises:
             RecordingError: If the first line of the recording could not be read.
         """
-        self.path = path
+        self.path = Path(path)
         self.model_label = model
         self.failed = False
         header = {KIND: VERSION, "model": model, "device": dict(device)} | ({"name": name} if name else {})
@@ -200,7 +200,7 @@ class Recording:
         name: Name of the film in the records; empty for the name of the sensor of the model.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: StrPath) -> None:
         """Read the first line of the file, which describes the recording.
 
         Args:
@@ -209,7 +209,7 @@ class Recording:
         Raises:
             RecordingError: If the file cannot be read, or is not a recording of this version.
         """
-        self._path = path
+        self._path = path = Path(path)
         try:
             if not path.is_file():
                 raise RecordingError("there is no file of that name")

@@ -27,7 +27,7 @@ from msgspec import Struct
 
 from isocharge.common.arrays import Array, Booleans, npz_arrays
 from isocharge.common.errors import DatasetError, SensorError, cut, error_prefix, shown
-from isocharge.common.files import new_folder, read_needed, sha256_of, write_whole
+from isocharge.common.files import StrPath, new_folder, read_needed, sha256_of, write_whole
 from isocharge.common.structs import MAX_JSON_BYTES, Positive, Text, convert, parse_json
 from isocharge.simulate.sensor.footprint import with_rotation
 from isocharge.simulate.sensor.sensor import Sensor
@@ -120,7 +120,7 @@ class Dataset:
     outside: Samples | None = None
 
 
-def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about: dict[str, Any]) -> Path:
+def write_dataset(folder: StrPath, sensor: Sensor, shards: Iterable[Samples], about: dict[str, Any]) -> Path:
     """Write a dataset into a new folder.
 
     Args:
@@ -137,6 +137,7 @@ def write_dataset(folder: Path, sensor: Sensor, shards: Iterable[Samples], about
         OutputExists: If the folder already exists.
         DatasetError: If a column of a shard has a wrong shape or type, or contains a number that is not finite.
     """
+    folder = Path(folder)
     with new_folder(folder) as draft:
         write_files(draft, folder.name, sensor, shards, about)
     return folder
@@ -255,7 +256,7 @@ def _check_samples(samples: Samples, n_electrode: int, shard_label: str) -> None
             )
 
 
-def read_dataset(folder: Path) -> Dataset:
+def read_dataset(folder: StrPath) -> Dataset:
     """Read a dataset, and check the checksums and the columns of all shards.
 
     Args:

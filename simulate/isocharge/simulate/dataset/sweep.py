@@ -29,7 +29,7 @@ from isocharge.common.arrays import Array, Integers
 from isocharge.common.contact_domain import Domain
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import SceneError, SolveError
-from isocharge.common.files import check_new_output, new_folder
+from isocharge.common.files import StrPath, check_new_output, new_folder
 from isocharge.common.progress import report, second_thread
 from isocharge.simulate.dataset.shards import (
     MAX_SHARD_BYTES,
@@ -200,7 +200,7 @@ MIN_RING_WIDTH = 1.0
 
 
 def run_sweep(
-    folder: Path,
+    folder: StrPath,
     sensor: Sensor,
     probes: Sequence[Probe],
     sweep: Sweep,

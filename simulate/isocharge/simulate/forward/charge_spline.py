@@ -120,8 +120,6 @@ class ChargeSpline:
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Compute charges and derivatives together.
 
-        One call is faster than separate calls of `charges` and `derivatives`.
-
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
 

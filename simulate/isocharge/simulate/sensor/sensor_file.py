@@ -15,7 +15,7 @@ import shapely
 from msgspec import Meta, field
 
 from isocharge.common.errors import SensorError, error_prefix
-from isocharge.common.files import check_new_output, write_whole
+from isocharge.common.files import StrPath, new_file
 from isocharge.common.structs import (
     Finite,
     NotNegative,
@@ -153,7 +153,7 @@ def built_in_sensors() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in BUILT_IN_FOLDER.glob("*.toml")))
 
 
-def load_sensor(sensor: str | Path) -> Sensor:
+def load_sensor(sensor: StrPath) -> Sensor:
     """Read a sensor file, which belongs to the package (built-in sensor) or to the user.
 
     If a file of the user describes a sensor with only one electrode, or an electrode of several parts that do not
@@ -308,7 +308,7 @@ def sensor_to_toml(sensor: Sensor, comment: Iterable[str] = ()) -> str:
     return text
 
 
-def write_sensor(sensor: Sensor, path: Path, comment: Iterable[str] = ()) -> None:
+def write_sensor(sensor: Sensor, path: StrPath, comment: Iterable[str] = ()) -> None:
     """Write a sensor file. If an error occurs, no file is written.
 
     Args:
@@ -319,9 +319,10 @@ def write_sensor(sensor: Sensor, path: Path, comment: Iterable[str] = ()) -> Non
     Raises:
         SensorError: If a sensor file cannot describe the sensor.
         OutputExists: If `path` exists.
+        OutputError: If the file cannot be written.
     """
-    check_new_output(path)
-    write_whole(path, sensor_to_toml(sensor, comment).encode())
+    with new_file(Path(path)) as draft:
+        draft.write_bytes(sensor_to_toml(sensor, comment).encode())
 
 
 def _electrode_tables(sensor: Sensor) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from msgspec.structs import replace as replace_setting
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, PressError, cut
-from isocharge.common.files import write_whole
+from isocharge.common.files import StrPath, write_whole
 from isocharge.common.structs import Text, plain_values, read_json
 from isocharge.serve.model.charge_file import FILE as CHARGES
 from isocharge.serve.model.charge_file import charge_map_bytes
@@ -238,7 +238,7 @@ def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
 
 def write_calibration(
     result: CalibrationResult,
-    folder: Path,
+    folder: StrPath,
     command: str = "",
     *,
     held_out: MeasuredPresses | None = None,
@@ -270,8 +270,9 @@ def write_calibration(
     from isocharge.simulate.plots.figure import picture_bytes
     from isocharge.train.calibration.picture import calibration_picture
 
-    check_calibration_folder(folder, result.problem.electrodes)
+    folder = Path(folder)
     problem, film = result.problem, result.film
+    check_calibration_folder(folder, problem.electrodes)
     if held_out is not None:
         held_out = usable_held_out(held_out, result.presses, problem)
     with single_threaded_blas():
@@ -385,7 +386,7 @@ def result_table(result: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def read_earlier(folder: Path, problem: CalibrationProblem, *presses: MeasuredPresses | None) -> FilmEstimate:
+def read_earlier(folder: StrPath, problem: CalibrationProblem, *presses: MeasuredPresses | None) -> FilmEstimate:
     """Read the film of an earlier calibration, and add the possible drift since then to its uncertainty.
 
     Args:
@@ -399,6 +400,7 @@ def read_earlier(folder: Path, problem: CalibrationProblem, *presses: MeasuredPr
             belongs to a calibration in the folder. It would count twice, and the standard deviations would be too
             small.
     """
+    folder = Path(folder)
     calibrated_versions = [version for version in version_folders(folder).values() if (version / RESULT).is_file()]
     versions = calibrated_versions or [folder]
     film = read_film(versions[-1] / RESULT, problem)

@@ -12,6 +12,7 @@ from msgspec import structs
 from isocharge.common.contact_domain import Domain
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import ModelError
+from isocharge.common.files import StrPath
 from isocharge.common.structs import convert
 from isocharge.serve.model.contact import MISFIT_LIMIT, disk_corners
 from isocharge.serve.model.metadata import ModelMetadata, ModelNoise
@@ -181,7 +182,7 @@ class Release:
 
 def release(
     fitted: Fitted,
-    folder: Path,
+    folder: StrPath,
     *,
     version: int = 1,
     command: str = "",
@@ -215,7 +216,7 @@ def release(
     packages = ("isocharge", "numpy", "onnx", "onnxruntime", "torch")
     package_versions = {name: installed_version(name) for name in packages}
     metadata_without_unnoticed = ModelMetadata(
-        name=folder.resolve().name,
+        name=Path(folder).resolve().name,
         version=version,
         sensor=dict(fitted.sensor),
         electrodes=fitted.electrodes,

@@ -3,7 +3,6 @@
 A TOML file with the tables `network` and `training` can replace the default values of the settings.
 """
 
-from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 from msgspec import Meta
@@ -11,6 +10,7 @@ from msgspec.structs import replace
 
 from isocharge.common.defaults import FEW_ELECTRODES
 from isocharge.common.errors import ConfigError
+from isocharge.common.files import StrPath
 from isocharge.common.structs import Settings, WrongKey, convert, plain_values, read_toml
 from isocharge.simulate import NoiseModel, noise_model
 
@@ -173,7 +173,7 @@ class FitConfig(Settings, frozen=True):
         return convert(self.to_dict(), FitConfig, "", ConfigError)
 
 
-def load_config(path: Path) -> FitConfig:
+def load_config(path: StrPath) -> FitConfig:
     """Read the settings of a training from a TOML file. Missing keys have their default values.
 
     Raises:

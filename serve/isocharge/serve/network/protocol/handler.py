@@ -17,10 +17,10 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 from isocharge.common.errors import TooLarge, UnknownPath, WrongMethod
+from isocharge.common.files import StrPath
 from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.browser_check import AccessCheck, header_values
 from isocharge.serve.network.metrics import Client, Exchange, Traffic
@@ -202,9 +202,7 @@ class Handler(Application):
         return answer if isinstance(answer, Response) else json_response(answer)
 
 
-def asgi_app(
-    models: str | Path | None = None, *, token: str | None = None, allowed_hosts: Iterable[str] = ()
-) -> Handler:
+def asgi_app(models: StrPath | None = None, *, token: str | None = None, allowed_hosts: Iterable[str] = ()) -> Handler:
     """Load models, and return an ASGI application that serves them with the Open Inference Protocol.
 
     The limits of connections belong to the server that runs the program. The application itself limits the size of a
