@@ -32,10 +32,10 @@ def test_sighup_loads_all_models_again(start, film, tmp_path):
     film.write(tmp_path, name="other")
     (film.write(tmp_path, name="broken") / "golden.json").unlink()
     process.send_signal(signal.SIGHUP)
-    lines = [process.stderr.readline() for _ in range(3)]
-    assert lines[0] == "serving linear/1; Ctrl-C stops\n"
-    assert lines[1].startswith(f"refused: {tmp_path}/broken/1/golden.json: cannot be read")
-    assert lines[2] == "serving linear/1, linear/2, other/1; Ctrl-C stops\n"
+    start_line, refusal, load_line = [process.stderr.readline() for _ in range(3)]
+    assert start_line == "serving linear/1; Ctrl-C stops\n"
+    assert refusal.startswith(f"refused: {tmp_path}/broken/1/golden.json: cannot be read")
+    assert load_line == "serving linear/1, linear/2, other/1; Ctrl-C stops\n"
     assert json.loads(send(url, "POST", INFER, BODY)[2])["model_version"] == "2"
 
 
@@ -72,26 +72,22 @@ def test_another_server_can_listen_on_the_port_of_a_killed_server(start):
 def test_http_command_refuses_wrong_options_and_models(refused, film, models, tmp_path, monkeypatch):
     (tmp_path / "empty").mkdir()
     (film.write(tmp_path / "damaged") / "golden.json").unlink()
-    (tmp_path / "cert.pem").write_text("no certificate")
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
+    with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        for folder, words, code, message in [
-            (models, ("--port", port), 1, f"ListenError: cannot listen on 127.0.0.1:{port}: "),
-            (models, ("--port", 0, "--grpc-port", port), 1, f"ListenError: cannot listen on 127.0.0.1:{port} for gRPC"),
-            (models, ("--host", "0.0.0.0"), 2, "InputError: 0.0.0.0 lets other machines in: give --token TOKEN"),
-            (models, ("--tls-key", "x"), 2, "InputError: --tls-key: expected --tls-cert too"),
-            (models, ("--tls-cert", tmp_path / "cert.pem"), 2, f"InputError: {tmp_path}/cert.pem: not a certificate"),
-            (tmp_path / "empty", (), 2, "ModelError: no model can be served: expected models"),
+        for words, code, message in [
+            (("--port", port), 1, f"ListenError: cannot listen on 127.0.0.1:{port}: "),
+            (("--port", 0, "--grpc-port", port), 1, f"ListenError: cannot listen on 127.0.0.1:{port} for gRPC"),
+            (("--host", "0.0.0.0"), 2, "InputError: 0.0.0.0 lets other machines in: give --token TOKEN"),
+            (("--tls-key", "x"), 2, "InputError: --tls-key: expected --tls-cert too"),
+            (("--tls-cert", __file__), 2, f"InputError: {__file__}: not a certificate"),
+            (("--models", tmp_path / "empty"), 2, "ModelError: no model can be served: expected models"),
             (
-                tmp_path / "damaged",
-                (),
+                ("--models", tmp_path / "damaged"),
                 2,
                 f"ModelError: no model can be served: {tmp_path}/damaged/linear/1/golden.json: ",
             ),
         ]:
-            refused("serve", "http", "--models", folder, *words, message=message, code=code)
+            refused("serve", "http", "--models", models, *words, message=message, code=code)
     monkeypatch.setenv("ISOCHARGE_TOKEN", "")  # whoever sets it means to have one
     refused("serve", "http", "--models", models, "--port", 0, message="token: expected printable ASCII")
 
@@ -109,3 +105,13 @@ def test_full_log_pipe_delays_no_request_and_sigterm_ends_the_server(start, film
     assert (refused["level"], refused["message"][:9]) == ("warning", "refused: ")
     assert (serving["level"], serving["message"]) == ("info", "serving linear/1; Ctrl-C stops")
     assert (process.returncode, len(requests)) == (0, 501)
+
+
+def test_each_log_line_that_cannot_be_written_counts_as_lost(start):
+    """A full disk may have space again, so the server tries to write each line."""
+    process = start("--port", 0, "--log", "json")
+    url = process.stdout.readline().strip()
+    process.stderr.close()
+    for _ in range(50):
+        metrics = send(url, "GET", "/metrics")[2]
+    assert float(metrics.split()[-1]) > 2  # the last metric is isocharge_log_lines_lost

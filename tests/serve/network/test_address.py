@@ -35,7 +35,6 @@ def test_server_on_a_unix_socket_takes_over_a_socket_left_by_a_killed_server(han
     assert start_http(handler, uds=path).url == f"unix:{path}"
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     with socket.socket(socket.AF_UNIX) as connection:
-        connection.settimeout(20)
         connection.connect(str(path))
         connection.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
         assert connection.recv(1000).startswith(b"HTTP/1.1 200")
@@ -105,9 +104,10 @@ def test_unix_socket_of_another_server_is_not_replaced(handler, tmp_path):
 
 @pytest.mark.timeout(20)
 def test_certificate_that_is_a_pipe_is_refused(tmp_path):
-    os.mkfifo(tmp_path / "cert.pem")
+    path = tmp_path / "cert.pem"
+    os.mkfifo(path)
     with pytest.raises(InputError, match="not a regular file"):
-        Tls(tmp_path / "cert.pem", tmp_path / "cert.pem").context()
+        Tls(path, path).context()
 
 
 def test_token_needs_the_bearer_scheme_in_any_case():

@@ -67,8 +67,7 @@ def test_metrics_list_loaded_and_refused_versions(film, tmp_path):
     (film.write(tmp_path, version=3) / "golden.json").unlink()
     store = ModelStore(tmp_path)
     samples = scrape(Handler(store))
-    ready = [value(samples, "model_ready", model="linear", version=v) for v in ("1", "2", "3")]
-    assert ready == [1, 1, 0]
+    assert [value(samples, "model_ready", model="linear", version=v) for v in ("1", "2", "3")] == [1, 1, 0]
     loaded = store.get("linear", "2")
     facts = {"sensor": loaded.metadata.frame_id, "sha256": loaded.golden.sha256}
     assert value(samples, "model_info", model="linear", version="2", **facts) == 1

@@ -133,12 +133,13 @@ def write_stdout(text: str) -> None:
     _write_all(STDOUT_FILENO, text.encode())
 
 
-def write_stderr(line: str) -> None:
-    """Write a line to stderr at once. The command continues if stderr is full or closed."""
+def write_stderr(line: str) -> bool:
+    """Write a line to stderr at once, and return False if that fails. The next line may succeed, as on a full disk."""
     try:
         _write_all(STDERR_FILENO, f"{printable(line)}\n".encode())
     except OSError:
-        discard_output(STDERR_FILENO)
+        return False
+    return True
 
 
 def _write_all(descriptor: int, data: bytes) -> None:

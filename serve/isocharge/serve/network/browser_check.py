@@ -159,9 +159,8 @@ class AccessCheck:
         # The following names contain no ports. If the names are equal and both have a port, the page belongs to another
         # server on the same machine.
         page_name = _name_in(page_host)
-        requested_name = _name_in(requested_host)
         is_port_removed = page_host.startswith(f"{requested_host}:")
-        return page_name in self._allowed_names and (page_name != requested_name or is_port_removed)
+        return page_name in self._allowed_names and (page_name != _name_in(requested_host) or is_port_removed)
 
 
 def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:

@@ -100,14 +100,14 @@ class WriterQueue(Generic[T]):
     therefore receives the newest items.
 
     Attributes:
-        lost: Number of items that were dropped without being written.
+        lost: Number of items that were dropped without being written, or that could not be written.
     """
 
     def __init__(self, write: Callable[[T], object]) -> None:
         """Start the thread.
 
         Args:
-            write: Function that the thread calls with each item.
+            write: Function that the thread calls with each item. If it returns False, the item counts as lost.
         """
         self.lost = 0
         self._write = write
@@ -172,10 +172,11 @@ class WriterQueue(Generic[T]):
     def _run(self) -> None:
         """Write items until the queue is closed and empty, or until `write` raises an exception."""
         try:
-            while (item := self._items.get()) is not None:
+            for item in iter(self._items.get, None):
                 if self._is_abandoned:
                     return
-                self._write(item)
+                if self._write(item) is False:
+                    self.lost += 1
                 self._items.task_done()
             self._items.task_done()
         except Exception as error:  # `put` or `close` raises it again in the thread of the caller

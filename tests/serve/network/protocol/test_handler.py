@@ -154,36 +154,32 @@ def with_data(text):
 
 
 BAD = {
-    "nothing": (b"", 400, "expected JSON, got b''"),
-    "NaN": (with_data(b"[1,NaN,3]"), 400, "expected JSON, got .*NaN"),
+    "nothing": (b"", "expected JSON, got b''"),
+    "NaN": (with_data(b"[1,NaN,3]"), "expected JSON, got .*NaN"),
     "beyond float64": (
         with_data(b"[1,1e999,3]"),
-        400,
         r"out of range - at .*data\[1\]",
     ),
-    "beyond float32": (changed(data=[1, 2, 1e39]), 400, r"finite float32 charges .* electrode 'C' \(1e\+39\)"),
+    "beyond float32": (changed(data=[1, 2, 1e39]), r"finite float32 charges .* electrode 'C' \(1e\+39\)"),
     "nested data": (
         with_data(b"[" * 500 + b"]" * 500),
-        400,
         r"data\[0\]\[0\]: expected a finite number, got",
     ),
-    "no inputs": (b'{"inputs": []}', 400, "inputs: expected a list with one tensor"),
-    "other type": (changed(datatype="INT64"), 400, "expected one of FP32, FP64, got 'INT64'"),
-    "no rows": (changed(shape=[0, 3], data=[]), 400, "with n > 0"),
-    "too many": (changed(shape=[10**12, 3]), 413, "at most 4096 presses in one request, got 1000000000000"),
-    "too few numbers": (changed(data=[1, 2]), 400, r"shape \[1, 3\], flat or in rows, .* got \[1.0, 2.0\] and 0 bytes"),
-    "ragged": (changed(shape=[2, 3], data=[[1, 2, 3], [1, 2]]), 400, r"expected 6 numbers for the shape \[2, 3\]"),
-    "yes": (changed(data=[1, 2, True]), 400, r"data\[2\]: expected a finite number or .*, got True"),
+    "no inputs": (b'{"inputs": []}', "inputs: expected a list with one tensor"),
+    "other type": (changed(datatype="INT64"), "expected one of FP32, FP64, got 'INT64'"),
+    "no rows": (changed(shape=[0, 3], data=[]), "with n > 0"),
+    "too many": (changed(shape=[10**12, 3]), "at most 4096 presses in one request, got 1000000000000"),
+    "too few numbers": (changed(data=[1, 2]), r"shape \[1, 3\], flat or in rows, .* got \[1.0, 2.0\] and 0 bytes"),
+    "ragged": (changed(shape=[2, 3], data=[[1, 2, 3], [1, 2]]), r"expected 6 numbers for the shape \[2, 3\]"),
+    "yes": (changed(data=[1, 2, True]), r"data\[2\]: expected a finite number or .*, got True"),
     "other output": (
         orjson.dumps(infer_request(outputs=[{"name": "z"}])),
-        400,
         "one of contact, contact_correlation, contact_std",
     ),
-    "output twice": (orjson.dumps(infer_request(outputs=[{"name": "misfit"}] * 2)), 400, "each name once"),
-    "memory": (changed(parameters={"shared_memory_region": "r"}), 400, "does not support it, got 'r'"),
+    "output twice": (orjson.dumps(infer_request(outputs=[{"name": "misfit"}] * 2)), "each name once"),
+    "memory": (changed(parameters={"shared_memory_region": "r"}), "does not support it, got 'r'"),
     "size without bytes": (
         changed(parameters={"binary_data_size": 12}),
-        400,
         "binary_data_size: expected 0, .* got 12",
     ),
 }
@@ -191,9 +187,9 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_bad_bodies_are_refused_with_the_reason(ask, case):
-    body, status, message = BAD[case]
-    got, error = refusal(ask("POST", INFER, body))
-    assert got == status
+    body, message = BAD[case]
+    status, error = refusal(ask("POST", INFER, body))
+    assert status == (413 if case == "too many" else 400)
     assert re.search(message, error)
 
 
@@ -257,12 +253,11 @@ def test_openapi_describes_each_route(ask):
     ("data", "status"), [([1, 2.5, 3], 200), ([[1, 2.5, 3]], 200), (["1", 2, 3], 400), ([None, 2, 3], 400), ("1", 400)]
 )
 def test_openapi_accepts_the_numbers_that_the_server_accepts(ask, data, status):
-    request = infer_request()
-    request["inputs"][0]["data"] = data
-    assert ask("POST", INFER, orjson.dumps(request))[0] == status
+    body = changed(data=data)
+    assert ask("POST", INFER, body)[0] == status
     components = orjson.loads(ask("GET", "/openapi.json")[2])["components"]
     schema = {"$ref": "#/components/schemas/InferBody", "components": components}
-    assert jsonschema_rs.Draft202012Validator(schema).is_valid(request) == (status == 200)
+    assert jsonschema_rs.Draft202012Validator(schema).is_valid(orjson.loads(body)) == (status == 200)
 
 
 @pytest.mark.parametrize(

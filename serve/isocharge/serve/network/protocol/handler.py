@@ -68,7 +68,7 @@ class Application(ABC):
         # Stop reading as soon as the body is larger than allowed. The application then refuses the body.
         body = bytearray()
         message: Message = {"more_body": True}
-        while message.get("more_body", False) and len(body) <= self.limits.body_bytes:
+        while message.get("more_body") and len(body) <= self.limits.body_bytes:
             message = await receive()
             if message["type"] == "http.disconnect":
                 return
@@ -134,7 +134,7 @@ def match_path(path: str) -> tuple[Route, dict[str, str]]:
     """
     for pattern, route in _PATTERNS:
         path_match = pattern.fullmatch(path)
-        if path_match is not None:
+        if path_match:
             return route, path_match.groupdict()
     return UNKNOWN, {}
 
