@@ -216,7 +216,13 @@ NOTATIONS = {
 }
 """Names of the channels by the notation of a frame."""
 
-DECIMAL_COMMAS = ["{a};{b}; {c}", "{a} {b}\t{c}", "A:  {a}, B: {b}, C: {c}", "(A: {a}; B: {b}; C: {c})"]
+DECIMAL_COMMAS = [
+    "{a};{b}; {c}",
+    "2026-11-25 12:34:56.789;{a};{b};{c}",
+    "{a} {b}\t{c}",
+    "A:  {a}, B: {b}, C: {c}",
+    "(A: {a}; B: {b}; C: {c})",
+]
 """Notations that are also read with decimal commas."""
 
 STATES = ["12 <{state}> {a} {b} {c}", "12 {state} {a} {b} {c}", "{state} -> {a}, {b}, {c}", "{a} ({state}) {b} {c}"]
