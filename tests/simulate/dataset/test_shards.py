@@ -14,7 +14,7 @@ from isocharge.simulate import Samples, load_sensor, read_dataset, write_dataset
 from isocharge.simulate.dataset.shards import COLUMNS
 
 
-def samples(count: int = 5, seed: int = 0) -> Samples:
+def samples(count=5, seed=0):
     rng = np.random.default_rng(seed)
     return Samples(
         x_mm=rng.uniform(-8, 8, count),

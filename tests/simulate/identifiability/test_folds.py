@@ -38,7 +38,7 @@ def rising(x, _):
     return x
 
 
-def folds_of(charge_map, rings: Rings | None = None) -> np.ndarray:
+def folds_of(charge_map, rings=None):
     """Positions on folds at 1 N, shape (n, 2), mm."""
     return find_folds(charge_map, rings or Rings.spread(charge_map.domain.radius), 1.0, REFERENCE)[0]
 

@@ -20,6 +20,7 @@ from isocharge.simulate import (
 )
 from isocharge.simulate.identifiability.identification import Identification, map_to_search
 from isocharge.simulate.plots.error_maps import identification_picture
+from isocharge.simulate.plots.figure import COLOURS
 from kept import kept
 from solved_charges import with_squares
 from whole_films import part_of
@@ -29,7 +30,7 @@ SENSOR = load_sensor("three-25um-biaxial")
 
 
 @pytest.fixture(scope="module")
-def film() -> ForwardMap:
+def film():
     return kept(ForwardMap.build, load_sensor("four-25um-uniaxial"), Circle(2.0), 4.0, (0.5, 2.0), COARSE)
 
 
@@ -46,7 +47,9 @@ def test_identification_to_dict_can_be_written_as_json(identification):
     area = numbers["working_area"]
     assert (area["radius_mm"], area["why"], area["fold_radius_mm"]) == (4.0, "searched", None)
     title = "four-25um-uniaxial, rectangle:4.0x2.0@30, noise reference"
-    assert identification_picture(turned).get_suptitle() == title
+    picture = identification_picture(turned)
+    assert picture.get_suptitle() == title
+    assert picture.axes[2].lines[0].get_color() == COLOURS[0]
 
 
 def test_statistics_agree_with_random_positions(identification):

@@ -10,7 +10,6 @@ from isocharge.common.errors import ChargeError, SceneError
 from isocharge.simulate import (
     ChargeSpline,
     Domain,
-    ForwardMap,
     Triangulation,
     load_sensor,
     noise_model,
@@ -23,7 +22,7 @@ LAYOUTS = {name: load_sensor(f"{name}-25um-biaxial") for name in ("three", "four
 CENTRES = {name: np.array([electrode.centre for electrode in sensor.electrodes]) for name, sensor in LAYOUTS.items()}
 
 
-def errors(fix, contact: np.ndarray) -> np.ndarray:
+def errors(fix, contact):
     """Return the distances between the found positions and the true positions, mm."""
     return np.hypot(*(fix.contact - contact)[fix.found, :2].T)
 
@@ -45,12 +44,12 @@ def test_triangulation_agrees_with_least_squares_of_scipy():
 
 
 @pytest.fixture(scope="module")
-def solved(three_map) -> ForwardMap:
+def solved(three_map):
     return part_of(three_map, LAYOUTS["three"], 6.0, (1.0, 1.0))
 
 
 @pytest.fixture(scope="module")
-def on_film(solved) -> Triangulation:
+def on_film(solved):
     return Triangulation(ChargeSpline.of(solved, spacing=0.3))
 
 

@@ -3,9 +3,7 @@
 import copy
 import json
 import tomllib
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -54,11 +52,11 @@ rotation_deg = 5.0
 """
 
 
-def whole() -> dict[str, Any]:
+def whole():
     return tomllib.loads(WHOLE)
 
 
-def tables(table: dict[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+def tables(table, path=()):
     """Paths of a table and all tables in it."""
     yield path
     for key, value in table.items():
@@ -66,7 +64,7 @@ def tables(table: dict[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[
             yield from tables(value, (*path, key))
 
 
-def at(table: dict[str, Any], path: tuple[str, ...]) -> dict[str, Any]:
+def at(table, path):
     for key in path:
         table = table[key]
     return table

@@ -15,7 +15,7 @@ from isocharge.common.errors import RecordingError
 from isocharge.common.files import as_output_errors
 from isocharge.serve import PredictionRecord, Recording
 from isocharge.serve.viewer.tape import FLAG_BITS, Samples, sample_type, sample_values
-from isocharge.simulate.plots.figure import INK, check_picture, new_figure, save_picture
+from isocharge.simulate.plots.figure import COLOURS, INK, check_picture, new_figure, save_picture
 
 
 def plot_command(
@@ -71,12 +71,13 @@ def recording_picture(samples: Samples, title: str) -> Figure:
     time_s = samples["timestamp"] - start_s
     flag_bits = samples["flags"].astype(int)
     flags = {flag: time_s[flag_bits & bit > 0] for flag, bit in FLAG_BITS.items() if (flag_bits & bit).any()}
-    flag_height = 0.1 * (1 + len(flags))  # grows with the number of rows of flags
     figure = new_figure(12.0, 8.6)
     figure.suptitle(f"{title}: {len(time_s)} records; faint points: ± 2 standard deviations", parse_math=False)
-    heights = (1.0, 1.0, 0.8, flag_height)
-    charge_axes, position_axes, force_axes, flag_axes = figure.subplots(4, 1, sharex=True, height_ratios=heights)
+    charge_axes, position_axes, force_axes, flag_axes = figure.subplots(
+        4, 1, sharex=True, height_ratios=(1.0, 1.0, 0.8, 0.1 * (1 + len(flags)))
+    )
 
+    charge_axes.set_prop_cycle(color=COLOURS)
     for name in samples.dtype.names or ():
         if name.startswith("charge_pC."):
             charge_axes.plot(time_s, samples[name], ".", ms=2.0, label=name.removeprefix("charge_pC."))
@@ -84,8 +85,8 @@ def recording_picture(samples: Samples, title: str) -> Figure:
         values = samples[f"{quantity}_{unit}"]
         two_std = 2.0 * samples[f"{quantity}_std_{unit}"]
         (points,) = axes.plot(time_s, values, ".", ms=2.0, label=quantity)
-        limits = np.column_stack([values - two_std, values + two_std])
-        axes.plot(time_s, limits, ".", ms=1.0, alpha=0.3, color=points.get_color())
+        for limit in (values - two_std, values + two_std):
+            axes.plot(time_s, limit, ".", ms=1.0, alpha=0.3, color=points.get_color())
     for row, flag_time_s in enumerate(flags.values()):
         flag_axes.plot(flag_time_s, np.full(len(flag_time_s), row), "|", color=INK)
 

@@ -12,7 +12,7 @@ from isocharge.simulate.identifiability.identification import Identification
 from isocharge.simulate.identifiability.mirror_region import MirrorRegion
 from isocharge.simulate.layout.case import NO_NUISANCES
 from isocharge.simulate.layout.design import Design
-from isocharge.simulate.plots.figure import FELT, INK, new_figure
+from isocharge.simulate.plots.figure import COLOURS, FELT, INK, new_figure
 from isocharge.simulate.plots.film import draw_circle, draw_electrodes, draw_rim, draw_working_area
 from isocharge.simulate.sensor.sensor import Sensor
 
@@ -50,8 +50,10 @@ def identification_picture(identification: Identification) -> Figure:
         axes.set_title(f"{limit_map.force:g} N; dashed: working area, {area.radius:g} mm{folds}")
     _add_colour_bar(figure, coloured_area, map_axes)
     _draw_distance(distance_axes, identification)
-    title = f"{identification.sensor.name}, {identification.probe.rotated_notation}, noise {identification.noise.name}"
-    figure.suptitle(title, fontsize=13)
+    figure.suptitle(
+        f"{identification.sensor.name}, {identification.probe.rotated_notation}, noise {identification.noise.name}",
+        fontsize=13,
+    )
     return figure
 
 
@@ -63,6 +65,7 @@ def _draw_distance(axes: Any, identification: Identification) -> None:
         identification: Result of `identify`, which contains a map of the errors for each force.
     """
     area = identification.area
+    axes.set_prop_cycle(color=COLOURS)
     for limit_map in identification.maps:
         distance = limit_map.rings.distance
         (curve,) = axes.semilogy(distance, np.median(limit_map.position, axis=1), label=f"{limit_map.force:g} N")

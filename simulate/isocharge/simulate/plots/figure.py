@@ -22,8 +22,8 @@ PRESSED = "#9aa5b1"
 FELT = "#d1495b"
 """Colour of estimated presses, and of objects that are emphasised."""
 
-COLOURS = ("#d1495b", "#2e6f9e", "#3a8f5c", "#c98a1b")
-"""Colours of the electrodes in the order of the charges."""
+COLOURS = ("#004488", "#ddaa33", "#56b4e9", "#d1495b", "#882255", "#c91f16", "#1845fb", "#9aa5b1")
+"""Colours of the electrodes in the order of the charges. People with red-green blindness can tell them apart."""
 
 FORMATS = ("png", "svg", "pdf")
 """Formats of pictures, which are also the allowed suffixes of their file names."""
