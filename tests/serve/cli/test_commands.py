@@ -223,7 +223,7 @@ def test_doctor_lists_the_ports_and_what_they_send(resting, run, monkeypatch):
     with resting() as sensor:
         ports = [ListPortInfo(sensor.url), ListPortInfo("/dev/ttyNone")]
         monkeypatch.setattr(list_ports, "comports", lambda: ports)
-        first, none = run("doctor").stdout.splitlines()
+        first, none = json.loads(run("doctor", "--json").stdout)["ports"]
     assert re.fullmatch(r"/dev/\S+ \(n/a\): binary frames of isocharge, \d+ frames/s at 115200 baud", first)
     assert none.startswith("/dev/ttyNone (n/a): /dev/ttyNone: there is no such port")
 

@@ -54,11 +54,11 @@ SHAPES = {
 
 
 @pytest.fixture(params=SHAPES.values(), ids=SHAPES)
-def shape(request) -> ShapeCase:
+def shape(request):
     return request.param
 
 
-def boundary_points(probe: Probe, count: int) -> np.ndarray:
+def boundary_points(probe, count):
     """Return the corners of a polygon, or points of a curve at evenly spaced parameters, shape (n,), mm."""
     if not probe.topology.is_curved:
         return probe.outline

@@ -87,7 +87,7 @@ def doctor_command(
     Example: isocharge serve doctor --port /dev/ttyACM0 --write board.toml
     """
     if port is None:
-        show("\n".join(port_lines()) or "no serial ports; is the board plugged in?")
+        show_result({"ports": [*port_lines()]}, json=json)
         return
     if write:
         check_new_output(write)
