@@ -28,7 +28,7 @@ MEANINGS = {
     TARE: "no tare yet, so no contact either",
     SATURATED: "an amplifier is at its limit, or was in this press: the device says so, or the device file's limit",
     NEGATIVE: "the charges are well below zero: an amplifier that inverts (see `[gain]`), or the end of a long press",
-    DRIFT: "the charges rose so slowly at the beginning of this contact that the charge at rest may have drifted",
+    DRIFT: "the charge at rest may have drifted: before this contact, the charges were opposite or rose slowly",
     THERMAL: "the film has warmed or cooled in this press by 10 pC or more on every electrode; it was subtracted",
     BLIND: "temperature is inseparable from force at this position: nothing was subtracted",
     OUTSIDE: "the position is outside the working area, or the force outside the range, that the model was trained for",

@@ -211,9 +211,9 @@ def test_single_precision_learns_the_leak_from_the_same_frames_after_a_release(b
 
 
 def test_contact_that_a_drift_begins_has_the_flag_drift_in_c_as_in_python(build):
-    """The zero of the board drifts by 6 pC/s, which the tare cannot follow."""
-    drift_pC = 6.0 * np.arange(1000)[:, None] / RATE_Hz
-    frames = regular_frames(np.random.default_rng(0).standard_normal((1000, 4)) + drift_pC)
+    """The zero of the board drifts by 6 pC/s, which the tare cannot follow, and is negative before a press."""
+    drift_pC = np.interp(np.arange(1400), [0, 1000, 1001, 1300, 1320], [0.0, 30.0, -300.0, -300.0, 300.0])
+    frames = regular_frames(np.random.default_rng(0).standard_normal((1400, 4)) + drift_pC[:, None])
     exported = build(FOUR, device("any board"))
     contact, flags = compare_chains(exported, frames, tolerance_pC=1e-9)
     np.testing.assert_array_equal((flags & BITS[DRIFT]) != 0, contact)

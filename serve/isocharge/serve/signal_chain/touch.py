@@ -81,12 +81,14 @@ The charges of a touch may have any sign, so the angle of another touch is about
 class Touch(Stage):
     """Determines whether something touches the film.
 
-    A touch begins when the charges differ from the base by more than the touch threshold. The base consists of the
-    charges that remained after the last release. The base follows charges that fall further, and decays exponentially.
+    A touch begins when the charges, and their difference from the base, exceed the touch threshold. The base consists
+    of the charges that remained after the last release. The base follows charges that fall further, and decays
+    exponentially.
 
-    After a long press, an amplifier with a leak shows charges of the opposite sign. A change in the direction opposite
-    to the latest touch is therefore no touch, and the base becomes the mean of the latest charges. If all charges of a
-    film are known to be positive, the same rule applies to charges that become negative before the first touch.
+    After a long press, an amplifier with a leak shows charges of the opposite sign. Charges or a change of the charges
+    in the direction opposite to the latest touch are therefore no touch. After such a change, the base becomes the mean
+    of the latest charges. If all charges of a film are known to be positive, the same rules apply to charges that
+    become negative before the first touch.
 
     A touch ends when the size of the charges falls below the release threshold. A touch also ends when the charges
     change their sign from one frame to the next. On a film whose charges are positive, a touch ends when the charges
@@ -96,7 +98,8 @@ class Touch(Stage):
 
     If the mean charges of the last `RISE_S` have already exceeded half of the touch threshold when a touch begins, the
     charges have risen slowly, and a drift of the charge at rest may have caused the touch. All frames of the touch then
-    have the flag `drift`. For a board that sends currents, three quarters of the threshold must be exceeded.
+    have the flag `drift`. For a board that sends currents, three quarters of the threshold must be exceeded. A touch
+    also has the flag if the latest charges were opposite to it, as after a long press with a leak.
 
     If charges exceed the touch threshold in the direction opposite to a touch, the frame has the flag `negative`.
     """
@@ -119,14 +122,14 @@ class Touch(Stage):
         """Discard the touch."""
         n_electrode = len(self._setup.electrodes)
         # Charges and sizes are relative to the touch thresholds. The size of charges is the norm of their vector.
-        self._touch_direction: Array | None = None  # sum of the directions of the frames of the latest touch
+        self._touch_direction = self._rest_direction  # sum of the directions of the frames of the latest touch
         self._base_charge = np.zeros(n_electrode)  # charges that are no touch
         self._previous_charge = np.zeros(n_electrode)  # charges of the previous frame
         self._idle_mean_charge = np.zeros(n_electrode)  # exponential mean of the charges out of contact
-        self._rose_slowly = False  # whether the charges rose too slowly at the beginning of this touch
+        self._may_have_drifted = False  # whether the charge at rest may have drifted before this touch
         self._is_contact = False
         self._peak_size = 0.0  # largest size in this touch
-        self._rest_s = 0.0  # time for which the charges have been small
+        self._rest_s = math.inf  # time for which the charges have been small
 
     @property
     def _rest_direction(self) -> Array:
@@ -144,23 +147,21 @@ class Touch(Stage):
                 self._noise_pC = frame.noise_pC
                 self._threshold_pC = self._rule.threshold_pC(frame.noise_pC)
             charge = frame.charge_pC / self._threshold_pC
-            direction = self._rest_direction if self._touch_direction is None else self._touch_direction
             if self._is_contact:
-                self._continue(self._rule, charge, direction)
+                self._continue(self._rule, charge)
             else:
-                self._await(frame, charge, direction)
+                self._await(frame, charge)
             self._previous_charge = charge
         frame.is_contact = self._is_contact
-        if self._is_contact and self._rose_slowly:
+        if self._is_contact and self._may_have_drifted:
             frame.flags.append(DRIFT)
 
-    def _continue(self, rule: TouchRule, charge: Array, direction: Array) -> None:
+    def _continue(self, rule: TouchRule, charge: Array) -> None:
         """Update the present touch with the charges of a frame, or end the touch.
 
         Args:
             rule: Thresholds.
             charge: Charges relative to the touch thresholds, shape (n_electrode,), dimensionless.
-            direction: Sum of the directions of the earlier frames of the touch, shape (n_electrode,), dimensionless.
         """
         # Update the peak, from which the release threshold follows.
         size = _norm(charge)
@@ -177,21 +178,24 @@ class Touch(Stage):
             self._idle_mean_charge = charge
             self._rest_s = 0.0
         else:
-            self._touch_direction = direction + charge / size
+            self._touch_direction = self._touch_direction + charge / size
 
-    def _await(self, frame: Frame, charge: Array, direction: Array) -> None:
+    def _await(self, frame: Frame, charge: Array) -> None:
         """Update the base, which contains the charges that belong to no touch, or begin a touch.
 
-        A touch begins if the charges above the base exceed the threshold in the expected direction. The base decays to
-        zero. If the charges change against this direction, the base becomes the mean of the latest charges.
+        A touch begins if both the charges and the charges above the base exceed the threshold in the expected
+        direction. The base decays to zero. If the charges change against this direction, the base becomes the mean of
+        the latest charges. While charges of the latest touch may remain, the expected direction is that of the latest
+        touch. Later, the direction is the one that all touches share, or zero if a touch may have any direction.
 
         Args:
             frame: The frame.
             charge: Charges relative to the touch thresholds, shape (n_electrode,), dimensionless.
-            direction: Expected direction of a touch, shape (n_electrode,), dimensionless. While charges of the latest
-                touch may remain, the direction is that of the latest touch. Later, the direction is the one that all
-                touches share, or zero if a touch may have any direction.
         """
+        if self._rest_s >= RISE_S - SUM_TOLERANCE_s:
+            self._touch_direction = self._rest_direction
+        direction = self._touch_direction
+        largest_opposing = OPPOSING_COSINE * _norm(direction)
         # After a touch, the base is the charge that remains of it. While the finger leaves the film, the charge at rest
         # is held, and the base must not decay, because the finger still causes this charge.
         is_remainder = self._base_charge @ direction > 0.0
@@ -200,15 +204,15 @@ class Touch(Stage):
         size = _norm(charge)
         change = charge - self._base_charge
         change_size = _norm(change)
-        if change @ direction < OPPOSING_COSINE * change_size * _norm(direction):
+        if change @ direction < largest_opposing * change_size:
             self._base_charge = self._idle_mean_charge  # a release or a drift, and not the noise of a single frame
-        elif change_size > 1.0:  # a touch begins
+        elif min(size, change_size) > 1.0 and charge @ direction >= largest_opposing * size:  # a touch begins
             self._is_contact = True
             self._peak_size = min(size, _norm(self._previous_charge))  # a spike of a single frame is not a peak
-            self._touch_direction = charge / max(size, 1.0)
+            self._touch_direction = charge / size
             # The sum of the noise of currents changes slowly. The mean of the latest charges still contains it.
             limit = 0.75 if self._setup.device.has_currents else 0.5
-            self._rose_slowly = _norm(self._idle_mean_charge - self._base_charge) > limit
+            self._may_have_drifted = _norm(self._idle_mean_charge - is_remainder * self._base_charge) > limit
             return
         elif is_remainder and size < _norm(self._base_charge):
             self._base_charge = charge  # the charge that remains of the latest touch becomes smaller
@@ -217,8 +221,6 @@ class Touch(Stage):
         if size > 1.0 and charge @ direction < 0.0:
             frame.flags.append(NEGATIVE)
         self._rest_s = 0.0 if size > 1.0 else self._rest_s + frame.dt_s
-        if self._rest_s >= RISE_S - SUM_TOLERANCE_s:
-            self._touch_direction = None
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:

@@ -308,7 +308,7 @@ static void update_contact(isocharge_chain *chain, const real charge_pC[N], real
 #if ISOCHARGE_TOUCH_ON
     const real root = SQRT((real)N), half_root = SQRT((real)0.5);
     const real sizes = root + (real)ISOCHARGE_TOUCH_SIGMAS * half_root;
-    real charge[N], change[N], size, change_size, two_frame_peak, rising;
+    real charge[N], change[N], size, change_size, opposing, two_frame_peak, rising;
     int reversed, remainder;
 
     EACH(k) charge[k] = charge_pC[k] / larger(sizes * chain->noise_pC[k] + (real)ISOCHARGE_TOUCH_FLOOR_PC / root, (real)1e-12);
@@ -338,15 +338,16 @@ static void update_contact(isocharge_chain *chain, const real charge_pC[N], real
         change[k] = charge[k] - chain->base[k];
     }
     change_size = size_of(change);
-    if (dot(change, chain->direction) < (real)-0.25 * change_size * size_of(chain->direction)) {
+    opposing = (real)-0.25 * size_of(chain->direction);
+    if (dot(change, chain->direction) < opposing * change_size) {
         copy(chain->base, chain->mean); /* the opposite of a touch, such as the end of a long press */
-    } else if (change_size > 1) {
+    } else if (smaller(size, change_size) > 1 && dot(charge, chain->direction) >= opposing * size) {
         chain->contact = 1;
         chain->peak = two_frame_peak;
         EACH(k)
         {
-            chain->direction[k] = charge[k] / larger(size, 1);
-            change[k] = chain->mean[k] - chain->base[k];
+            chain->direction[k] = charge[k] / size;
+            change[k] = chain->mean[k] - (remainder ? chain->base[k] : 0);
         }
         chain->slow = size_of(change) > (real)0.5;
         return;
