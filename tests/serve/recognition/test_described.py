@@ -258,7 +258,8 @@ def test_datagrams_are_recognised_even_if_a_line_feed_was_added_to_some():
     [
         ("", "{k},{ms},{q}", 500, {"columns": ["seq", "t_ms", "ch1"]}),
         ("seq,millis,north,south", "{k},{ms},{q},1.5", 500, {"columns": ["seq", "t_ms", "north", "south"]}),
-        ("", "{wrapping};{q};7", 500, {}),
+        ("", "{k}5;{q};7", 500, {}),
+        ("", "17 {ms_of_second} {q}", 500, {}),
         ("", '{{"i": {k}, "at": {unix_s:.4f}, "x": {q}}}', 500, {"seq": "i", "t_s": "at"}),
         ("", "micros:{ms}000,q:{q}", 500, {"t_us": "micros"}),
         ("", "A:{q},B:{q}5", 500, {}),
@@ -277,7 +278,7 @@ def test_counter_and_clock_columns_in_text_are_recognised(header, notation, rate
     for k, q in enumerate(rng.normal(5.0, 0.3, 2000).round(3)):
         time_ms = 5000 + 1e3 / rate_Hz * k
         times = {"ms": int(time_ms), "late_ms": int(time_ms + 1.1 * rng.random()), "unix_s": 1.7e9 + time_ms / 1e3}
-        lines.append(notation.format(k=k, q=q, wrapping=5 * k % 65536, **times))
+        lines.append(notation.format(k=k, q=q, ms_of_second=2 * k % 1000, **times))
     lines.insert(1000, header)
     assert recognise(["\n".join([*lines, ""]).encode()], 2000 / rate_Hz) == {"format": "text"} | expected
 

@@ -29,7 +29,7 @@ CHANNEL = "channel"
 """Name of all channels during the recognition."""
 
 
-def identify(steps: Array, frame_rate_Hz: float, tolerance: float = 0.04) -> tuple[bool, tuple[str, float] | None]:
+def identify(steps: Array, frame_rate_Hz: float, tolerance: float = 0.04) -> tuple[bool, tuple[str, float] | None, int]:
     """Determine whether the values of consecutive frames are those of a frame counter or of a clock.
 
     A counter increases by 1. A clock has one of the usual tick rates of boards. At about 1000 frames per second, a
@@ -45,17 +45,20 @@ def identify(steps: Array, frame_rate_Hz: float, tolerance: float = 0.04) -> tup
     Returns:
         Whether the values are those of a counter. For values that may be those of a clock, also the name of the field,
         which is `t_s`, `t_ms` or `t_us`, and the duration of one tick in the unit of this name; otherwise None.
+        Finally, how often the values wrap. A damaged value also causes a step back, but causes a step forwards, too.
     """
     median_step = np.median(steps)
+    large_step = 20.0 * median_step
+    wrap_count = int((steps < -large_step).sum() - (steps > large_step).sum())
     regular_steps = steps[np.abs(steps - median_step) <= 0.7 * median_step]
     if len(regular_steps) < INTACT_SHARE * len(steps):
-        return False, None
+        return False, None, wrap_count
     ticks_per_frame = float(regular_steps.mean())
     tick_rate_Hz = ticks_per_frame * frame_rate_Hz
     deviation, nearest_tick_rate_Hz = min((abs(tick_rate_Hz / usual_Hz - 1.0), usual_Hz) for usual_Hz in CLOCKS)
     clock = CLOCKS[nearest_tick_rate_Hz] if deviation < tolerance else None
     is_counter = ticks_per_frame == 1.0 and (clock is None or bool(np.mean(steps == 0.0) < 0.01))
-    return is_counter, clock
+    return is_counter, clock, wrap_count
 
 
 class Weights:
@@ -178,12 +181,8 @@ def _number_parts(
         half_range = 1 << (8 * size - 1)
         counter_steps = (steps + half_range) % (2 * half_range) - half_range  # a counter that overflows restarts at 0
 
-    is_counter, clock = identify(counter_steps, frame_rate_Hz)
-    # Upper bytes that do not change while the number wraps do not belong to it. A damaged byte may also cause
-    # a step back, but causes a step forwards, too.
-    large_step = 20.0 * np.median(counter_steps)
-    wraps_early = (counter_steps < -large_step).sum() > (counter_steps > large_step).sum()
-    if not wraps_early:
+    is_counter, clock, wrap_count = identify(counter_steps, frame_rate_Hz)
+    if wrap_count <= 0:  # otherwise, upper bytes that do not change while the number wraps do not belong to it
         score = Weights.constant_high * (is_constant & ~is_zero).sum() if size == 3 else 0.0
         if is_counter:
             yield Part(SEQ, type_name, size, score)  # the values of a counter need no bits

@@ -199,7 +199,8 @@ def _is_text(data: bytes, min_share: float = 0.85) -> bool:
 def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) -> dict[str, Any]:
     """Return the keys that describe the counter, the clock and the columns of lines of text in a device file.
 
-    A counter increases by 1 from frame to frame, and a clock increases at one of the usual rates. A clock in ms that
+    A counter increases by 1 from frame to frame, and a clock increases at one of the usual rates. The milliseconds of a
+    time whose seconds are in another column are no clock, because they return to 0 every second. A clock in ms that
     increases by about 1 could also be a counter. Its name, or values that occur twice, show that it is a clock. If the
     parser has already recognised a counter or a clock, the function does not search for another one.
 
@@ -215,20 +216,17 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
     """
     names = list(layout.names)
     keys: dict[str, Any] = {}
-    unnamed_channels: list[int] = []
     steps = np.diff([frame.values for frame in frames], axis=0)  # shape (n - 1, channels)
     for (column, _), channel_steps in zip(layout.columns.channels, steps.T, strict=True):
         name = names[column]
         meaning = ""
-        is_counter, clock = identify(channel_steps, frame_rate_Hz)
+        is_counter, clock, wrap_count = identify(channel_steps, frame_rate_Hz)
         has_time_name = clock is not None and any(word in name.lower() for word in ("ms", "milli", "time"))
         if is_counter and SEQ not in names and not has_time_name:
             meaning = SEQ
-        # A device file for lines of text cannot state another duration of a tick.
-        elif clock is not None and clock[1] == 1.0 and TIMES_US.keys().isdisjoint(names):
+        # A device file for lines of text cannot state another duration of a tick. A usual clock wraps at most once.
+        elif clock is not None and clock[1] == 1.0 and wrap_count < 2 and TIMES_US.keys().isdisjoint(names):
             meaning = clock[0]
-        elif not name:
-            unnamed_channels.append(column)
         if meaning:
             names[column] = meaning
             if column not in layout.unnamed:
@@ -236,7 +234,6 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
 
     # Number the channels without names. Without names from a header, a counter or a clock, the columns need no names.
     if any(names[column] for column in layout.unnamed):
-        for number, column in enumerate(unnamed_channels, 1):
-            names[column] = f"ch{number}"
-        keys["columns"] = [names[column] for column in layout.unnamed]
+        channel_numbers = count(1)
+        keys["columns"] = [names[column] or f"ch{next(channel_numbers)}" for column in layout.unnamed]
     return keys
