@@ -89,15 +89,14 @@ def test_bad_press_and_press_outside_are_named_by_their_lines(fit, press_film):
     result = fit(presses)
     assert result.bad_lines == (6,)
     assert result.cautions[0].startswith("line 10: a calibration takes presses within 8.5 mm")
-    assert any(caution.startswith("line 6: does not agree") for caution in result.cautions)
+    assert "'line 6: does not agree" in str(result.cautions)
 
 
 def test_forces_that_scatter_more_than_stated_are_named(fit, press_film):
     presses = press_film(25, seed=14)
-    scattered = presses.contact
-    scattered[:, 2] *= np.exp(0.04 * np.random.default_rng(0).standard_normal(25))
-    result = fit(replace(presses, contact=np.clip(scattered, [-9, -9, 0.05], [9, 9, 2.0])))
-    assert any("about 3 % more than stated: is the load cell zero" in caution for caution in result.cautions)
+    presses.contact[:, 2] *= np.exp(0.04 * np.random.default_rng(0).standard_normal(25))
+    presses.contact.clip([-9, -9, 0.05], [9, 9, 2.0], out=presses.contact)
+    assert "about 3 % more than stated: is the load cell zero" in str(fit(presses).cautions)
 
 
 def presses_on_changed_film(problem, press_film, **changes):
@@ -125,7 +124,7 @@ def test_presses_at_one_place_are_named(fit, problem, synthetic):
     charge = synthetic.charges(synthetic.values, contact)
     contact[:, :2] += 0.005 * np.random.default_rng(0).standard_normal((8, 2))
     cautions = fit(measured_presses(problem, contact, charge)).cautions
-    assert any("at one place" in caution for caution in cautions)
+    assert "at one place" in str(cautions)
 
 
 def test_presses_with_few_known_values_change_nothing(fit, press_film):
@@ -186,11 +185,8 @@ def test_proposed_presses_reduce_the_errors_as_announced(fit, press_film, proble
     charge = synthetic.charges(synthetic.values, contact)
     chosen = fit(measured_presses(problem, contact, charge)).film_error.position_mm
     assert chosen == pytest.approx(errors[-1], rel=0.6)
-    random_errors = []
-    for seed in range(3):
-        presses = press_film(6, seed, values=synthetic.values)
-        random_errors.append(fit(presses).film_error.position_mm)
-    assert chosen < np.mean(random_errors)
+    random_presses = (press_film(6, seed, values=synthetic.values) for seed in range(3))
+    assert chosen < np.mean([fit(presses).film_error.position_mm for presses in random_presses])
 
 
 def test_errors_that_are_announced_after_noisy_presses_contain_the_noise(fit, problem, synthetic):
@@ -210,16 +206,16 @@ def test_errors_that_are_announced_after_noisy_presses_contain_the_noise(fit, pr
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda p: replace(p, contact=np.full_like(p.contact, np.nan))[np.arange(3)], None),
         (lambda p: replace(p, contact=p.contact + np.array([20.0, 0.0, 0.0])), r"and of .* N \(--radius\); is it"),
         (lambda p: replace(p, contact=p.contact[::-1].copy()), "no film of 'four-25um-biaxial' explains these 12"),
     ],
 )
 def test_presses_that_no_film_explains_are_refused(fit, press_film, change, message):
-    presses = press_film(12, seed=21)
-    changed = change(presses)
-    if message is None:  # four charges of unknown contacts are accepted
-        assert len(fit(changed).presses) == 3
-        return
     with pytest.raises(PressError, match=message):
-        fit(changed)
+        fit(change(press_film(12, seed=21)))
+
+
+def test_four_charges_of_unknown_contacts_are_accepted(fit, press_film):
+    presses = press_film(3, seed=21)
+    presses.contact[:] = np.nan
+    assert len(fit(presses).presses) == 3

@@ -4,14 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.train.calibration.conftest import rig, uneven_film
+from tests.train.calibration.conftest import film_values, rig, uneven_film
+from tests.train.calibration.synthetic_film import SyntheticFilm
 
 from isocharge.train import calibrate
 from isocharge.train.calibration import compact_map
 from isocharge.train.calibration.calibrate import solve_even
 from isocharge.train.calibration.compact_map import _ChangedFilm, _nodes
 from isocharge.train.calibration.film_charges import FilmCharges
+from isocharge.train.data.presses import draw_contacts
 from solved_charges import solved_charges, with_film
+
+CONTACT = np.array([[3.0, 2.0, 0.5], [-5.0, 1.0, 1.5]])
 
 
 @pytest.mark.slow
@@ -35,11 +39,10 @@ def test_derivatives_of_a_film_after_warming_are_those_with_respect_to_the_calib
 ):
     """If the calibrated film was tauter or more uneven than estimated, so is the film after warming."""
     monkeypatch.setattr(FilmCharges, "of_even_film", lambda *_: synthetic)
-    contact = np.array([[3.0, 2.0, 0.5], [-5.0, 1.0, 1.5]])
 
     def charges_after(values, change_MPa=-0.3):
         calibrated = _ChangedFilm(0.0, synthetic, values, np.eye(values.size))
-        return calibrated.changed(change_MPa, None).linearised(contact)
+        return calibrated.changed(change_MPa, None).linearised(CONTACT)
 
     values = uneven_film(problem).film_values
     _, derivatives = charges_after(values)
@@ -62,19 +65,29 @@ def test_no_node_makes_a_film_slack_in_one_direction(problem):
 def test_node_at_which_the_charges_are_unknown_is_left_out(problem, synthetic, monkeypatch, caplog):
     """Otherwise, the fit to its charges would also spoil the charges at the other nodes."""
 
-    def factors(charge, _node_MPa):
-        ratio = 0.5 * np.random.default_rng(3).standard_normal(charge.shape)
-        return 1.0 + ratio * np.array([0.0, 0.0, 1.0])[:, None]
+    def node_charges(charge, changed_charge, _node_MPa):
+        ratio = 0.5 * np.random.default_rng(3).standard_normal(changed_charge.shape)
+        return charge * (1.0 + ratio * np.array([0.0, 0.0, 1.0])[:, None])
 
     monkeypatch.setattr(compact_map, "_nodes", lambda _: np.array([-0.3, 0.0, 0.9]))
-    monkeypatch.setattr(compact_map, "_tension_factors", factors)
+    monkeypatch.setattr(compact_map, "_node_charges", node_charges)
     monkeypatch.setattr(FilmCharges, "of_even_film", lambda *_: synthetic)
     series = compact_map.compact_charges(problem.domain, synthetic, uneven_film(problem), None)
     assert series.node_MPa.tolist() == [-0.3, 0.0]
     assert "changes from -0.3 to +0 MPa can be followed" in caplog.text
-    contact = np.array([[3.0, 2.0, 0.5], [-5.0, 1.0, 1.5]])
-    expected = synthetic.charges(uneven_film(problem).film_values, contact)
-    np.testing.assert_allclose(series.charges(contact), expected, rtol=0.01)
+    expected = synthetic.charges(uneven_film(problem).film_values, CONTACT)
+    np.testing.assert_allclose(series.charges(CONTACT), expected, rtol=0.01)
+
+
+def test_charges_change_their_sign_with_the_pretension(problem, synthetic, monkeypatch):
+    charges = SyntheticFilm.charges
+    monkeypatch.setattr(SyntheticFilm, "charges", lambda *arguments: charges(*arguments) - 30.0)
+    monkeypatch.setattr(FilmCharges, "of_even_film", lambda *_: synthetic)
+    series = compact_map.compact_charges(problem.domain, synthetic, uneven_film(problem), None)
+    contact = draw_contacts(np.random.default_rng(4), problem.domain, 300)
+    later = film_values(synthetic.prior, pretension=2.1, tension_difference=-0.3 / 2.1)
+    found = series.in_state(contact, [0.9]).charge_pC
+    np.testing.assert_allclose(found, synthetic.charges(later, contact), atol=2.5)
 
 
 @pytest.mark.slow

@@ -98,7 +98,7 @@ def test_split_keeps_positions_together_and_does_not_depend_on_the_order_or_on_o
 
 
 def test_positions_of_an_encoder_with_noise_are_merged_to_places_but_not_scattered_positions(sensor):
-    places = np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
+    places = np.argwhere(np.ones((6, 6)))
     reported = np.repeat(places, 60, axis=0) + np.random.default_rng(1).normal(0.0, 0.005, (60 * len(places), 2))
     contact = np.column_stack([reported, np.ones(len(reported))])
     merged = merged_places(contact)

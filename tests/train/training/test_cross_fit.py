@@ -175,7 +175,7 @@ def test_pressed_area_contains_its_own_presses_and_no_others(released_pad):
 
 
 def test_outline_of_a_square_grid_is_larger_by_half_the_grid_step():
-    places = np.stack(np.meshgrid(np.arange(11.0), np.arange(11.0)), axis=-1).reshape(-1, 2)
+    places = np.argwhere(np.ones((11, 11)))
     assert sorted(map(tuple, outline(places))) == [(-0.5, -0.5), (-0.5, 10.5), (10.5, -0.5), (10.5, 10.5)]
     contact = np.column_stack([places, np.ones(len(places))])
     assert PressedArea.of_contacts(contact).radius == pytest.approx(5.5 * np.sqrt(2.0))
@@ -294,8 +294,10 @@ def test_presses_of_one_force_or_without_forces_train_x_and_y(force_N, stated_N,
     stated = f"every answer is {stated_N:g} N with a standard deviation of {100.0 * stated_std:g} %"
     assert f"| forces | not estimated: {stated}" in (folder / "card.md").read_text()
     np.testing.assert_array_equal(read_presses(folder / "presses.csv").contact, presses.contact)
-    assert np.isfinite(Predictor(folder).predict(presses.charge_pC[0])[:7]).all()
-    assert Predictor(folder).flags(Predictor(folder).predict(presses.charge_pC[0])) == ()
+    predictor = Predictor(folder)
+    answer = predictor.predict(presses.charge_pC[0])
+    assert np.isfinite(answer[:7]).all()
+    assert predictor.flags(answer) == ()
 
 
 def test_unknown_forces_that_vary_are_not_taken_for_noise():

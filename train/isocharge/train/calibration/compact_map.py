@@ -5,9 +5,9 @@ charges. These combinations are called directions. The compact charge map contai
 direction. The training uses them to draw films, and the live follower uses them to find out how the real film differs
 from the estimated one.
 
-The nodes of the map are films with other pretensions. Their charges are those of the calibrated film, times a ratio:
-that of the charges of two nearly axisymmetric films, with the other pretension and with that of the calibration. The
-changes along the directions are also computed for these films, because they depend on the pretension.
+The nodes of the map are films with other pretensions. Their charges are those of the calibrated film, changed by the
+ratio or the difference of the charges of two nearly axisymmetric films, with the other pretension and with that of the
+calibration. The changes along the directions are also computed for these films, because they depend on the pretension.
 
 Worker processes compute the charges of the films. This module does not import torch, so that they start quickly.
 """
@@ -32,7 +32,7 @@ from isocharge.train.data.presses import LOWEST_CHARGE, draw_contacts
 
 log = logging.getLogger(__name__)
 
-SERIES_CONTACTS = 3600
+SERIES_CONTACTS = 6800
 """Number of contacts to which the series of the charges are fitted."""
 
 DIRECTION_CONTACTS = 1200
@@ -77,7 +77,7 @@ def compact_charges(
     discrepancy = discrepancy_jacobian(film_charge, contact, charges.domain) @ film.values[film.layout.coefficients]
     charge = film_charge + discrepancy  # most probable charges without offset, shape (n, n_electrode)
     node_MPa = np.array([one.change_MPa for one in films])
-    node_charge = charge[:, None] * _tension_factors(np.stack(changed_charges, axis=1), node_MPa)
+    node_charge = _node_charges(charge[:, None], np.stack(changed_charges, axis=1), node_MPa)
     series = _fit_followable_nodes(domain, names, contact, node_charge, node_MPa)
     few_contacts, few_charges = contact[:DIRECTION_CONTACTS], charge[:DIRECTION_CONTACTS]
     followed_films = [one for one in films if one.change_MPa in series.node_MPa]
@@ -192,24 +192,28 @@ def _nodes(film: FilmEstimate) -> Array:
     node_MPa = np.array(NODES_MPa)
     sensor, _ = film.layout.prior.film(film.film_values)
     lowest_MPa = -0.95 * (sensor.film.pretension - np.hypot(*sensor.film.deviator))
-    factor = min(1.0, lowest_MPa / node_MPa.min())
-    return np.unique(np.where(node_MPa < 0.0, factor * node_MPa, node_MPa))
+    node_MPa[node_MPa < 0.0] *= min(1.0, lowest_MPa / node_MPa.min())
+    return np.unique(node_MPa)
 
 
-def _tension_factors(charge: Array, node_MPa: Array) -> Array:
-    """Compute the factors by which changes of the pretension multiply the charges.
+def _node_charges(charge: Array, changed_charge: Array, node_MPa: Array) -> Array:
+    """Compute the charges of the calibrated film at the nodes from those of axisymmetric films.
 
-    If a change reverses the sign of a charge, no factor can describe it, and the result is 1.
+    If all charges have the same sign, the ratio of two of them hardly depends on the neglected properties of the film.
+    Otherwise, some charges are nearly zero or change their sign, so that the difference is used instead of the ratio.
 
     Args:
-        charge: Charges of films with changed pretensions, shape (n, n_node, n_electrode), pC.
+        charge: Charges of the calibrated film, shape (n, 1, n_electrode), pC.
+        changed_charge: Charges of the axisymmetric films at the nodes, shape (n, n_node, n_electrode), pC.
         node_MPa: Changes of the pretension, one of which is zero, shape (n_node,), MPa.
 
     Returns:
-        Factors, shape (n, n_node, n_electrode), dimensionless.
+        Charges, shape (n, n_node, n_electrode), pC.
     """
-    charge_before = charge[:, node_MPa == 0.0]
-    return np.divide(charge, charge_before, out=np.ones_like(charge), where=charge_before * charge > 0.0)
+    charge_before = changed_charge[:, node_MPa == 0.0]
+    if np.ptp(np.sign(changed_charge)):  # not all signs are equal
+        return charge + changed_charge - charge_before
+    return charge * changed_charge / charge_before
 
 
 def _directions(
