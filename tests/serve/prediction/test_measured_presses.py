@@ -98,6 +98,7 @@ def test_default_uncertainty_fills_empty_cells(read):
         (f"{HEADER}\n1,2,3,4,5,6\n1,2,x,4,5,6\n", "line 3, column 'force_N': expected a positive force in N.*got 'x'"),
         (f"{HEADER}\n1,inf,3,4,5,6\n", "line 2, column 'y_mm': expected a position in mm.*got 'inf'"),
         (f"{HEADER}\n1,1e999,3,4,5,6\n", "line 2, column 'y_mm': .*got '1e999'"),
+        (f"{HEADER}\nmm,mm,g,pC,pC,pC\n1,2,3,4,5,6\n", "got 'pC'; a row of units may only contain mm, N and pC"),
         (f"{HEADER}\n\n1,2,0,4,5,6\n", "line 3, column 'force_N': expected a positive force in N.*got 0$"),
         (
             f"{HEADER},position_std_mm\n1,2,3,4,5,6,0\n",

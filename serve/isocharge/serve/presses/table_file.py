@@ -186,6 +186,8 @@ class CsvTable:
                 if number is None:
                     has_other_mark = self._mark != "" and any(mark in cell for mark in ",." if mark != self._mark)
                     advice = f"; the decimal mark is {self._mark!r}" if has_other_mark else ""
+                    if "pC" in cell:  # this cell is right, but another one is wrong
+                        advice = "; a row of units may only contain mm, N and pC"
                     raise self.error(
                         f", line {line_number}, column {shown(name)}: expected {rules[name].description}, got "
                         f"{shown(cell)}{advice}"
