@@ -23,15 +23,16 @@ pytestmark = pytest.mark.usefixtures("never_solved")
 
 EXPLAINED = {
     "columns": (lambda c, q: (c, q[:, [1, 2, 0, 3]]), "columns are swapped: those named A, B, C, D hold B, C, A, D"),
-    "rotated": (lambda c, q: (c @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]]), q), "turned by -?90 degrees"),
+    "rotated": (lambda c, q: (c[:, [1, 0, 2]] * [-1.0, 1.0, 1.0], q), "turned by -?90 degrees"),
     "mirrored": (lambda c, q: (c * [-1.0, 1.0, 1.0], q), "x is mirrored"),
     "millinewtons": (lambda c, q: (c / [1.0, 1.0, 1e-3], q), "forces are in mN, not N"),
+    "gain": (lambda c, q: (c, q * [1.0, 1.0, 9.0, 1.0]), "the gain of C is about 6 times"),
     "nanocoulombs": (lambda c, q: (c, q / 1e3), "charges are in nC, not pC"),
 }
 """Functions that put a mistake into contacts and charges, and the sentence that names the mistake."""
 
 IMPOSSIBLE = {
-    "metres": (lambda c, q: (c / [1e3, 1e3, 1.0], q), "written in metres"),
+    "metres": (lambda c, q: (c / [1e3, 1e3, 1.0], q), "positions are in m, not mm"),
     "micrometres": (lambda c, q: (c * [1e3, 1e3, 1.0], q), "off the film"),
     "dead": (lambda c, q: (c, np.where(np.arange(4) == 2, 0.4, q)), r"electrode 'C' is dead.* 0\.4 pC, 0\.\d+ % of"),
     "negative": (

@@ -17,7 +17,7 @@ from isocharge.simulate import NoiseModel, noise_model
 from isocharge.simulate.mechanics.warming import warmed
 from isocharge.train.calibration import estimator
 from isocharge.train.calibration.contact_error import ContactSensitivity
-from isocharge.train.calibration.estimator import NOISE_RATIOS, Hypothesis, Prior, estimate, hypotheses
+from isocharge.train.calibration.estimator import NOISE_RATIOS, Hypothesis, estimate, hypotheses
 from isocharge.train.calibration.film_estimate import SESSION, terms
 from isocharge.train.calibration.press_data import Linearised, PressData, PressErrors, in_domain
 from isocharge.train.data.presses import draw_contacts
@@ -131,13 +131,11 @@ def test_ellipses_of_contacts_contain_95_percent_on_films_of_all_hypotheses(prob
         unknowns = draw_unknowns(problem, hypothesis, rng)
         presses = presses_on(replace(problem, noise=hypothesis.errors.noise), synthetic, unknowns, 8, rng)
         film = film_estimate(problem, synthetic, presses).film
-        gain = ContactSensitivity.of(film, synthetic, problem.domain).film_gain[:, :2]
         # The offset and the drift of the session are not errors of later contacts in this comparison.
         lasting = np.r_[problem.prior.layout.film, problem.prior.layout.coefficients]
-        error = gain[:, :, lasting] @ (film.values - unknowns)[lasting]
-        covariance = (
-            gain[:, :, lasting] @ film.covariance[np.ix_(lasting, lasting)] @ gain[:, :, lasting].swapaxes(1, 2)
-        )
+        gain = ContactSensitivity.of(film, synthetic, problem.domain).film_gain[:, :2, lasting]
+        error = gain @ (film.values - unknowns)[lasting]
+        covariance = gain @ film.covariance[np.ix_(lasting, lasting)] @ gain.swapaxes(1, 2)
         squared = (error * np.linalg.solve(covariance, error[:, :, None])[:, :, 0]).sum(axis=1)
         within.append((squared < chi2.ppf(0.95, 2)).mean())
     assert 0.88 < np.mean(within) <= 0.99
@@ -194,11 +192,11 @@ def test_touches_at_unknown_places_find_a_change_of_the_pretension(problem, synt
     changed[0] += 0.3 if values[0] < 2.0 else -0.3
     _, contact, touches = rig(problem, synthetic, 40, seed=6, values=changed)
     touches.contact[:] = np.nan
-    prior = Prior(problem.prior.layout, before.drifted())
-    found = film_estimate(replace(problem, earlier=prior.earlier), synthetic, touches)
+    earlier = before.drifted()
+    found = film_estimate(replace(problem, earlier=earlier), synthetic, touches)
     std = found.film.std("pretension")
     assert abs(found.film.value("pretension") - changed[0]) < 3.0 * std
-    assert std < 0.6 * np.sqrt(prior.earlier.covariance[0, 0])
+    assert std < 0.6 * earlier.std("pretension")
     assert np.median(np.hypot(*(found.contact - contact)[:, :2].T)) < 0.3
 
 

@@ -245,7 +245,7 @@ class FilmPrior:
             std = min(0.3, 0.3 * radius)
             probe_properties.append(FilmProperty("probe_radius", "radius of the probe", "mm", std, 0.01, bounds=bounds))
         gains = [
-            FilmProperty(f"gain {name}", f"ln of the gain of {name}", "1", 0.05, 0.005)
+            FilmProperty(f"gain {name}", f"ln of the gain of {name}", "1", 0.05, 0.005, bounds=(-1.5, 1.5))
             for name in self.sensor.electrode_names
         ]
         return (*film_properties, *probe_properties, *gains)

@@ -93,12 +93,11 @@ def calibrate(
     is_outside = problem.solved_domain.is_outside(ordered_presses.contact)
     used_presses = ordered_presses[~is_outside]
     cautions = []
-    outside_words = ""
+    outside_words = (
+        f"{ordered_presses[is_outside].line_words}: a calibration takes presses {domain_words(problem.solved_domain)} "
+        "(--radius)"
+    )
     if is_outside.any():
-        outside_words = (
-            f"{ordered_presses[is_outside].line_words}: a calibration takes presses "
-            f"{domain_words(problem.solved_domain)} (--radius)"
-        )
         if len(ordered_presses) == 1 or _is_uninformative(used_presses):
             raise PressError(outside_words)
         cautions.append(f"{outside_words}; left out")
@@ -111,8 +110,7 @@ def calibrate(
             raise unexplained_error(used_presses, charges, "their charges are very different from those of its films")
         data = PressData.of(used_presses, problem.noise, problem.solved_domain)
         estimation = _fit_even_film(problem, data, charges, executor)
-        lowest, highest = problem.prior.layout.prior.bounds
-        is_at_end = (estimation.film.film_values <= lowest) | (estimation.film.film_values >= highest)
+        is_at_end = np.equal(estimation.film.film_values, problem.prior.layout.prior.bounds)
         is_doubtful = estimation.hypothesis.errors.position_ratio > 1.0 or is_at_end.any()
         if is_doubtful and find_mistakes(used_presses, charges):
             raise unexplained_error(
@@ -124,8 +122,11 @@ def calibrate(
                 cautions.append(NOT_CONVERGED)
         if estimation.is_unexplained:
             residual = np.sqrt(estimation.chi2 / estimation.redundancy)
-            reason = f"the charges of the best film differ from theirs by {residual:.2g} times the noise"
-            raise unexplained_error(used_presses, estimation.charges, reason)
+            raise unexplained_error(
+                used_presses,
+                estimation.charges,
+                f"the charges of the best film differ from theirs by {residual:.2g} times the noise",
+            )
         _check_placement(estimation.film)
         sensitivity = ContactSensitivity.of(estimation.film, estimation.charges, problem.domain)
     return CalibrationResult(
@@ -226,9 +227,8 @@ def _check_placement(film: FilmEstimate) -> None:
             that neither the estimate nor its standard deviation is right.
     """
     for film_property in film.layout.prior.properties:
-        lowest, highest = film_property.limits
         value = film.value(film_property.name)
-        if film_property.name in PLACEMENT and not lowest < value < highest:
+        if film_property.name in PLACEMENT and value in film_property.limits:
             raise PressError(
                 f"{film_property.meaning}: the presses agree best with {value:.3g} {film_property.unit}, which is an "
                 "end of the range that is searched: is the origin of the stage the centre of the film, are its axes "
@@ -262,8 +262,8 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
     cautions.extend(film.session_cautions())
     cautions.extend(
         f"{one.meaning}: {film.value(one.name):.3g} {one.unit}, which is unusually far from the sensor file: is the "
-        "origin of the stage the centre of the film, are its axes those of the film, are the forces in N, and the "
-        "charges in pC?"
+        "origin of the stage the centre of the film, are its axes those of the film, are the forces in N and the "
+        "charges in pC, and has each channel the gain of the sensor file?"
         for one in film.layout.prior.properties
         if not one.is_imperfection and abs(film.value(one.name) - one.mean) > UNUSUAL_DEVIATION * one.std
     )

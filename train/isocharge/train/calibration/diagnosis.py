@@ -1,9 +1,9 @@
 """Search for mistakes in the records of presses, if no film explains these presses.
 
-The search considers swapped charge columns, rotated or mirrored axes of the rig, and wrong units. For each mistake, a
-corrected copy of the presses is compared with the charges of a few films. If the correction of a mistake makes the
-presses agree with a film, an error message names the mistake. The presses themselves are never changed. Before the
-search, separate checks find positions outside the film, dead channels, and channels with the wrong sign.
+The search considers swapped charge columns, wrong gains, rotated or mirrored axes of the rig, and wrong units. For each
+mistake, a corrected copy of the presses is compared with the charges of a few films. If the correction of a mistake
+makes the presses agree with a film, an error message names the mistake. The presses themselves are never changed.
+Before the search, separate checks find positions outside the film, dead channels, and channels with the wrong sign.
 """
 
 from collections.abc import Iterator
@@ -28,10 +28,6 @@ those of the other channels on some possible film, and for presses of unknown pl
 
 UNPLACED_RATIO = 0.2
 """Factor of this limit for presses of unknown places and forces, which may all be near one electrode."""
-
-MIN_LARGEST_DISTANCE_MM = 0.05
-"""Smallest credible distance of the outermost press, mm. If it is smaller, the positions were probably in metres."""
-
 
 UNITS = {
     "the forces are in g, not N": (1.0, 9.80665e-3, 1.0),
@@ -89,31 +85,22 @@ Each entry is a description, and the correct coordinates x and y in terms of the
 
 
 def check_places(presses: MeasuredPresses, film: Film) -> None:
-    """Raise an error if a press lies outside the film, or if the positions were probably written in metres.
+    """Raise an error if a press lies outside the film.
 
     Args:
         presses: The presses. Positions that were not measured are NaN.
         film: The film, which may be oval.
 
     Raises:
-        PressError: If a position is outside the film, or if all positions lie within `MIN_LARGEST_DISTANCE_MM` of the
-            centre, but not all of them are the centre.
+        PressError: If a position is outside the film.
     """
     places = presses.contact[:, :2]
     distance = np.hypot(places[:, 0], places[:, 1])
     rim_distance = film.rim_distance(np.arctan2(places[:, 1], places[:, 0]))
-    outside_rows = np.flatnonzero(distance >= rim_distance)  # the comparison is False for NaN, an unknown position
-    if outside_rows.size:
-        row = outside_rows[0]
+    for row in np.flatnonzero(distance >= rim_distance):  # the comparison is False for NaN, an unknown position
         raise PressError(
             f"line {presses.lines[row]}: a press at ({places[row, 0]:g}, {places[row, 1]:g}) mm is off the film, "
             f"whose radius there is {rim_distance[row]:.4g} mm; positions are in mm from the film's centre"
-        )
-    largest_distance = np.fmax.reduce(distance, initial=0.0)  # ignores NaN
-    if 0.0 < largest_distance < MIN_LARGEST_DISTANCE_MM:
-        raise PressError(
-            f"all places lie within {largest_distance:.3g} mm of the centre; positions are in mm: were they written in "
-            "metres? Write 0 for the coordinates of presses at the centre"
         )
 
 
@@ -136,7 +123,7 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
     film_charges = expected_charges(charges, placed.contact)
     film_ratios = [_charge_ratios(film_charge) for film_charge in film_charges if len(placed)]
     largest_ratio = 1.0 if len(placed) else UNPLACED_RATIO
-    smallest_film_ratio = np.min([np.full(len(presses.electrodes), largest_ratio), *film_ratios], axis=0)
+    smallest_film_ratio = np.min(film_ratios, axis=0, initial=largest_ratio)
     ratio = _charge_ratios(presses.charge_pC)
     for channel in np.flatnonzero(ratio < MAX_DEAD_RATIO * smallest_film_ratio):
         typical_charge = np.nanmedian(np.abs(presses.charge_pC[:, channel]))
@@ -226,7 +213,7 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     limit = min(BETTER_MISFIT_RATIO * misfit(placed_presses, charges), SUSPICIOUS_MISFIT)
     smallest = min(misfits.values())
     probable = [name for name, value in misfits.items() if value < limit and BETTER_MISFIT_RATIO * value <= smallest]
-    return sorted(probable, key=lambda name: misfits[name])
+    return sorted(probable, key=misfits.__getitem__)
 
 
 def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
@@ -274,8 +261,9 @@ def _log_ratio(measured: Array, expected: Array) -> Array:
 def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Iterator[tuple[str, Array, Array]]:
     """Yield a corrected copy of the presses for each possible mistake.
 
-    The mistakes are wrong units, swapped charge columns, and rotated or mirrored axes of the rig. For presses at one
-    place, only wrong units are considered, because another order of the columns may fit their charges by chance.
+    The mistakes are wrong units, swapped charge columns, a channel with a wrong gain, and rotated or mirrored axes of
+    the rig. For presses at one place, only wrong units are considered, because another order of the columns may fit
+    their charges by chance.
 
     Args:
         presses: The measured presses, all with a known place and force.
@@ -297,6 +285,16 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
         held_names = ", ".join(electrodes[electrode] for electrode in electrode_of_column)
         sentence = f"the charge columns are swapped: those named {', '.join(electrodes)} hold {held_names}"
         yield sentence, contact, charge[:, np.argsort(electrode_of_column)]
+
+    # A gain is the typical ratio of measured to expected charges of a channel, relative to that of the other channels.
+    log_ratios = np.nanmedian(_log_ratio(charge, expected_charges(charges, contact)), axis=(0, 1))
+    gains = np.exp(log_ratios - np.median(log_ratios))
+    for name, is_own, gain in zip(electrodes, np.eye(len(electrodes)), gains, strict=True):
+        yield (
+            f"the gain of {name} is about {gain:.1g} times that of the sensor file",
+            contact,
+            charge / gain**is_own,
+        )
 
     x, y, force = contact.T
     coordinates = {"x": x, "-x": -x, "y": y, "-y": -y}
@@ -347,9 +345,8 @@ def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: st
     """
     sensor_name = charges.prior.sensor.name
     statement = f"no film of {sensor_name!r} explains these {len(presses)} presses: {reason}"
-    mistakes = find_mistakes(presses, charges)
-    if mistakes:
-        alternatives = "; or ".join(mistakes[:3])
+    alternatives = "; or ".join(find_mistakes(presses, charges)[:3])
+    if alternatives:
         return PressError(
             f"{statement}. A film would explain them if {alternatives}. Nothing was changed: correct the file"
         )
@@ -363,4 +360,4 @@ def is_one_place(presses: MeasuredPresses) -> bool:
     """Return whether the presses have known positions, which are the same within their errors."""
     position = presses.contact[np.isfinite(presses.contact[:, 0]), :2]
     # One press may be much less accurate than the others, so the median of the standard deviations counts.
-    return position.size > 0 and float(np.ptp(position, 0).max()) <= 6.0 * float(np.median(presses.position_std_mm))
+    return position.size > 0 and bool(np.ptp(position, 0).max() <= 6.0 * np.median(presses.position_std_mm))
