@@ -23,7 +23,7 @@ from model_files import put_graph
 @pytest.fixture
 def own_model(models, tmp_path):
     """A copy of the model's version folder, to be damaged."""
-    return shutil.copytree(models / "linear" / "1", tmp_path / "linear" / "1")
+    return shutil.copytree(models / "linear/1", tmp_path / "linear/1")
 
 
 def test_existing_version_is_not_overwritten(film, tmp_path):
@@ -102,7 +102,7 @@ def test_golden_vectors_are_checked_before_a_version_appears(film, tmp_path, mon
     monkeypatch.setattr("isocharge.serve.model.model_folder.make_golden", wrong)
     with pytest.raises(ModelError, match=r"contact\[0, .\]: expected"):
         write(film, tmp_path / "linear")
-    assert list(tmp_path.iterdir()) == []
+    assert not any(tmp_path.iterdir())
 
 
 def test_tolerance_near_zero_is_that_of_a_twentieth_of_the_range(film):
@@ -120,14 +120,15 @@ def test_model_in_a_folder_with_another_name_or_other_files_is_refused(film, tmp
 
 
 def test_version_with_other_electrodes_in_the_same_model_folder_is_refused(film, tmp_path):
-    film.write(tmp_path)
+    film.write(tmp_path, version=2)
+    (tmp_path / "linear/1").mkdir()  # a damaged version
     with pytest.raises(ModelError, match=r"config.pbtxt: describes a model other than .*'D'"):
-        film.with_electrodes(4).write(tmp_path, version=2)
+        film.with_electrodes(4).write(tmp_path, version=3)
     with pytest.raises(ModelError, match=r"expected the electrodes .*'B', 'C'\) of its last version in this order"):
-        film.write(tmp_path, version=2, electrodes=("C", "B", "A"))
+        film.write(tmp_path, version=3, electrodes=("C", "B", "A"))
     (tmp_path / "linear/config.pbtxt").write_bytes(b"\xff")
     with pytest.raises(ModelError, match=r"config.pbtxt: describes a model other than"):
-        film.write(tmp_path, version=2)
+        film.write(tmp_path, version=3)
 
 
 @pytest.mark.parametrize(

@@ -410,8 +410,8 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
             "name or, if the folder was copied or renamed, its old name"
         )
     used_electrodes = electrodes
-    with suppress(ModelError):  # a damaged version does not prevent a new one
-        for existing in versions.values():
+    for existing in versions.values():
+        with suppress(ModelError):  # a damaged version does not prevent a new one
             used_electrodes = load_model(existing).metadata.electrodes
     if used_electrodes != electrodes:
         raise ModelError(
