@@ -88,7 +88,7 @@ class AccessCheck:
         if host and not is_served:  # HTTP/1.0 does not require the header, but browsers always send it
             raise OriginError(
                 f"Host: expected an IP address or one of {', '.join(sorted(self._host_names))}, got {_quoted(host)}; "
-                "use the server's address, or name the host by --allow-host"
+                "use the server's address, or name the host by --allow-host (allowed_hosts of asgi_app)"
             )
 
         # Browsers send `same-origin` if a page of this server sends the request, and `none` if the user has typed the
@@ -102,7 +102,7 @@ class AccessCheck:
             if not self._is_own_page(origin, host):
                 raise OriginError(
                     f"Origin: expected a page of this server, got a page of {_quoted(origin)}; open {_quoted(host)} "
-                    "itself, or name the page's host by --allow-host"
+                    "itself, or name the page's host by --allow-host (allowed_hosts of asgi_app)"
                 )
         elif fetch_site.lower() not in (b"same-origin", b"none") and not is_link:
             raise OriginError(
@@ -188,7 +188,7 @@ _HOST_NAME_PATTERN = re.compile(r"[a-z0-9_-][a-z0-9_.-]*")
 
 
 def host_name(text: str) -> str:
-    """Check a value of the option --allow-host, and return the host name in lower case.
+    """Check a value of --allow-host or `allowed_hosts`, and return the host name in lower case.
 
     Args:
         text: Host name or IP address. An IPv6 address may be in square brackets.
@@ -199,7 +199,10 @@ def host_name(text: str) -> str:
     """
     name = text.strip().lower().strip("[]")
     if not _HOST_NAME_PATTERN.fullmatch(name) and ip_address(name) is None:
-        raise InputError(f"--allow-host: expected a host name without scheme, port and path, got {text!r:.100}")
+        raise InputError(
+            "--allow-host (allowed_hosts of asgi_app): expected a host name without scheme, port and path, "
+            f"got {text!r:.100}"
+        )
     return name.removesuffix(".")  # "example.org." is the same host as "example.org"
 
 
