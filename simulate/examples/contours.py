@@ -11,6 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from isocharge.simulate import ChargeSpline, Circle, ForwardMap, Triangulation, load_sensor
+from isocharge.simulate.plots.figure import COLOURS
 from isocharge.simulate.plots.film import draw_electrodes, frame_film
 
 sensor = load_sensor("three-25um-biaxial")
@@ -25,8 +26,8 @@ figure, axes = plt.subplots(figsize=(6.0, 6.0), layout="constrained")
 x, y = np.meshgrid(np.linspace(-6.3, 6.3, 101), np.linspace(-6.3, 6.3, 101))  # within the radius of the map
 grid_charges = charge_map.charges(np.column_stack([x.ravel(), y.ravel(), np.full(x.size, force)]))
 for number, name in enumerate(sensor.electrode_names):
-    axes.contour(x, y, grid_charges[:, number].reshape(x.shape), [charge[0, number]], colors=f"C{number}")
-    axes.plot([], [], color=f"C{number}", label=f"{charge[0, number]:.0f} pC on {name}")
+    axes.contour(x, y, grid_charges[:, number].reshape(x.shape), [charge[0, number]], colors=COLOURS[number])
+    axes.plot([], [], color=COLOURS[number], label=f"{charge[0, number]:.0f} pC on {name}")
 draw_electrodes(axes, sensor)
 axes.plot(*touch[0, :2], "k+", ms=12, label="the press")
 axes.legend()
