@@ -50,7 +50,7 @@ MAX_SERIES_ERROR = 0.03
 NODES_MPa = (-0.7, -0.3, 0.0, 0.4, 0.9)
 """Changes of the pretension at the nodes of a film that can be followed, MPa.
 
-The negative changes are smaller for a film that they would make slack."""
+Changes that would make the film slack are replaced by the largest decrease that does not."""
 
 SEED = 3
 """Seed of the contacts and of the drawn films."""
@@ -189,11 +189,10 @@ def _fit_followable_nodes(
 
 def _nodes(film: FilmEstimate) -> Array:
     """Return the changes of the pretension at the nodes, of which none makes the film slack, shape (n_node,), MPa."""
-    node_MPa = np.array(NODES_MPa)
     sensor, _ = film.layout.prior.film(film.film_values)
-    lowest_MPa = -0.95 * (sensor.film.pretension - np.hypot(*sensor.film.deviator))
-    node_MPa[node_MPa < 0.0] *= min(1.0, lowest_MPa / node_MPa.min())
-    return np.unique(node_MPa)
+    # An interpolation between several nodes near zero would amplify the errors of their charges.
+    lowest_MPa = min(0.0, -0.95 * (sensor.film.pretension - np.hypot(*sensor.film.deviator)))
+    return np.unique(np.maximum(NODES_MPa, lowest_MPa))
 
 
 def _node_charges(charge: Array, changed_charge: Array, node_MPa: Array) -> Array:
