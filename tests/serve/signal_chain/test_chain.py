@@ -112,11 +112,14 @@ def test_noise_exceeds_the_touch_threshold_rarely_with_any_number_of_electrodes(
 
 @pytest.mark.parametrize("ratios", [(1.0, -1.0, 0.0), (-1.0, -1.0, -1.0)])
 def test_touch_is_detected_from_charges_of_any_sign(ratios):
-    """The charges of a sensor without a film may have any sign, and their sum may be zero or negative."""
+    """The charges of a sensor without a film may have any sign, and their sum may be zero or negative.
+
+    The charge of the finger that leaves the film does not give the next touch the flag `drift`.
+    """
     touch = touch_stage(has_any_sign=True)
-    forces = (0.0, 0.0, 100.0, 100.0, 0.0, 0.0, 0.0, -100.0, 0.0)
+    forces = (0.0, 1e3, 1e3, 40.0, 0.0, 0.0, -100.0, 0.0)
     frames = [detect(touch, force * np.array(ratios), dt_s=0.1) for force in forces]
-    assert contacts_of(frames) == [force != 0.0 for force in forces]
+    assert [(frame.is_contact, frame.flags) for frame in frames] == [(abs(force) > 40.0, []) for force in forces]
 
 
 @pytest.mark.parametrize("has_any_sign", [False, True])
@@ -183,10 +186,9 @@ def test_noise_of_many_electrodes_is_no_touch():
     assert not any(contacts_of(StageRunner(8).run(noise_pC, RATE_HZ)))
 
 
-@pytest.mark.parametrize("drift_pC_per_s", [4.0, 10.0])
-def test_contact_that_a_fast_drift_begins_has_the_flag_drift(drift_pC_per_s):
+def test_contact_that_a_fast_drift_begins_has_the_flag_drift():
     """The tare cannot follow the drift of an untouched film. A press that follows another press has no flag."""
-    drifting_pC = rest(2000) + drift_pC_per_s * np.arange(2000)[:, None] / RATE_HZ
+    drifting_pC = rest(2000) + 4.0 * np.arange(2000)[:, None] / RATE_HZ
     readings = run(drifting_pC)
     assert readings[-1].is_contact
     assert contacts_of(readings) == ["drift" in reading.flags for reading in readings]

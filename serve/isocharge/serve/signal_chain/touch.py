@@ -42,11 +42,12 @@ class TouchRule(Rule, frozen=True, kw_only=True):
 
     def resolved(self, *, has_currents: bool) -> "TouchRule":
         """Return the settings with the default values for a board that sends charges, or currents."""
-        defaults = {"floor_pC": 10.0, "release_share": 0.05}
-        if has_currents:
-            defaults = {"floor_pC": 0.0, "release_share": 0.3}
-        missing = {name: value for name, value in defaults.items() if getattr(self, name) is None}
-        return structs.replace(self, **missing)
+        floor_pC, release_share = (0.0, 0.3) if has_currents else (10.0, 0.05)
+        return structs.replace(
+            self,
+            floor_pC=floor_pC if self.floor_pC is None else self.floor_pC,
+            release_share=release_share if self.release_share is None else self.release_share,
+        )
 
     def threshold_pC(self, noise_pC: Array) -> Array:
         """Return the touch threshold of each electrode, shape (n_electrode,), pC. The settings must be resolved.
@@ -120,12 +121,12 @@ class Touch(Stage):
 
     def reset(self) -> None:
         """Discard the touch."""
-        n_electrode = len(self._setup.electrodes)
+        no_charge = np.zeros(len(self._setup.electrodes))
         # Charges and sizes are relative to the touch thresholds. The size of charges is the norm of their vector.
         self._touch_direction = self._rest_direction  # sum of the directions of the frames of the latest touch
-        self._base_charge = np.zeros(n_electrode)  # charges that are no touch
-        self._previous_charge = np.zeros(n_electrode)  # charges of the previous frame
-        self._idle_mean_charge = np.zeros(n_electrode)  # exponential mean of the charges out of contact
+        self._base_charge = no_charge  # charges that are no touch
+        self._previous_charge = no_charge  # charges of the previous frame
+        self._idle_mean_charge = no_charge  # exponential mean of the charges out of contact
         self._may_have_drifted = False  # whether the charge at rest may have drifted before this touch
         self._is_contact = False
         self._peak_size = 0.0  # largest size in this touch
@@ -198,7 +199,7 @@ class Touch(Stage):
         largest_opposing = OPPOSING_COSINE * _norm(direction)
         # After a touch, the base is the charge that remains of it. While the finger leaves the film, the charge at rest
         # is held, and the base must not decay, because the finger still causes this charge.
-        is_remainder = self._base_charge @ direction > 0.0
+        is_remainder = self._base_charge @ direction >= 0.0
         if not (frame.is_base_held and is_remainder):
             self._base_charge = self._base_charge * math.exp(-frame.dt_s / frame.base_relax_s)
         size = _norm(charge)
@@ -212,10 +213,13 @@ class Touch(Stage):
             self._touch_direction = charge / size
             # The sum of the noise of currents changes slowly. The mean of the latest charges still contains it.
             limit = 0.75 if self._setup.device.has_currents else 0.5
-            self._may_have_drifted = _norm(self._idle_mean_charge - is_remainder * self._base_charge) > limit
+            slow_rise = _norm(self._idle_mean_charge - self._base_charge)
+            # The change is larger than the charges if the base was opposite to them.
+            self._may_have_drifted = max(slow_rise, change_size - size) > limit
             return
         elif is_remainder and size < _norm(self._base_charge):
             self._base_charge = charge  # the charge that remains of the latest touch becomes smaller
+            self._idle_mean_charge = charge
 
         self._idle_mean_charge = charge + math.exp(-frame.dt_s / RISE_S) * (self._idle_mean_charge - charge)
         if size > 1.0 and charge @ direction < 0.0:

@@ -330,7 +330,7 @@ static void update_contact(isocharge_chain *chain, const real charge_pC[N], real
         }
         return;
     }
-    remainder = dot(chain->base, chain->direction) > 0;
+    remainder = dot(chain->base, chain->direction) >= 0;
     EACH(k)
     {
         if (!(follows && remainder))
@@ -347,12 +347,13 @@ static void update_contact(isocharge_chain *chain, const real charge_pC[N], real
         EACH(k)
         {
             chain->direction[k] = charge[k] / size;
-            change[k] = chain->mean[k] - (remainder ? chain->base[k] : 0);
+            change[k] = chain->mean[k] - chain->base[k];
         }
-        chain->slow = size_of(change) > (real)0.5;
+        chain->slow = larger(size_of(change), change_size - size) > (real)0.5;
         return;
     } else if (remainder && size < size_of(chain->base)) {
         copy(chain->base, charge);
+        copy(chain->mean, charge);
     }
     rising = EXP(-dt_s / (real)ISOCHARGE_TOUCH_RISE_S);
     EACH(k) chain->mean[k] = charge[k] + rising * (chain->mean[k] - charge[k]);
