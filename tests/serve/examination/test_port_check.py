@@ -168,7 +168,7 @@ def test_channels_of_a_board_that_sends_the_same_values_all_the_time_are_propose
     gain = {"pC_per_unit": dict.fromkeys(electrodes or FOUR[:3], 0.5)}
     report = examined(lambda _: b"100,200,300\n", electrodes=electrodes, gain=gain)
     assert report.device["channels"] == dict(zip(electrodes or FOUR[:3], "123", strict=False))
-    assert "channel 1 is dead" in missing(report)
+    assert "1 is dead: every value is 0; check the amplifier and the wire of this channel, or send" in missing(report)
 
 
 def test_gain_of_some_electrodes_is_refused():

@@ -244,7 +244,10 @@ def channel_sentences(
                 "amplifier and the wire of this channel"
             )
         if channel.span_pC == 0.0:
-            yield f"{name} is dead: every value is {channel.offset_pC:g}"
+            yield (
+                f"{name} is dead: every value is {channel.offset_pC:g}; check the amplifier and the wire of this "
+                "channel, or send more digits"
+            )
         # Of a channel without a usable value, only the unusable values are reported.
         if unit != "pC" or channel.noise_pC is None or channel.offset_pC is None or channel.drift_pC_per_s is None:
             continue
