@@ -70,8 +70,7 @@ def http_command(
     # Check the options that protect the server.
     address = Address(host, port, uds)
     # The gRPC server listens on the host even if the HTTP server listens on a Unix socket.
-    most_exposed_address = address if grpc_port is None else Address(host)
-    check_exposure(most_exposed_address, token)
+    check_exposure(address if grpc_port is None else Address(host), token)
     tls = given_tls(tls_cert, tls_key)
     # Pages of other sites cannot reach a Unix socket, so every host name is then accepted.
     access = AccessCheck(host, allow_host or (), token=token, any_host=uds is not None)

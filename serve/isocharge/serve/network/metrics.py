@@ -238,8 +238,7 @@ class Traffic:
         """Count a request that was answered, and log the request if there is a log."""
         self.count(exchange.transport, exchange.route, exchange.status)
         if self.log is not None:
-            is_internal_error = exchange.status in (500, "INTERNAL")  # the status of HTTP, and that of gRPC
             client = exchange.client
             client_text = "%s:%d" % client if isinstance(client, tuple) else client  # noqa: UP031 - twice as fast
-            level = "error" if is_internal_error else "info"
+            level = "error" if exchange.status in (500, "INTERNAL") else "info"  # internal errors of HTTP and of gRPC
             self.log.write_line(level, "request", vars(exchange) | {"client": client_text})

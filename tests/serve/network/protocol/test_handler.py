@@ -169,7 +169,7 @@ BAD = {
     "other type": (changed(datatype="INT64"), "expected one of FP32, FP64, got 'INT64'"),
     "no rows": (changed(shape=[0, 3], data=[]), "with n > 0"),
     "too many": (changed(shape=[10**12, 3]), "at most 4096 presses in one request, got 1000000000000"),
-    "too few numbers": (changed(data=[1, 2]), r"shape \[1, 3\], flat or in rows, .* got \[1.0, 2.0\] and 0 bytes"),
+    "too many numbers": (changed(data=[1] * 200), r"shape \[1, 3\], flat or in rows, .* got \[1.0, .* and 0 bytes"),
     "ragged": (changed(shape=[2, 3], data=[[1, 2, 3], [1, 2]]), r"expected 6 numbers for the shape \[2, 3\]"),
     "yes": (changed(data=[1, 2, True]), r"data\[2\]: expected a finite number or .*, got True"),
     "other output": (

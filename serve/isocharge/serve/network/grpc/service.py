@@ -240,8 +240,9 @@ class Service:
         try:
             request = request_type.FromString(data)
         except DecodeError as error:
-            expected = request_type.DESCRIPTOR.name
-            raise RequestError(f"expected a {expected}, got {len(data)} bytes of another kind") from error
+            raise RequestError(
+                f"expected a {request_type.DESCRIPTOR.name}, got {len(data)} bytes of another kind"
+            ) from error
         # The name and the version of the model are called `model_name` and `model_version` in some messages of the
         # protocol, and `name` and `version` in other messages. Messages about the server contain none of these fields.
         model_name = getattr(request, "model_name", "") or getattr(request, "name", "")

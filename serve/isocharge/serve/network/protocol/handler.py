@@ -96,9 +96,10 @@ class Application(ABC):
             The response. If an error occurs, it is not raised, but the response contains its status and its message.
         """
         try:
-            max_bytes = self.limits.body_bytes
-            if len(body) > max_bytes:
-                raise TooLarge(f"expected a body of at most {max_bytes} bytes, got more; send smaller batches")
+            if len(body) > self.limits.body_bytes:
+                raise TooLarge(
+                    f"expected a body of at most {self.limits.body_bytes} bytes, got more; send smaller batches"
+                )
             return self._check_and_answer(method, path, header_values(headers), body)
         except Exception as error:  # every error is sent to the client
             return error_response(error)

@@ -168,15 +168,17 @@ def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...
 
     dtype = DATATYPES[tensor.datatype]
     count = math.prod(shape)
+    # Too many numbers are refused, and the message shows the first of them. The other numbers need not be converted.
+    data = tensor.data and tensor.data[: count + 100]
     try:
-        charges = np.frombuffer(binary, dtype) if binary else np.asarray(tensor.data, np.float64)
+        charges = np.frombuffer(binary, dtype) if binary else np.asarray(data, np.float64)
     except (TypeError, ValueError):  # an incomplete number, no numbers, or rows of different lengths
         charges = np.empty(0)
-    is_sent_twice = binary and tensor.data is not None
+    is_sent_twice = binary and data is not None
     if is_sent_twice or charges.shape not in (tuple(shape), (count,)):
         raise RequestError(
             f"input {INPUT!r}: expected {count} numbers for the shape {shape}, flat or in rows, or {count} binary "
-            f"numbers of {dtype.itemsize} bytes each, got {tensor.data!r:.100} and {len(binary)} bytes"
+            f"numbers of {dtype.itemsize} bytes each, got {data!r:.100} and {len(binary)} bytes"
         )
     return as_float32(charges.reshape(shape), electrodes)
 
