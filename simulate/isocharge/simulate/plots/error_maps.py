@@ -174,10 +174,12 @@ def mirror_picture(sensor: Sensor, mirror: MirrorRegion) -> Figure:
     draw_rim(axes, sensor.film, color=INK, lw=2.0)
     draw_circle(axes, mirror.inner, color=INK, ls="--", lw=1.6)
     draw_electrodes(axes, sensor)
-    title = (
-        f"{sensor.name}: {100.0 * mirror.total_share:.2g} % of the presses of {mirror.forces[0]:.2g} to "
-        f"{mirror.forces[-1]:.2g} N\noutside the working area (dashed, {mirror.inner:.3g} mm) cannot be noticed"
+    axes.set(
+        aspect="equal",
+        xlabel="x, mm",
+        ylabel="y, mm",
+        title=f"{sensor.name}: {100.0 * mirror.total_share:.2g} % of the presses of {mirror.forces[0]:.2g} to "
+        f"{mirror.forces[-1]:.2g} N\noutside the working area (dashed, {mirror.inner:.3g} mm) cannot be noticed",
     )
-    axes.set(aspect="equal", xlabel="x, mm", ylabel="y, mm", title=title)
     axes.margins(0.03)
     return figure

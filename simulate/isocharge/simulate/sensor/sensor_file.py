@@ -322,7 +322,7 @@ def write_sensor(sensor: Sensor, path: StrPath, comment: Iterable[str] = ()) -> 
         OutputError: If the file cannot be written.
     """
     with new_file(Path(path)) as draft:
-        draft.write_bytes(sensor_to_toml(sensor, comment).encode())
+        draft.write_text(sensor_to_toml(sensor, comment), "utf-8")
 
 
 def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
