@@ -74,12 +74,14 @@ def test_mistake_that_explains_the_presses_exactly_is_the_only_one_that_is_named
     _, charge, _ = expected_charges(synthetic, contact)
     in_kg = measured_presses(problem, contact / [1.0, 1.0, 9.80665], charge)
     assert find_mistakes(in_kg, synthetic) == ["the forces are in kg, not N"]
+    assert not find_mistakes(with_mistake(problem, synthetic, IMPOSSIBLE["negative"][0]), synthetic)  # is no gain
 
 
 def test_misfit_of_one_usual_offset_and_one_usual_scatter_is_two(problem, synthetic):
     contact = rig_presses(problem, synthetic, 12, seed=7).contact
-    loosest, _, _ = expected_charges(synthetic, contact)
-    charge = loosest * np.exp(OFFSET_STD + SCATTER_STD * np.array([1.0, -1.0, -1.0, 1.0]))
+    charge = expected_charges(synthetic, contact)[0] * np.exp(
+        OFFSET_STD + SCATTER_STD * np.array([1.0, -1.0, -1.0, 1.0])
+    )
     assert misfit(measured_presses(problem, contact, charge), synthetic) == pytest.approx(2.0)
 
 

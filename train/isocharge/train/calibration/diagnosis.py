@@ -94,12 +94,11 @@ def check_places(presses: MeasuredPresses, film: Film) -> None:
     Raises:
         PressError: If a position is outside the film.
     """
-    places = presses.contact[:, :2]
-    distance = np.hypot(places[:, 0], places[:, 1])
-    rim_distance = film.rim_distance(np.arctan2(places[:, 1], places[:, 0]))
-    for row in np.flatnonzero(distance >= rim_distance):  # the comparison is False for NaN, an unknown position
+    x, y, _ = presses.contact.T
+    rim_distance = film.rim_distance(np.arctan2(y, x))
+    for row in np.flatnonzero(np.hypot(x, y) >= rim_distance):  # the comparison is False for NaN, an unknown position
         raise PressError(
-            f"line {presses.lines[row]}: a press at ({places[row, 0]:g}, {places[row, 1]:g}) mm is off the film, "
+            f"line {presses.lines[row]}: a press at ({x[row]:g}, {y[row]:g}) mm is off the film, "
             f"whose radius there is {rim_distance[row]:.4g} mm; positions are in mm from the film's centre"
         )
 
@@ -154,7 +153,8 @@ def _check_signs(presses: MeasuredPresses, film_charges: Array) -> None:
     for channel in reversed_channels:
         raise PressError(
             f"electrode {presses.electrodes[channel]!r}: {opposite_counts[channel]} of its {measured_counts[channel]} "
-            "charges have the opposite sign to those of the film; exchange its wires or its sign"
+            "charges have the opposite sign to those of the film; exchange its wires or its sign, or check the order "
+            "of the columns"
         )
 
 
@@ -288,7 +288,8 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
 
     # A gain is the typical ratio of measured to expected charges of a channel, relative to that of the other channels.
     log_ratios = np.nanmedian(_log_ratio(charge, expected_charges(charges, contact)), axis=(0, 1))
-    gains = np.exp(log_ratios - np.median(log_ratios))
+    # A channel with the wrong sign has no gain, so the gains are limited.
+    gains = np.exp(np.clip(log_ratios - np.median(log_ratios), -3.0, 3.0))
     for name, is_own, gain in zip(electrodes, np.eye(len(electrodes)), gains, strict=True):
         yield (
             f"the gain of {name} is about {gain:.1g} times that of the sensor file",
