@@ -34,7 +34,7 @@ FEW_VALUES = {
 
 
 def use_few_hypotheses(patch):
-    """To save time, let the estimator compare 256 hypotheses instead of 5,832."""
+    """To save time, let the estimator compare 256 hypotheses instead of 6,480."""
     for name, values_and_probabilities in FEW_VALUES.items():
         patch.setattr(estimator, name, values_and_probabilities)
 

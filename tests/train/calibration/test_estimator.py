@@ -184,20 +184,25 @@ def test_positions_worse_than_stated_are_not_taken_for_noise(problem, synthetic,
 
 
 @pytest.mark.usefixtures("few_hypotheses")
-def test_touches_at_unknown_places_find_a_change_of_the_pretension(problem, synthetic):
+def test_touches_at_unknown_places_find_a_change_of_the_pretension(problem, synthetic, monkeypatch):
     """Four charges have one number more than a contact has unknowns, and the estimate before knows the rest."""
+    monkeypatch.setattr(estimator, "NOISE_RATIOS", NOISE_RATIOS[:2])
     values, _, presses = rig(problem, synthetic, 20, seed=5)
     before = film_estimate(problem, synthetic, presses).film
+    earlier = before.drifted()
     changed = values.copy()
     changed[0] += 0.3
-    _, contact, touches = rig(problem, synthetic, 40, seed=6, values=changed)
-    touches.contact[:] = np.nan
-    earlier = before.drifted()
-    found = film_estimate(replace(problem, earlier=earlier), synthetic, touches)
-    std = found.film.std("pretension")
-    assert abs(found.film.value("pretension") - changed[0]) < 3.0 * std
-    assert std < 0.6 * earlier.std("pretension")
-    assert np.median(np.hypot(*(found.contact - contact)[:, :2].T)) < 0.3
+    for ratio in (1.0, 0.3):  # a frame of each touch, and an average of ten frames
+        noise = NoiseModel("bench", ratio * problem.noise.white, ratio * problem.noise.gain)
+        _, contact, touches = rig(replace(problem, noise=noise), synthetic, 40, seed=6, values=changed)
+        touches.contact[:] = np.nan
+        found = film_estimate(replace(problem, earlier=earlier), synthetic, touches)
+        std = found.film.std("pretension")
+        assert abs(found.film.value("pretension") - changed[0]) < 3.0 * std
+        assert std < 0.6 * earlier.std("pretension")
+        assert np.median(np.hypot(*(found.contact - contact)[:, :2].T)) < 0.3
+        assert found.hypothesis.errors.noise.white == noise.white
+        assert found.film.noise.gain == pytest.approx(problem.noise.gain)  # of a frame
 
 
 def test_one_press_needs_little_memory(problem, synthetic, monkeypatch):

@@ -12,7 +12,7 @@ over the hypotheses, weighted by their evidence.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress, groupby, product
 
@@ -62,8 +62,12 @@ FORCE_SCATTERS = ((0.0, 0.8), (0.01, 0.1), (0.03, 0.1))
 POSITION_RATIOS = ((1.0, 0.8), (3.0, 0.1), (8.0, 0.1))
 """Errors of the positions relative to the stated ones, with their prior probabilities."""
 
-NOISE_RATIOS = ((1.0, 0.36), *((2.0 ** (step / 2), 0.08) for step in range(1, 9)))
-"""Noise that is proportional to the charge, relative to that of a good amplifier, with its prior probabilities."""
+NOISE_RATIOS = ((0.3, 0.02), (1.0, 0.34), *((2.0 ** (step / 2), 0.08) for step in range(1, 9)))
+"""Noise of the charges, relative to that of a frame from a good amplifier, with its prior probabilities.
+
+A ratio above 1 only concerns the noise that is proportional to the charge. With the smallest ratio, the charges of the
+presses are averages of about ten frames.
+"""
 
 MIN_WEIGHT = 1e-6
 """Weight of a hypothesis below which its estimate is neglected."""
@@ -101,10 +105,10 @@ def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
     """Yield all hypotheses about presses.
 
     Args:
-        noise: Noise of a good amplifier.
+        noise: Noise of a frame from a good amplifier.
     """
     noises = [
-        (noise if ratio == 1.0 else NoiseModel("presses", noise.white, ratio * noise.gain), probability)
+        (replace(noise, white=min(ratio, 1.0) * noise.white, gain=ratio * noise.gain), probability)
         for ratio, probability in NOISE_RATIOS
     ]
     session = [one.stds for one in SESSION]
@@ -330,7 +334,9 @@ def _estimate_with_errors(
     final_model = model_values(charges, prior.layout, data, unknowns, log_contact)
     final_residual, _ = Linearised.of(final_model, data, log_contact).eliminated()
     final_chi2 = (final_residual**2).sum(axis=1)
-    gain_variance = np.average([one.errors.noise.gain**2 for one in probable], weights=weight)
+    # The noise of a frame is at least the stated one, although averages of frames have less noise.
+    gains = np.maximum([one.errors.noise.gain for one in probable], stated.noise.gain)
+    gain_variance = np.average(gains**2, weights=weight)
     noise = NoiseModel("presses", stated.noise.white, float(np.sqrt(gain_variance)))
     return Estimation(
         charges=charges,
