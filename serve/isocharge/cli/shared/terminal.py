@@ -134,7 +134,10 @@ def write_stdout(text: str) -> None:
 
 
 def write_stderr(line: str) -> bool:
-    """Write a line to stderr at once, and return False if that fails. The next line may succeed, as on a full disk."""
+    """Write a line to stderr at once, and return whether this succeeded.
+
+    After a failure, for example because the disk was full, the next line may succeed.
+    """
     try:
         _write_all(STDERR_FILENO, f"{printable(line)}\n".encode())
     except OSError:

@@ -147,7 +147,7 @@ class Predictor:
         return contact
 
     def _predict_one(self, charge_pC: ArrayLike) -> Contact:
-        """Compute the contact of one press, with the standard deviations for the noise of the training.
+        """Compute the contact of one press. Its standard deviations assume the noise of the training of the model.
 
         Args:
             charge_pC: Touch charges, shape (electrodes,), pC.
@@ -158,9 +158,9 @@ class Predictor:
         values = charge_pC.tolist() if isinstance(charge_pC, np.ndarray) else charge_pC
         press = self._press
         with self._press_lock:
-            # `write_finite` writes the charges, and returns False if it cannot convert them or a charge is not finite.
+            # `write_finite` is fast. It returns False if it cannot convert the values, or if a charge is not finite.
             if not write_finite(press.write, values):
-                # The slow conversion `as_charges` accepts more number types. Its errors name the electrode.
+                # `as_charges` is slower, accepts more number types, and raises errors that name the electrode.
                 press.write(*as_charges(charge_pC, self.metadata.electrodes, is_batch=False)[0])
             press.run()
             return Contact(*press.read())

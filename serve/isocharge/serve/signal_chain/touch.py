@@ -138,10 +138,10 @@ class Touch(Stage):
         return np.full(len(self._setup.electrodes), 0.0 if self._setup.has_any_sign else 1.0)
 
     def step(self, frame: Frame) -> None:
-        """Determine whether something touches the film in this frame."""
+        """Determine whether something touches the film in this frame. A frame without charges is not changed."""
         if frame.charge_pC is None:
             return
-        if self._rule is None:
+        if self._rule is None:  # the detection is switched off, so every frame counts as a contact
             self._is_contact = True
         else:
             if frame.noise_pC is not self._noise_pC:  # the film was tared
@@ -196,7 +196,7 @@ class Touch(Stage):
         if self._rest_s >= RISE_S - SUM_TOLERANCE_s:
             self._touch_direction = self._rest_direction
         direction = self._touch_direction
-        largest_opposing = OPPOSING_COSINE * _norm(direction)
+        opposing_limit = OPPOSING_COSINE * _norm(direction)
         # After a touch, the base is the charge that remains of it. While the finger leaves the film, the charge at rest
         # is held, and the base must not decay, because the finger still causes this charge.
         is_remainder = self._base_charge @ direction >= 0.0
@@ -205,9 +205,9 @@ class Touch(Stage):
         size = _norm(charge)
         change = charge - self._base_charge
         change_size = _norm(change)
-        if change @ direction < largest_opposing * change_size:
+        if change @ direction < opposing_limit * change_size:
             self._base_charge = self._idle_mean_charge  # a release or a drift, and not the noise of a single frame
-        elif min(size, change_size) > 1.0 and charge @ direction >= largest_opposing * size:  # a touch begins
+        elif min(size, change_size) > 1.0 and charge @ direction >= opposing_limit * size:  # a touch begins
             self._is_contact = True
             self._peak_size = min(size, _norm(self._previous_charge))  # a spike of a single frame is not a peak
             self._touch_direction = charge / size

@@ -108,7 +108,7 @@ class TouchPeak:
 
         The average is None if no frame was averaged, or if a flag of the touch is not harmless.
         """
-        is_usable = self._is_reliable and self._averaged_count
+        is_usable = self._is_reliable and self._averaged_count > 0
         return self._charge_sum_pC / self._averaged_count if is_usable else None
 
 
@@ -345,9 +345,9 @@ class FilmFollower(Stage):
         # Decide whether the film is lost.
         is_changed = np.abs(estimate.state) > CLEAR_CHANGE * np.sqrt(self._covariance.diagonal())
         is_at_bound = is_changed & np.any(estimate.state == self._state_bounds, axis=0)
+        has_implausible_state = bool(is_at_bound[[0, self._offset]].any())  # the pretension or the offset
         was_lost = self.is_lost
-        # The second condition concerns the pretension and the offset.
-        self.is_lost = self._mean_square > MAX_MEAN_SQUARE or bool(is_at_bound[[0, self._offset]].any())
+        self.is_lost = self._mean_square > MAX_MEAN_SQUARE or has_implausible_state
         if self.is_lost and not was_lost:
             self._start_estimate()  # the film may have changed suddenly, so earlier touches do not help
         elif not self.is_lost:

@@ -227,8 +227,9 @@ def _check_placement(film: FilmEstimate) -> None:
             that neither the estimate nor its standard deviation is right.
     """
     for film_property in film.layout.prior.properties:
+        lowest, highest = film_property.limits
         value = film.value(film_property.name)
-        if film_property.name in PLACEMENT and value in film_property.limits:
+        if film_property.name in PLACEMENT and not lowest < value < highest:
             raise PressError(
                 f"{film_property.meaning}: the presses agree best with {value:.3g} {film_property.unit}, which is an "
                 "end of the range that is searched: is the origin of the stage the centre of the film, are its axes "

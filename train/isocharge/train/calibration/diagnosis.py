@@ -96,7 +96,9 @@ def check_places(presses: MeasuredPresses, film: Film) -> None:
     """
     x, y, _ = presses.contact.T
     rim_distance = film.rim_distance(np.arctan2(y, x))
-    for row in np.flatnonzero(np.hypot(x, y) >= rim_distance):  # the comparison is False for NaN, an unknown position
+    outside_rows = np.flatnonzero(np.hypot(x, y) >= rim_distance)  # an unknown position, NaN, is not outside
+    if outside_rows.size:
+        row = outside_rows[0]
         raise PressError(
             f"line {presses.lines[row]}: a press at ({x[row]:g}, {y[row]:g}) mm is off the film, "
             f"whose radius there is {rim_distance[row]:.4g} mm; positions are in mm from the film's centre"

@@ -243,7 +243,7 @@ def estimate(charges: FilmCharges, data: PressData, prior: Prior, previous: Esti
 
     Args:
         charges: Charges of a solved film and of similar films.
-        data: The presses with their stated errors, and with the smallest possible noise.
+        data: The presses with their stated errors, and with the noise of a frame from a good amplifier.
         prior: Prior distribution of the unknowns.
         previous: Estimate from which the search begins; None for the prior mean and the measured contacts.
     """
