@@ -110,15 +110,14 @@ class Part(NamedTuple):
 
 
 @np.errstate(all="ignore")
-def possible_parts(rows: Bytes, order: ByteOrder, checksum_start: int, frame_rate_Hz: float) -> list[list[Part]]:
+def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[list[Part]]:
     """List the possible parts of a frame that begin at each byte.
 
     A part is a single byte without a meaning (padding), or a number of one of the types in `STRUCT_FORMATS`.
 
     Args:
-        rows: Bytes of the frames before the checksum, shape (n, length).
+        rows: Bytes of the frames and the 7 bytes behind, where the largest numbers end, shape (n, length + 7).
         order: Byte order of the numbers.
-        checksum_start: First byte that the checksum covers.
         frame_rate_Hz: Number of frames per second, Hz, from which the tick rate of a clock follows.
 
     Returns:
@@ -126,16 +125,13 @@ def possible_parts(rows: Bytes, order: ByteOrder, checksum_start: int, frame_rat
     """
     usual, is_constant = usual_bytes(rows)
     is_zero = is_constant & (usual == 0)
-    length = rows.shape[1]
     byte_step = 1 if order == "little" else -1
     parts_at_each_byte: list[list[Part]] = []
-    for position in range(length):
+    for position in range(rows.shape[1] - 7):
         # One byte of padding
         parts = [Part("", PADDING, 1, Weights.constant if is_constant[position] else Weights.noise)]
         for type_name in STRUCT_FORMATS:  # such as "u16", whose size is 16 bits
             end = position + int(type_name[1:]) // 8
-            if end > length or position < checksum_start < end:  # a checksum covers all bytes of a number or none
-                continue
             if all(is_constant[position:end]):
                 parts.append(Part(CHANNEL, type_name, end - position, Weights.constant, is_constant=True))
                 continue
@@ -201,8 +197,8 @@ def _number_parts(
 
 
 def split_frame(
-    parts_at_each_byte: Sequence[Sequence[Part]], sync_lengths: Iterable[int]
-) -> tuple[float, int, tuple[Part, ...]]:
+    parts_at_each_byte: Sequence[Sequence[Part]], sync_lengths: Iterable[int], checksum_start: int
+) -> tuple[float, tuple[Part, ...], int]:
     """Divide a frame into parts so that the score of the division is as low as possible.
 
     The frame begins with the sync pattern, a constant pattern of bytes that marks the beginning of the frame. The best
@@ -210,12 +206,13 @@ def split_frame(
     after this position is computed once and stored.
 
     Args:
-        parts_at_each_byte: Parts that may begin at each byte before the checksum, and end before the checksum.
+        parts_at_each_byte: Parts that may begin at each byte before the checksum. Parts that end behind are not used.
         sync_lengths: Possible lengths of the sync pattern, bytes; 0 if the frame has no sync pattern. If several
-            lengths have the lowest score, the shortest of them is chosen.
+            lengths have the lowest score, the first of them is chosen.
+        checksum_start: First byte that the checksum covers. It covers all bytes of a number or none.
 
     Returns:
-        The score in bits, the length of the sync pattern in bytes, and the parts after the sync pattern.
+        The score in bits, the parts after the sync pattern, and the length of the sync pattern in bytes.
     """
 
     @cache
@@ -237,18 +234,19 @@ def split_frame(
             return 0.0, ()
         divisions = []
         for part in parts_at_each_byte[position]:
+            end = position + part.size
+            if end > len(parts_at_each_byte) or position < checksum_start < end:
+                continue
             channel_type = part.type_name if part.name == CHANNEL else ""
             begins_group = channel_type not in ("", previous_channel_type)
             if begins_group and part.is_constant:
                 continue
-            rest_score, rest_parts = best_division(position + part.size, channel_type)
+            rest_score, rest_parts = best_division(end, channel_type)
             group_score = Weights.channel_group if begins_group else 0.0
             divisions.append((part.score + rest_score + group_score, (part, *rest_parts)))
         return min(divisions, key=itemgetter(0))  # of equal scores, the first division
 
-    # Of equal scores, `min` returns the one with the shortest pattern.
-    lowest_score, best_sync_length = min((best_division(length, "")[0], length) for length in sync_lengths)
-    return lowest_score, best_sync_length, best_division(best_sync_length, "")[1]
+    return min(((*best_division(length, ""), length) for length in sync_lengths), key=itemgetter(0))
 
 
 def _values(number_bytes: Bytes, type_name: str) -> Array:

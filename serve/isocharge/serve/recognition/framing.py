@@ -10,9 +10,10 @@ All checksums with a name are tried for every possible position of the first byt
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import product
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -61,15 +62,17 @@ class FrameDivision(NamedTuple):
     starts: NDArray[np.int64]
     length: int
 
-    def rows(self, distance: int = 0) -> Bytes:
-        """Return the bytes of each frame that is not too close to the end of the stream, shape (frames, length).
+    def rows(self, distance: int = 0, next_bytes: int = 0) -> Bytes:
+        """Return the bytes of each frame that is not too close to the end, shape (frames, length + next_bytes).
 
         Args:
             distance: Distance of the beginnings of the frames from `starts`, bytes.
+            next_bytes: Number of bytes behind each frame that are also returned.
         """
         starts = self.starts + distance
-        whole_starts = starts[starts + self.length <= len(self.stream)]
-        return np.asarray(self.stream[whole_starts[:, None] + np.arange(self.length)])
+        width = self.length + next_bytes
+        whole_starts = starts[starts + width <= len(self.stream)]
+        return np.asarray(self.stream[whole_starts[:, None] + np.arange(width)])
 
 
 def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
@@ -163,9 +166,7 @@ def _most_common_length(frames: Sequence[bytes]) -> tuple[int, int]:
 
     The length and the number are 0 if there are no frames.
     """
-    if not frames:
-        return 0, 0
-    return Counter(map(len, frames)).most_common(1)[0]
+    return max(Counter(map(len, frames)).items(), key=itemgetter(1), default=(0, 0))
 
 
 def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDivision]:
@@ -252,26 +253,8 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
         names = [name for name, checksum in CHECKSUMS.items() if checksum.size == size]
         for order in ORDERS[:size]:  # a single byte has no byte order
             for start, name in product(range(last_possible_start + 1), names):
-                if _fits(CHECKSUMS[name].compute, frames, start, size, order):
+                compute = CHECKSUMS[name].compute
+                wrong = [compute(frame[start:-size]) != int.from_bytes(frame[-size:], order) for frame in frames]
+                if sum(wrong) <= (1.0 - INTACT_SHARE) * len(frames):  # some frames may be damaged
                     yield Check(size, order, name, start)
                     break
-
-
-def _fits(compute: Callable[[bytes], int], frames: list[bytes], start: int, size: int, order: ByteOrder) -> bool:
-    """Return whether most frames end with the checksum of the covered bytes.
-
-    The checksum covers the bytes from a given position to the checksum.
-
-    Args:
-        compute: Function that computes the checksum of bytes.
-        frames: The frames, which are of one length.
-        start: Position of the first byte that the checksum covers.
-        size: Number of bytes of the checksum.
-        order: Byte order of the checksum.
-    """
-    wrong_count = 0
-    for frame in frames:
-        wrong_count += compute(frame[start:-size]) != int.from_bytes(frame[-size:], order)
-        if wrong_count > (1.0 - INTACT_SHARE) * len(frames):
-            return False
-    return True

@@ -87,21 +87,23 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
     # A frame with a sync pattern may begin at any byte that may belong to the pattern.
     has_sync = division.framing == SYNC
     distances = np.flatnonzero(_may_be_sync(division.rows()))[:MAX_CONSTANT_BYTES].tolist() if has_sync else [0]
-    possible_rows = [division.rows(distance) for distance in distances]
-    checked_rows = [(rows, check) for rows in possible_rows for check in find_checks(rows)]
-    unchecked_rows = [(rows, Check(0, "little")) for rows in possible_rows]
+    rows_at = {distance: division.rows(distance) for distance in distances}
+    checks = [(distance, check) for distance, rows in rows_at.items() for check in find_checks(rows)]
+    unchecked = [(distance, Check(0, "little")) for distance in distances]
 
     # For each byte order and each checksum, find the division of the frame into parts with the lowest score.
     stream_bytes = len(division.stream)
     covered_share = min(1.0, len(division.starts) * length / stream_bytes)  # share of the bytes inside frames
     frame_rate_Hz = stream_bytes / length / seconds  # as if all bytes of the stream belonged to frames
-    for order, (rows, check) in product(ORDERS, checked_rows or unchecked_rows):
-        rows_before_check = rows[:, : length - check.size]
-        parts_at_each_byte = possible_parts(rows_before_check, order, check.start, frame_rate_Hz)
+    # Frames that begin at another byte have the same parts in another order, so the parts are listed only once.
+    parts_of_order = {order: possible_parts(division.rows(next_bytes=7), order, frame_rate_Hz) for order in ORDERS}
+    for order, (distance, check) in product(ORDERS, checks or unchecked):
+        rows = rows_at[distance]
+        parts_at_each_byte = (2 * parts_of_order[order])[distance : distance + length - check.size]
         # The first byte always belongs to the pattern, even if a damaged frame among these rows hides that it is
         # constant.
         sync_lengths = range(1, max(1, count_leading(_may_be_sync(rows))) + 1) if has_sync else [0]
-        score, sync_length, parts = split_frame(parts_at_each_byte, sync_lengths)
+        score, parts, sync_length = split_frame(parts_at_each_byte, sync_lengths, check.start)
         if all(part.name != CHANNEL for part in parts):
             continue
         sync = usual_bytes(rows)[0][:sync_length].tobytes()
