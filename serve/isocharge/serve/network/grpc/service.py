@@ -19,6 +19,7 @@ from typing import Any
 
 import grpc
 import grpc.aio
+import numpy as np
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.json_format import MessageToJson, ParseDict
@@ -29,7 +30,7 @@ from isocharge.common.errors import ModelError, RequestError, TooMany
 from isocharge.common.structs import convert
 from isocharge.serve.network.metrics import Exchange
 from isocharge.serve.network.protocol.handler import Handler
-from isocharge.serve.network.protocol.inference import DATATYPES, InferBody, infer
+from isocharge.serve.network.protocol.inference import DATATYPES, InferBody, infer, take_binary_tensor
 from isocharge.serve.network.protocol.response import refusal
 from isocharge.serve.network.protocol.routes import ROUTES, Request
 
@@ -56,74 +57,39 @@ METHODS: dict[str, tuple[type[Any], type[Any]]] = {
 def read_request(message: Any) -> tuple[InferBody, bytes]:
     """Read a ModelInferRequest, and return its content and the charges that are sent as raw contents.
 
-    The message is converted to the JSON object that the equivalent HTTP request would contain. If the charges are sent
-    as raw contents, so are the outputs of the response.
-
     Args:
         message: The ModelInferRequest.
 
     Raises:
         RequestError: If the message is not a request for an inference.
     """
-    raw_contents = message.raw_input_contents
-    if len(raw_contents) > 1:
-        raise RequestError(f"raw_input_contents: expected the bytes of one input tensor, got {len(raw_contents)}")
     content = {
         "id": message.id,
         "inputs": [
-            {
-                "name": tensor.name,
-                "datatype": tensor.datatype,
-                "shape": list(tensor.shape),
-                "data": _numbers(tensor),
-                "parameters": _unsupported_parameters(tensor),
-            }
-            for tensor in message.inputs
+            {"name": tensor.name, "datatype": tensor.datatype, "shape": list(tensor.shape)} for tensor in message.inputs
         ],
-        "outputs": [{"name": output.name, "parameters": _unsupported_parameters(output)} for output in message.outputs],
-        "parameters": {"binary_data_output": len(raw_contents) > 0},
+        "outputs": [{"name": output.name} for output in message.outputs],
     }
-    return convert(content, InferBody, "", RequestError), b"".join(raw_contents)
+    body = convert(content, InferBody, "", RequestError)
+    # The numbers are either raw bytes, or a list whose name depends on their type.
+    datatype = body.inputs[0].datatype
+    numbers = getattr(message.inputs[0].contents, f"{datatype.lower()}_contents")
+    raw_contents = [*message.raw_input_contents]
+    if numbers:
+        raw_contents.append(np.array(numbers, DATATYPES[datatype]).tobytes())
+    if len(raw_contents) != 1:
+        raise RequestError(
+            f"expected the numbers of one input tensor, in raw_input_contents or in {datatype.lower()}_contents, "
+            f"got {len(raw_contents)} lists"
+        )
+    return body, raw_contents[0]
 
 
-def _numbers(tensor: Any) -> list[Any] | None:
-    """Return the contents of a tensor, or None if it has none.
-
-    Raises:
-        RequestError: If the tensor has contents of another type than its datatype. They could be other numbers.
-    """
-    contents = {field.name: list(values) for field, values in tensor.contents.ListFields()}
-    expected = f"{tensor.datatype.lower()}_contents"
-    numbers = contents.pop(expected, None)
-    if contents and tensor.datatype in DATATYPES:
-        raise RequestError(f"input {tensor.name!r:.50}: expected only {expected}, got {', '.join(contents)}")
-    return numbers
-
-
-def _unsupported_parameters(tensor: Any) -> dict[str, bool]:
-    """Return the unsupported parameters of a tensor, each with the value True.
-
-    The server must refuse unsupported parameters, because they change the meaning of a request.
-    """
-    return {name: True for name in ("shared_memory_region", "classification") if name in tensor.parameters}
-
-
-def write_response(content: dict[str, Any], binary_tensors: list[bytes]) -> Any:
-    """Convert the content of an HTTP response to a ModelInferResponse.
-
-    Args:
-        content: Content of the HTTP response. If an output contains its values, they become a list of texts or numbers.
-        binary_tensors: Outputs that are sent as raw contents.
-    """
-    for tensor in content["outputs"]:
-        tensor.pop("parameters", None)  # the raw contents themselves have a length
-        values = tensor.pop("data", None)
-        if isinstance(values, list):
-            tensor["contents"] = {"bytes_contents": [text.encode() for text in values]}
-        elif values is not None:
-            tensor["contents"] = {"fp32_contents": values.tolist()}
+def write_response(content: dict[str, Any]) -> Any:
+    """Convert the content of an HTTP response to a ModelInferResponse. All outputs are sent as raw contents."""
     _, response_type = METHODS["ModelInfer"]
-    return response_type(**content, raw_output_contents=binary_tensors)
+    raw_contents = [take_binary_tensor(tensor) for tensor in content["outputs"]]
+    return response_type(**content, raw_output_contents=raw_contents)
 
 
 ROUTE_OF_METHOD = {name: route for route in ROUTES for name in route.rpcs}
@@ -274,7 +240,7 @@ class Service:
         """Run a model on the charges of a ModelInferRequest, and return the ModelInferResponse."""
         loaded = self._store.get(request.model_name, request.model_version)
         with loaded.statistics.measure():
-            return write_response(*infer(loaded, self._limits.batch, *read_request(request)))
+            return write_response(infer(loaded, self._limits.batch, *read_request(request)))
 
     def _infer_in_stream(self, request: Any) -> Any:
         """Return the response to one request of a stream.

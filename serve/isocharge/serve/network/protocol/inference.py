@@ -21,21 +21,8 @@ from isocharge.serve.model.contact import Contacts, as_float32
 from isocharge.serve.model.session import COLUMNS, INPUT, OUTPUTS, run
 from isocharge.serve.network.model_store import LoadedVersion
 
-Unsupported = Annotated[None, Meta(description="nothing, as this server does not support it")]
-
-
-class Parameters(Struct, frozen=True):
-    """Parameters of a request, of an input or of an output. Unknown parameters are ignored, as in Triton."""
-
-    binary_data: bool | None = None
-    binary_data_output: bool | None = None
-    binary_data_size: int | None = None
-    shared_memory_region: Unsupported = None
-    classification: Unsupported = None
-
-
-NO_PARAMETERS = Parameters()
-"""Parameters of a request, of an input or of an output that contains none."""
+Parameters = dict[str, Any] | None
+"""Parameters of a request, of an input or of an output. Unknown parameters are ignored, as in Triton."""
 
 
 class InputTensor(Struct, frozen=True):
@@ -45,14 +32,14 @@ class InputTensor(Struct, frozen=True):
     datatype: Literal["FP32", "FP64"]
     shape: list[int]
     data: Annotated[list[float | list[float]], Meta(description="numbers, flat or in rows")] | None = None
-    parameters: Parameters | None = None
+    parameters: Parameters = None
 
 
 class OutputTensor(Struct, frozen=True):
     """Output that the client requests."""
 
     name: Literal["contact", "contact_std", "contact_correlation", "misfit", "flags"]
-    parameters: Parameters | None = None
+    parameters: Parameters = None
 
 
 class InferBody(Struct, frozen=True):
@@ -61,7 +48,7 @@ class InferBody(Struct, frozen=True):
     inputs: Annotated[list[InputTensor], Meta(min_length=1, max_length=1, description="a list with one tensor")]
     id: str | None = None
     outputs: list[OutputTensor] | None = None
-    parameters: Parameters | None = None
+    parameters: Parameters = None
 
 
 class IndexBody(Struct, frozen=True):
@@ -78,9 +65,6 @@ FLAGS = "flags"
 
 This output is only computed if the client requests it.
 """
-
-Rows = np.ndarray[Any, Any]
-"""Values of an output, shape (n, width). They are texts for the output `flags`, and numbers for all other outputs."""
 
 
 def read_infer(body: bytes, header_length: bytes | None) -> tuple[InferBody, bytes]:
@@ -101,46 +85,21 @@ def read_infer(body: bytes, header_length: bytes | None) -> tuple[InferBody, byt
     if header_length is not None:
         # The characters are checked before the conversion, because int() also accepts signs, blanks and underscores,
         # and is slow for long texts.
-        is_short_number = header_length.isdigit() and len(header_length) <= len(str(len(body)))
-        if not is_short_number or int(header_length) > len(body):
+        if not header_length.isdigit() or len(header_length) > len(str(len(body))):
             raise RequestError(
                 f"Inference-Header-Content-Length: expected a whole number up to {len(body)}, the bytes of the body, "
                 f"got {header_length.decode('latin-1')!r:.50}"
             )
         json_length = int(header_length)
-    content = parse_json(body[:json_length], "", RequestError, InferBody)
-    binary = body[json_length:]
-    stated_size = (content.inputs[0].parameters or NO_PARAMETERS).binary_data_size or 0
-    if stated_size != len(binary):
-        raise RequestError(
-            f"inputs[0].parameters.binary_data_size: expected {len(binary)}, the bytes after the JSON text of "
-            f"Inference-Header-Content-Length bytes, got {stated_size!r:.50}"
-        )
-    return content, binary
+    return parse_json(body[:json_length], "", RequestError, InferBody), body[json_length:]
 
 
-def _requested_outputs(body: InferBody) -> dict[str, bool]:
-    """Return whether each requested output is sent as a binary tensor, by the name of the output.
-
-    The outputs are in the order of the response. If a request contains no names of outputs, all outputs of the model
-    are returned.
-
-    Args:
-        body: Content of the request.
-
-    Raises:
-        RequestError: If an output is requested twice.
-    """
-    default_is_binary = bool((body.parameters or NO_PARAMETERS).binary_data_output)
-    if not body.outputs:
-        return dict.fromkeys(OUTPUTS, default_is_binary)
-    outputs: dict[str, bool] = {}
-    for output in body.outputs:
-        stated_choice = (output.parameters or NO_PARAMETERS).binary_data
-        outputs[output.name] = default_is_binary if stated_choice is None else stated_choice
-    if len(outputs) < len(body.outputs):
-        raise RequestError("outputs: expected each name once")
-    return outputs
+def binary_outputs(body: InferBody) -> set[str]:
+    """Return the names of the outputs that a client of HTTP requests as binary tensors."""
+    is_default = (body.parameters or {}).get("binary_data_output")
+    outputs: dict[str, Parameters] = {output.name: output.parameters for output in body.outputs or ()}
+    outputs = outputs or dict.fromkeys(OUTPUTS)
+    return {name for name, parameters in outputs.items() if (parameters or {}).get("binary_data", is_default)}
 
 
 def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...], max_presses: int) -> Singles:
@@ -148,7 +107,7 @@ def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...
 
     Args:
         tensor: Input tensor of the request.
-        binary: Binary tensor with the charges. It is empty if the input tensor itself contains the charges.
+        binary: Binary tensor with the charges. It is ignored if the input tensor itself contains the charges.
         electrodes: Names of the electrodes of the model, in the order of the charges.
         max_presses: Largest number of presses in one request.
 
@@ -166,38 +125,33 @@ def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...
     if shape[0] > max_presses:
         raise TooLarge(f"input {INPUT!r}: expected at most {max_presses} presses in one request, got {shape[0]}")
 
-    dtype = DATATYPES[tensor.datatype]
     count = math.prod(shape)
-    # Too many numbers are refused, and the message shows the first of them. The other numbers need not be converted.
-    data = tensor.data and tensor.data[: count + 100]
+    dtype = DATATYPES[tensor.datatype]
     try:
-        charges = np.frombuffer(binary, dtype) if binary else np.asarray(data, np.float64)
-    except (TypeError, ValueError):  # an incomplete number, no numbers, or rows of different lengths
+        charges = np.frombuffer(binary, dtype) if tensor.data is None else np.asarray(tensor.data, np.float64)
+    except ValueError:  # an incomplete number, or rows of different lengths
         charges = np.empty(0)
-    is_sent_twice = binary and data is not None
-    if is_sent_twice or charges.shape not in (tuple(shape), (count,)):
+    if charges.shape not in (tuple(shape), (count,)):
         raise RequestError(
-            f"input {INPUT!r}: expected {count} numbers for the shape {shape}, flat or in rows, or {count} binary "
-            f"numbers of {dtype.itemsize} bytes each, got {data!r:.100} and {len(binary)} bytes"
+            f"input {INPUT!r}: expected {count} numbers for the shape {shape}, flat or in rows of equal length, or "
+            f"{count} binary numbers of {dtype.itemsize} bytes each, got an array of the shape {charges.shape} and "
+            f"{len(binary)} bytes"
         )
     return as_float32(charges.reshape(shape), electrodes)
 
 
-def _flags(loaded: LoadedVersion, outputs: dict[str, Rows]) -> Rows:
-    """Return the flags of each press as one text with commas between the flags, shape (n, 1).
+def _flags(loaded: LoadedVersion, outputs: dict[str, Any]) -> list[str]:
+    """Return the flags of each press as one text with commas between the flags.
 
     Args:
         loaded: Version of the model that was run.
         outputs: Outputs of the model for the presses by name, each of shape (n, width).
     """
     contacts = Contacts(*np.concatenate([outputs[name] for name in COLUMNS], axis=1).T)
-    texts = [",".join(flags) for flags in loaded.validity.batch_flags(contacts)]
-    return np.array(texts, dtype=object)[:, np.newaxis]
+    return [",".join(flags) for flags in loaded.validity.batch_flags(contacts)]
 
 
-def infer(
-    loaded: LoadedVersion, max_presses: int, body: InferBody, binary: bytes
-) -> tuple[dict[str, Any], list[bytes]]:
+def infer(loaded: LoadedVersion, max_presses: int, body: InferBody, binary: bytes) -> dict[str, Any]:
     """Run a model on the presses of a request, and count the presses.
 
     Args:
@@ -207,53 +161,42 @@ def infer(
         binary: Binary tensor with the charges, which is empty if the content contains the charges.
 
     Returns:
-        The content of the response, and its binary tensors. The content is the JSON object that an HTTP response
-        contains. Its numbers are arrays, and its texts are lists.
+        The content of the response, in the form of the JSON object of an HTTP response. The values of each output are
+        under the key `data`: an array of numbers, or a list of texts for the output `flags`.
 
     Raises:
         IsochargeError: If the request does not fit the model, or if the model fails.
     """
-    requested_outputs = _requested_outputs(body)
     charge_pC = _read_charges(body.inputs[0], binary, loaded.metadata.electrodes, max_presses)
-    outputs = dict[str, Rows](run(loaded.session, charge_pC))
-    if FLAGS in requested_outputs:
-        outputs[FLAGS] = _flags(loaded, outputs)
+    outputs = dict[str, Any](run(loaded.session, charge_pC))
+    alarm_count = np.count_nonzero(~(outputs["misfit"] <= loaded.validity.misfit_limit))  # also NaN
+    loaded.statistics.presses.inc(len(charge_pC))
+    loaded.statistics.alarms.inc(float(alarm_count))
+
+    names = [output.name for output in body.outputs or ()] or OUTPUTS
+    tensors: list[dict[str, Any]] = []
+    for name in names:
+        if name == FLAGS:
+            shape, flags = (len(charge_pC), 1), _flags(loaded, outputs)
+            tensors.append({"name": name, "datatype": "BYTES", "shape": shape, "data": flags})
+        else:
+            rows = outputs[name]
+            tensors.append({"name": name, "datatype": "FP32", "shape": rows.shape, "data": rows.ravel()})
     content: dict[str, Any] = {"model_name": loaded.metadata.name, "model_version": loaded.version}
     if body.id:
         content["id"] = body.id
-    binary_tensors: list[bytes] = []
-    content["outputs"] = [
-        _output_tensor(name, outputs[name], binary_tensors if is_binary else None)
-        for name, is_binary in requested_outputs.items()
-    ]
-    loaded.statistics.presses.inc(len(charge_pC))
-    alarm_count = np.count_nonzero(~(outputs["misfit"] <= loaded.validity.misfit_limit))  # also NaN
-    loaded.statistics.alarms.inc(float(alarm_count))
-    return content, binary_tensors
+    content["outputs"] = tensors
+    return content
 
 
-def _output_tensor(name: str, rows: Rows, binary_tensors: list[bytes] | None) -> dict[str, Any]:
-    """Return the JSON object that describes an output in the response.
+def take_binary_tensor(tensor: dict[str, Any]) -> bytes:
+    """Remove the values from the object that describes an output, and return them as a binary tensor.
 
     In a binary tensor, numbers are little-endian float32. Each text is preceded by its length in bytes, a 32-bit
     unsigned integer.
-
-    Args:
-        name: Name of the output.
-        rows: Values of the output.
-        binary_tensors: List to which the values are appended as a binary tensor. None if the object itself contains the
-            values.
     """
-    is_text = name == FLAGS
-    values = rows.ravel()
-    tensor: dict[str, Any] = {"name": name, "datatype": "BYTES" if is_text else "FP32", "shape": rows.shape}
-    if binary_tensors is None:
-        tensor["data"] = values.tolist() if is_text else values  # orjson writes arrays of numbers only
-        return tensor
-    if is_text:
-        data = b"".join(struct.pack("<I", len(text)) + text.encode() for text in values)
-    else:
-        data = values.astype("<f4", copy=False).tobytes()
-    binary_tensors.append(data)
-    tensor["parameters"] = {"binary_data_size": len(data)}
-    return tensor
+    values = tensor.pop("data")
+    if tensor["datatype"] == "BYTES":
+        return b"".join(struct.pack("<I", len(text)) + text.encode() for text in values)
+    data: bytes = values.astype("<f4", copy=False).tobytes()
+    return data

@@ -17,7 +17,7 @@ from isocharge.serve.model.session import INPUT, OUTPUTS
 from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.metrics import CONTENT_TYPE, Traffic
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
-from isocharge.serve.network.protocol.inference import IndexBody, infer, read_infer
+from isocharge.serve.network.protocol.inference import IndexBody, binary_outputs, infer, read_infer, take_binary_tensor
 from isocharge.serve.network.protocol.response import Response, response_of
 
 EXTENSIONS = (
@@ -190,7 +190,13 @@ def _infer(request: Request) -> Response:
     header_length = request.headers.get(b"inference-header-content-length")
     with loaded.statistics.measure():
         body, binary = read_infer(request.body, header_length)
-        content, binary_tensors = infer(loaded, request.limits.batch, body, binary)
+        content = infer(loaded, request.limits.batch, body, binary)
+        binary_names = binary_outputs(body)
+        binary_tensors: list[bytes] = []
+        for tensor in content["outputs"]:
+            if tensor["name"] in binary_names:
+                binary_tensors.append(take_binary_tensor(tensor))
+                tensor["parameters"] = {"binary_data_size": len(binary_tensors[-1])}
         json_text = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
     if not binary_tensors:
         return response_of(200, b"application/json", json_text)
