@@ -69,12 +69,12 @@ def test_no_node_makes_a_film_slack_in_one_direction(problem, pretension_MPa):
 def test_node_at_which_the_charges_are_unknown_is_left_out(problem, synthetic, monkeypatch, caplog):
     """Otherwise, the fit to its charges would also spoil the charges at the other nodes."""
 
-    def node_charges(charge, changed_charge, _node_MPa):
-        ratio = 0.5 * np.random.default_rng(3).standard_normal(changed_charge.shape)
-        return charge * (1.0 + ratio * np.array([0.0, 0.0, 1.0])[:, None])
+    def charge(film, contact):
+        factor = np.random.default_rng(3).uniform(0.1, 1.9, (len(contact), 4))
+        return film.charges.charges(film.values, contact) * (factor if film.change_MPa == 0.9 else 1.0)
 
     monkeypatch.setattr(compact_map, "_nodes", lambda _: np.array([-0.3, 0.0, 0.9]))
-    monkeypatch.setattr(compact_map, "_node_charges", node_charges)
+    monkeypatch.setattr(_ChangedFilm, "charge", charge)
     monkeypatch.setattr(FilmCharges, "of_even_film", lambda *_: synthetic)
     series = compact_map.compact_charges(problem.domain, synthetic, uneven_film(problem), None)
     assert series.node_MPa.tolist() == [-0.3, 0.0]

@@ -5,9 +5,9 @@ charges. These combinations are called directions. The compact charge map contai
 direction. The training uses them to draw films, and the live follower uses them to find out how the real film differs
 from the estimated one.
 
-The nodes of the map are films with other pretensions. Their charges are those of the calibrated film, changed by the
-ratio or the difference of the charges of two nearly axisymmetric films, with the other pretension and with that of the
-calibration. The changes along the directions are also computed for these films, because they depend on the pretension.
+The nodes of the map are films with other pretensions. Their charges are those of the calibrated film, changed by as
+much as those of a nearly axisymmetric film between the pretension of the calibration and the other one. The changes
+along the directions are also computed for these films, because they depend on the pretension.
 
 Worker processes compute the charges of the films. This module does not import torch, so that they start quickly.
 """
@@ -15,12 +15,13 @@ Worker processes compute the charges of the films. This module does not import t
 import logging
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from operator import methodcaller
+from functools import partial
+from operator import call, methodcaller
 
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.serve.model.charge_series import ChargeSeries, series_size
+from isocharge.serve.model.charge_series import ChargeSeries, Series, series_size
 from isocharge.serve.presses.measured_presses import CONTACT
 from isocharge.simulate import Domain
 from isocharge.simulate.execution import in_order
@@ -34,6 +35,12 @@ log = logging.getLogger(__name__)
 
 SERIES_CONTACTS = 6800
 """Number of contacts to which the series of the charges are fitted."""
+
+CHANGE_CONTACTS = 2000
+"""Number of contacts to which the changes of the charges to other pretensions are fitted."""
+
+CHANGE_DEGREES = (10, 5)
+"""Degrees of the series of these changes in the position and in the force."""
 
 DIRECTION_CONTACTS = 1200
 """Number of contacts to which the series of the directions are fitted."""
@@ -73,11 +80,13 @@ def compact_charges(
     films = [calibrated]
     if len(names) > len(CONTACT):  # three charges only determine the contact
         films = [calibrated.changed(change_MPa, executor) for change_MPa in _nodes(film)]
-    film_charge, *changed_charges = in_order(executor, methodcaller("charge", contact), [calibrated, *films])
+    few_for_change = contact[:CHANGE_CONTACTS]
+    jobs = [partial(calibrated.charge, contact), *(partial(one.charge, few_for_change) for one in films)]
+    film_charge, *changed_charges = in_order(executor, call, jobs)
     discrepancy = discrepancy_jacobian(film_charge, contact, charges.domain) @ film.values[film.layout.coefficients]
     charge = film_charge + discrepancy  # most probable charges without offset, shape (n, n_electrode)
     node_MPa = np.array([one.change_MPa for one in films])
-    node_charge = _node_charges(charge[:, None], np.stack(changed_charges, axis=1), node_MPa)
+    node_charge = _node_charges(domain.to_unit(contact), charge[:, None], np.stack(changed_charges, axis=1), node_MPa)
     series = _fit_followable_nodes(domain, names, contact, node_charge, node_MPa)
     few_contacts, few_charges = contact[:DIRECTION_CONTACTS], charge[:DIRECTION_CONTACTS]
     followed_films = [one for one in films if one.change_MPa in series.node_MPa]
@@ -195,24 +204,37 @@ def _nodes(film: FilmEstimate) -> Array:
     return np.unique(np.maximum(NODES_MPa, lowest_MPa))
 
 
-def _node_charges(charge: Array, changed_charge: Array, node_MPa: Array) -> Array:
+def _node_charges(unit_contact: Array, charge: Array, changed_charge: Array, node_MPa: Array) -> Array:
     """Compute the charges of the calibrated film at the nodes from those of axisymmetric films.
 
-    If all charges have the same sign, the ratio of two of them hardly depends on the neglected properties of the film.
-    Otherwise, some charges are nearly zero or change their sign, so that the difference is used instead of the ratio.
+    The relative change of the charges from the pretension of the calibration to each node is a smooth function of the
+    contact. A series is fitted to the changes for the first contacts, and evaluated for the other contacts. If all
+    charges have the same sign, the change is relative to the charge itself, because the ratio of two charges hardly
+    depends on the neglected properties of the film. Otherwise, some charges are nearly zero, so that the change is
+    relative to the size of the charges of all electrodes.
 
     Args:
-        charge: Charges of the calibrated film, shape (n, 1, n_electrode), pC.
-        changed_charge: Charges of the axisymmetric films at the nodes, shape (n, n_node, n_electrode), pC.
+        unit_contact: Contacts in unit coordinates, shape (n, 3).
+        charge: Their charges on the calibrated film, shape (n, 1, n_electrode), pC.
+        changed_charge: Charges of the first contacts on the axisymmetric films at the nodes, shape (n_first, n_node,
+            n_electrode), pC.
         node_MPa: Changes of the pretension, one of which is zero, shape (n_node,), MPa.
 
     Returns:
         Charges, shape (n, n_node, n_electrode), pC.
     """
+    has_one_sign = np.ptp(np.sign(changed_charge)) == 0.0
+
+    def size(charge: Array) -> Array:
+        return charge if has_one_sign else np.linalg.norm(charge, axis=2, keepdims=True)
+
     charge_before = changed_charge[:, node_MPa == 0.0]
-    if np.ptp(np.sign(changed_charge)):  # not all signs are equal
-        return charge + changed_charge - charge_before
-    return charge * changed_charge / charge_before
+    changes = (changed_charge - charge_before) / size(charge_before)
+    first_contact, other_contact = np.split(unit_contact, [len(changes)])
+    series = Series(fit_series(first_contact, changes.reshape(len(changes), -1), *CHANGE_DEGREES))
+    other_changes = series.values_and_derivatives(other_contact, np.zeros_like(other_contact))[:, 0]
+    all_changes = np.concatenate([changes, other_changes.reshape(-1, *changes.shape[1:])])
+    return charge + all_changes * size(charge)
 
 
 def _directions(
