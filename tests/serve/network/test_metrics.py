@@ -68,6 +68,3 @@ def test_metrics_list_loaded_and_refused_versions(film, tmp_path):
     store = ModelStore(tmp_path)
     samples = scrape(Handler(store))
     assert [value(samples, "model_ready", model="linear", version=v) for v in ("1", "2", "3")] == [1, 1, 0]
-    loaded = store.get("linear", "2")
-    facts = {"sensor": loaded.metadata.frame_id, "sha256": loaded.golden.sha256}
-    assert value(samples, "model_info", model="linear", version="2", **facts) == 1

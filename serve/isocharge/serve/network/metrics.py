@@ -10,15 +10,13 @@ log line, fill the disk with long lines, or create new counters.
 
 import json
 import logging
-import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 import onnxruntime as ort
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info, ProcessCollector
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info, Metric, ProcessCollector
 
 from isocharge.common.errors import package_version
 
@@ -32,110 +30,57 @@ They range from half the latency of a single press to three times the latency of
 """
 
 
-class ModelMetrics:
-    """Metrics of all models of one server, in a registry that also contains the metrics of the process.
+class Statistics(NamedTuple):
+    """Metrics of the inferences of one version of a model since the start of the server, or of all versions.
 
     Attributes:
-        registry: The registry.
-    """
-
-    def __init__(self) -> None:
-        """Create the metrics, which have no values before `of` is called."""
-        registry = self.registry = CollectorRegistry()
-        ProcessCollector(registry=registry)
-        versions = Info("isocharge", "Versions of the server.", registry=registry)
-        versions.info({"version": package_version(), "onnxruntime": ort.__version__})
-        settings: dict[str, Any] = {"labelnames": ("model", "version"), "registry": registry}
-        # Each name is a field of `Statistics`.
-        self._metrics: dict[str, Any] = {
-            "description": Info("isocharge_model", "Versions of the models.", **settings),
-            "ready": Gauge("isocharge_model_ready", "Whether a version is loaded.", **settings),
-            "presses": Counter("isocharge_presses", "Presses that were answered.", **settings),
-            "alarms": Counter(
-                "isocharge_misfit_alarms", "Presses whose misfit is above the limit of the model.", **settings
-            ),
-            "refused": Counter(
-                "isocharge_inferences_refused", "Requests for an inference that were refused.", **settings
-            ),
-            "latency": Histogram(
-                "isocharge_inference_seconds",
-                "Time to read, compute and write an inference, without the network.",
-                buckets=LATENCY_BOUNDS_S,
-                **settings,
-            ),
-            "refused_time": Counter("isocharge_refused_seconds", "Time of refused requests.", **settings),
-            "latest": Gauge("isocharge_inference_latest_seconds", "Unix time of the latest inference.", **settings),
-        }
-
-    def of(self, name: str, version: int) -> "Statistics":
-        """Return the metrics of a version. The metrics keep their values if the version has been loaded before."""
-        return Statistics(**{field: metric.labels(name, version) for field, metric in self._metrics.items()})
-
-    def remove(self, name: str, version: int) -> None:
-        """Remove the metrics of a version whose folder no longer exists. An alarm would otherwise never end."""
-        for metric in self._metrics.values():
-            metric.remove(name, version)
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """Metrics of one version of a model since the start of the server. Any thread may call any method.
-
-    Attributes:
-        description: Sensor and checksum of the version.
-        ready: 1 if the version is loaded, otherwise 0.
         presses: Number of presses that were answered.
         alarms: Number of presses whose misfit is above the limit.
         refused: Number of requests for an inference that were refused.
-        latency: Durations of the requests that were answered, s.
-        refused_time: Total duration of the refused requests, s.
-        latest: Unix time of the latest inference, s.
+        latency: Durations of all requests for an inference, s.
     """
 
-    description: Info
-    ready: Gauge
     presses: Counter
     alarms: Counter
     refused: Counter
     latency: Histogram
-    refused_time: Counter
-    latest: Gauge
 
-    @contextmanager
-    def measure(self) -> Iterator[None]:
-        """Context manager that measures the time to read a request, to run the model and to write the response.
+    @classmethod
+    def of_all_versions(cls) -> "Statistics":
+        """Create the metrics of all versions, which have no values before `of` is called."""
+        labels = ("model", "version")
+        description = "Time to read, compute and write an inference, without the network."
+        return cls(
+            Counter("isocharge_presses", "Presses that were answered.", labels, registry=None),
+            Counter("isocharge_misfit_alarms", "Presses with the flag misfit.", labels, registry=None),
+            Counter(
+                "isocharge_inferences_refused", "Requests for an inference that were refused.", labels, registry=None
+            ),
+            Histogram("isocharge_inference_seconds", description, labels, registry=None, buckets=LATENCY_BOUNDS_S),
+        )
 
-        The request is counted as answered or, if an error occurs, as refused.
-        """
-        start_s = time.perf_counter()
-        try:
-            yield
-        except Exception:
-            self.refused.inc()
-            self.refused_time.inc(time.perf_counter() - start_s)
-            raise
-        self.latency.observe(time.perf_counter() - start_s)
-        self.latest.set(time.time())
+    def of(self, name: str, version: int) -> "Statistics":
+        """Return the metrics of a version. The metrics keep their values if the version has been loaded before."""
+        return Statistics._make(metric.labels(name, version) for metric in self)
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield the present values for Prometheus."""
+        for metric in self:
+            yield from metric.collect()
 
     def to_json(self) -> dict[str, Any]:
-        """Return the counters as a JSON object with the names that Triton uses in its statistics."""
-        values = {
-            sample.name: sample.value
-            for metric in vars(self).values()
-            for family in metric.collect()
-            for sample in family.samples
-        }
-        answered = int(values["isocharge_inference_seconds_count"])
+        """Return the counters of a version as a JSON object with the names that Triton uses in its statistics."""
+        values = {sample.name: sample.value for metric in self.collect() for sample in metric.samples}
         refused = int(values["isocharge_inferences_refused_total"])
+        answered = int(values["isocharge_inference_seconds_count"]) - refused
+        nanoseconds = round(1e9 * values["isocharge_inference_seconds_sum"])
         return {
-            "last_inference": round(1e3 * values["isocharge_inference_latest_seconds"]),
             "inference_count": int(values["isocharge_presses_total"]),
             "execution_count": answered,
             "inference_stats": {
-                "success": {"count": answered, "ns": round(1e9 * values["isocharge_inference_seconds_sum"])},
-                "fail": {"count": refused, "ns": round(1e9 * values["isocharge_refused_seconds_total"])},
+                "success": {"count": answered, "ns": nanoseconds},  # includes the time of refused requests
+                "fail": {"count": refused},
             },
-            "batch_stats": [],
         }
 
 
@@ -195,7 +140,7 @@ class Traffic:
 
     Attributes:
         log: Log to which each request is written, or None if there is no log.
-        registry: Registry of the metrics.
+        registry: Registry of the metrics of the requests, of the process, and of the models of a `Handler`.
         open: Number of open connections or calls, with the label "http" or "grpc".
         lost_lines: Number of log lines that could not be written.
     """
@@ -204,6 +149,9 @@ class Traffic:
         """Create the metrics of a server that has not received any request."""
         self.log = log
         self.registry = CollectorRegistry()
+        ProcessCollector(registry=self.registry)
+        versions = Info("isocharge", "Versions of the server.", registry=self.registry)
+        versions.info({"version": package_version(), "onnxruntime": ort.__version__})
         self._requests = Counter(
             "isocharge_requests",
             "Requests that were answered or refused.",
@@ -224,7 +172,4 @@ class Traffic:
         """Count a request that was answered, possibly with an error, and log the request if there is a log."""
         self._requests.labels(exchange.transport, exchange.route, exchange.status).inc()
         if self.log is not None:
-            client = exchange.client
-            client_text = "%s:%d" % client if isinstance(client, tuple) else client  # noqa: UP031 - twice as fast
-            level = "error" if exchange.status in (500, "INTERNAL") else "info"  # internal errors of HTTP and of gRPC
-            self.log.write_line(level, "request", vars(exchange) | {"client": client_text})
+            self.log.write_line("info", "request", vars(exchange))

@@ -9,21 +9,21 @@ single assignment. Requests that have already begun are answered with the old se
 are refused, the old version remains available.
 """
 
-import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
+from prometheus_client import Metric
+from prometheus_client.core import GaugeMetricFamily
+
 from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.common.files import StrPath
 from isocharge.serve.model.contact import Validity
 from isocharge.serve.model.model_folder import Model, load_checked_model, model_names, repositories, version_folders
-from isocharge.serve.network.metrics import ModelMetrics, Statistics
-
-log = logging.getLogger(__name__)
+from isocharge.serve.network.metrics import Statistics
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,6 @@ class ModelStore:
     """Loaded models by name and version.
 
     Any thread may call any method. A lock ensures that only one thread at a time loads or unloads models.
-
-    Attributes:
-        metrics: Metrics of the requests to each version. They also contain versions that were refused or unloaded.
     """
 
     def __init__(self, models: StrPath | None = None) -> None:
@@ -88,7 +85,7 @@ class ModelStore:
         roots = repositories(models)
         self._roots = roots if models is None else roots[:1]
         self._change_lock = threading.Lock()
-        self.metrics = ModelMetrics()
+        self._statistics = Statistics.of_all_versions()
         # The list is sorted, and is replaced as a whole, so that no thread reads half of a change.
         self._versions: list[Version] = []
         for name, folder in self._folders().items():
@@ -211,53 +208,28 @@ class ModelStore:
         except ModelError as error:  # the folder cannot be listed
             folders = {}
             rows[0] = Version(name, 0, reason=str(error))
-            self.metrics.of(name, 0)  # the gauge of a model that is not ready
         for number, version_folder in folders.items():
             try:
-                rows[number] = Version(name, number, self._load_version(name, number, version_folder))
+                model = load_checked_model(version_folder)
+                loaded = LoadedVersion(**vars(model), statistics=self._statistics.of(name, number))
+                rows[number] = Version(name, number, loaded)
             except Exception as error:  # any error in one folder must not affect the other models
                 row = earlier.get(number, Version(name, number))
-                rows[number] = row._replace(reason=_refusal_reason(version_folder, error))
+                reason = str(error) if isinstance(error, ModelError) else f"{version_folder}: {error!r}"
+                rows[number] = row._replace(reason=reason)
         if not rows or any(row.reason for row in rows.values()):
             rows = earlier | rows
         self._replace(name, list(rows.values()))
 
-    def _load_version(self, name: str, number: int, folder: Path) -> LoadedVersion:
-        """Load one version of a model, check its files, and return the version.
-
-        Args:
-            name: Name of the model, which is the name of the parent folder.
-            number: Number of the version, which is the name of the folder.
-            folder: Folder of the version.
-
-        Raises:
-            ModelError: If a check fails.
-        """
-        statistics = self.metrics.of(name, number)
-        statistics.ready.set_function(lambda: len(self.versions_of(name, str(number))))
-        model = load_checked_model(folder)
-        statistics.description.info({"sensor": model.metadata.frame_id, "sha256": model.golden.sha256})
-        return LoadedVersion(**vars(model), statistics=statistics)
-
     def _replace(self, name: str, rows: list[Version]) -> None:
-        """Replace all versions of a model, and remove the metrics of the versions that are no longer listed."""
-        removed_numbers = {row.number for row in self._find(name)} - {row.number for row in rows}
+        """Replace all versions of a model."""
         others = [row for row in self._versions if row.name != name]
         self._versions = sorted([*others, *rows])
-        for number in removed_numbers:
-            self.metrics.remove(name, number)
 
-
-def _refusal_reason(folder: Path, error: Exception) -> str:
-    """Return the reason why a version is refused.
-
-    Every error other than a ModelError is unexpected, and is therefore also written to the log with its traceback.
-
-    Args:
-        folder: Folder of the version.
-        error: Error that has occurred while the version was loaded and checked.
-    """
-    if isinstance(error, ModelError):
-        return str(error)
-    log.error("%s: the model cannot be checked", folder, exc_info=error)
-    return f"{folder}: cannot be checked ({type(error).__name__}); copy or export the model again"
+    def collect(self) -> Iterator[Metric]:
+        """Yield the metrics of all models for Prometheus. A registry calls this method."""
+        ready = GaugeMetricFamily("isocharge_model_ready", "Whether a version is loaded.", labels=("model", "version"))
+        for row in self._versions:
+            ready.add_metric((row.name, str(row.number)), row.loaded is not None)
+        yield ready
+        yield from self._statistics.collect()

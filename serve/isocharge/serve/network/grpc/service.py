@@ -227,7 +227,7 @@ class Service:
     def _infer(self, request: Any) -> Any:
         """Run a model on the charges of a ModelInferRequest, and return the ModelInferResponse."""
         loaded = self._store.get(request.model_name, request.model_version)
-        with loaded.statistics.measure():
+        with loaded.statistics.refused.count_exceptions(), loaded.statistics.latency.time():
             return write_response(infer(loaded, self._limits.batch, *read_request(request)))
 
     def _infer_in_stream(self, request: Any) -> Any:

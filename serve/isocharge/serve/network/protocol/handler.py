@@ -166,6 +166,7 @@ class Handler(Application):
         self.access = access or AccessCheck()
         self.limits = limits or ServerLimits()
         self.traffic = traffic or Traffic()
+        self.traffic.registry.register(store)
 
     def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client = None) -> Response:
         """Answer one request as `Application.answer`, count the request, and log the request if there is a log."""

@@ -97,8 +97,7 @@ def _show_server(_: Request) -> dict[str, Any]:
 
 
 def _show_metrics(request: Request) -> Response:
-    text = generate_latest(request.store.metrics.registry) + generate_latest(request.traffic.registry)
-    return response_of(200, CONTENT_TYPE, text)
+    return response_of(200, CONTENT_TYPE, generate_latest(request.traffic.registry))
 
 
 def _is_ready(request: Request) -> dict[str, bool]:
@@ -188,7 +187,7 @@ def _infer(request: Request) -> Response:
     if not request.body and b"upgrade" in request.headers:  # uvicorn discards the body of a request for an upgrade
         raise RequestError("Upgrade: this server reads no body after this header; set the client to HTTP/1.1")
     header_length = request.headers.get(b"inference-header-content-length")
-    with loaded.statistics.measure():
+    with loaded.statistics.refused.count_exceptions(), loaded.statistics.latency.time():
         body, binary = read_infer(request.body, header_length)
         content = infer(loaded, request.limits.batch, body, binary)
         binary_names = binary_outputs(body)
