@@ -169,6 +169,10 @@ class TooLarge(RequestError):
     """A request is larger than the server allows."""
 
 
+class TooMany(RequestError):
+    """More calls are open than the server allows."""
+
+
 class UnknownEncoding(RequestError):
     """The body of a request is compressed by a method that the server does not support."""
 

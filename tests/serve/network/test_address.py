@@ -1,6 +1,7 @@
 """Where a server listens and whom it lets in: addresses, Unix sockets, tokens, certificate files."""
 
 import os
+import resource
 import socket
 import stat
 
@@ -64,6 +65,15 @@ def test_addresses_in_use_or_impossible_are_refused(handler, start_http, tmp_pat
         with pytest.raises(ListenError, match=message):
             address.listen(1)
     assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_server_may_open_as_many_files_as_the_system_permits():
+    """The usual limit of a process, 1,024 descriptors, is too low for 1,024 connections."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft // 2, hard))
+    Address().listen(1).close()
+    assert resource.getrlimit(resource.RLIMIT_NOFILE) == (hard, hard)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 @pytest.mark.parametrize("client", ["127.0.0.1", "::1"])

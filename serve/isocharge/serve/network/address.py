@@ -4,8 +4,10 @@ The HTTP server, the gRPC server and the live page use the classes of this modul
 loopback address, to which only programs on the same machine can connect.
 """
 
+import contextlib
 import errno
 import ipaddress
+import resource
 import socket
 import ssl
 from dataclasses import dataclass
@@ -34,12 +36,17 @@ class Address:
     def listen(self, backlog: int) -> socket.socket:
         """Open a Unix socket or a TCP socket that listens on this address, and return the socket.
 
+        Each connection needs an open file. The process is therefore allowed as many open files as the system permits.
+
         Args:
             backlog: Largest number of connections that wait to be accepted.
 
         Raises:
             ListenError: If the address is in use or cannot be used. The message states what to do.
         """
+        _, max_open_files = resource.getrlimit(resource.RLIMIT_NOFILE)
+        with contextlib.suppress(ValueError, OSError):  # macOS refuses an unlimited number
+            resource.setrlimit(resource.RLIMIT_NOFILE, (max_open_files, max_open_files))
         try:
             if self.uds is not None:
                 self.release()
@@ -126,21 +133,24 @@ class ServerLimits:
         body_bytes: Largest size of the body of a request, bytes. The limit applies before and after the body is
             decompressed.
         header_bytes: Largest total size of the request line and the headers, bytes.
-        client_seconds: Longest time that the server waits for a client, s. The server waits for the next request, for
-            the rest of a request, or until the client reads its response. The default is longer than the time for
-            which nginx keeps a connection open.
+        header_seconds: Longest time in which the headers of a request must arrive, s. It begins with the connection or
+            with the first byte of the request.
+        body_seconds: Longest time from the end of the headers to the end of the body, s. It is also the longest time in
+            which the client must read the response.
+        idle_seconds: Longest time between two requests of a connection, s.
         grace_seconds: Longest time to wait, when a server stops, until the requests that have begun are finished, s.
-        connections: Largest number of open connections. With the default, an HTTP server and a gRPC server together
-            need fewer than 1024 open files, which is the usual limit of a process.
+        connections: Largest number of open connections.
         queued_requests: Largest number of requests of a connection that wait for the response to an earlier request.
     """
 
     batch: int = MAX_BATCH
     body_bytes: int = 1 << 20
     header_bytes: int = 1 << 14
-    client_seconds: float = 75.0
-    grace_seconds: float = 5.0
-    connections: int = 500
+    header_seconds: float = 10.0
+    body_seconds: float = 30.0
+    idle_seconds: float = 75.0
+    grace_seconds: float = 10.0
+    connections: int = 1024
     queued_requests: int = 100
 
 

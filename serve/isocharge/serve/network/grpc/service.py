@@ -3,7 +3,8 @@
 The service uses the same models, limits and token as the HTTP server.
 
 Every method of the service is declared as a method that receives a stream of messages. The token and the limits can
-therefore be checked before the first message of a call arrives, and a call that sends no messages ends after some time.
+therefore be checked before the first message of a call arrives. If a new call exceeds the limit on open calls, the
+service ends the call that has waited longest for a message from its client.
 
 The message classes are created from the compiled file `inference.proto` in a separate descriptor pool. A program can
 therefore also import another implementation of the protocol, although the messages of both implementations have the
@@ -25,7 +26,7 @@ from google.protobuf.json_format import MessageToJson, ParseDict
 from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 
-from isocharge.common.errors import ModelError, RequestError
+from isocharge.common.errors import ModelError, RequestError, TooMany
 from isocharge.common.structs import convert
 from isocharge.serve.network.metrics import Exchange
 from isocharge.serve.network.protocol.handler import Handler
@@ -114,7 +115,12 @@ class Service:
         self._limits = handler.limits
         self._traffic = handler.traffic
         self._access = handler.access
-        self._open_calls = self._traffic.open.labels("grpc")
+        self._open_count = 0
+        self._is_stopping = False
+        # One timeout for each call that waits for a message of its client, in the order in which the waits began. The
+        # dictionary has no values and serves as an ordered set.
+        self._waiting: dict[asyncio.Timeout, None] = {}
+        self._traffic.open.labels("grpc").set_function(lambda: self._open_count)
 
     async def handle(self, name: str, _messages: object, context: grpc.aio.ServicerContext) -> None:
         """Answer a call, count the call by its status, and log the call if there is a log.
@@ -130,19 +136,22 @@ class Service:
         call = Exchange("grpc", name, "CANCELLED", client=context.peer())
         start_ns = time.perf_counter_ns()
         message = ""
+        self._open_count += 1
         try:
-            with self._open_calls.track_inprogress():
-                await self._answer(name, context, call)
+            self._limit_open_calls()
+            await self._answer(name, context, call)
             call.status = "OK"
         except grpc.aio.InternalError as error:  # no message can be sent or read, as the client has ended the call
             raise asyncio.CancelledError from error
         except TimeoutError:
             call.status = "DEADLINE_EXCEEDED"
-            message = "the call waited too long for its client"
+            call.error = "TimeoutError"
+            message = "the call waited too long for its client, others needed its place, or the server stops"
         except Exception as error:  # every error is sent to the client
             _, call.status, message = refusal(error)
             call.error = type(error).__name__
         finally:
+            self._open_count -= 1
             call.duration_us = (time.perf_counter_ns() - start_ns) / 1000
             self._traffic.count_and_log(call)
         if message:
@@ -152,7 +161,9 @@ class Service:
         """Check the token, and answer the messages of a call.
 
         A call of the method `STREAM_METHOD` may contain any number of messages, and every other call contains one
-        message. The client must send each message and read its response within `client_seconds`.
+        message. The first message must arrive within `header_seconds`, and each later message within `idle_seconds`
+        after the previous response. The client must read each response within `body_seconds`. If the server is to stop,
+        no message is read after the present one.
 
         Args:
             name: Name of the method.
@@ -166,18 +177,17 @@ class Service:
         if ROUTE_OF_METHOD[name].needs_token:
             metadata = dict(context.invocation_metadata() or ())
             self._access.check_token(str(metadata.get("authorization", "")).encode())
-        while True:
-            async with asyncio.timeout(self._limits.client_seconds):
-                data = await context.read()
-                if data is grpc.aio.EOF:
-                    return
-                if name.startswith("RepositoryModel"):  # loading a model takes a long time
-                    response = await asyncio.to_thread(self._respond, name, data, call)
-                else:
-                    response = self._respond(name, data, call)
+        timeout_s = self._limits.header_seconds
+        while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:
+            if name.startswith("RepositoryModel"):  # loading a model takes a long time
+                response = await asyncio.to_thread(self._respond, name, data, call)
+            else:
+                response = self._respond(name, data, call)
+            async with asyncio.timeout(self._limits.body_seconds):
                 await context.write(response)
-            if name != STREAM_METHOD:
+            if name != STREAM_METHOD or self._is_stopping:
                 return
+            timeout_s = self._limits.idle_seconds
 
     def _respond(self, name: str, data: bytes, call: Exchange) -> bytes:
         """Answer one message, and return the serialized response.
@@ -185,13 +195,14 @@ class Service:
         Args:
             name: Name of the method.
             data: The serialized message of the request.
-            call: Properties of the call, in which the model is set.
+            call: Properties of the call, in which the model is set and the sizes of the messages are added up.
 
         Raises:
             RequestError: If the data are not a message of the expected type.
             IsochargeError: If the request is refused.
         """
         request_type, response_type = METHODS[name]
+        call.bytes_in += len(data)
         try:
             request = request_type.FromString(data)
         except DecodeError as error:
@@ -222,6 +233,7 @@ class Service:
                 answer = {ANSWER_FIELDS[name]: answer}
             response = ParseDict(answer, response_type())
         response_data: bytes = response.SerializeToString()
+        call.bytes_out += len(response_data)
         return response_data
 
     def _infer(self, request: Any) -> Any:
@@ -236,8 +248,56 @@ class Service:
         If an error occurs, the response contains the error message. An error therefore does not end the stream.
         """
         _, response_type = METHODS[STREAM_METHOD]
+        status = "OK"
         try:
-            return response_type(infer_response=self._infer(request))
+            response = response_type(infer_response=self._infer(request))
         except Exception as error:  # every error is sent to the client
-            _, _, message = refusal(error)
-            return response_type(error_message=message)
+            _, status, message = refusal(error)
+            response = response_type(error_message=message)
+        self._traffic.count("grpc", f"{STREAM_METHOD} message", status)  # `handle` counts the whole stream as one call
+        return response
+
+    def _limit_open_calls(self) -> None:
+        """If there are too many open calls, end the call that has waited longest for a message.
+
+        Raises:
+            TooMany: If there are too many open calls, and none of them waits for a message.
+        """
+        if self._open_count <= self._limits.connections:
+            return
+        oldest_timeout = next(iter(self._waiting), None)  # the first element has waited longest
+        if oldest_timeout is None:
+            raise TooMany(f"all {self._limits.connections} calls are taken; try again later")
+        # A timeout with a deadline in the past expires at once, and ends its call. The call counts as open until its
+        # coroutine ends. The count may briefly exceed the limit.
+        del self._waiting[oldest_timeout]
+        oldest_timeout.reschedule(0.0)
+
+    def end_streams(self) -> None:
+        """End the streams, because the server stops. A call that waits for a message waits for 0.1 s more."""
+        self._is_stopping = True
+        for timeout in self._waiting:
+            timeout.reschedule(asyncio.get_running_loop().time() + 0.1)
+
+    async def _next_message(self, context: grpc.aio.ServicerContext, timeout_s: float) -> Any:
+        """Wait for the next message of a call.
+
+        While a call waits for a message, the service may end the call to make room for a new call.
+
+        Args:
+            context: Context of the call.
+            timeout_s: Longest time to wait, s.
+
+        Returns:
+            The serialized message, or `grpc.aio.EOF` if the client has ended the call.
+
+        Raises:
+            TimeoutError: If the message does not arrive in time, or if the service ends this call because of a new
+                call or because the server stops.
+        """
+        async with asyncio.timeout(timeout_s) as timeout:
+            self._waiting[timeout] = None  # `_limit_open_calls` may let this timeout expire early
+            try:
+                return await context.read()
+            finally:
+                self._waiting.pop(timeout, None)

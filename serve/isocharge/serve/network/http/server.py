@@ -3,17 +3,22 @@
 uvicorn limits neither the size of headers and trailers, nor the time in which a request must arrive, nor the time in
 which a client must read its response. uvicorn also queues any number of requests that a client sends without waiting
 for responses. `Connection` closes connections that exceed such a limit. The server regularly calls `close_if_overdue`,
-which compares the waiting time with its limit, because a timer for each request would take more time.
+which compares the deadlines with the present time, because a timer for each request would take more time.
+
+The signals of the process are left to the program that runs the server.
 """
 
 import asyncio
 import math
-from contextlib import AbstractAsyncContextManager, nullcontext
+import resource
+import socket
+from collections.abc import Iterator
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, contextmanager, nullcontext
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import httptools
-import orjson
 import uvicorn
 import uvloop
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
@@ -21,10 +26,15 @@ from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from isocharge.serve.network.address import Address, ServerLimits, Tls
 from isocharge.serve.network.metrics import Exchange, Traffic
 from isocharge.serve.network.protocol.handler import Application
+from isocharge.serve.network.protocol.response import json_response
 
 
 class Connection(HttpToolsProtocol):
-    """One connection of the server."""
+    """One connection of the server.
+
+    Attributes:
+        deadline: Time by which the client must send further data, s, on the clock of the event loop.
+    """
 
     def __init__(self, limits: ServerLimits, traffic: Traffic, **uvicorn_arguments: Any) -> None:
         """Create the state of a new connection.
@@ -35,22 +45,47 @@ class Connection(HttpToolsProtocol):
             uvicorn_arguments: Arguments that uvicorn passes to its protocols.
         """
         super().__init__(**uvicorn_arguments)
+        self.deadline = math.inf
+        self._write_deadline = math.inf  # time by which the client must have read its responses, s
         self._limits = limits
         self._traffic = traffic
-        self._waiting_since = self.loop.time()  # time at which the server began to wait for the client, s
-        self._pending_bytes = 0  # bytes since the latest complete head or part of a body
+        self._is_reading = False  # whether a request has begun and is not complete
+        self._pending_bytes = 0  # bytes since the latest complete head, part of a body, or complete request
+
+    def _allow(self, seconds: float) -> None:
+        """Set the time that the client has from now on to send further data, s."""
+        self.deadline = self.loop.time() + seconds
 
     def connection_made(self, transport: Any) -> None:
-        """Begin the connection. If there are too many connections, refuse the new connection."""
+        """Begin the connection. If there are too many connections, end a connection that waits for a request.
+
+        Among the connections that wait for a request, the connection with the earliest deadline is ended. A connection
+        that has not sent any request has an earlier deadline than a connection whose requests were answered. If no
+        other connection waits for a request, the new connection is refused.
+        """
         super().connection_made(transport)
-        if len(self.connections) > self._limits.connections:
+        self._allow(self._limits.header_seconds)  # the TLS handshake, which is over, has a limit of its own
+        self._write_deadline = self.loop.time() + self._limits.body_seconds
+        if len(self.connections) <= self._limits.connections:
+            return
+        others: Any = self.connections - {self}  # all connections are of this class
+        idle = [other for other in others if other.is_idle]
+        if idle:
+            min(idle, key=lambda other: other.deadline).transport.abort()
+        else:
             self.refuse(503, f"all {self._limits.connections} connections are taken; try again later")
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether the server owes no response to this connection."""
+        is_answered = self.cycle is None or (self.cycle.response_complete and not self._is_reading)
+        return is_answered and not self.transport.is_closing()
 
     def data_received(self, data: bytes) -> None:
         """Parse data of the client in pieces. Refuse a request whose head, trailers or chunk extensions are too long.
 
-        The bytes are counted from the end of the previous head or part of a body. If a piece of the data contains this
-        end, the beginning of the next head in the same piece is not counted, so that such a head may be twice as long.
+        The bytes are counted from the end of the previous request. If a piece of the data contains this end, the
+        beginning of the next head in the same piece is not counted, so that such a head may be twice as long.
         """
         limit = self._limits.header_bytes
         while data and not self.transport.is_closing():
@@ -75,12 +110,14 @@ class Connection(HttpToolsProtocol):
         """Begin a request, and refuse it if too many requests wait for the response to an earlier request."""
         if len(self.pipeline) >= self._limits.queued_requests:
             raise httptools.HttpParserError  # uvicorn calls `send_400_response`; the parser ignores all later data
-        self._waiting_since = self.loop.time()
+        self._is_reading = True
+        self._allow(self._limits.header_seconds)
         super().on_message_begin()
 
     def on_headers_complete(self) -> None:
-        """Pass the head to the application, and discard the trailers that may follow the body (RFC 9110, 6.5.1)."""
+        """Set the deadline of the body, and discard the trailers that may follow the body (RFC 9110, 6.5.1)."""
         self._pending_bytes = 0
+        self._allow(self._limits.body_seconds)
         super().on_headers_complete()
         self.headers = []  # uvicorn adds trailers to this list, which the request no longer uses
 
@@ -89,27 +126,33 @@ class Connection(HttpToolsProtocol):
         self._pending_bytes = 0
         super().on_body(body)
 
-    def close_if_overdue(self, now: float) -> None:
-        """End the connection if the server has waited too long for the client.
+    def on_message_complete(self) -> None:
+        """Remove the deadline, because the request is complete."""
+        self._is_reading = False
+        self._pending_bytes = 0
+        self.deadline = math.inf
+        super().on_message_complete()
 
-        The server waits for the next request, for the rest of a request, or until the client reads its responses. If a
-        request has begun, the client receives the reason. The timer of uvicorn between two requests is not sufficient,
-        because a client can stop the timer by an empty line, with which no request begins.
+    def close_if_overdue(self, now: float) -> None:
+        """End the connection if a deadline has passed. If a request has begun, the client receives the reason.
+
+        The time between two requests has a deadline of its own, which replaces the timer of uvicorn. A client could
+        stop that timer by an empty line, with which no request begins.
 
         Args:
             now: Present time on the clock of the event loop, s.
         """
-        cycle = self.cycle  # the latest request whose head is complete
-        is_idle = cycle is None or cycle.response_complete
-        is_unread = self.flow.write_paused
-        if not (is_idle or cycle.more_body or is_unread):
-            self._waiting_since = now
-        elif now < self._waiting_since + self._limits.client_seconds:
+        if self.is_idle and self.deadline == math.inf:
+            self._allow(self._limits.idle_seconds)
+        if not self.flow.write_paused:  # uvicorn pauses if the client does not read its responses
+            self._write_deadline = now + self._limits.body_seconds
+        if min(self.deadline, self._write_deadline) > now:
             return
-        elif is_unread or self.transport.is_closing() or (is_idle and not self._pending_bytes):
-            self.transport.abort()
-        else:
+        if self._is_reading:
+            self._is_reading = False
             self.refuse(408, "waited too long for the rest of the request")
+        else:
+            self.transport.abort()
 
     def _close_after_responses(self) -> bool:
         """Let the response to the latest complete request close the connection.
@@ -118,10 +161,17 @@ class Connection(HttpToolsProtocol):
             Whether a complete request is not answered yet.
         """
         cycle = self.cycle
-        is_owed = cycle is not None and not (cycle.response_complete or cycle.more_body)
+        is_owed = cycle is not None and not (cycle.response_complete or cycle.more_body or cycle.disconnected)
         if is_owed:
             cycle.keep_alive = False
+            self.deadline = math.inf
         return is_owed
+
+    def refuse_unanswered(self) -> None:
+        """Refuse the open request because the server stops, unless its response has begun."""
+        if self.cycle is not None and not self.cycle.response_started:
+            self.cycle.disconnected = True  # uvicorn would otherwise add a response of its own
+            self.refuse(503, "the server has stopped before it could answer; send the request again")
 
     def send_400_response(self, msg: str) -> None:
         """Refuse data that are not an HTTP request. uvicorn calls this method with a message."""
@@ -139,11 +189,13 @@ class Connection(HttpToolsProtocol):
         """
         if self.transport.is_closing() or self._close_after_responses():
             return
-        self._traffic.count_and_log(Exchange("http", "none", status, client=self.client))
-        body = orjson.dumps({"error": message})
-        head = b"content-type: application/json\r\ncontent-length: %d\r\nconnection: close\r\n\r\n" % len(body)
-        self.transport.write(STATUS_LINE[status] + head + body)
+        response = json_response({"error": message}, status)
+        exchange = Exchange("http", "none", status, bytes_out=len(response.body), client=self.client)
+        self._traffic.count_and_log(exchange)
+        headers = b"".join(b"%s: %s\r\n" % header for header in response.headers)
+        self.transport.write(STATUS_LINE[status] + headers + b"connection: close\r\n\r\n" + response.body)
         self.transport.close()
+        self._allow(self._limits.header_seconds)
 
 
 class HttpServer(uvicorn.Server):
@@ -174,6 +226,10 @@ class HttpServer(uvicorn.Server):
         tls_context = tls.context() if tls else None
         self._address = address
         self._socket = address.listen(limits.connections)
+        # Each connection needs an open file. Without a free one, no connection could be accepted, nor one ended for it.
+        max_open_files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        if max_open_files != resource.RLIM_INFINITY:
+            limits = replace(limits, connections=min(limits.connections, max_open_files * 7 // 8))
         connection: Any = partial(Connection, limits, traffic)
         config = uvicorn.Config(
             application,
@@ -186,7 +242,7 @@ class HttpServer(uvicorn.Server):
             proxy_headers=False,
             server_header=False,
             date_header=False,
-            timeout_keep_alive=math.ceil(limits.client_seconds),
+            timeout_keep_alive=math.ceil(limits.idle_seconds),
             timeout_graceful_shutdown=math.ceil(limits.grace_seconds),
             ssl_context_factory=(lambda *_: tls_context) if tls_context else None,
         )
@@ -197,14 +253,14 @@ class HttpServer(uvicorn.Server):
     def run(self, beside: AbstractAsyncContextManager[Any] | None = None) -> None:  # type: ignore[override]
         """Answer requests until `stop` is called, and then finish the requests that have already begun.
 
-        In the main thread, SIGINT and SIGTERM also stop the server, and then reach the handlers of the program.
-
         Args:
-            beside: Context that is open while the server runs, such as a gRPC server in the same event loop.
+            beside: Context that is open until `stop` is called, such as a gRPC server in the same event loop. If `stop`
+                is called again, the exit of the context is cancelled.
         """
 
         async def serve() -> None:
-            async with beside or nullcontext():
+            async with AsyncExitStack() as self._beside:
+                await self._beside.enter_async_context(beside or nullcontext())
                 await self.serve([self._socket])
 
         uvloop.run(serve())
@@ -222,6 +278,11 @@ class HttpServer(uvicorn.Server):
         self._socket.close()
         self._address.release()
 
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Leave the signals to the program that runs the server."""
+        yield
+
     async def on_tick(self, counter: int) -> bool:
         """End overdue connections. uvicorn calls this method ten times per second until the server is stopped."""
         now = asyncio.get_running_loop().time()
@@ -229,3 +290,18 @@ class HttpServer(uvicorn.Server):
         for connection in connections:
             connection.close_if_overdue(now)
         return await super().on_tick(counter)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Finish the open requests within the grace period, and then refuse the remaining requests.
+
+        Meanwhile, the context that was passed to `run` is closed.
+        """
+        closing = asyncio.create_task(self._beside.aclose())
+        await super().shutdown(sockets)
+        connections: Any = list(self.server_state.connections)
+        for connection in connections:
+            connection.refuse_unanswered()
+        while not (closing.done() or self.force_exit):
+            await asyncio.sleep(0.1)
+        closing.cancel()  # no effect if it is done
+        await asyncio.wait([closing])

@@ -15,6 +15,7 @@ _STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (errors.UnknownPath, 404, "NOT_FOUND"),
     (errors.WrongMethod, 405, "UNIMPLEMENTED"),
     (errors.TooLarge, 413, "RESOURCE_EXHAUSTED"),
+    (errors.TooMany, 429, "RESOURCE_EXHAUSTED"),
     (errors.UnknownEncoding, 415, "INVALID_ARGUMENT"),
     (errors.TokenError, 401, "UNAUTHENTICATED"),
     (errors.OriginError, 403, "PERMISSION_DENIED"),
