@@ -1,4 +1,4 @@
-"""Check of Host and Origin, which refuses requests of browsers for pages of other sites."""
+"""Check of Host, Origin and Sec-Fetch-Site, which refuses requests of browsers for pages of other sites."""
 
 from contextlib import nullcontext
 
@@ -10,7 +10,8 @@ from isocharge.serve.network.protocol.handler import Handler
 
 
 def headers_of(**headers):
-    return {name.encode(): value.encode() for name, value in headers.items()}
+    """Return headers as bytes. An underscore in a name stands for a hyphen."""
+    return {name.replace("_", "-").encode(): value.encode() for name, value in headers.items()}
 
 
 SERVED = [
@@ -20,7 +21,8 @@ SERVED = [
     {"host": "LocalHost:8000"},
     {"host": "localhost.:8000"},
     {},  # HTTP/1.0
-    {"host": "localhost:8000", "origin": "http://localhost:8000"},
+    {"host": "localhost:8000", "origin": "http://localhost:8000", "sec_fetch_site": "same-origin"},
+    {"host": "localhost:8000", "sec_fetch_site": "none", "sec_fetch_mode": "navigate"},  # the address was typed
 ]
 
 REFUSED = [
@@ -34,18 +36,41 @@ REFUSED = [
     ({"host": "127.0.0.1:8000", "origin": "http://127.0.0.1:3000"}, "Origin"),
     ({"host": "127.0.0.1:8000", "origin": "null"}, "Origin"),  # a page in a sandbox
     ({"host": "127.0.0.1:8000", "origin": "file://"}, "Origin"),
+    ({"host": "127.0.0.1:8000", "sec_fetch_site": "cross-site"}, "Sec-Fetch-Site"),
+    ({"host": "127.0.0.1:8000", "sec_fetch_site": "same-site"}, "Sec-Fetch-Site"),
+    ({"host": "127.0.0.1:8000", "sec_fetch_site": "new-value"}, "Sec-Fetch-Site"),
 ]
 
 
 @pytest.mark.parametrize("headers", SERVED)
 def test_clients_and_own_pages_are_served(headers):
-    AccessCheck().check(headers_of(**headers))
+    AccessCheck().check("POST", headers_of(**headers))
 
 
 @pytest.mark.parametrize(("headers", "header"), REFUSED)
 def test_pages_of_other_sites_are_refused(headers, header):
-    with pytest.raises(OriginError, match=f"^{header}: expected"):
-        AccessCheck().check(headers_of(**headers))
+    for method in ("GET", "POST"):
+        with pytest.raises(OriginError, match=f"^{header}: expected"):
+            AccessCheck().check(method, headers_of(**headers))
+
+
+def test_repeated_host_is_refused_and_other_repeated_headers_are_joined(handler):
+    """A second Host or Origin could be the one that a proxy has not checked."""
+    own, other = (b"host", b"localhost"), (b"host", b"127.0.0.1")
+    origins = [(b"origin", b"http://localhost"), (b"origin", b"http://evil.example")]
+    for headers, status in [([own], 200), ([own, other], 400), ([own, own], 400), ([own, *origins], 403)]:
+        for order in (headers, headers[::-1]):
+            assert handler.answer("GET", "/v2", order, b"").status == status
+
+
+def test_link_on_another_site_is_accepted():
+    link = headers_of(
+        host="127.0.0.1:8000", sec_fetch_site="cross-site", sec_fetch_mode="navigate", sec_fetch_dest="document"
+    )
+    AccessCheck().check("GET", link)
+    for method, changes in (("POST", {}), ("GET", {b"sec-fetch-dest": b"iframe"})):
+        with pytest.raises(OriginError, match="Sec-Fetch-Site"):
+            AccessCheck().check(method, link | changes)
 
 
 @pytest.mark.parametrize(
@@ -56,14 +81,16 @@ def test_pages_of_other_sites_are_refused(headers, header):
         ("robot.example", "https://robot.example:8443", None),  # nginx: proxy_set_header Host $host
         ("robot.example:443", "https://robot.example", None),  # nginx: proxy_set_header Host $host:$server_port
         ("other.example", "", r"Host: .*0\.0\.0\.0, localhost, robot\.example, .*\(allowed_hosts of asgi_app\)"),
+        ("robot.example:8000", "http://robot.example:3000", "Origin: expected a page of this server"),
         ("robot.example:443", "https://robot.example.evil.example:1", "Origin: expected a page of this server"),
+        ("robot.example:443", "http://robot.example", "Origin: expected a page of this server"),
     ],
 )
-def test_allow_host_accepts_pages_behind_a_proxy(host, origin, message):
+def test_allow_host_accepts_pages_behind_a_proxy_and_none_of_another_port(host, origin, message):
     expected = pytest.raises(OriginError, match=message) if message else nullcontext()
     for allowed_hosts in (["Robot.Example"], "Robot.Example"):
         with expected:
-            AccessCheck("0.0.0.0", allowed_hosts).check(headers_of(host=host, origin=origin))
+            AccessCheck("0.0.0.0", allowed_hosts).check("POST", headers_of(host=host, origin=origin))
 
 
 @pytest.mark.parametrize(

@@ -13,11 +13,12 @@ The server recognises requests from pages of other sites by the following header
 
 - The header `Host` contains the host name that the browser has requested. After DNS rebinding, `Host` contains neither
   an IP address nor a name of this server.
-- The header `Origin` contains the site of the page that has sent the request. Browsers send it with every POST request.
+- The header `Origin` contains the site of the page that has sent the request.
+- The header `Sec-Fetch-Site` states whether the page belongs to the same site. Browsers send `Sec-Fetch-Site` even with
+  requests that have no header `Origin`.
 
-Browsers omit `Origin` in some GET requests, for example when the user follows a link. GET requests change nothing, and
-a page of another site cannot read the responses. Programs other than browsers do not send `Origin` either. In requests
-without `Origin`, the server therefore checks only the header `Host`.
+Programs other than browsers send neither `Origin` nor `Sec-Fetch-Site`. In the requests of such programs, the server
+therefore checks only the header `Host`.
 """
 
 import hmac
@@ -26,7 +27,7 @@ from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from urllib.parse import urlsplit
 
-from isocharge.common.errors import InputError, OriginError, TokenError
+from isocharge.common.errors import InputError, OriginError, RequestError, TokenError
 from isocharge.serve.network.address import ip_address
 
 _TOKEN_PATTERN = re.compile(r"(?! )[ -$&-~]+(?<! )")
@@ -69,10 +70,11 @@ class AccessCheck:
         self._token = None if token is None else token.encode()
         self._any_host = any_host or token is not None
 
-    def check(self, headers: Mapping[bytes, bytes], *, needs_token: bool = True) -> None:
+    def check(self, method: str, headers: Mapping[bytes, bytes], *, needs_token: bool = True) -> None:
         """Check the headers of a request, and raise an error if the request is refused.
 
         Args:
+            method: Method in capitals.
             headers: Value of each header by the name of the header in lower case.
             needs_token: Whether the request must contain the token, if the server has one.
 
@@ -81,7 +83,7 @@ class AccessCheck:
             TokenError: If the token is missing or wrong.
         """
         host = headers.get(b"host", b"")
-        name = _name_in(host)
+        name = _name_in(host.decode("latin-1"))
         is_served = self._any_host or name in self._host_names or ip_address(name) is not None
         if host and not is_served:  # HTTP/1.0 does not require the header, but browsers always send it
             raise OriginError(
@@ -89,16 +91,25 @@ class AccessCheck:
                 "use the server's address, or name the host by --allow-host (allowed_hosts of asgi_app)"
             )
 
-        # A reverse proxy may change the header `Host`, or remove its port. The name of a page of `allowed_hosts` is
-        # therefore sufficient.
+        # Browsers send `same-origin` if a page of this server sends the request, and `none` if the user has typed the
+        # address. Other programs do not send the header. A link on another site may open a page of this server, because
+        # the other site cannot read the response.
         origin = headers.get(b"origin")
-        _, _, page_host = (origin or b"").lower().partition(b"://")
-        is_own_page = page_host == host.lower() or _name_in(page_host) in self._allowed_names
-        if origin is not None and not is_own_page:
+        fetch_site = headers.get(b"sec-fetch-site", b"none")
+        is_navigation = headers.get(b"sec-fetch-mode") == b"navigate" and headers.get(b"sec-fetch-dest") == b"document"
+        is_link = is_navigation and method in ("GET", "HEAD")
+        if origin is not None:
+            if not self._is_own_page(origin, host):
+                raise OriginError(
+                    f"Origin: expected a page of this server, got a page of {_quoted(origin)}; open {_quoted(host)} "
+                    "itself, or name the page's host by --allow-host (allowed_hosts of asgi_app)"
+                )
+        elif fetch_site.lower() not in (b"same-origin", b"none") and not is_link:
             raise OriginError(
-                f"Origin: expected a page of this server, got a page of {_quoted(origin)}; open {_quoted(host)} "
-                "itself, or name the page's host by --allow-host (allowed_hosts of asgi_app)"
+                f"Sec-Fetch-Site: expected a request by a page of this server, got {_quoted(fetch_site)}; open the "
+                f"page of {_quoted(host)}"
             )
+
         if needs_token:
             self.check_token(headers.get(b"authorization", b""))
 
@@ -125,6 +136,52 @@ class AccessCheck:
                 f"gRPC, got {received}"
             )
 
+    def _is_own_page(self, origin: bytes, host: bytes) -> bool:
+        """Return whether the page that has sent a request belongs to this server.
+
+        A page belongs to this server in two cases:
+
+        - Its origin contains the same host and the same port as the header `Host`.
+        - Its host name is one of `allowed_hosts`, and a reverse proxy has changed the header `Host`: the header
+          contains another name, or the same name without the port.
+
+        Args:
+            origin: Value of the header `Origin`, which is the origin of the page, such as b"http://localhost:8000".
+            host: Value of the header `Host`, for example b"localhost:8000".
+        """
+        scheme, _, page_host = origin.decode("latin-1").lower().partition("://")
+        if scheme not in ("http", "https"):
+            return False
+        requested_host = host.decode("latin-1").lower()
+        default_port = ":443" if scheme == "https" else ":80"  # which proxies may add
+        if requested_host in (page_host, page_host + default_port):
+            return True
+        # The following names contain no ports. If the names are equal and both have a port, the page belongs to another
+        # server on the same machine.
+        page_name = _name_in(page_host)
+        is_port_removed = page_host.startswith(f"{requested_host}:")
+        return page_name in self._allowed_names and (page_name != _name_in(requested_host) or is_port_removed)
+
+
+def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
+    """Return the value of each header by its name. The values of a repeated header are joined (RFC 9110, 5.3).
+
+    Args:
+        headers: Pairs of the name of a header in lower case and its value.
+
+    Raises:
+        RequestError: If the header `Host` is repeated (RFC 9112, 3.2). A proxy could have checked the other value.
+    """
+    values: dict[bytes, bytes] = {}
+    for name, value in headers:
+        if name not in values:
+            values[name] = value
+        elif name == b"host":
+            raise RequestError(f"Host: expected one header, got {_quoted(values[name])} and {_quoted(value)}; send one")
+        else:
+            values[name] += b", " + value
+    return values
+
 
 _HOST_NAME_PATTERN = re.compile(r"[a-z0-9_-][a-z0-9_.-]*")
 """Host name, or IPv4 address, in lower case."""
@@ -150,17 +207,17 @@ def host_name(text: str) -> str:
 
 
 @lru_cache
-def _name_in(host: bytes) -> str:
-    """Return the host name in lower case, without the port, or "?" if the bytes contain no host name.
+def _name_in(host: str) -> str:
+    """Return the host name in lower case, without the port, or "?" if the text contains no host name.
 
     Args:
         host: Value of the header `Host`, or the part of the header `Origin` after the scheme.
     """
     try:
-        name = urlsplit(b"//" + host).hostname or b"?"
+        name = urlsplit(f"//{host}").hostname or "?"
     except ValueError:
         return "?"
-    return name.decode("latin-1").removesuffix(".")
+    return name.removesuffix(".")
 
 
 def _quoted(value: bytes) -> str:

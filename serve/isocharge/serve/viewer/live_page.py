@@ -173,7 +173,7 @@ class LivePage(Application):
         """
         if path in self._files:
             return self._files[path]
-        self._access.check(headers)
+        self._access.check(method, headers)
         if path == SESSION_PATH:
             return json_response(self._session)
         if path != REQUEST_PATH:

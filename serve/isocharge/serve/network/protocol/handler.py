@@ -22,7 +22,7 @@ from typing import Any
 from isocharge.common.errors import TooLarge, UnknownPath, WrongMethod
 from isocharge.common.files import StrPath
 from isocharge.serve.network.address import ServerLimits
-from isocharge.serve.network.browser_check import AccessCheck
+from isocharge.serve.network.browser_check import AccessCheck, header_values
 from isocharge.serve.network.metrics import Client, Exchange, Traffic
 from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol.response import Response, decompress, error_response, json_response
@@ -100,7 +100,7 @@ class Application(ABC):
                 raise TooLarge(
                     f"expected a body of at most {self.limits.body_bytes} bytes, got more; send smaller batches"
                 )
-            return self._check_and_answer(method, path, dict(headers), body)
+            return self._check_and_answer(method, path, header_values(headers), body)
         except Exception as error:  # every error is sent to the client
             return error_response(error)
 
@@ -111,7 +111,7 @@ class Application(ABC):
         Args:
             method: Method in capitals.
             path: Path without the query.
-            headers: Values of the headers by name. If a header is repeated, the last value counts.
+            headers: Values of the headers by name.
             body: Body of the request, which may be compressed.
 
         Raises:
@@ -192,7 +192,7 @@ class Handler(Application):
         route, model = match_path(path)
         # The token is checked before unknown paths are refused. A client without the token therefore cannot find out
         # which paths exist.
-        self.access.check(headers, needs_token=route.needs_token)
+        self.access.check(method, headers, needs_token=route.needs_token)
         if route is UNKNOWN:
             raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
         # A HEAD request is answered like a GET request. The server then sends the response without its body.
