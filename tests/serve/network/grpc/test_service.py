@@ -67,9 +67,10 @@ def tensor(charges, datatype="FP32", **fields):
 @pytest.mark.parametrize("datatype", ["FP32", "FP64"])
 def test_charges_as_fp32_contents(serve, film, predictor, datatype):
     answer = call(serve()(), "ModelInfer", model_name="linear", id="7", inputs=[tensor(film.golden_pC(), datatype)])
-    assert answer.id == "7"
+    assert (answer.id, list(answer.raw_output_contents)) == ("7", [])
     assert [output.name for output in answer.outputs] == [*OUTPUTS]
-    rows = np.frombuffer(answer.raw_output_contents[0], "<f4").reshape(answer.outputs[0].shape)
+    contact = answer.outputs[0]
+    rows = np.float32(contact.contents.fp32_contents).reshape(contact.shape)
     np.testing.assert_array_equal(rows.T, predictor.predict_batch(film.golden_pC())[:3])
 
 

@@ -85,11 +85,24 @@ def read_request(message: Any) -> tuple[InferBody, bytes]:
     return body, raw_contents[0]
 
 
-def write_response(content: dict[str, Any]) -> Any:
-    """Convert the content of an HTTP response to a ModelInferResponse. All outputs are sent as raw contents."""
+def write_response(content: dict[str, Any], *, is_raw: bool) -> Any:
+    """Convert the content of an HTTP response to a ModelInferResponse.
+
+    Args:
+        content: Content of the HTTP response, whose outputs contain their values.
+        is_raw: Whether the values become raw contents instead of lists of numbers or texts.
+    """
     _, response_type = METHODS["ModelInfer"]
-    raw_contents = [take_binary_tensor(tensor) for tensor in content["outputs"]]
-    return response_type(**content, raw_output_contents=raw_contents)
+    if is_raw:
+        raw_contents = [take_binary_tensor(tensor) for tensor in content["outputs"]]
+        return response_type(**content, raw_output_contents=raw_contents)
+    for tensor in content["outputs"]:
+        values = tensor.pop("data")
+        if tensor["datatype"] == "BYTES":
+            tensor["contents"] = {"bytes_contents": [text.encode() for text in values]}
+        else:
+            tensor["contents"] = {"fp32_contents": values.tolist()}
+    return response_type(**content)
 
 
 ROUTE_OF_METHOD = {name: route for route in ROUTES for name in route.rpcs}
@@ -240,7 +253,8 @@ class Service:
         """Run a model on the charges of a ModelInferRequest, and return the ModelInferResponse."""
         loaded = self._store.get(request.model_name, request.model_version)
         with loaded.statistics.refused.count_exceptions(), loaded.statistics.latency.time():
-            return write_response(infer(loaded, self._limits.batch, *read_request(request)))
+            content = infer(loaded, self._limits.batch, *read_request(request))
+            return write_response(content, is_raw=len(request.raw_input_contents) > 0)
 
     def _infer_in_stream(self, request: Any) -> Any:
         """Return the response to one request of a stream.
