@@ -48,7 +48,8 @@ class LeakRule(Rule, frozen=True, kw_only=True):
         clip_sigmas: Limit to which an innovation is clipped, in standard deviations of an innovation at rest.
         clip_pC: Smallest limit to which an innovation is clipped, pC.
         relax_s: Time constant with which the charge decays to zero out of contact, s.
-        look_back_s: Age of the inflow with which a touch begins, s. The inflow may be up to twice as old.
+        look_back_s: Smallest age of the inflow with which a touch begins, and length of the interval over which this
+            inflow is averaged, s.
     """
 
     tau_s: Positive | dict[str, Positive] = LARGEST
@@ -81,18 +82,17 @@ class Inflow:
             n_electrode: Number of electrodes.
         """
         self._rule = rule
-        self.pC_per_s = np.zeros(n_electrode)
+        self._trusted_pC_per_s = np.zeros(n_electrode)  # mean inflow of an interval, at least `look_back_s` ago
+        self.pause()
         self.learned_s = 1.0  # as if the inflow had been zero for one second
         self.hold_s = 0.0
-        self._trusted_pC_per_s = self.pC_per_s  # inflow at least `look_back_s` ago
-        self._candidate_pC_per_s = self.pC_per_s  # becomes the trusted inflow when its age is `look_back_s`
-        self._candidate_age_s = 0.0
 
     def pause(self) -> None:
         """Use the trusted inflow during a touch, and for some time after its release."""
         self.pC_per_s = self._trusted_pC_per_s
-        self._candidate_pC_per_s = self._trusted_pC_per_s
+        self._candidate_pC_per_s = self._trusted_pC_per_s  # becomes the trusted inflow when its age is `look_back_s`
         self._candidate_age_s = 0.0
+        self._new_pC_per_s = [self.pC_per_s]  # inflows in the present interval, whose mean is the next candidate
         self.hold_s = self._rule.hold_off_s
 
     def learn(self, surplus_pC: Array, noise_pC: Array, dt_s: float) -> None:
@@ -104,7 +104,8 @@ class Inflow:
 
         A touch is detected some time after it has begun, and until then it has falsified the inflow. During a touch, an
         older inflow is therefore used, which is the trusted inflow. After each time interval `look_back_s`, the
-        candidate becomes the trusted inflow, and the present inflow becomes the candidate.
+        candidate becomes the trusted inflow, and the mean inflow of the interval becomes the candidate. The mean has
+        less noise than the latest inflow, which contains the whole noise of the latest frame.
 
         Args:
             surplus_pC: New charge minus the contribution of the inflow, shape (n_electrode,), pC.
@@ -125,11 +126,13 @@ class Inflow:
             self.pC_per_s = self.pC_per_s + clipped_surplus_pC / averaging_s
 
         # Replace the trusted inflow and the candidate if the candidate is old enough.
+        self._new_pC_per_s.append(self.pC_per_s)
         self._candidate_age_s += dt_s
         if self._candidate_age_s >= rule.look_back_s - SUM_TOLERANCE_s:
             self._trusted_pC_per_s = self._candidate_pC_per_s
-            self._candidate_pC_per_s = self.pC_per_s
+            self._candidate_pC_per_s = np.mean(self._new_pC_per_s, axis=0)
             self._candidate_age_s = 0.0
+            self._new_pC_per_s = [self.pC_per_s]
 
 
 class Leak(Stage):
@@ -152,7 +155,7 @@ class Leak(Stage):
     def reset(self) -> None:
         """Discard the state. A new state begins at the first frame after the next tare."""
         self._previous: Frame | None = None
-        self._output_pC = np.zeros(len(self._tau_s))  # output of the amplifiers above the tare
+        self._output_pC = np.zeros(len(self._tau_s))  # output of the amplifiers above the tare; 0 is its mean at rest
         self._charge_pC = np.zeros(len(self._tau_s))  # touch charge
         self._is_falsified = False  # whether a gap may have falsified the charge of this touch
         self._inflow = Inflow(self._rule, len(self._tau_s))
@@ -165,10 +168,9 @@ class Leak(Stage):
         output_pC = frame.charge_pC
         if output_pC is None:
             return
-        if self._previous is not None:
-            self._advance(frame, self._previous, output_pC)
-            if self._is_falsified:
-                frame.flags.append(GAP)
+        self._advance(frame, self._previous or frame, output_pC)
+        if self._is_falsified:
+            frame.flags.append(GAP)
         self._previous = frame
         self._output_pC = output_pC
         frame.charge_pC = self._charge_pC
@@ -184,7 +186,7 @@ class Leak(Stage):
 
         Args:
             frame: The frame.
-            previous: The previous frame with charges.
+            previous: The previous frame with charges; the frame itself if it is the first.
             output_pC: Output of the amplifiers above the tare, shape (n_electrode,), pC.
         """
         # Compute the charge that is new since the previous frame.
@@ -209,9 +211,10 @@ class Leak(Stage):
         if has_gap and previous.is_contact and self._has_ended_in_gap(frame, output_pC, surplus_pC):
             self._is_falsified = False
             surplus_pC = -self._charge_pC  # so that no touch charge remains
-        elif has_gap:
-            self._is_falsified |= self._may_be_falsified(frame, surplus_pC)
+            has_gap = False
         self._charge_pC = self._charge_pC + surplus_pC
+        if has_gap:
+            self._is_falsified |= self._is_large(np.abs(surplus_pC) * (self._growth(frame) - 1.0) / 2.0, frame)
 
     def _innovation_pC(self, output_pC: Array, decay: Array) -> Array:
         """Return the change of the output that the leak does not explain, shape (n_electrode,), pC.
@@ -250,15 +253,14 @@ class Leak(Stage):
         smallest_pC = self._charge_pC + surplus_pC * (1.0 + growth) / 2.0
         return bool(((sign * output_pC <= margin_pC) & (sign * smallest_pC <= growth * margin_pC)).all())
 
-    def _may_be_falsified(self, frame: Frame, surplus_pC: Array) -> bool:
-        """Return whether the touch charge may be wrong by more than 1 % and the noise, because of a gap.
+    def _is_large(self, error_pC: Array, frame: Frame) -> bool:
+        """Return whether an error of the touch charge exceeds both the noise and 1 % of the touch charge.
 
         Args:
+            error_pC: Largest error because of a gap, shape (n_electrode,), pC.
             frame: The frame after the gap.
-            surplus_pC: New touch charge, if it arrived evenly in the gap, shape (n_electrode,), pC.
         """
-        error_pC = np.abs(surplus_pC) * (self._growth(frame) - 1.0) / 2.0
-        limit_pC = np.maximum(frame.noise_pC, 0.01 * np.abs(self._charge_pC + surplus_pC))
+        limit_pC = np.maximum(frame.noise_pC, 0.01 * np.abs(self._charge_pC))
         return bool((error_pC > limit_pC).any())
 
     @classmethod
@@ -323,8 +325,7 @@ class Integrator(Leak):
         error_pC = missing_count * np.abs(current_pC - self._current_pC) / 2.0  # if the current rose or fell steadily
         self._current_pC = current_pC
         frame.noise_pC = frame.noise_pC * math.sqrt(max(1.0, 0.5 * self._rule.relax_s / interval_s))
-        limit_pC = np.maximum(frame.noise_pC, 0.01 * np.abs(self._charge_pC))
-        if (error_pC > limit_pC).any():
+        if self._is_large(error_pC, frame):
             self._is_falsified = True
             frame.flags.append(GAP)
 

@@ -178,6 +178,14 @@ static int look_for_tare(isocharge_chain *chain, const real quiet_pC[N])
 }
 
 #if ISOCHARGE_LEAK_ON
+/* Begin the interval whose mean inflow is the next candidate. */
+static void begin_interval(isocharge_chain *chain)
+{
+    chain->candidate_age_s = 0;
+    chain->inflow_count = 1;
+    EACH(k) chain->inflow_sum[k] = chain->inflow[k];
+}
+
 /* Correct the inflow by the clipped surplus; after a while the candidate becomes the trusted inflow. */
 static void learn_inflow(isocharge_chain *chain, const real surplus_pC[N], real dt_s)
 {
@@ -190,17 +198,19 @@ static void learn_inflow(isocharge_chain *chain, const real surplus_pC[N], real 
         const real limit_pC = larger((real)ISOCHARGE_LEAK_CLIP_PC, sigmas);
 
         chain->inflow[k] += within(surplus_pC[k], limit_pC) / averaging_s;
+        chain->inflow_sum[k] += chain->inflow[k];
     }
+    ++chain->inflow_count;
     chain->learned_s = learned_s;
     chain->candidate_age_s += dt_s;
     if (chain->candidate_age_s < (real)(ISOCHARGE_LEAK_LOOK_BACK_S - ISOCHARGE_SUM_TOLERANCE_S))
         return;
-    chain->candidate_age_s = 0;
     EACH(k)
     {
         chain->trusted[k] = chain->candidate[k];
-        chain->candidate[k] = chain->inflow[k];
+        chain->candidate[k] = chain->inflow_sum[k] / (real)chain->inflow_count;
     }
+    begin_interval(chain);
 }
 
 /* Set the charges to 0 if the touch ended in a gap; otherwise state whether the gap may have falsified them. */
@@ -255,7 +265,7 @@ static void undo_leak(isocharge_chain *chain, const real output_pC[N], real dt_s
     }
     if (chain->contact) {
         EACH(k) chain->inflow[k] = chain->candidate[k] = chain->trusted[k];
-        chain->candidate_age_s = 0;
+        begin_interval(chain);
         chain->hold_s = (real)ISOCHARGE_LEAK_HOLD_OFF_S;
         return;
     }
@@ -265,14 +275,16 @@ static void undo_leak(isocharge_chain *chain, const real output_pC[N], real dt_s
         learn_inflow(chain, surplus_pC, dt_s);
 }
 
-static void start_leak(isocharge_chain *chain, const real output_pC[N], real dt_s)
+/* The state at the tare, which is the mean output at rest. */
+static void start_leak(isocharge_chain *chain, real dt_s)
 {
     EACH(k)
     {
-        chain->output_pC[k] = output_pC[k];
-        chain->charge_pC[k] = chain->inflow[k] = chain->trusted[k] = chain->candidate[k] = 0;
+        chain->output_pC[k] = chain->charge_pC[k] = 0;
+        chain->inflow[k] = chain->trusted[k] = chain->candidate[k] = 0;
     }
-    chain->candidate_age_s = chain->hold_s = 0;
+    begin_interval(chain);
+    chain->hold_s = 0;
     chain->learned_s = 1;
     chain->step_s = dt_s;
     chain->falsified = 0;
@@ -424,10 +436,9 @@ static void advance_tared(isocharge_chain *chain, const real quiet_pC[N], real d
         output_pC[k] = quiet_pC[k] - chain->tare_pC[k];
     }
 #if ISOCHARGE_LEAK_ON
-    if (chain->leak_running)
-        undo_leak(chain, output_pC, dt_s);
-    else
-        start_leak(chain, output_pC, dt_s);
+    if (!chain->leak_running)
+        start_leak(chain, dt_s);
+    undo_leak(chain, output_pC, dt_s);
     decay = EXP(-dt_s / (real)ISOCHARGE_LEAK_RELAX_S);
     EACH(k) charge_pC[k] = chain->charge_pC[k];
     reading->flags |= chain->falsified ? ISOCHARGE_GAP : 0u;

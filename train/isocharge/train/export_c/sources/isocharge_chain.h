@@ -58,8 +58,9 @@ typedef struct {
     int leak_running;
     isocharge_real charge_pC[ISOCHARGE_ELECTRODES], output_pC[ISOCHARGE_ELECTRODES];
     isocharge_real inflow[ISOCHARGE_ELECTRODES], trusted[ISOCHARGE_ELECTRODES], candidate[ISOCHARGE_ELECTRODES];
+    isocharge_real inflow_sum[ISOCHARGE_ELECTRODES]; /* inflows in the present interval */
     isocharge_real candidate_age_s, learned_s, hold_s, step_s;
-    int falsified;
+    int inflow_count, falsified;
 #endif
     int contact, below, saturated, slow;
 #if ISOCHARGE_TOUCH_ON
