@@ -67,11 +67,11 @@ def test_addresses_in_use_or_impossible_are_refused(handler, start_http, tmp_pat
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_server_may_open_as_many_files_as_the_system_permits():
+def test_server_may_open_as_many_files_as_the_system_permits(handler):
     """The usual limit of a process, 1,024 descriptors, is too low for 1,024 connections."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (soft // 2, hard))
-    Address().listen(1).close()
+    HttpServer(handler, Address()).close()
     assert resource.getrlimit(resource.RLIMIT_NOFILE) == (hard, hard)
     resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 

@@ -4,10 +4,8 @@ The HTTP server, the gRPC server and the live page use the classes of this modul
 loopback address, to which only programs on the same machine can connect.
 """
 
-import contextlib
 import errno
 import ipaddress
-import resource
 import socket
 import ssl
 from dataclasses import dataclass
@@ -36,17 +34,12 @@ class Address:
     def listen(self, backlog: int) -> socket.socket:
         """Open a Unix socket or a TCP socket that listens on this address, and return the socket.
 
-        Each connection needs an open file. The process is therefore allowed as many open files as the system permits.
-
         Args:
             backlog: Largest number of connections that wait to be accepted.
 
         Raises:
             ListenError: If the address is in use or cannot be used. The message states what to do.
         """
-        _, max_open_files = resource.getrlimit(resource.RLIMIT_NOFILE)
-        with contextlib.suppress(ValueError, OSError):  # macOS refuses an unlimited number
-            resource.setrlimit(resource.RLIMIT_NOFILE, (max_open_files, max_open_files))
         try:
             if self.uds is not None:
                 self.release()

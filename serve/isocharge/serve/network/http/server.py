@@ -4,21 +4,19 @@ uvicorn limits neither the size of headers and trailers, nor the time in which a
 which a client must read its response. uvicorn also queues any number of requests that a client sends without waiting
 for responses. `Connection` closes connections that exceed such a limit. The server regularly calls `close_if_overdue`,
 which compares the deadlines with the present time, because a timer for each request would take more time.
-
-The signals of the process are left to the program that runs the server.
 """
 
 import asyncio
 import math
 import resource
 import socket
-from collections.abc import Iterator
-from contextlib import AbstractAsyncContextManager, AsyncExitStack, contextmanager, nullcontext
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import httptools
+import orjson
 import uvicorn
 import uvloop
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
@@ -26,7 +24,6 @@ from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from isocharge.serve.network.address import Address, ServerLimits, Tls
 from isocharge.serve.network.metrics import Exchange, Traffic
 from isocharge.serve.network.protocol.handler import Application
-from isocharge.serve.network.protocol.response import json_response
 
 
 class Connection(HttpToolsProtocol):
@@ -46,7 +43,7 @@ class Connection(HttpToolsProtocol):
         """
         super().__init__(**uvicorn_arguments)
         self.deadline = math.inf
-        self._write_deadline = math.inf  # time by which the client must have read its responses, s
+        self._write_deadline = self.loop.time() + limits.body_seconds  # for reading the responses, s
         self._limits = limits
         self._traffic = traffic
         self._is_reading = False  # whether a request has begun and is not complete
@@ -65,7 +62,6 @@ class Connection(HttpToolsProtocol):
         """
         super().connection_made(transport)
         self._allow(self._limits.header_seconds)  # the TLS handshake, which is over, has a limit of its own
-        self._write_deadline = self.loop.time() + self._limits.body_seconds
         if len(self.connections) <= self._limits.connections:
             return
         others: Any = self.connections - {self}  # all connections are of this class
@@ -161,17 +157,11 @@ class Connection(HttpToolsProtocol):
             Whether a complete request is not answered yet.
         """
         cycle = self.cycle
-        is_owed = cycle is not None and not (cycle.response_complete or cycle.more_body or cycle.disconnected)
+        is_owed = cycle is not None and not (cycle.response_complete or cycle.more_body)
         if is_owed:
             cycle.keep_alive = False
             self.deadline = math.inf
         return is_owed
-
-    def refuse_unanswered(self) -> None:
-        """Refuse the open request because the server stops, unless its response has begun."""
-        if self.cycle is not None and not self.cycle.response_started:
-            self.cycle.disconnected = True  # uvicorn would otherwise add a response of its own
-            self.refuse(503, "the server has stopped before it could answer; send the request again")
 
     def send_400_response(self, msg: str) -> None:
         """Refuse data that are not an HTTP request. uvicorn calls this method with a message."""
@@ -189,11 +179,11 @@ class Connection(HttpToolsProtocol):
         """
         if self.transport.is_closing() or self._close_after_responses():
             return
-        response = json_response({"error": message}, status)
-        exchange = Exchange("http", "none", status, bytes_out=len(response.body), client=self.client)
+        body = orjson.dumps({"error": message})
+        head = b"content-type: application/json\r\ncontent-length: %d\r\nconnection: close\r\n\r\n" % len(body)
+        exchange = Exchange("http", "none", status, bytes_out=len(body), client=self.client)
         self._traffic.count_and_log(exchange)
-        headers = b"".join(b"%s: %s\r\n" % header for header in response.headers)
-        self.transport.write(STATUS_LINE[status] + headers + b"connection: close\r\n\r\n" + response.body)
+        self.transport.write(STATUS_LINE[status] + head + body)
         self.transport.close()
         self._allow(self._limits.header_seconds)
 
@@ -226,10 +216,11 @@ class HttpServer(uvicorn.Server):
         tls_context = tls.context() if tls else None
         self._address = address
         self._socket = address.listen(limits.connections)
-        # Each connection needs an open file. Without a free one, no connection could be accepted, nor one ended for it.
-        max_open_files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-        if max_open_files != resource.RLIM_INFINITY:
-            limits = replace(limits, connections=min(limits.connections, max_open_files * 7 // 8))
+        # Each connection needs an open file. The process is therefore allowed as many open files as the system permits.
+        # Without a free one, no connection could be accepted, nor one ended for it.
+        _, max_open_files = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max_open_files, max_open_files))
+        limits = replace(limits, connections=min(limits.connections, max_open_files * 7 // 8))
         connection: Any = partial(Connection, limits, traffic)
         config = uvicorn.Config(
             application,
@@ -252,6 +243,8 @@ class HttpServer(uvicorn.Server):
 
     def run(self, beside: AbstractAsyncContextManager[Any] | None = None) -> None:  # type: ignore[override]
         """Answer requests until `stop` is called, and then finish the requests that have already begun.
+
+        In the main thread, SIGINT and SIGTERM also stop the server, and then reach the handlers of the program.
 
         Args:
             beside: Context that is open until `stop` is called, such as a gRPC server in the same event loop. If `stop`
@@ -278,11 +271,6 @@ class HttpServer(uvicorn.Server):
         self._socket.close()
         self._address.release()
 
-    @contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        """Leave the signals to the program that runs the server."""
-        yield
-
     async def on_tick(self, counter: int) -> bool:
         """End overdue connections. uvicorn calls this method ten times per second until the server is stopped."""
         now = asyncio.get_running_loop().time()
@@ -292,16 +280,11 @@ class HttpServer(uvicorn.Server):
         return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Finish the open requests within the grace period, and then refuse the remaining requests.
+        """Finish the open requests within the grace period, and then cancel the remaining requests.
 
         Meanwhile, the context that was passed to `run` is closed.
         """
         closing = asyncio.create_task(self._beside.aclose())
+        self.server_state.tasks.add(closing)  # uvicorn waits for these tasks as long as for the requests
+        closing.add_done_callback(self.server_state.tasks.discard)
         await super().shutdown(sockets)
-        connections: Any = list(self.server_state.connections)
-        for connection in connections:
-            connection.refuse_unanswered()
-        while not (closing.done() or self.force_exit):
-            await asyncio.sleep(0.1)
-        closing.cancel()  # no effect if it is done
-        await asyncio.wait([closing])

@@ -55,30 +55,31 @@ class Application(ABC):
     ) -> None:
         """Answer one HTTP request. If the client disconnects before its request is complete, nothing is sent.
 
+        A server that stops cancels requests that it cannot finish in time. The client of such a request is told so.
+
         Args:
             scope: Method, path, headers and client of the request.
             receive: Function that returns the next part of the request.
             send: Function that sends a part of the response.
-
-        Raises:
-            ValueError: If the scope is not an HTTP request. A server then knows that there is no ASGI lifespan.
         """
-        if scope["type"] != "http":
-            raise ValueError(f"expected a scope of the type 'http', got {scope['type']!r}")
-        # Stop reading as soon as the body is larger than allowed. The application then refuses the body.
-        body = bytearray()
-        message: Message = {"more_body": True}
-        while message.get("more_body") and len(body) <= self.limits.body_bytes:
-            message = await receive()
-            if message["type"] == "http.disconnect":
-                return
-            body += message.get("body", b"")
-        path = scope["path"].removeprefix(scope.get("root_path", ""))  # the root path is the path of a mounted program
-        request = (scope["method"], path, scope["headers"], bytes(body), scope.get("client"))
-        if path.startswith(self.blocking_paths):
-            response = await asyncio.to_thread(self.answer, *request)
-        else:  # most answers take only microseconds
-            response = self.answer(*request)
+        try:
+            # Stop reading as soon as the body is larger than allowed. The application then refuses the body.
+            body = bytearray()
+            message: Message = {"more_body": True}
+            while message.get("more_body") and len(body) <= self.limits.body_bytes:
+                message = await receive()
+                if message["type"] == "http.disconnect":
+                    return
+                body += message.get("body", b"")
+            path = scope["path"].removeprefix(scope.get("root_path", ""))  # the root path belongs to a mounting program
+            request = (scope["method"], path, scope["headers"], bytes(body), scope.get("client"))
+            if path.startswith(self.blocking_paths):
+                response = await asyncio.to_thread(self.answer, *request)
+            else:  # most answers take only microseconds
+                response = self.answer(*request)
+        except asyncio.CancelledError:
+            error = "the server has stopped before it could answer; send the request again"
+            response = json_response({"error": error}, 503)
         await send({"type": "http.response.start", "status": response.status, "headers": response.headers})
         await send({"type": "http.response.body", "body": response.body})
 
