@@ -99,8 +99,6 @@ class Exchange:
         model: Label `name/version` of the requested model, or None if no loaded model was requested.
         error: Name of the type of the error, or None if no error occurred.
         duration_us: Time from the complete request to the complete response, us; 0 if the time is unknown.
-        bytes_in: Size of the body of the request, bytes; of a call of gRPC, the total size of the received messages.
-        bytes_out: Size of the body of the response, bytes; of a call of gRPC, the total size of the sent messages.
         client: Address and port of the client, or a text that contains both.
     """
 
@@ -110,8 +108,6 @@ class Exchange:
     model: str | None = None
     error: str | None = None
     duration_us: float = 0.0
-    bytes_in: int = 0
-    bytes_out: int = 0
     client: Client | str = None
 
 
@@ -172,18 +168,8 @@ class Traffic:
             "isocharge_log_lines_lost", "Lines of the log that could not be written.", registry=self.registry
         )
 
-    def count(self, transport: str, route: str, status: int | str) -> None:
-        """Count a request that was answered, possibly with an error.
-
-        Args:
-            transport: Transport of the request, which is "http" or "grpc".
-            route: Name of the route.
-            status: HTTP status, or name of the gRPC status.
-        """
-        self._requests.labels(transport, route, status).inc()
-
     def count_and_log(self, exchange: Exchange) -> None:
-        """Count a request that was answered, and log the request if there is a log."""
-        self.count(exchange.transport, exchange.route, exchange.status)
+        """Count a request that was answered, possibly with an error, and log the request if there is a log."""
+        self._requests.labels(exchange.transport, exchange.route, exchange.status).inc()
         if self.log is not None:
             self.log.write_line("info", "request", vars(exchange))

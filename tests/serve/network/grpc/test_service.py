@@ -229,11 +229,12 @@ def test_end_of_a_connection_is_not_logged_as_an_error(store, caplog):
     context.invocation_metadata.return_value = ()
     context.peer.return_value = "ipv4:127.0.0.1:50000"
     lines = []
-    service = Service(Handler(store, None, Traffic(RequestLog(lines.append))))
+    traffic = Traffic(RequestLog(lines.append))
+    service = Service(Handler(store, None, traffic))
     with pytest.raises(asyncio.CancelledError):
         asyncio.run(service.handle("ModelStreamInfer", None, context))
     labels = {"transport": "grpc", "route": "ModelStreamInfer", "status": "CANCELLED"}
-    assert service._traffic.registry.get_sample_value("isocharge_requests_total", labels) == 1
+    assert traffic.registry.get_sample_value("isocharge_requests_total", labels) == 1
     assert not caplog.records
     assert 0.0 < json.loads(lines[0])["duration_us"] < 1e6
 

@@ -124,16 +124,13 @@ class Service:
         Args:
             handler: Handler of the requests of the HTTP server.
         """
-        self._store = handler.store
-        self._limits = handler.limits
-        self._traffic = handler.traffic
-        self._access = handler.access
+        self._handler = handler
         self._open_count = 0
         self._is_stopping = False
         # One timeout for each call that waits for a message of its client, in the order in which the waits began. The
         # dictionary has no values and serves as an ordered set.
         self._waiting: dict[asyncio.Timeout, None] = {}
-        self._traffic.open.labels("grpc").set_function(lambda: self._open_count)
+        handler.traffic.open.labels("grpc").set_function(lambda: self._open_count)
 
     async def handle(self, name: str, _messages: object, context: grpc.aio.ServicerContext) -> None:
         """Answer a call, count the call by its status, and log the call if there is a log.
@@ -166,7 +163,7 @@ class Service:
         finally:
             self._open_count -= 1
             call.duration_us = (time.perf_counter_ns() - start_ns) / 1000
-            self._traffic.count_and_log(call)
+            self._handler.traffic.count_and_log(call)
         if message:
             await context.abort(grpc.StatusCode[str(call.status)], message)
 
@@ -189,18 +186,18 @@ class Service:
         """
         if ROUTE_OF_METHOD[name].needs_token:
             metadata = dict(context.invocation_metadata() or ())
-            self._access.check_token(str(metadata.get("authorization", "")).encode())
-        timeout_s = self._limits.header_seconds
+            self._handler.access.check_token(str(metadata.get("authorization", "")).encode())
+        timeout_s = self._handler.limits.header_seconds
         while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:
             if name.startswith("RepositoryModel"):  # loading a model takes a long time
                 response = await asyncio.to_thread(self._respond, name, data, call)
             else:
                 response = self._respond(name, data, call)
-            async with asyncio.timeout(self._limits.body_seconds):
+            async with asyncio.timeout(self._handler.limits.body_seconds):
                 await context.write(response)
             if name != STREAM_METHOD or self._is_stopping:
                 return
-            timeout_s = self._limits.idle_seconds
+            timeout_s = self._handler.limits.idle_seconds
 
     def _respond(self, name: str, data: bytes, call: Exchange) -> bytes:
         """Answer one message, and return the serialized response.
@@ -208,14 +205,13 @@ class Service:
         Args:
             name: Name of the method.
             data: The serialized message of the request.
-            call: Properties of the call, in which the model is set and the sizes of the messages are added up.
+            call: Properties of the call, in which the model is set.
 
         Raises:
             RequestError: If the data are not a message of the expected type.
             IsochargeError: If the request is refused.
         """
         request_type, response_type = METHODS[name]
-        call.bytes_in += len(data)
         try:
             request = request_type.FromString(data)
         except DecodeError as error:
@@ -226,7 +222,7 @@ class Service:
         # protocol, and `name` and `version` in other messages. Messages about the server contain none of these fields.
         model_name = getattr(request, "model_name", "") or getattr(request, "name", "")
         model_version = getattr(request, "model_version", "") or getattr(request, "version", "")
-        call.model = self._store.label(model_name, model_version)
+        call.model = self._handler.store.label(model_name, model_version)
 
         if name == STREAM_METHOD:
             response = self._infer_in_stream(request)
@@ -235,7 +231,9 @@ class Service:
         else:
             # The body of the equivalent HTTP request has the same fields as the message.
             body = MessageToJson(request, preserving_proto_field_name=True).encode()
-            equivalent = Request(self._store, self._limits, self._traffic, {}, body, model_name, model_version)
+            equivalent = Request(
+                self._handler.store, self._handler.limits, self._handler.traffic, {}, body, model_name, model_version
+            )
             try:
                 answer = ROUTE_OF_METHOD[name].respond(equivalent)
             except ModelError:
@@ -246,14 +244,13 @@ class Service:
                 answer = {ANSWER_FIELDS[name]: answer}
             response = ParseDict(answer, response_type())
         response_data: bytes = response.SerializeToString()
-        call.bytes_out += len(response_data)
         return response_data
 
     def _infer(self, request: Any) -> Any:
         """Run a model on the charges of a ModelInferRequest, and return the ModelInferResponse."""
-        loaded = self._store.get(request.model_name, request.model_version)
+        loaded = self._handler.store.get(request.model_name, request.model_version)
         with loaded.statistics.refused.count_exceptions(), loaded.statistics.latency.time():
-            content = infer(loaded, self._limits.batch, *read_request(request))
+            content = infer(loaded, self._handler.limits.batch, *read_request(request))
             return write_response(content, is_raw=len(request.raw_input_contents) > 0)
 
     def _infer_in_stream(self, request: Any) -> Any:
@@ -262,14 +259,11 @@ class Service:
         If an error occurs, the response contains the error message. An error therefore does not end the stream.
         """
         _, response_type = METHODS[STREAM_METHOD]
-        status = "OK"
         try:
-            response = response_type(infer_response=self._infer(request))
+            return response_type(infer_response=self._infer(request))
         except Exception as error:  # every error is sent to the client
-            _, status, message = refusal(error)
-            response = response_type(error_message=message)
-        self._traffic.count("grpc", f"{STREAM_METHOD} message", status)  # `handle` counts the whole stream as one call
-        return response
+            _, _, message = refusal(error)
+            return response_type(error_message=message)
 
     def _limit_open_calls(self) -> None:
         """If there are too many open calls, end the call that has waited longest for a message.
@@ -277,11 +271,11 @@ class Service:
         Raises:
             TooMany: If there are too many open calls, and none of them waits for a message.
         """
-        if self._open_count <= self._limits.connections:
+        if self._open_count <= self._handler.limits.connections:
             return
         oldest_timeout = next(iter(self._waiting), None)  # the first element has waited longest
         if oldest_timeout is None:
-            raise TooMany(f"all {self._limits.connections} calls are taken; try again later")
+            raise TooMany(f"all {self._handler.limits.connections} calls are taken; try again later")
         # A timeout with a deadline in the past expires at once, and ends its call. The call counts as open until its
         # coroutine ends. The count may briefly exceed the limit.
         del self._waiting[oldest_timeout]

@@ -181,7 +181,7 @@ class Connection(HttpToolsProtocol):
             return
         body = orjson.dumps({"error": message})
         head = b"content-type: application/json\r\ncontent-length: %d\r\nconnection: close\r\n\r\n" % len(body)
-        exchange = Exchange("http", "none", status, bytes_out=len(body), client=self.client)
+        exchange = Exchange("http", "none", status, client=self.client)
         self._traffic.count_and_log(exchange)
         self.transport.write(STATUS_LINE[status] + head + body)
         self.transport.close()

@@ -181,8 +181,6 @@ class Handler(Application):
             model=self.store.label(**model),
             error=response.error,
             duration_us=(time.perf_counter_ns() - start_ns) / 1000,
-            bytes_in=len(body),
-            bytes_out=len(response.body),
             client=client,
         )
         self.traffic.count_and_log(exchange)
