@@ -27,7 +27,7 @@ from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from urllib.parse import urlsplit
 
-from isocharge.common.errors import InputError, OriginError, RequestError, TokenError
+from isocharge.common.errors import InputError, OriginError, RequestError, TokenError, shown
 from isocharge.serve.network.address import ip_address
 
 _TOKEN_PATTERN = re.compile(r"(?! )[ -$&-~]+(?<! )")
@@ -82,32 +82,31 @@ class AccessCheck:
             OriginError: If a page of another site has sent the request, or if `Host` is not a name of this server.
             TokenError: If the token is missing or wrong.
         """
-        host = headers.get(b"host", b"")
-        name = _name_in(host.decode("latin-1"))
+        host = headers.get(b"host", b"").decode("latin-1").lower()
+        name = _name_in(host)
         is_served = self._any_host or name in self._host_names or ip_address(name) is not None
         if host and not is_served:  # HTTP/1.0 does not require the header, but browsers always send it
             raise OriginError(
-                f"Host: expected an IP address or one of {', '.join(sorted(self._host_names))}, got {_quoted(host)}; "
-                "use the server's address, or name the host by --allow-host (allowed_hosts of asgi_app)"
+                f"Host: expected an IP address or one of {', '.join(sorted(self._host_names))}, got {shown(host)}; use "
+                "the server's address, or name the host by --allow-host (allowed_hosts of asgi_app)"
             )
 
         # Browsers send `same-origin` if a page of this server sends the request, and `none` if the user has typed the
         # address. Other programs do not send the header. A link on another site may open a page of this server, because
         # the other site cannot read the response.
-        origin = headers.get(b"origin")
-        fetch_site = headers.get(b"sec-fetch-site", b"none")
-        is_navigation = headers.get(b"sec-fetch-mode") == b"navigate" and headers.get(b"sec-fetch-dest") == b"document"
-        is_link = is_navigation and method in ("GET", "HEAD")
-        if origin is not None:
+        origin = headers.get(b"origin", b"").decode("latin-1").lower()
+        fetch_site = headers.get(b"sec-fetch-site", b"none").decode("latin-1").lower()
+        is_link = headers.get(b"sec-fetch-dest") == b"document" and method in ("GET", "HEAD")
+        if origin:
             if not self._is_own_page(origin, host):
                 raise OriginError(
-                    f"Origin: expected a page of this server, got a page of {_quoted(origin)}; open {_quoted(host)} "
+                    f"Origin: expected a page of this server, got a page of {shown(origin)}; open {shown(host)} "
                     "itself, or name the page's host by --allow-host (allowed_hosts of asgi_app)"
                 )
-        elif fetch_site.lower() not in (b"same-origin", b"none") and not is_link:
+        elif fetch_site not in ("same-origin", "none") and not is_link:
             raise OriginError(
-                f"Sec-Fetch-Site: expected a request by a page of this server, got {_quoted(fetch_site)}; open the "
-                f"page of {_quoted(host)}"
+                f"Sec-Fetch-Site: expected a request by a page of this server, got {shown(fetch_site)}; open the page "
+                f"of {shown(host)}"
             )
 
         if needs_token:
@@ -136,7 +135,7 @@ class AccessCheck:
                 f"gRPC, got {received}"
             )
 
-    def _is_own_page(self, origin: bytes, host: bytes) -> bool:
+    def _is_own_page(self, origin: str, host: str) -> bool:
         """Return whether the page that has sent a request belongs to this server.
 
         A page belongs to this server in two cases:
@@ -146,40 +145,34 @@ class AccessCheck:
           contains another name, or the same name without the port.
 
         Args:
-            origin: Value of the header `Origin`, which is the origin of the page, such as b"http://localhost:8000".
-            host: Value of the header `Host`, for example b"localhost:8000".
+            origin: Value of the header `Origin`, which is the origin of the page, such as "http://localhost:8000".
+            host: Value of the header `Host`, for example "localhost:8000".
         """
-        scheme, _, page_host = origin.decode("latin-1").lower().partition("://")
-        if scheme not in ("http", "https"):
-            return False
-        requested_host = host.decode("latin-1").lower()
+        scheme, _, page_host = origin.partition("://")
         default_port = ":443" if scheme == "https" else ":80"  # which proxies may add
-        if requested_host in (page_host, page_host + default_port):
+        if host in (page_host, page_host + default_port):
             return True
         # The following names contain no ports. If the names are equal and both have a port, the page belongs to another
         # server on the same machine.
         page_name = _name_in(page_host)
-        is_port_removed = page_host.startswith(f"{requested_host}:")
-        return page_name in self._allowed_names and (page_name != _name_in(requested_host) or is_port_removed)
+        is_port_removed = page_host.startswith(f"{host}:")
+        return page_name in self._allowed_names and (page_name != _name_in(host) or is_port_removed)
 
 
 def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
-    """Return the value of each header by its name. The values of a repeated header are joined (RFC 9110, 5.3).
+    """Return the value of each header by its name. Of a repeated header, the last value counts.
 
     Args:
         headers: Pairs of the name of a header in lower case and its value.
 
     Raises:
-        RequestError: If the header `Host` is repeated (RFC 9112, 3.2). A proxy could have checked the other value.
+        RequestError: If `Host` (RFC 9112, 3.2) or `Origin` is repeated. A proxy could have checked the other value.
     """
     values: dict[bytes, bytes] = {}
     for name, value in headers:
-        if name not in values:
-            values[name] = value
-        elif name == b"host":
-            raise RequestError(f"Host: expected one header, got {_quoted(values[name])} and {_quoted(value)}; send one")
-        else:
-            values[name] += b", " + value
+        if name in values and name in (b"host", b"origin"):
+            raise RequestError(f"{name.decode()}: expected one header, got {shown(values[name])} and {shown(value)}")
+        values[name] = value
     return values
 
 
@@ -208,7 +201,7 @@ def host_name(text: str) -> str:
 
 @lru_cache
 def _name_in(host: str) -> str:
-    """Return the host name in lower case, without the port, or "?" if the text contains no host name.
+    """Return the host name without the port, or "?" if the text contains no host name.
 
     Args:
         host: Value of the header `Host`, or the part of the header `Origin` after the scheme.
@@ -218,8 +211,3 @@ def _name_in(host: str) -> str:
     except ValueError:
         return "?"
     return name.removesuffix(".")
-
-
-def _quoted(value: bytes) -> str:
-    """Return the value of a header as a quoted text for an error message. Long values are shortened."""
-    return repr(value[:100].decode("latin-1"))
