@@ -81,8 +81,6 @@ def _options(limits: ServerLimits) -> list[tuple[str, int]]:
     """Convert the limits of a server to options of the package grpcio."""
     return [
         ("grpc.max_receive_message_length", limits.body_bytes),
-        ("grpc.max_metadata_size", limits.header_bytes),
-        ("grpc.absolute_max_metadata_size", limits.header_bytes),
         ("grpc.max_concurrent_streams", MAX_CALLS_PER_CONNECTION),
         ("grpc.max_allowed_incoming_connections", limits.connections),
         ("grpc.server_handshake_timeout_ms", round(1e3 * limits.header_seconds)),

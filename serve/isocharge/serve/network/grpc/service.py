@@ -47,7 +47,7 @@ def _service_descriptor() -> Any:
     return pool.FindServiceByName(SERVICE)
 
 
-METHODS: dict[str, tuple[type[Any], type[Any]]] = {
+METHODS = {
     method.name: (GetMessageClass(method.input_type), GetMessageClass(method.output_type))
     for method in _service_descriptor().methods
 }
@@ -95,6 +95,8 @@ def write_response(content: dict[str, Any], *, is_raw: bool) -> Any:
     _, response_type = METHODS["ModelInfer"]
     if is_raw:
         raw_contents = [take_binary_tensor(tensor) for tensor in content["outputs"]]
+        for tensor in content["outputs"]:
+            del tensor["parameters"]  # the raw contents themselves have a length
         return response_type(**content, raw_output_contents=raw_contents)
     for tensor in content["outputs"]:
         values = tensor.pop("data")

@@ -51,13 +51,14 @@ class InferBody(Struct, frozen=True):
     parameters: Parameters = None
 
 
-class IndexBody(Struct, frozen=True):
-    """Body of a request for the index of the repository."""
+class RepositoryBody(Struct, frozen=True):
+    """Body of a request for the index of the repository, or for loading a model."""
 
     ready: bool | None = None
+    parameters: Parameters = None
 
 
-DATATYPES: dict[str, np.dtype[Any]] = {"FP32": np.dtype("<f4"), "FP64": np.dtype("<f8")}
+DATATYPES = {"FP32": "<f4", "FP64": "<f8"}
 """NumPy type of the charges by the name of the number type. The protocol prescribes little-endian numbers."""
 
 FLAGS = "flags"
@@ -126,7 +127,7 @@ def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...
         raise TooLarge(f"input {INPUT!r}: expected at most {max_presses} presses in one request, got {shape[0]}")
 
     count = math.prod(shape)
-    dtype = DATATYPES[tensor.datatype]
+    dtype = np.dtype(DATATYPES[tensor.datatype])
     try:
         charges = np.frombuffer(binary, dtype) if tensor.data is None else np.asarray(tensor.data, np.float64)
     except ValueError:  # an incomplete number, or rows of different lengths
@@ -174,29 +175,37 @@ def infer(loaded: LoadedVersion, max_presses: int, body: InferBody, binary: byte
     loaded.statistics.alarms.inc(float(alarm_count))
 
     names = [output.name for output in body.outputs or ()] or OUTPUTS
-    tensors: list[dict[str, Any]] = []
-    for name in names:
-        if name == FLAGS:
-            shape, flags = (len(charge_pC), 1), _flags(loaded, outputs)
-            tensors.append({"name": name, "datatype": "BYTES", "shape": shape, "data": flags})
-        else:
-            rows = outputs[name]
-            tensors.append({"name": name, "datatype": "FP32", "shape": rows.shape, "data": rows.ravel()})
+    if FLAGS in names:
+        outputs[FLAGS] = _flags(loaded, outputs)
     content: dict[str, Any] = {"model_name": loaded.metadata.name, "model_version": loaded.version}
     if body.id:
         content["id"] = body.id
-    content["outputs"] = tensors
+    content["outputs"] = [_output_tensor(name, outputs[name]) for name in names]
     return content
 
 
+def _output_tensor(name: str, values: Any) -> dict[str, Any]:
+    """Return the object that describes an output, with its values.
+
+    Args:
+        name: Name of the output.
+        values: Array of numbers, shape (n, width), or a list of n texts for the output `flags`.
+    """
+    if name == FLAGS:
+        return {"name": name, "datatype": "BYTES", "shape": (len(values), 1), "data": values}
+    return {"name": name, "datatype": "FP32", "shape": values.shape, "data": values.ravel()}
+
+
 def take_binary_tensor(tensor: dict[str, Any]) -> bytes:
-    """Remove the values from the object that describes an output, and return them as a binary tensor.
+    """Replace the values in the object that describes an output by their size, and return them as a binary tensor.
 
     In a binary tensor, numbers are little-endian float32. Each text is preceded by its length in bytes, a 32-bit
     unsigned integer.
     """
     values = tensor.pop("data")
     if tensor["datatype"] == "BYTES":
-        return b"".join(struct.pack("<I", len(text)) + text.encode() for text in values)
-    data: bytes = values.astype("<f4", copy=False).tobytes()
+        data = b"".join(struct.pack("<I", len(text)) + text.encode() for text in values)
+    else:
+        data = values.astype("<f4", copy=False).tobytes()
+    tensor["parameters"] = {"binary_data_size": len(data)}
     return data

@@ -10,7 +10,7 @@ from isocharge.common import errors
 
 log = logging.getLogger(__name__)
 
-_STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
+_STATUSES = (
     (errors.ModelNotFound, 404, "NOT_FOUND"),
     (errors.UnknownPath, 404, "NOT_FOUND"),
     (errors.WrongMethod, 405, "UNIMPLEMENTED"),

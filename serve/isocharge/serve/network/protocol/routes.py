@@ -6,7 +6,7 @@ messages of the gRPC service have the same fields as the JSON objects that the f
 
 from collections.abc import Callable, Mapping
 from importlib.resources import files
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import orjson
 from prometheus_client import generate_latest
@@ -17,7 +17,13 @@ from isocharge.serve.model.session import INPUT, OUTPUTS
 from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.metrics import CONTENT_TYPE, Traffic
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
-from isocharge.serve.network.protocol.inference import IndexBody, binary_outputs, infer, read_infer, take_binary_tensor
+from isocharge.serve.network.protocol.inference import (
+    RepositoryBody,
+    binary_outputs,
+    infer,
+    read_infer,
+    take_binary_tensor,
+)
 from isocharge.serve.network.protocol.response import Response, response_of
 
 EXTENSIONS = (
@@ -29,8 +35,6 @@ EXTENSIONS = (
     "statistics",
 )
 """Extensions of the protocol that the servers support."""
-
-T = TypeVar("T")
 
 PLATFORM = "onnxruntime_onnx"
 """Triton's name for ONNX models."""
@@ -61,10 +65,6 @@ class Request(NamedTuple):
     def loaded(self) -> LoadedVersion:
         """Loaded version of the model in the path. ModelNotFound is raised if the version is not loaded."""
         return self.store.get(self.name, self.version)
-
-    def content(self, target_type: type[T]) -> T:
-        """Convert the JSON object in the body to a type. Without a body, the object is empty."""
-        return parse_json(self.body or b"{}", "", RequestError, target_type)
 
 
 class Route(NamedTuple):
@@ -112,13 +112,13 @@ def _show_index(request: Request) -> list[dict[str, str]]:
 
     If the body contains `ready: true`, the index contains only the loaded versions.
     """
-    only_ready = request.content(IndexBody).ready
-    return [row for row in request.store.index() if row["state"] == "READY" or not only_ready]
+    body = parse_json(request.body or b"{}", "", RequestError, RepositoryBody)
+    return [row for row in request.store.index() if row["state"] == "READY" or not body.ready]
 
 
 def _load(request: Request) -> dict[str, Any]:
     """Read the files of a model again, and return an empty object."""
-    if request.content(dict[str, Any]).get("parameters") not in (None, {}):
+    if parse_json(request.body or b"{}", "", RequestError, RepositoryBody).parameters:
         raise RequestError(
             "load: parameters are not supported; put the files into the model's folder and load it again"
         )
@@ -127,7 +127,6 @@ def _load(request: Request) -> dict[str, Any]:
 
 
 def _unload(request: Request) -> dict[str, Any]:
-    request.content(dict)  # refuses a body that is not an object
     request.store.unload(request.name)
     return {}
 
@@ -191,11 +190,7 @@ def _infer(request: Request) -> Response:
         body, binary = read_infer(request.body, header_length)
         content = infer(loaded, request.limits.batch, body, binary)
         binary_names = binary_outputs(body)
-        binary_tensors: list[bytes] = []
-        for tensor in content["outputs"]:
-            if tensor["name"] in binary_names:
-                binary_tensors.append(take_binary_tensor(tensor))
-                tensor["parameters"] = {"binary_data_size": len(binary_tensors[-1])}
+        binary_tensors = [take_binary_tensor(tensor) for tensor in content["outputs"] if tensor["name"] in binary_names]
         json_text = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
     if not binary_tensors:
         return response_of(200, b"application/json", json_text)
