@@ -40,7 +40,7 @@ def test_sighup_loads_all_models_again(start, film, tmp_path):
 
 
 def test_sighup_reports_a_folder_of_models_that_cannot_be_listed(caplog):
-    _load_all(Mock(index=Mock(side_effect=ModelError("models: cannot be listed"))))
+    _load_all(Mock(load_all=Mock(side_effect=ModelError("models: cannot be listed"))))
     assert caplog.messages == ["models: cannot be listed"]
 
 

@@ -78,8 +78,6 @@ def http_command(
     # Load the models, and serve them until Ctrl-C.
     with suppress(KeyboardInterrupt), _traffic(log_format) as traffic:
         store = ModelStore(models)
-        for reason in store.refusals():
-            log.warning("refused: %s", reason)
         handler = Handler(store, traffic=traffic, access=access)
         server = HttpServer(handler, address, tls)
         load_all = unless_hung_up(lambda: threading.Thread(target=_load_all, args=[store], name="load").start())
@@ -89,12 +87,14 @@ def http_command(
             on_signal(signal.SIGINT, server.stop),
             on_signal(signal.SIGHUP, load_all),
         ):
-            _log_loaded_models(store)
+            _log_models(store)
             server.run(beside=_announced(server, handler, host, grpc_port, tls))
 
 
-def _log_loaded_models(store: ModelStore) -> None:
-    """Log the labels of all loaded models, separated by commas."""
+def _log_models(store: ModelStore) -> None:
+    """Log why versions were refused, and the labels of all loaded versions, separated by commas."""
+    for reason in store.refusals():
+        log.warning("refused: %s", reason)
     log.info("serving %s; Ctrl-C stops", ", ".join(loaded.metadata.label for loaded in store.versions_of()))
 
 
@@ -104,16 +104,11 @@ def _load_all(store: ModelStore) -> None:
     If a model cannot be loaded, the reason is logged, and its loaded version is kept.
     """
     try:
-        names = {row["name"] for row in store.index()}
+        store.load_all()
     except IsochargeError as error:  # a folder of models cannot be listed
         log.warning("%s", error)
         return
-    for name in sorted(names):
-        try:
-            store.load(name)
-        except IsochargeError as error:
-            log.warning("refused: %s", error)
-    _log_loaded_models(store)
+    _log_models(store)
 
 
 @contextmanager

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
-import onnxruntime as ort
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info, Metric, ProcessCollector
 
 from isocharge.common.errors import package_version
@@ -126,13 +125,12 @@ class RequestLog(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a line with a message of the module `logging`. The line also contains the traceback, if any."""
-        properties = {"logger": record.name, "message": self.format(record)}
-        self.write_line(record.levelname.lower(), "message", properties)
+        level = record.levelname.lower()
+        self.write_line(level=level, event="message", logger=record.name, message=self.format(record))
 
-    def write_line(self, level: str, event: str, properties: dict[str, Any]) -> None:
+    def write_line(self, **properties: Any) -> None:
         """Write a line about an event, which begins with the present time."""
-        line = {"time": datetime.now(UTC).isoformat(), "level": level, "event": event, **properties}
-        self._write(json.dumps(line))
+        self._write(json.dumps({"time": datetime.now(UTC).isoformat(), **properties}))
 
 
 class Traffic:
@@ -150,8 +148,7 @@ class Traffic:
         self.log = log
         self.registry = CollectorRegistry()
         ProcessCollector(registry=self.registry)
-        versions = Info("isocharge", "Versions of the server.", registry=self.registry)
-        versions.info({"version": package_version(), "onnxruntime": ort.__version__})
+        Info("isocharge", "Version of the server.", registry=self.registry).info({"version": package_version()})
         self._requests = Counter(
             "isocharge_requests",
             "Requests that were answered or refused.",
@@ -172,4 +169,4 @@ class Traffic:
         """Count a request that was answered, possibly with an error, and log the request if there is a log."""
         self._requests.labels(exchange.transport, exchange.route, exchange.status).inc()
         if self.log is not None:
-            self.log.write_line("info", "request", vars(exchange))
+            self.log.write_line(level="info", event="request", **vars(exchange))

@@ -86,10 +86,10 @@ class ModelStore:
         self._roots = roots if models is None else roots[:1]
         self._change_lock = threading.Lock()
         self._statistics = Statistics.of_all_versions()
-        # The list is sorted, and is replaced as a whole, so that no thread reads half of a change.
-        self._versions: list[Version] = []
-        for name, folder in self._folders().items():
-            self._load_versions(name, folder)
+        # Sorted versions by the name of their model. The table is replaced as a whole and never changed, so that no
+        # thread reads half of a change.
+        self._versions: dict[str, list[Version]] = {}
+        self.load_all()
         if not self.versions_of():
             searched = ", ".join(map(str, self._roots))
             missing = f"expected models, <name>/<version>/model.onnx, found none in {searched}; correct --models"
@@ -134,7 +134,9 @@ class ModelStore:
 
     def _find(self, name: str | None = None, version: str = "") -> list[Version]:
         """Return the versions that `versions_of` returns, and those that are not loaded."""
-        return [row for row in self._versions if name in (None, row.name) and version in ("", str(row.number))]
+        names = sorted(self._versions) if name is None else [name]
+        rows = [row for name in names for row in self._versions.get(name, ())]
+        return [row for row in rows if version in ("", str(row.number))]
 
     def index(self) -> list[dict[str, str]]:
         """Return one row for every version that is loaded, was refused or was unloaded, and for every other model.
@@ -142,7 +144,7 @@ class ModelStore:
         A row contains the name of the model, and the number and the state of the version. If the version was refused or
         unloaded, the row also contains the reason. The number is empty if no version of a model was found.
         """
-        new_names = self._folders().keys() - {row.name for row in self._versions}
+        new_names = [name for name in self._folders() if not self._find(name)]
         return [
             {
                 "name": row.name,
@@ -150,8 +152,19 @@ class ModelStore:
                 "state": "READY" if row.loaded else "UNAVAILABLE",
                 "reason": row.reason,
             }
-            for row in sorted([*self._versions, *(Version(name, 0) for name in new_names)])
+            for row in sorted([*self._find(), *(Version(name, 0) for name in new_names)])
         ]
+
+    def load_all(self) -> None:
+        """Read the files of all models again. `refusals` returns the reasons why versions were refused.
+
+        Raises:
+            ModelError: If a repository cannot be listed.
+        """
+        with self._change_lock:
+            folders = self._folders()
+            for name in folders.keys() | self._versions.keys():
+                self._load_versions(name, folders.get(name))
 
     def load(self, name: str) -> None:
         """Read the files of a model again, and replace its loaded versions.
@@ -185,7 +198,9 @@ class ModelStore:
         """
         with self._change_lock:
             self.get(name)  # raises ModelNotFound
-            self._replace(name, [row._replace(loaded=None, reason="unloaded") for row in self._find(name)])
+            self._versions = self._versions | {
+                name: [row._replace(loaded=None, reason="unloaded") for row in self._find(name)]
+            }
 
     def _folders(self) -> Mapping[str, Path]:
         """Search the repositories for models, and return the folder of each model by the name of the model."""
@@ -219,17 +234,12 @@ class ModelStore:
                 rows[number] = row._replace(reason=reason)
         if not rows or any(row.reason for row in rows.values()):
             rows = earlier | rows
-        self._replace(name, list(rows.values()))
-
-    def _replace(self, name: str, rows: list[Version]) -> None:
-        """Replace all versions of a model."""
-        others = [row for row in self._versions if row.name != name]
-        self._versions = sorted([*others, *rows])
+        self._versions = self._versions | {name: sorted(rows.values())}
 
     def collect(self) -> Iterator[Metric]:
         """Yield the metrics of all models for Prometheus. A registry calls this method."""
         ready = GaugeMetricFamily("isocharge_model_ready", "Whether a version is loaded.", labels=("model", "version"))
-        for row in self._versions:
+        for row in self._find():
             ready.add_metric((row.name, str(row.number)), row.loaded is not None)
         yield ready
         yield from self._statistics.collect()

@@ -284,10 +284,10 @@ class Service:
         oldest_timeout.reschedule(0.0)
 
     def end_streams(self) -> None:
-        """End the streams, because the server stops. A call that waits for a message waits for 0.1 s more."""
+        """End the streams, because the server stops. A call that waits for a message ends at once."""
         self._is_stopping = True
         for timeout in self._waiting:
-            timeout.reschedule(asyncio.get_running_loop().time() + 0.1)
+            timeout.reschedule(0.0)
 
     async def _next_message(self, context: grpc.aio.ServicerContext, timeout_s: float) -> Any:
         """Wait for the next message of a call.
