@@ -16,7 +16,7 @@ import logging
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import call, methodcaller
+from operator import call
 
 import numpy as np
 
@@ -279,7 +279,11 @@ def _directions(
     lower, upper = films[max(node - 1, 0)], films[min(node + 1, len(films) - 1)]
     neighbours = [] if lower is upper else [lower, upper]
     changes_of_films = []  # changes of v by one standard deviation of each unknown, shape (n, n_electrode, n_unknown)
-    for film_charge, jacobian in in_order(executor, methodcaller("linearised", contact), [calibrated, *neighbours]):
+    halves = np.array_split(contact, 2)  # two workers share each film
+    jobs = [partial(one.linearised, half) for one in (calibrated, *neighbours) for half in halves]
+    results = in_order(executor, call, jobs)
+    for first, second in zip(results, results, strict=True):  # both halves of one film
+        film_charge, jacobian = map(np.concatenate, zip(first, second, strict=True))
         charge_per_value = np.maximum(film_charge, LOWEST_CHARGE) if size is None else size
         changes_of_films.append((jacobian / charge_per_value[:, :, None]) @ covariance_root)
     changes, *neighbour_changes = changes_of_films
