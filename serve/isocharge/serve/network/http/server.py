@@ -10,7 +10,7 @@ import asyncio
 import math
 import resource
 import socket
-from contextlib import AbstractAsyncContextManager, AsyncExitStack, nullcontext
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, nullcontext, suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -218,9 +218,12 @@ class HttpServer(uvicorn.Server):
         self._socket = address.listen(limits.connections)
         # Each connection needs an open file. The process is therefore allowed as many open files as the system permits.
         # Without a free one, no connection could be accepted, nor one ended for it.
-        _, max_open_files = resource.getrlimit(resource.RLIMIT_NOFILE)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (max_open_files, max_open_files))
-        limits = replace(limits, connections=min(limits.connections, max_open_files * 7 // 8))
+        _, most_open_files = resource.getrlimit(resource.RLIMIT_NOFILE)
+        with suppress(ValueError, OSError):  # macOS refuses an unlimited number
+            resource.setrlimit(resource.RLIMIT_NOFILE, (most_open_files, most_open_files))
+        max_open_files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        if max_open_files != resource.RLIM_INFINITY:
+            limits = replace(limits, connections=min(limits.connections, max_open_files * 7 // 8))
         connection: Any = partial(Connection, limits, traffic)
         config = uvicorn.Config(
             application,
