@@ -77,6 +77,9 @@ def test_offset_of_all_charges_or_forces_is_found_with_its_sign(fit, press_film,
     readings += offset
     result = fit(presses)
     assert abs(result.film.value(name) - offset) < 3.0 * result.film.std(name) < 0.3 * abs(offset)
+    # A wrong zero of the load cell causes no error of a later contact.
+    only_force_offset = np.diag(np.array(result.film.layout.names) == "force_offset")
+    assert result.sensitivity.film_error(only_force_offset).force_percent == 0.0
     (caution,) = result.cautions
     assert re.search(r"contain an offset of (-?\d+)", caution)[1].startswith("-") == (offset < 0.0)
 

@@ -114,8 +114,14 @@ def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
     session = [one.stds for one in SESSION]
     for cases in product(noises, POSITION_RATIOS, FORCE_SCATTERS, IMPERFECTION_SCALES, DISCREPANCY_SIZES, *session):
         sizes, probabilities = zip(*cases, strict=True)
-        errors, (imperfections, discrepancy, *session_std) = PressErrors(*sizes[:3]), sizes[3:]
-        yield Hypothesis(imperfections, discrepancy, tuple(session_std), errors, float(np.prod(probabilities)))
+        level, position_ratio, force_scatter, imperfections, discrepancy, *session_std = sizes
+        yield Hypothesis(
+            imperfections,
+            discrepancy,
+            tuple(session_std),
+            PressErrors(level, position_ratio, force_scatter),
+            float(np.prod(probabilities)),
+        )
 
 
 TYPICAL = np.array([1.0, 1.0, 1.0, 0.01, *(one.stds[-1][0] for one in SESSION)])
@@ -289,7 +295,7 @@ def _estimate_with_errors(
     data = stated.with_errors(assumed)
     point = _most_probable_point(charges, data, prior, previous)
     redundancy = np.maximum(np.isfinite(data.measured_std).sum(axis=1) - 3, 0)  # a contact has three unknowns
-    is_bad = (redundancy > 0) & (chdtrc(np.maximum(redundancy, 1), point.chi2) < BAD_PROBABILITY)
+    is_bad = (redundancy > 0) & (chdtrc(redundancy, point.chi2) < BAD_PROBABILITY)
     # If most presses seem to be bad, the assumed film is wrong, and not the presses. Among a few presses, a bad press
     # cannot be recognised. In both cases, all presses are used.
     if is_bad.mean() > 0.5 or len(data) <= FEW_PRESSES:
