@@ -20,9 +20,8 @@ from isocharge.simulate import NoiseModel, noise_model
 NOISE = noise_model("reference")
 
 
-@pytest.fixture(scope="module")
-def series():
-    """Charge map of degree 2 whose charges fall with the pretension, most for small forces and near the centre."""
+def charge_map(*node_MPa):
+    """Return a map of degree 2 whose charges fall with the pretension, most for small forces and near the centre."""
     rng = np.random.default_rng(0)
     base = np.zeros((3, 3, 2, 4))
     base[0, 0, 0], base[0, 0, 1] = 6.0, 1.2
@@ -32,17 +31,21 @@ def series():
     tension[0, 0, 0], tension[0, 0, 1] = [-0.4, -0.35, -0.3, -0.38], 0.1
     tension[1, 0, 0], tension[0, 1, 0] = [-0.1, 0.02, 0.1, 0.0], [0.02, -0.1, 0.0, 0.1]
     direction = 0.003 * rng.standard_normal((2, 2, 2, 2, 2, 4))
-    nodes = np.array([-0.7, 0.0, 0.7])
     return ChargeSeries(
         domain=Domain(8.0, (0.05, 2.0)),
         electrodes=tuple("ABCD"),
-        coefficients=np.stack([base + node * tension for node in nodes]),
-        node_MPa=nodes,
+        coefficients=np.stack([base + node * tension for node in node_MPa]),
+        node_MPa=np.array(node_MPa),
         directions=direction,
         charge_std=0.001,
         pretension_MPa=1.0,
         tension_std_MPa=0.35,
     )
+
+
+@pytest.fixture(scope="module")
+def series():
+    return charge_map(-0.7, 0.0, 0.7)
 
 
 def with_electrodes(series, count):
@@ -196,16 +199,12 @@ def test_stated_uncertainty_contains_the_change_as_long_as_the_touches_show_litt
     assert np.mean(np.array(deviations) < 2.0) > 0.9
 
 
-def test_nearly_slack_film_that_has_not_changed_is_not_lost(series, tmp_path):
+def test_nearly_slack_film_that_has_not_changed_is_not_lost(tmp_path):
     """The pretension is 0.01 MPa and cannot become smaller."""
     rng = np.random.default_rng(2)
-    looser = series.coefficients[1] + 0.01 / 0.7 * (series.coefficients[0] - series.coefficients[1])
-    slack = replace(
-        series, node_MPa=np.array([-0.01, 0.0, 0.7]), coefficients=np.stack([looser, *series.coefficients[1:]])
-    )
-    model = model_in(tmp_path, slack)
+    slack = charge_map(-0.01, 0.0, 0.7)
     _, charge = touches(slack, np.zeros(3), rng, 60)
-    _, was_lost = followed(model, charge, rng, 1)
+    _, was_lost = followed(model_in(tmp_path, slack), charge, rng, 1)
     assert not any(was_lost)
 
 
@@ -255,13 +254,8 @@ def test_film_that_is_lost_again_keeps_the_state_of_the_latest_touches(series, m
 def test_film_whose_pretension_is_at_the_end_of_the_charge_map_is_lost(series, tmp_path):
     """The largest change of the map explains the touches well enough, but the real change may be larger."""
     rng = np.random.default_rng(5)
-    middle, highest = series.coefficients[1:]
-    nodes = np.array([-0.3, 0.0, 0.3])
-    narrow = replace(
-        series, node_MPa=nodes, coefficients=np.stack([middle + node / 0.7 * (highest - middle) for node in nodes])
-    )
     _, charge = touches(series, [0.32, 0.0, 0.0], rng, 40)
-    _, was_lost = followed(model_in(tmp_path, narrow), charge, rng)
+    _, was_lost = followed(model_in(tmp_path, charge_map(-0.3, 0.0, 0.3)), charge, rng)
     assert any(was_lost)
 
 

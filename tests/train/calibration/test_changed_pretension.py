@@ -66,6 +66,20 @@ def test_no_node_makes_a_film_slack_in_one_direction(problem, pretension_MPa):
     assert interpolation_weights(node_MPa, np.array([0.2]))[0].max() < 50.0
 
 
+def test_errors_of_the_offset_and_of_d31_partly_cancel_in_the_directions(problem, synthetic, monkeypatch):
+    """The presses of the calibration determine their sum better than each of them."""
+    monkeypatch.setattr(compact_map, "_nodes", lambda _: np.zeros(1))
+    film = uneven_film(problem)
+    unknowns = [film.layout.index(name) for name in ("d31", "offset")]
+    covariance = np.array([[0.002, -0.4], [-0.4, 100.0]])
+    film.covariance[np.ix_(unknowns, unknowns)] = covariance
+    series = compact_map.compact_charges(problem.domain, synthetic, film, None)
+    *_, (changes,) = series.in_state(CONTACT[:1], np.zeros(1 + series.direction_count))
+    *_, (by_property,) = synthetic.linearised(film.film_values, CONTACT[:1])
+    slopes = np.column_stack([by_property[:, unknowns[0]], np.ones(4)])
+    np.testing.assert_allclose(changes @ changes.T, slopes @ covariance @ slopes.T, rtol=0.02)
+
+
 def test_node_at_which_the_charges_are_unknown_is_left_out(problem, synthetic, monkeypatch, caplog):
     """Otherwise, the fit to its charges would also spoil the charges at the other nodes."""
 

@@ -23,7 +23,7 @@ def test_charges_agree_with_the_simulator(split, film):
     contact = draw_contacts(np.random.default_rng(8), DOMAIN, 500)
     relative_error = np.abs(field.charges(contact) / film.charges(contact) - 1.0)
     assert np.median(relative_error) < 2e-4
-    assert np.sqrt(np.mean(relative_error**2)) < 2.0 * field.charge_std
+    assert rms(relative_error) < 2.0 * field.charge_std
 
 
 def signed_charges(contact):

@@ -154,7 +154,7 @@ class _ChangedFilm:
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Compute the charges of this film, and their derivatives with respect to the unknowns of the calibrated film.
 
-        The unknowns are the properties of the film and the coefficients of the discrepancy; see `Layout`.
+        The unknowns are the properties of the film, the offset of the charges and the coefficients of the discrepancy.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -163,8 +163,9 @@ class _ChangedFilm:
             Charges, shape (n, n_electrode), pC, and derivatives, shape (n, n_electrode, n_unknown), pC per unit.
         """
         charge, _, by_property = self.charges.linearised(self.values, contact)
+        by_offset = np.ones((*charge.shape, 1))
         by_coefficient = discrepancy_jacobian(charge, contact, self.charges.domain)
-        return charge, np.concatenate([by_property @ self.by_calibrated, by_coefficient], axis=2)
+        return charge, np.concatenate([by_property @ self.by_calibrated, by_offset, by_coefficient], axis=2)
 
 
 def _fit_followable_nodes(
@@ -269,7 +270,7 @@ def _directions(
     Returns:
         Coefficients, as in `ChargeSeries.directions`.
     """
-    unknowns = np.r_[film.layout.film, film.layout.coefficients]
+    unknowns = np.r_[film.layout.film, film.layout.index("offset"), film.layout.coefficients]
     eigenvalues, vectors = np.linalg.eigh(film.covariance[np.ix_(unknowns, unknowns)])
     covariance_root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
     unit_contact = series.domain.to_unit(contact)

@@ -42,10 +42,8 @@ def training_data(
     # During the session, the gain changed linearly by the drift. The gains of the presses are therefore uniformly
     # distributed over an interval of this width, which has the standard deviation drift / sqrt(12). The drift itself is
     # uncertain: its root mean square follows from its estimate and its standard deviation.
-    drift_rms = np.hypot(film.value("drift"), film.std("drift"))
-    gain_std = drift_rms / np.sqrt(12.0)
+    gain_std = np.hypot(film.value("drift"), film.std("drift")) / np.sqrt(12.0)
     charge *= 1.0 + gain_std * rng.standard_normal((PRESSES, 1))
-    charge += film.std("offset") * rng.standard_normal((PRESSES, 1))
     sensor, probe = charges.prior.film(film.film_values)
     return TrainingData(
         sensor=sensor,
