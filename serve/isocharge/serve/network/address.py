@@ -46,11 +46,10 @@ class Address:
                 return _listen_unix(self.uds, backlog)
             # create_server sets SO_REUSEADDR. The port of an earlier server can therefore be used again at once.
             family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
-            accepts_ipv4_too = self.host == "::" and socket.has_dualstack_ipv6()
             return socket.create_server(
-                (self.host, self.port), family=family, backlog=backlog, dualstack_ipv6=accepts_ipv4_too
+                (self.host, self.port), family=family, backlog=backlog, dualstack_ipv6=self.host == "::"
             )
-        except (OSError, UnicodeError) as error:  # a host name that cannot be encoded causes a UnicodeError
+        except (OSError, ValueError) as error:  # a ValueError if the host name cannot be encoded, or without IPv6
             place = self.uds or f"{self.host}:{self.port}"
             raise ListenError(f"cannot listen on {place}: {error}; choose another address or port") from error
 

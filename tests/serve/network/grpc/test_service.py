@@ -84,10 +84,10 @@ def test_charges_as_fp32_contents(serve, film, predictor, datatype):
                 message,
             )
             for contents, raw, message in [
-                ({"bool_contents": [True]}, [], "in raw_input_contents or in fp32_contents, got 0 lists"),
-                ({"fp64_contents": [1.0] * 3}, [], "got 0 lists"),
-                ({"fp32_contents": [1.0] * 3}, [bytes(12)], "got 2 lists"),
-                ({}, [bytes(4), bytes(8)], "got 2 lists"),
+                ({"bool_contents": [True]}, [], "expected 3 numbers .* and 0 bytes"),
+                ({"fp64_contents": [1.0] * 3}, [], "expected 3 numbers .* and 0 bytes"),
+                ({"fp32_contents": [1.0] * 3}, [bytes(12)], r"of the shape \(3,\) and 12 bytes"),
+                ({}, [bytes(4), bytes(8)], "one input tensor, got 2"),
                 ({}, [bytes(11)], "expected 3 numbers .* and 11 bytes"),
             ]
         ),

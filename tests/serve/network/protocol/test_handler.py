@@ -205,6 +205,7 @@ def test_wrong_inference_header_content_length_is_refused(ask, length):
 @pytest.mark.parametrize(
     ("changes", "spoil", "message"),
     [
+        ({"tensor": {"data": [1, 2, 3]}}, bytes, "of the shape (3,) and 12 bytes"),
         ({"tensor": {"shape": [2, 3]}}, bytes, "or 6 binary numbers of 4 bytes each, got an array of the shape (3,)"),
         ({}, lambda body: body[:-4], "of the shape (2,) and 8 bytes"),
         ({}, lambda body: body[:-1], "of the shape (0,) and 11 bytes"),

@@ -19,7 +19,6 @@ from typing import Any
 
 import grpc
 import grpc.aio
-import numpy as np
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.json_format import MessageToJson, ParseDict
@@ -30,7 +29,7 @@ from isocharge.common.errors import ModelError, RequestError, TooMany
 from isocharge.common.structs import convert
 from isocharge.serve.network.metrics import Exchange
 from isocharge.serve.network.protocol.handler import Handler
-from isocharge.serve.network.protocol.inference import DATATYPES, InferBody, infer, take_binary_tensor
+from isocharge.serve.network.protocol.inference import InferBody, infer, take_binary_tensor
 from isocharge.serve.network.protocol.response import refusal
 from isocharge.serve.network.protocol.routes import ROUTES, Request
 
@@ -63,26 +62,24 @@ def read_request(message: Any) -> tuple[InferBody, bytes]:
     Raises:
         RequestError: If the message is not a request for an inference.
     """
+    raw_contents = message.raw_input_contents
+    if len(raw_contents) > 1:
+        raise RequestError(f"raw_input_contents: expected the bytes of one input tensor, got {len(raw_contents)}")
     content = {
         "id": message.id,
         "inputs": [
-            {"name": tensor.name, "datatype": tensor.datatype, "shape": list(tensor.shape)} for tensor in message.inputs
+            {
+                "name": tensor.name,
+                "datatype": tensor.datatype,
+                "shape": [*tensor.shape],
+                # The name of the list of numbers depends on their type. An empty list was not sent.
+                "data": [*getattr(tensor.contents, f"{tensor.datatype.lower()}_contents", ())] or None,
+            }
+            for tensor in message.inputs
         ],
         "outputs": [{"name": output.name} for output in message.outputs],
     }
-    body = convert(content, InferBody, "", RequestError)
-    # The numbers are either raw bytes, or a list whose name depends on their type.
-    datatype = body.inputs[0].datatype
-    numbers = getattr(message.inputs[0].contents, f"{datatype.lower()}_contents")
-    raw_contents = [*message.raw_input_contents]
-    if numbers:
-        raw_contents.append(np.array(numbers, DATATYPES[datatype]).tobytes())
-    if len(raw_contents) != 1:
-        raise RequestError(
-            f"expected the numbers of one input tensor, in raw_input_contents or in {datatype.lower()}_contents, "
-            f"got {len(raw_contents)} lists"
-        )
-    return body, raw_contents[0]
+    return convert(content, InferBody, "", RequestError), b"".join(raw_contents)
 
 
 def write_response(content: dict[str, Any], *, is_raw: bool) -> Any:

@@ -108,7 +108,7 @@ def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...
 
     Args:
         tensor: Input tensor of the request.
-        binary: Binary tensor with the charges. It is ignored if the input tensor itself contains the charges.
+        binary: Binary tensor with the charges. It is empty if the input tensor itself contains the charges.
         electrodes: Names of the electrodes of the model, in the order of the charges.
         max_presses: Largest number of presses in one request.
 
@@ -132,7 +132,8 @@ def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...
         charges = np.frombuffer(binary, dtype) if tensor.data is None else np.asarray(tensor.data, np.float64)
     except ValueError:  # an incomplete number, or rows of different lengths
         charges = np.empty(0)
-    if charges.shape not in (tuple(shape), (count,)):
+    is_sent_twice = binary and tensor.data is not None
+    if is_sent_twice or charges.shape not in (tuple(shape), (count,)):
         raise RequestError(
             f"input {INPUT!r}: expected {count} numbers for the shape {shape}, flat or in rows of equal length, or "
             f"{count} binary numbers of {dtype.itemsize} bytes each, got an array of the shape {charges.shape} and "
