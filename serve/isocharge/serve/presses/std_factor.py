@@ -40,15 +40,17 @@ class StdFactor(NamedTuple):
     def statement(self) -> str:
         """Statement about the contacts of a model whose standard deviations were multiplied by the factor."""
         return (
-            f"with standard deviations that are {self.factor:.3g} times as large, the 95 % regions hold for at least "
-            f"{100.0 * COVERAGE:.0f} % of contacts like these {self.presses} presses, with probability {CONFIDENCE:g}"
+            f"with standard deviations that are {self.factor:.3g} times as large, the 95 % regions (without "
+            f"correlations) hold for at least {100.0 * COVERAGE:.0f} % of contacts like these {self.presses} presses, "
+            f"with probability {CONFIDENCE:g}"
         )
 
     @classmethod
     def from_errors(cls, error: Array, std: Array) -> "StdFactor":
         """Compute the factor from the errors of held-out presses.
 
-        The score of a press is the factor with which its 95 % region just contains the measured values.
+        The score of a press is the factor with which its 95 % region just contains the measured values. The region is
+        an ellipsoid with axes along x, y and the force, without the correlations that the model states.
 
         Args:
             error: Errors of x, y and the force, shape (n, 3); NaN if unknown. At least one value of
