@@ -11,7 +11,7 @@ from isocharge.simulate import load_amplifier, noise_model
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict
 from kept import ROOT
 
-DOCS = ROOT / "simulate" / "docs"
+DOCS = ROOT / "simulate/docs"
 DATASETS, FILES = ((DOCS / f"{name}.md").read_text("utf-8") for name in ("datasets", "files"))
 TABLES = re.findall(r"```toml\n(.*?)```", FILES, re.DOTALL)
 

@@ -35,7 +35,7 @@ negative."""
 NOISE_pC = np.array([0.3, 0.2, 0.3, 0.4])
 """Standard deviation of the white noise of each channel, pC."""
 
-REAL_PAD = ROOT / "tests" / "data" / "tactile_fsi.csv"
+REAL_PAD = ROOT / "tests/data/tactile_fsi.csv"
 """Presses on a real pad of TactileFSI."""
 
 CHANNELS = ("Q1", "Q2", "Q3", "Q4")
@@ -246,6 +246,10 @@ FAULTY_PRESSES = {
         with_column("charge_pC", 2, lambda _: np.where(np.arange(1_200) == 7, 5.0, 0.0)),
         "channel 'Q3': expected charges that vary, got 0 in 1199 of 1200 presses",
     ),
+    "a channel with the numbers of the presses": (
+        with_column("charge_pC", 2, lambda _: np.arange(1_200.0)),
+        "channel 'Q3': expected charges, got values in ascending order; leave out",
+    ),
     "positions with one y but for rounding": (
         with_column("contact", 1, lambda _: 3.0 + 1e-9 * JITTER),
         "got [0-9]+ places on one line; press beside it, too",
@@ -318,9 +322,9 @@ def test_intact_presses_are_accepted_without_a_warning(caplog):
     usable_presses(read_presses(REAL_PAD))
     presses = presses_on_l()
     for unit in (1e-12, 1e12):
-        usable_presses(measured_presses(presses.contact, unit * presses.charge_pC, CHANNELS))
+        usable_presses(replace(presses, charge_pC=unit * presses.charge_pC))
     is_zero = np.random.default_rng(7).random((1_200, 4)) < 0.9
-    usable_presses(measured_presses(presses.contact, np.where(is_zero, 0.0, presses.charge_pC), CHANNELS))
+    usable_presses(replace(presses, charge_pC=np.where(is_zero, 0.0, presses.charge_pC)))
     usable_presses(with_column("charge_pC", 1, lambda charge: charge[:, 0] * (1.0 + 0.01 * JITTER)))
     assert not caplog.text
 

@@ -246,7 +246,7 @@ def test_rounded_weights_are_whole_numbers_times_the_scale_of_their_output(datas
     assert not np.array_equal(rounded.last.weight, exact.last.weight)  # trained after the rounding
 
 
-CONFIGS = ROOT / "train" / "configs"
+CONFIGS = ROOT / "train/configs"
 
 
 def write(folder, text):

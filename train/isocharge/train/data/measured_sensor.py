@@ -4,7 +4,6 @@ Without such checks, the loss could become infinite or NaN during the training. 
 model could also be meaningless.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -137,31 +136,35 @@ def check_measured_presses(presses: MeasuredPresses) -> None:
         presses: The presses. None of their positions, forces and charges may be unknown.
 
     Raises:
-        PressError: If the charges of a channel hardly vary, if a value is far from all others, or if channels depend
-            linearly on each other. The message names the channels, or the line and the column.
+        PressError: If the charges of a channel hardly vary or are in ascending order, if a value is far from all
+            others, or if channels depend linearly on each other. The message names the channels, or the line and the
+            column.
     """
-    channels = dict(zip(presses.electrodes, presses.charge_pC.T, strict=True))
-    contact_columns = dict(zip(CONTACT, presses.contact.T, strict=True))
-    for name, values in {**contact_columns, **channels}.items():
+    for name in (*CONTACT, *presses.electrodes):
+        values = presses.columns[name]
         _check_far_value(presses, name, values, compared_values=values)
-    for name, charge in channels.items():
-        _check_variation(name, charge)
+    for name in presses.electrodes:
+        _check_variation(name, presses.columns[name])
 
     # A force that is far too small is not far from the other forces, but its inverse is far from the other inverses.
-    force = contact_columns["force_N"]
+    force = presses.columns["force_N"]
     _check_far_value(presses, "force_N", force, compared_values=1.0 / force)
-    _check_independence(channels)
+    _check_independence(presses)
 
 
 def _check_variation(name: str, charge: Array) -> None:
-    """Raise an error if nearly all charges of a channel are equal.
+    """Raise an error if nearly all charges of a channel are equal, or if they are in ascending order.
+
+    Values in ascending order are times or numbers of the presses. Presses at neighbouring places often have similar
+    times, so the estimated errors of the model would be far too small.
 
     Args:
         name: Name of the channel.
         charge: Charges of the channel, shape (n,), pC.
 
     Raises:
-        PressError: If all charges are equal, except for the share `LEAST_SHARE` of the largest and of the smallest.
+        PressError: If all charges are in ascending order, or if all are equal, except for the share `LEAST_SHARE` of
+            the largest and of the smallest.
     """
     low, high = np.quantile(charge, (LEAST_SHARE, 1.0 - LEAST_SHARE))
     if np.isclose(low, high, atol=0.0):
@@ -169,6 +172,11 @@ def _check_variation(name: str, charge: Array) -> None:
         raise PressError(
             f"channel {shown(name)}: expected charges that vary, got {low:g} in {equal_count} of {len(charge)} "
             "presses; leave the channel out"
+        )
+    if (np.diff(charge) >= 0.0).all():
+        raise PressError(
+            f"channel {shown(name)}: expected charges, got values in ascending order; leave out columns with times or "
+            "numbers of the presses"
         )
 
 
@@ -201,17 +209,17 @@ def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compare
         )
 
 
-def _check_independence(channels: Mapping[str, Array]) -> None:
+def _check_independence(presses: MeasuredPresses) -> None:
     """Raise an error if the charges of any channel are a linear combination of those of other channels.
 
     Args:
-        channels: Charges of each channel, shape (n,), pC, by its name.
+        presses: The presses.
 
     Raises:
         PressError: If the smallest singular value of the standardised charges is nearly zero. The message names the
             channels that contribute to the singular vector of this value.
     """
-    charge = np.column_stack(list(channels.values()))
+    charge = presses.charge_pC
     standardised_charge = (charge - charge.mean(axis=0)) / charge.std(axis=0)
     _, singular_values, directions = np.linalg.svd(standardised_charge, full_matrices=False)
     largest, *_, smallest = singular_values
@@ -221,7 +229,7 @@ def _check_independence(channels: Mapping[str, Array]) -> None:
     # zero.
     dependent_names = [
         shown(name)
-        for name, coefficient in zip(channels, directions[-1], strict=True)
+        for name, coefficient in zip(presses.electrodes, directions[-1], strict=True)
         if abs(coefficient) > LEAST_INDEPENDENCE
     ]
     raise PressError(
