@@ -84,11 +84,10 @@ def folded_tracker():
 def track(x, rate_Hz=1000.0, **options):
     """Track contacts at positions x, mm; return the tracked contact and the other contact of each frame."""
     tracker = folded_tracker()
-    results = []
-    for number, charge_pC in enumerate(noisy_charges(x, **options)):
-        tracked, _ = track_frame(tracker, MODEL_CONTACT, number / rate_Hz, (), charge_pC)
-        results.append((tracked, tracker._other))
-    return results
+    return [
+        (track_frame(tracker, MODEL_CONTACT, number / rate_Hz, (), charge_pC)[0], tracker._other)
+        for number, charge_pC in enumerate(noisy_charges(x, **options))
+    ]
 
 
 def test_contact_at_rest_beside_a_fold_has_an_other_contact_of_equal_probability():
@@ -152,13 +151,22 @@ def test_charges_of_no_contact_are_not_tracked_and_saturated_frames_are_ignored(
         assert track_frame(tracker, MODEL_CONTACT, number / 1000.0, (), np.array([1e3, 1e6, 10.0])) == (None, None)
     assert track_frame(tracker, None, 0.05) == (None, None)
 
-    results = []
-    for number, charge_pC in enumerate(noisy_charges(np.full(30, -4.0))):
-        results.append(track_frame(tracker, MODEL_CONTACT, 0.1 + number / 1000.0, (), charge_pC))
+    results = [
+        track_frame(tracker, MODEL_CONTACT, 0.1 + number / 1000.0, (), charge_pC)
+        for number, charge_pC in enumerate(noisy_charges(np.full(30, -4.0)))
+    ]
     last_tracked, _ = results[-1]
     assert [event for _, event in results if event] == ["press"]
     assert last_tracked.x_mm == pytest.approx(-4.0, abs=0.3)
     assert track_frame(tracker, MODEL_CONTACT, 0.2, ("saturated",), np.full(3, 1e5)) == (last_tracked, None)
+
+
+def test_rapidly_rising_force_is_followed():
+    """The force triples from frame to frame, which the motion of a contact does not explain."""
+    mixture = ContactMixture(folded_series(), NOISE)
+    for number, force in enumerate([0.06, 0.2, 0.6]):
+        contact, *_ = mixture.update(charges(-4.0, 1.0, force), 5e-3 * number)
+        assert contact.mean[2] == pytest.approx(np.log(force), abs=0.05)
 
 
 def test_frames_before_a_gap_do_not_change_the_contact_after_it():

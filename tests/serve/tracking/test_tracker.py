@@ -29,15 +29,15 @@ LOG_FORCE_STD = 0.003
 
 RNG = np.random.default_rng(0)
 
-X, Y, _, X_STD, Y_STD = range(5)
+X, Y, FORCE, X_STD, Y_STD = range(5)
 """Columns of an array of tracked contacts."""
 
 
-def noisy_contacts(path, std=STD, correlation=0.6):
+def noisy_contacts(path, std=STD, correlation=0.6, force_N=1.0):
     """Yield noisy contacts along a path of positions x + iy, shape (n,), mm."""
     root = np.linalg.cholesky([[1.0, correlation], [correlation, 1.0]])
     noise = root @ RNG.standard_normal((2, len(path))) * std
-    forces = np.exp(LOG_FORCE_STD * RNG.standard_normal(len(path)))
+    forces = force_N * np.exp(LOG_FORCE_STD * RNG.standard_normal(len(path)))
     for position, (x_error, y_error), force_N in zip(path, noise.T, forces, strict=True):
         yield Contact(
             x_mm=float(position.real + x_error),
@@ -280,3 +280,9 @@ def test_records_with_track_only_add_fields(film, predictor):
 def test_contact_with_very_small_and_very_large_standard_deviations_is_tracked():
     contacts = noisy_contacts(np.zeros(100), correlation=0.99999)
     assert np.isfinite(track_contacts(contact._replace(x_std_mm=1e-9, y_std_mm=1e9) for contact in contacts)).all()
+
+
+def test_rapidly_rising_force_is_followed():
+    forces_N = np.linspace(0.05, 0.45, 20)
+    tracked = track_contacts(noisy_contacts(np.zeros(20), force_N=forces_N))
+    np.testing.assert_allclose(tracked[:, FORCE], forces_N, rtol=0.05)

@@ -28,7 +28,6 @@ from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.model.contact import Contact
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.tracking.motion_filter import (
-    INITIAL_RATE_STD,
     POSITION,
     RATES,
     SQUARED_GATE,
@@ -50,11 +49,15 @@ GAINS = slice(6, None)
 MAX_ITERATION_STEP = np.array([0.5, 0.5, 0.2])
 """Largest change of x and y (mm) and of ln F in one iteration. The linearisation is inaccurate for larger changes."""
 
-FORCE_ACCELERATION_DENSITY = 2.0
-"""Spectral density of the second derivative of ln F, 1/s^3.
+INITIAL_RATE_STD = np.array([60.0, 60.0, 10.0])
+"""Standard deviations of the rates at the beginning of a movement, mm/s, mm/s and 1/s.
 
-The density is small, because a wrong contact together with a change of the force may explain the charges.
+The rate of ln F is small, because a wrong contact together with a change of the force may explain the charges. If the
+force changes faster, the film is searched again.
 """
+
+FORCE_ACCELERATION_DENSITY = 2.0
+"""Spectral density of the second derivative of ln F, 1/s^3. It is small for the same reason."""
 
 
 class ContactHypothesis(NamedTuple):
@@ -240,7 +243,7 @@ SLOW_NOISE_STD = 0.003
 """Standard deviation of slow noise, relative to the charge. Slow noise lasts for several frames."""
 
 SEARCH_INTERVAL_s = 0.05
-"""Shortest time between two searches over the whole film, s. Each search takes milliseconds."""
+"""Pause of the searches over the whole film after an unsuccessful search, s. Each search takes milliseconds."""
 
 MAX_RELATIVE_RADIUS = 1.1
 """Distance from the centre, relative to the radius of the film, beyond which components are removed."""
@@ -315,8 +318,9 @@ class ContactMixture:
 
         # The frame noise of the n frames is independent, so its variance is divided by n. The slow noise is the same in
         # all frames of a step.
-        mean_pC = np.mean([charge for charge, _ in self._frames], axis=0)
-        time_s = float(np.mean([time for _, time in self._frames]))
+        charges, times_s = zip(*self._frames, strict=True)
+        mean_pC = np.mean(charges, axis=0)
+        time_s = float(np.mean(times_s))
         variance_pC2 = self._noise.variance(mean_pC) / len(self._frames) + (SLOW_NOISE_STD * mean_pC) ** 2
         dt_s = time_s - self.time_s
         self._frames = []
@@ -324,15 +328,16 @@ class ContactMixture:
         self.time_s = time_s
 
         # Follow the contact of the previous step. If there was no contact, or the charges no longer fit it, search the
-        # whole film. The search takes milliseconds, so it is not repeated in every step.
+        # whole film. The search takes milliseconds, so it is not repeated in every step if it finds no contact.
         previous = self._components
         self._components = None
         self._hypotheses = []
         if previous is not None and dt_s < MAX_GAP_s:
             self._update(_predicted(previous, dt_s), mean_pC, variance_pC2, UPDATE_ITERATIONS)
         if self._components is None and t_s >= self._next_search_s:
-            self._next_search_s = t_s + SEARCH_INTERVAL_s
             self._update(self._initial_components(), mean_pC, variance_pC2, INITIAL_ITERATIONS)
+            if self._components is None:
+                self._next_search_s = t_s + SEARCH_INTERVAL_s
         return self._hypotheses
 
     def _initial_components(self, grid_points: int = 13) -> Components:

@@ -38,7 +38,7 @@ IS_MOVING = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0], [1.0, 1
 MEAN_MODE_TIME_s = 0.7
 """Mean time after which a position or a force that is held starts to change, or the reverse, s."""
 
-INITIAL_RATE_STD = np.array([60.0, 60.0, 10.0])
+INITIAL_RATE_STD = np.array([60.0, 60.0, 100.0])
 """Standard deviations of the rates at the beginning of a movement, mm/s, mm/s and 1/s."""
 
 _HELD_RATE_COVARIANCE = np.eye(6) * np.pad((1.0 - IS_MOVING) * INITIAL_RATE_STD**2, ((0, 0), (3, 0)))[:, None]
@@ -67,7 +67,7 @@ ACCELERATION_DENSITY = 150.0
 SPEED_CHANGE_RATE = 0.5
 """Increase of the spectral density of the acceleration with the squared speed, 1/s."""
 
-FORCE_ACCELERATION_DENSITY = 1e3
+FORCE_ACCELERATION_DENSITY = 1e6
 """Spectral density of the second derivative of a changing ln F, 1/s^3."""
 
 SQUARED_GATE = 30.0

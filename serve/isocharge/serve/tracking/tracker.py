@@ -14,7 +14,7 @@ from isocharge.serve.model.charge_file import read_charge_map
 from isocharge.serve.model.contact import Contact, disk_corners
 from isocharge.serve.record.record import OtherContact, TrackedContact
 from isocharge.serve.signal_chain.stage import Rule, Setup, Share, Stage
-from isocharge.serve.tracking.contact_mixture import ContactHypothesis, ContactMixture
+from isocharge.serve.tracking.contact_mixture import ContactMixture
 from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.motion_filter import VELOCITY, ContactFilter
 
@@ -185,9 +185,9 @@ class Tracker(Stage):
         if self._mixture is None:
             tracked = self._filter.step(contact, t_s, (*frame.flags, *frame.contact_flags))
         else:
-            hypotheses: list[ContactHypothesis] = []  # possible contacts, the most probable first
-            if SATURATED not in frame.flags and frame.charge_pC is not None:  # saturated charges are wrong
-                hypotheses = self._mixture.update(frame.charge_pC, t_s)
+            if SATURATED in frame.flags or frame.charge_pC is None:  # saturated charges are wrong
+                return None
+            hypotheses = self._mixture.update(frame.charge_pC, t_s)  # possible contacts, the most probable first
             if not hypotheses:  # the frame contains no information, so the tracked contact remains
                 return None
             best, *others = hypotheses
