@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tests.train.calibration.conftest import rig, use_few_hypotheses
+from tests.train.calibration.conftest import rig, uneven_film, use_few_hypotheses
 from tests.train.short_training import short_training
 
 from isocharge.common.errors import ModelError, OutputError, PressError
@@ -80,6 +80,15 @@ def test_network_is_trained_with_the_noise_of_the_presses(written, tmp_path):
     assert noisy.metadata.noise.gain == 0.016
     charge_pC = written.result.presses.charge_pC[0]
     assert noisy.predict(charge_pC).force_std_N > 1.5 * quiet.predict(charge_pC).force_std_N
+
+
+@pytest.mark.usefixtures("written")
+def test_charges_after_a_session_differ_by_half_of_its_drift(problem, synthetic):
+    film = uneven_film(problem)
+    film.values[film.layout.index("drift")] = 0.2
+    series = compact_map.compact_charges(problem.domain, synthetic, film, None)
+    presses = film_network.training_data(synthetic, film, series, None).presses
+    assert np.std(presses.charge / series.charges(presses.contact)) == pytest.approx(0.1, rel=0.05)
 
 
 def test_next_version_has_wider_regions_that_hold_for_held_out_presses(written, problem, synthetic, tmp_path):

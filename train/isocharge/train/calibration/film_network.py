@@ -39,10 +39,10 @@ def training_data(
     domain = series.domain
     contact = draw_contacts(rng, domain, PRESSES)
     charge = _drawn_charges(series, rng, contact)
-    # During the session, the gain changed linearly by the drift. The gains of the presses are therefore uniformly
-    # distributed over an interval of this width, which has the standard deviation drift / sqrt(12). The drift itself is
-    # uncertain: its root mean square follows from its estimate and its standard deviation.
-    gain_std = np.hypot(film.value("drift"), film.std("drift")) / np.sqrt(12.0)
+    # The film is estimated for the middle of the session. After the session, the gain differs by half of the drift, and
+    # may change further or return. The root mean square of the drift follows from its estimate and its standard
+    # deviation.
+    gain_std = 0.5 * np.hypot(film.value("drift"), film.std("drift"))
     charge *= 1.0 + gain_std * rng.standard_normal((PRESSES, 1))
     sensor, probe = charges.prior.film(film.film_values)
     return TrainingData(
