@@ -12,7 +12,7 @@ from isocharge.train import fit, release
 from kept import ROOT, kept
 from press_faults import fault_shares, film_map, whole_film_shares
 
-PAGE = (ROOT / "serve" / "docs" / "unnoticed.md").read_text("utf-8")
+PAGE = (ROOT / "serve/docs/unnoticed.md").read_text("utf-8")
 
 PRESSES = 1500
 SEED = 7

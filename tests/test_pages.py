@@ -141,7 +141,7 @@ def test_the_readme_is_short():
     assert len(words) <= 650
 
 
-SITE_CONTENTS = (ROOT / ".ci" / "docs" / "contents.md").read_text("utf-8")
+SITE_CONTENTS = (ROOT / ".ci/docs/contents.md").read_text("utf-8")
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -164,7 +164,7 @@ def test_figures_of_the_released_models_are_their_cards():
     )
     assert len(rows) == 10
     for name, radius, median, rms, force in rows:
-        card = (ROOT / "models" / name / "1" / "card.md").read_text("utf-8")
+        card = (ROOT / "models" / name / "1/card.md").read_text("utf-8")
         assert f"within {radius} mm" in card
         patterns = (r"position, median \| (\S+) mm", r"position, rms \| (\S+) mm", r"force, rms \| (\S+) %")
         figures = [float(re.search(pattern, card)[1]) for pattern in patterns]

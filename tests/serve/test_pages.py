@@ -41,7 +41,7 @@ def is_slow(example):
 def test_the_sketch_for_teensy_and_arduino_compiles_and_sends_lines_that_are_read(tmp_path):
     sketch = tmp_path / "frames.ino"
     sketch.write_text(re.search(r"```cpp\n(.*?)```", PAGES["boards.md"], re.DOTALL)[1])
-    board = Path(__file__).parents[1] / "train" / "export_c" / "board"
+    board = Path(__file__).parents[1] / "train/export_c/board"
     words = ["g++", "-Wall", "-DISOCHARGE_ELECTRODES=3", f'-DSKETCH="{sketch}"', "-I", board, board / "run_sketch.cpp"]
     subprocess.run([*words, "-o", tmp_path / "sketch"], check=True)
     pins = b"".join(b"%d 512 %d 498\n" % (5000 * k, 500 + k) for k in range(1, 21))

@@ -20,7 +20,7 @@ from isocharge.serve import Frame, device_from_table
 from isocharge.serve.frames.frame_layout import SyncParser
 from layout_encoder import encode_layout
 
-FOLDER = Path(__file__).parents[2] / "data" / "frames"
+FOLDER = Path(__file__).parents[2] / "data/frames"
 
 
 def layout(keys):

@@ -50,7 +50,7 @@ def test_schema_refuses_missing_and_wrong_values_and_accepts_null_only_where_a_v
 
 
 def test_table_of_the_documentation_has_every_field_with_its_meaning(pytestconfig):
-    page = (pytestconfig.rootpath / "serve" / "docs" / "record.md").read_text("utf-8")
+    page = (pytestconfig.rootpath / "serve/docs/record.md").read_text("utf-8")
     table = page.partition("## All fields")[2].partition("\n## ")[0]
     rows = dict(re.findall(r"^\| `([\w.]+)` \| .*? \| .*? \| (.*) \|$", table, re.MULTILINE))
     for field in RECORD_FIELDS:

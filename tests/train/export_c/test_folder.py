@@ -49,7 +49,7 @@ def test_command_writes_the_folder_once(command, refused, tmp_path):
     words = ("train", "export-c", "three-25um-biaxial", "--device", tmp_path / "board.toml", "-o", tmp_path / "c")
     code, out, err = command(*words)
     assert (code, out, "isocharge_model.c" in err) == (0, "", True)
-    header = (tmp_path / "c" / "isocharge_device.h").read_text()
+    header = (tmp_path / "c/isocharge_device.h").read_text()
     assert "#define ISOCHARGE_LEAK_TAU_S {(isocharge_real)10.0, " in header
     assert header.startswith('/* The numbers of the signal chain, from the device file "bench board". Written by')
     readme = (tmp_path / "c" / "README.md").read_text()
@@ -167,7 +167,7 @@ def run_sketch(export, folder, pins, *options, start_us=0):
         subprocess.run(["gcc", "-std=c11", "-c", source, "-o", objects[-1]], check=True)
     ino = f'-DSKETCH="{export / "isocharge_sketch.ino"}"'
     words = ["g++", "-Wall", "-Wextra", "-Werror", *options, ino, "-I", export, "-I", HERE / "board"]
-    subprocess.run([*words, HERE / "board" / "run_sketch.cpp", *objects, "-o", folder / "sketch"], check=True)
+    subprocess.run([*words, HERE / "board/run_sketch.cpp", *objects, "-o", folder / "sketch"], check=True)
     lines = "".join(f"{start_us + 5000 * (k + 1)} {' '.join(map(str, row))}\n" for k, row in enumerate(pins.tolist()))
     return subprocess.run([folder / "sketch"], input=lines.encode(), capture_output=True, check=True).stdout
 
@@ -175,7 +175,7 @@ def run_sketch(export, folder, pins, *options, start_us=0):
 @needs_compiler_of_sketches
 def test_sketch_prints_our_contacts_and_sends_frames_that_we_read(exports, tmp_path):
     """Rest, a press of some hundred counts, rest."""
-    export = exports[0] / "arduino" / "isocharge_sketch"
+    export = exports[0] / "arduino/isocharge_sketch"
     pins = np.random.default_rng(1).normal(20.0, 1.0, (900, 3))
     pins[400:600] += [700.0, 750.0, 800.0]
     pins = pins.astype(int)
@@ -194,7 +194,7 @@ def test_sketch_prints_our_contacts_and_sends_frames_that_we_read(exports, tmp_p
 def test_clock_of_a_board_that_begins_again_leaves_the_hum_removed(tmp_path):
     """After 71.6 minutes, `micros` is 0 again. A hum with another phase would look like touches."""
     device = device_from_table({"hum": {"frequency_Hz": 50.0}}, "x")
-    export = export_c(find_model(MODEL), tmp_path / "c", device) / "arduino" / "isocharge_sketch"
+    export = export_c(find_model(MODEL), tmp_path / "c", device) / "arduino/isocharge_sketch"
     times_s = 0.005 * np.arange(2000)
     hum = 40.0 * np.sin(2.0 * np.pi * (50.0 * times_s + 0.1))
     pins = np.random.default_rng(1).normal(20.0, 1.0, (2000, 3)) + hum[:, None]

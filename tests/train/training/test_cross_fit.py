@@ -132,7 +132,7 @@ def released_pad(fitted_pad, tmp_path, command, monkeypatch):
     monkeypatch.setattr(fit_command, "fit_presses", lambda *_, probes, **__: replace(fitted_pad, probes=probes))
     write_presses(tmp_path / "pad.csv", presses_on_l())
     assert command("train", "fit", tmp_path / "pad.csv", "-o", tmp_path / "pad")[0] == 0
-    return tmp_path / "pad" / "1"
+    return tmp_path / "pad/1"
 
 
 def test_fit_command_releases_a_model_of_measured_presses(fitted_pad, fresh, released_pad):

@@ -105,12 +105,7 @@ class ChannelNoise(GaussianNoise):
             planes = LocalPlanes.fit(unit_contact, charge)
             size = planes.value
             residual = planes.residual
-        white_std, gain_std = np.array(
-            [
-                _fit_noise(channel_size, channel_residual)
-                for channel_size, channel_residual in zip(size.T, residual.T, strict=True)
-            ]
-        ).T  # each of shape (n_electrode,)
+        white_std, gain_std = np.array(list(map(_fit_noise, size.T, residual.T))).T  # each of shape (n_electrode,)
         gain = np.maximum(gain_std, LEAST_GAIN)
         # The presses do not determine the white noise if all charges are large. The lower limit of the white noise is a
         # small fraction of the noise of the gain at the usual charge.
@@ -315,6 +310,9 @@ def _fit_noise(charge: Array, residual: Array) -> Array:
     The likelihood of the residuals is maximised. Their variance is white^2 + gain^2 Q^2. The likelihood is that of a
     normal distribution with longer tails beyond `OUTLIER` standard deviations (Huber 1964, proposal 2).
 
+    A channel that is silent below a threshold does not show its noise there. Charges that are zero and have no residual
+    are therefore left out. Otherwise, the likelihood would be infinite without white noise.
+
     Args:
         charge: Charges Q without noise, shape (n,), pC.
         residual: Residuals, shape (n,), pC.
@@ -324,6 +322,7 @@ def _fit_noise(charge: Array, residual: Array) -> Array:
     """
     # Each unknown is divided by the value with which it alone explains the residuals, because charges may be very large
     # or small.
+    is_silent = (charge == 0.0) & (residual == 0.0)
     units = np.full(2, np.finfo(float).tiny) + np.sqrt(np.mean(residual**2)) / [1.0, np.sqrt(np.mean(charge**2))]
 
     def loss(log_std: Array) -> float:
@@ -332,7 +331,7 @@ def _fit_noise(charge: Array, residual: Array) -> Array:
         variance = np.maximum(white**2 + (gain * charge) ** 2, np.finfo(float).tiny)
         square = residual**2 / variance  # in squared standard deviations
         tail = OUTLIER**2 * np.log(np.maximum(square / OUTLIER**2, 1.0))
-        return float(np.mean(np.log(variance) + np.minimum(square, OUTLIER**2) + tail))
+        return float(np.mean(np.where(is_silent, 0.0, np.log(variance) + np.minimum(square, OUTLIER**2) + tail)))
 
     return np.asarray(units * np.exp(minimize(loss, [-0.5, -0.5], method="Nelder-Mead").x))
 
