@@ -63,7 +63,8 @@ class TareRule(Rule, frozen=True, kw_only=True):
         if largest_noise_pC > self.noise_limit_pC:
             return (
                 f"the charge of an electrode varies by {largest_noise_pC:.3g} pC rms, expected at most "
-                f"{self.noise_limit_pC:g} pC; leave the film alone and start again"
+                f"{self.noise_limit_pC:g} pC; leave the film alone and start again; if nothing touches the film, look "
+                "for hum and noise with `isocharge serve doctor`"
             )
         largest_offset_pC = np.abs(mean_pC).max()
         if largest_offset_pC > self.offset_limit_pC:
