@@ -83,9 +83,9 @@ class ChannelNoise(GaussianNoise):
     def estimate(cls, charge: Array, unit_contact: Array) -> "ChannelNoise":
         """Estimate the noise of each channel from measured presses.
 
-        Rows that are copies of other rows are left out, because they contain no further noise. If at least
-        `MIN_REPEATED_CONTACTS` contacts are repeated, the residuals are the differences between the repeated charges
-        and their means. Differences of repeated charges contain only noise. If fewer contacts are repeated, the
+        Rows that are copies of other rows are left out, because they contain no further noise. If every channel has
+        charges at `MIN_REPEATED_CONTACTS` or more repeated contacts, the residuals are the differences between the
+        repeated charges and their means. Differences of repeated charges contain only noise. Otherwise, the
         residuals are the differences between the charges of a press and the values of a quadratic function, which is
         fitted to the neighbours of the press. Differences from the function contain the noise and the error of the
         quadratic approximation. The white noise and the noise of the gain are fitted to the residuals. Both kinds of
@@ -101,7 +101,8 @@ class ChannelNoise(GaussianNoise):
         different_rows = np.unique(np.column_stack([unit_contact, charge]), axis=0)
         unit_contact, charge = np.split(different_rows, [unit_contact.shape[1]], axis=1)
         size, residual = _repeated_residuals(unit_contact, charge)
-        if len(np.unique(size, axis=0)) < MIN_REPEATED_CONTACTS:
+        # A channel that is silent at repeated contacts does not show its noise there.
+        if np.count_nonzero(np.unique(size, axis=0), axis=0).min() < MIN_REPEATED_CONTACTS:
             planes = LocalPlanes.fit(unit_contact, charge)
             size = planes.value
             residual = planes.residual
@@ -323,7 +324,7 @@ def _fit_noise(charge: Array, residual: Array) -> Array:
     # Each unknown is divided by the value with which it alone explains the residuals, because charges may be very large
     # or small.
     is_silent = (charge == 0.0) & (residual == 0.0)
-    units = np.full(2, np.finfo(float).tiny) + np.sqrt(np.mean(residual**2)) / [1.0, np.sqrt(np.mean(charge**2))]
+    units = np.finfo(float).tiny + np.sqrt(np.mean(residual**2)) / [1.0, np.sqrt(np.mean(charge**2))]
 
     def loss(log_std: Array) -> float:
         """Return the mean negative logarithm of the likelihood, without a constant."""
