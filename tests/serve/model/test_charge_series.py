@@ -12,7 +12,7 @@ from isocharge.serve.model.charge_file import FILE, charge_map_bytes, read_charg
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.simulate.forward.charge_map import differences
 
-ELECTRODES = ("A", "B", "C", "D")
+ELECTRODES = tuple("ABCD")
 DOMAIN = Domain(8.0, (0.05, 2.0))
 NODES = np.array([-0.5, 0.0, 0.25])
 OFFSET_pC = 3.5
@@ -111,7 +111,7 @@ def test_file_is_read_as_it_was_written(is_signed, tmp_path):
     [
         ("format", ELECTRODES, r"format 1 is not supported \(this version reads 3\)"),
         ("series", ELECTRODES, "'series'"),
-        ("", ("A", "B", "C"), r"series: expected charges of \('A', 'B', 'C'\), got .*4\)"),
+        ("", tuple("ABC"), r"series: expected charges of \('A', 'B', 'C'\), got .*4\)"),
     ],
 )
 def test_file_of_another_format_or_model_is_refused(left_out, electrodes, reason, tmp_path):

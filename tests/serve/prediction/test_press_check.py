@@ -94,7 +94,7 @@ def test_common_shift_is_detected_with_a_smaller_p_value_than_chi_squared(checke
     assert check.fits is False
     assert check.agreement.p_value > check.agreement.common_p_value
     assert check.agreement.common.mean[0] == pytest.approx(0.06, abs=4 * check.agreement.common.std[0])
-    assert any(note.startswith("positions are off by (0.0") for note in check.notes)
+    assert "positions are off by (0.0" in str(check.notes)
 
 
 @pytest.mark.parametrize(("known", "degrees"), [((True, False), 40), ((False, True), 20)])
@@ -105,7 +105,7 @@ def test_presses_with_only_positions_or_only_forces(checked, known, degrees):
     wrong = checked(20, known=known, noise=8.0, force_scale=1.1)
     assert wrong.fits is False
     assert ("mm" in wrong.verdict, "%" in wrong.verdict) == known
-    assert any(note.startswith("forces are 1.") for note in wrong.notes) == known[1]
+    assert ("forces are 1." in str(wrong.notes)) == known[1]
 
 
 @pytest.mark.parametrize(("count", "fits"), [(2, None), (3, True)])
@@ -114,7 +114,7 @@ def test_verdict_needs_three_presses(checked, count, fits):
     assert check.fits is fits
     assert fits or check.verdict == f"too few presses to say: {count} can be compared, 3 are needed"
     far = checked(count, seed=4, shift_mm=(1.0, 0.0))
-    assert any("shifted" in note for note in far.notes) == (count >= 3)  # one wrong press is no common shift
+    assert ("shifted" in str(far.notes)) == (count >= 3)  # one wrong press is no common shift
 
 
 def test_bad_press_is_reported_and_excluded(predictor, measure):
@@ -165,7 +165,7 @@ def test_note_for_a_film_that_does_not_fit_states_the_explaining_rig_std(predict
 def test_no_rig_std_is_proposed_that_does_not_explain_the_errors(checked, shift_mm, force_scale):
     check = checked(30, seed=1, shift_mm=shift_mm, force_scale=force_scale)
     assert check.fits is False
-    assert not any("-std" in note for note in check.notes)
+    assert "-std" not in str(check.notes)
 
 
 def test_proposed_rig_std_is_not_below_the_stated_one(predictor, measure):

@@ -42,16 +42,13 @@ def charges(x, y, force):
 
 def folded_series():
     """Return the function `charges` as a series."""
-    log_low, log_high = np.log(FORCES)
+    domain = Domain(RADIUS, FORCES)
     coefficients = np.zeros((3, 3, 2, 3))
-    coefficients[0, 0, 0, :] = np.log(2000.0) + 0.7 * 0.5 * (log_low + log_high)
-    coefficients[0, 0, 1, :] = 0.7 * 0.5 * (log_high - log_low)
+    coefficients[0, 0] = [[np.log(2000.0) + 0.7 * domain.centre[2]], [0.7 * domain.scale[2]]]
     folded_x = Polynomial([0.0, 0.1, -0.05 / FOLD])(Polynomial([0.0, RADIUS]))
     coefficients[:, 0, 0, 1] += chebyshev.poly2cheb(folded_x.coef)
     coefficients[0, 1, 0, 2] += 0.1 * RADIUS
-    return ChargeSeries(
-        domain=Domain(RADIUS, FORCES), electrodes=tuple("ABC"), coefficients=coefficients[None], is_folded=True
-    )
+    return ChargeSeries(domain=domain, electrodes=tuple("ABC"), coefficients=coefficients[None], is_folded=True)
 
 
 def noisy_charges(x, gains=(1.0, 1.0, 1.0), noise=NOISE):

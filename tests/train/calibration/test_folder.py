@@ -124,7 +124,7 @@ def test_unsuitable_folders_are_refused_and_left_as_they_are(written, problem, t
     with pytest.raises(ModelError, match="expected a new folder or one of an earlier calibration"):
         write_calibration(written.result, tmp_path / "mine")
     with pytest.raises(ModelError):
-        check_calibration_folder(written.path, ("A", "B", "C"))
+        check_calibration_folder(written.path, tuple("ABC"))
     with pytest.raises(OutputError, match=r"card\.md is not a writable folder"):
         check_calibration_folder(written.path / "card.md" / "film", problem.electrodes)
     assert list(tmp_path.iterdir()) == [tmp_path / "mine"]

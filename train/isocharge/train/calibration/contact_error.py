@@ -162,8 +162,9 @@ def next_presses(
     film = film or problem.film_before
     covariance = film.covariance
     candidates = _candidates(problem)
-    contact_std = (position_std_mm, position_std_mm, force_std)
-    _, candidate_rows = _linearise_at(film, charges, candidates, contact_std).eliminated()
+    _, candidate_rows = _linearise_at(
+        film, charges, candidates, (position_std_mm, position_std_mm, force_std)
+    ).eliminated()
     sensitivity = ContactSensitivity.of(film, charges, problem.domain)
 
     # Divide the errors of x, y and ln F by those that the noise causes, so that they can be added.

@@ -260,8 +260,7 @@ def estimate(charges: FilmCharges, data: PressData, prior: Prior, previous: Esti
     if estimation.is_bad.any():
         # With larger errors of the positions, a press at a wrong place would not be recognised.
         middle_ratio, _ = POSITION_RATIOS[len(POSITION_RATIOS) // 2]
-        largest_noise = all_hypotheses[-1].errors.noise
-        probable = PressErrors(largest_noise, middle_ratio)
+        probable = PressErrors(all_hypotheses[-1].errors.noise, middle_ratio)  # the largest noise
     for _ in range(MAX_SEARCHES):
         if probable == assumed:
             break
@@ -303,10 +302,12 @@ def _estimate_with_errors(
     is_used = ~is_bad
 
     # The estimate of each hypothesis follows from the linearised problem at the most probable unknowns so far.
-    # The second round considers only the hypotheses that are possible after the first.
+    # The second round considers only the hypotheses that are possible after the first. If the evidence is smaller at
+    # the estimate of the first round, the charges are too nonlinear there, and the second round is discarded.
     used_data, used_contact = data[is_used], point.contacts[is_used]
     unknowns = point.state
     probable = all_hypotheses
+    largest_evidence = -np.inf
     for _ in range(2):
         # Compare the hypotheses. Those with the same errors of the presses share one linearised problem.
         model = model_values(charges, prior.layout, used_data, unknowns, used_contact)
@@ -315,6 +316,9 @@ def _estimate_with_errors(
             for errors, group in groupby(probable, lambda one: one.errors)
         ]
         all_chi2, log_evidence = np.concatenate([one.chi2_and_log_evidence() for one in evidences], axis=1)
+        if log_evidence.max() < largest_evidence:
+            break
+        largest_evidence = log_evidence.max()
         all_weights = softmax(log_evidence)
         all_weights[all_weights < MIN_WEIGHT] = 0.0
         all_weights /= all_weights.sum()
@@ -334,7 +338,7 @@ def _estimate_with_errors(
         used_contact = used_contact + Linearised.of(model, used_data, used_contact).contact_change(mean - unknowns)
         unknowns = np.clip(mean, *prior.bounds)
 
-    best = int(weight.argmax())
+    best = weight.argmax()
     log_contact = point.contacts.copy()
     log_contact[is_used] = used_contact
     final_model = model_values(charges, prior.layout, data, unknowns, log_contact)
@@ -342,14 +346,13 @@ def _estimate_with_errors(
     final_chi2 = (final_residual**2).sum(axis=1)
     # The noise of a frame is at least the stated one, although averages of frames have less noise.
     gains = np.maximum([one.errors.noise.gain for one in probable], stated.noise.gain)
-    gain_variance = np.average(gains**2, weights=weight)
-    noise = NoiseModel("presses", stated.noise.white, float(np.sqrt(gain_variance)))
+    noise = NoiseModel("presses", stated.noise.white, float(np.sqrt(weight @ gains**2)))
     return Estimation(
         charges=charges,
         film=FilmEstimate(prior.layout, unknowns, covariance, noise),
         contact=in_domain(log_contact, charges.domain),
         is_bad=is_bad,
-        press_chi2=np.divide(final_chi2, redundancy, out=np.full(len(data), np.nan), where=redundancy > 0),
+        press_chi2=np.where(redundancy > 0, final_chi2 / np.maximum(redundancy, 1), np.nan),
         chi2=float(chi2[best]),
         redundancy=float(redundancy[is_used].sum()),
         hypothesis=probable[best],
@@ -371,7 +374,7 @@ def _most_probable_point(
     problem = RobustProblem(
         lambda contacts, state: model_values(charges, prior.layout, data, state, contacts),
         data.charge,
-        charge_variance[:, :, None] * np.eye(charge_variance.shape[1]),
+        charge_variance[:, None] * np.eye(charge_variance.shape[1]),
         prior.mean,
         prior.covariance(TYPICAL),
         measured_contacts=data.contact,
