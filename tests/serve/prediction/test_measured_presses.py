@@ -80,6 +80,11 @@ def test_row_of_units_below_the_header_is_ignored(read):
     assert (presses.charge_pC.tolist(), presses.lines) == ([[502.3, 244.8, 215.8]], (3,))
 
 
+def test_header_may_be_a_comment(read):
+    """`numpy.savetxt` writes such a header."""
+    assert read(f"# pad\n# {HEADER}\n1,2,3,4,5,6\n").lines == (3,)
+
+
 def test_default_uncertainty_fills_empty_cells(read):
     presses = read(f"{HEADER},force_std\n1,2,3,4,5,6,0.003\n1,2,3,4,5,6,\n", position_std_mm=0.3, force_std=0.02)
     assert (presses.position_std_mm.tolist(), presses.force_std.tolist()) == ([0.3, 0.3], [0.003, 0.02])

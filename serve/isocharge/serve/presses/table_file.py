@@ -5,9 +5,9 @@ meaning; rows above it are ignored. The decimal mark is a point or a comma, and 
 such as `1,064` may be 1.064 or 1064. A file in which no number determines the decimal mark is therefore refused. A
 point is always the decimal mark if commas separate the columns.
 
-A row that begins with # is a comment. Blank rows, and a row below the header that has the units mm, N and pC in the
-columns to read, are ignored. Blanks before and after a name or a number are also ignored. The texts `nan` and `inf` are
-not accepted.
+A row that begins with # is a comment, or the header if no other row is. Blank rows, and a row below the header that has
+the units mm, N and pC in the columns to read, are ignored. Blanks before and after a name or a number are also ignored.
+The texts `nan` and `inf` are not accepted.
 """
 
 import csv
@@ -88,7 +88,12 @@ class CsvTable:
         self._expected = expected
         checked_lines = self._checked_lines(lines)
         first_lines = list(islice(checked_lines, _MAX_LINES_TO_HEADER))
-        lines_above, self._separator = _find_header(first_lines, names)
+        # NumPy writes the header as a comment. Such a header is only used if there is no other one.
+        uncommented = [line.removeprefix("# ") for line in first_lines]
+        possible_headers = ["" if line.startswith("# ") else line for line in first_lines] + uncommented
+        header_index, self._separator = _find_header(possible_headers, names)
+        lines_above = header_index % max(1, len(first_lines))
+        first_lines[lines_above : lines_above + 1] = possible_headers[header_index : header_index + 1]
         self._rows = self._numbered_rows(chain(first_lines[lines_above:], checked_lines), lines_above)
         header_row = next(self._rows, None)
         if header_row is None:
@@ -348,11 +353,11 @@ def _find_header(lines: list[str], names: Collection[str]) -> tuple[int, str]:
     many names, the function chooses the separator with the most cells.
 
     Args:
-        lines: First lines of the text.
+        lines: Lines among which the header is searched.
         names: Names of columns that have a meaning.
 
     Returns:
-        The number of lines above the header, and the separator.
+        The index of the header, and the separator.
     """
     best_score = (0, 0)
     best = (0, _SEPARATORS[0])
