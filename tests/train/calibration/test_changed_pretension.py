@@ -87,12 +87,11 @@ def test_node_at_which_the_charges_are_unknown_is_left_out(problem, synthetic, m
         factor = np.random.default_rng(3).uniform(0.1, 1.9, (len(contact), 4))
         return film.charges.charges(film.values, contact) * (factor if film.change_MPa == 0.9 else 1.0)
 
-    monkeypatch.setattr(compact_map, "_nodes", lambda _: np.array([-0.3, 0.0, 0.9]))
     monkeypatch.setattr(_ChangedFilm, "charge", charge)
     monkeypatch.setattr(FilmCharges, "of_even_film", lambda *_: synthetic)
     series = compact_map.compact_charges(problem.domain, synthetic, uneven_film(problem), None)
-    assert series.node_MPa.tolist() == [-0.3, 0.0]
-    assert "changes from -0.3 to +0 MPa can be followed" in caplog.text
+    assert series.node_MPa.tolist() == [-0.7, -0.3, 0.0, 0.4]
+    assert "changes from -0.7 to +0.4 MPa can be followed" in caplog.text
     expected = synthetic.charges(uneven_film(problem).film_values, CONTACT)
     np.testing.assert_allclose(series.charges(CONTACT), expected, rtol=0.01)
 
