@@ -186,7 +186,7 @@ def test_log_has_one_line_for_each_request(app, lines):
         "status": 200,
         "model": "linear/2",
         "error": None,
-        "client": ["127.0.0.1", 5000],
+        "client": "127.0.0.1:5000",
     }
 
 
@@ -248,8 +248,8 @@ def test_log_has_a_line_for_an_unreadable_request(app, lines, start_http):
     server = start_http(app)
     for sent in (b"rubbish\r\n\r\n", b"GET / HTTP/1.1\r\nx: " + b"a" * 20_000 + b"\r\n\r\n"):
         exchange(server, sent)
-    logged = [(line["route"], line["status"], line["client"][0]) for line in map(json.loads, lines)]
-    assert logged == [("none", 400, "127.0.0.1"), ("none", 431, "127.0.0.1")]
+    logged = [(line["route"], line["status"], line["client"][:10]) for line in map(json.loads, lines)]
+    assert logged == [("none", 400, "127.0.0.1:"), ("none", 431, "127.0.0.1:")]
     assert not any("rubbish" in line for line in lines)
 
 

@@ -91,19 +91,19 @@ class AccessCheck:
                 "the server's address, or name the host by --allow-host (allowed_hosts of asgi_app)"
             )
 
-        # Browsers send `same-origin` if a page of this server sends the request, and `none` if the user has typed the
-        # address. Other programs do not send the header. A link on another site may open a page of this server, because
-        # the other site cannot read the response.
         origin = headers.get(b"origin", b"").decode("latin-1").lower()
+        if origin and not self._is_own_page(origin, host):
+            raise OriginError(
+                f"Origin: expected a page of this server, got a page of {shown(origin)}; open {shown(host)} "
+                "itself, or name the page's host by --allow-host (allowed_hosts of asgi_app)"
+            )
+
+        # Without `Origin`, `Sec-Fetch-Site` decides. Browsers send `same-origin` if a page of this server sends the
+        # request, and `none` if the user has typed the address. Other programs do not send the header. A link on
+        # another site may open a page of this server, because the other site cannot read the response.
         fetch_site = headers.get(b"sec-fetch-site", b"none").decode("latin-1").lower()
         is_link = headers.get(b"sec-fetch-dest") == b"document" and method in ("GET", "HEAD")
-        if origin:
-            if not self._is_own_page(origin, host):
-                raise OriginError(
-                    f"Origin: expected a page of this server, got a page of {shown(origin)}; open {shown(host)} "
-                    "itself, or name the page's host by --allow-host (allowed_hosts of asgi_app)"
-                )
-        elif fetch_site not in ("same-origin", "none") and not is_link:
+        if not (origin or is_link or fetch_site in ("same-origin", "none")):
             raise OriginError(
                 f"Sec-Fetch-Site: expected a request by a page of this server, got {shown(fetch_site)}; open the page "
                 f"of {shown(host)}"
@@ -160,7 +160,7 @@ class AccessCheck:
 
 
 def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
-    """Return the value of each header by its name. Of a repeated header, the last value counts.
+    """Return the value of each header by its name. If a header is repeated, its last value is returned.
 
     Args:
         headers: Pairs of the name of a header in lower case and its value.

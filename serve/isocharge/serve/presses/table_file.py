@@ -88,12 +88,12 @@ class CsvTable:
         self._expected = expected
         checked_lines = self._checked_lines(lines)
         first_lines = list(islice(checked_lines, _MAX_LINES_TO_HEADER))
-        # NumPy writes the header as a comment. Such a header is only used if there is no other one.
-        uncommented = [line.removeprefix("# ") for line in first_lines]
-        possible_headers = ["" if line.startswith("# ") else line for line in first_lines] + uncommented
-        header_index, self._separator = _find_header(possible_headers, names)
-        lines_above = header_index % max(1, len(first_lines))
-        first_lines[lines_above : lines_above + 1] = possible_headers[header_index : header_index + 1]
+        lines_above, self._separator, is_found = _find_header(first_lines, names)
+        if not is_found:  # `numpy.savetxt` writes the header as a comment
+            uncommented = [line.removeprefix("# ") for line in first_lines]
+            lines_above, self._separator, is_found = _find_header(uncommented, names)
+            if is_found:
+                first_lines[lines_above] = uncommented[lines_above]
         self._rows = self._numbered_rows(chain(first_lines[lines_above:], checked_lines), lines_above)
         header_row = next(self._rows, None)
         if header_row is None:
@@ -345,19 +345,19 @@ def _is_row_of_units(cells: list[str]) -> bool:
     return "pC" in units and units <= _UNITS
 
 
-def _find_header(lines: list[str], names: Collection[str]) -> tuple[int, str]:
+def _find_header(lines: list[str], names: Collection[str]) -> tuple[int, str, bool]:
     """Find the header at the beginning of a text, and the separator of the columns.
 
-    The header is the first line that contains a name and no number. If there is no such line, the result is the first
-    line. The function chooses the separator with which the header has the most names. Among separators with equally
-    many names, the function chooses the separator with the most cells.
+    The header is the first line that contains a name and no number, and is no comment. If there is no such line, the
+    result is the first line. The function chooses the separator with which the header has the most names. Among
+    separators with equally many names, the function chooses the separator with the most cells.
 
     Args:
-        lines: Lines among which the header is searched.
+        lines: First lines of the text.
         names: Names of columns that have a meaning.
 
     Returns:
-        The index of the header, and the separator.
+        The number of lines above the header, the separator, and whether the header contains a name.
     """
     best_score = (0, 0)
     best = (0, _SEPARATORS[0])
@@ -367,13 +367,16 @@ def _find_header(lines: list[str], names: Collection[str]) -> tuple[int, str]:
                 texts = {cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])}
                 has_number = any(map(_NUMBER.fullmatch, texts.difference(names)))
                 # Number of names, and number of cells. Without a name, only the first line may be the header.
-                score = (0 if has_number else len(texts.intersection(names)), len(texts) if line_index == 0 else 0)
+                score = (
+                    0 if has_number or line.startswith("# ") else len(texts.intersection(names)),
+                    len(texts) if line_index == 0 else 0,
+                )
                 if score > best_score:
                     best_score = score
                     best = (line_index, separator)
         if best_score[0] > 0:
             break
-    return best
+    return *best, best_score[0] > 0
 
 
 def _spellings(name: str) -> set[str]:

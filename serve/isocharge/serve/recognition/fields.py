@@ -25,6 +25,9 @@ CLOCKS = {1.0: ("t_s", 1.0), 1e3: ("t_ms", 1.0)} | {
 }
 """For each tick rate of a clock, Hz: name of the clock field, and duration of one tick in the unit of the name."""
 
+LARGEST_SIZE = 8
+"""Size of the largest numbers, bytes."""
+
 CHANNEL = "channel"
 """Name of all channels during the recognition."""
 
@@ -116,7 +119,8 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[
     A part is a single byte without a meaning (padding), or a number of one of the types in `STRUCT_FORMATS`.
 
     Args:
-        rows: Bytes of the frames and the 7 bytes behind, where the largest numbers end, shape (n, length + 7).
+        rows: Bytes of the frames, followed by the `LARGEST_SIZE` bytes behind each frame, shape (n, length +
+            `LARGEST_SIZE`). A number that begins near the end of a frame ends in these bytes.
         order: Byte order of the numbers.
         frame_rate_Hz: Number of frames per second, Hz, from which the tick rate of a clock follows.
 
@@ -127,7 +131,7 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[
     is_zero = is_constant & (usual == 0)
     byte_step = 1 if order == "little" else -1
     parts_at_each_byte: list[list[Part]] = []
-    for position in range(rows.shape[1] - 7):
+    for position in range(rows.shape[1] - LARGEST_SIZE):
         # One byte of padding
         parts = [Part("", PADDING, 1, Weights.constant if is_constant[position] else Weights.noise)]
         for type_name in STRUCT_FORMATS:  # such as "u16", whose size is 16 bits
@@ -206,7 +210,8 @@ def split_frame(
     after this position is computed once and stored.
 
     Args:
-        parts_at_each_byte: Parts that may begin at each byte before the checksum. Parts that end behind are not used.
+        parts_at_each_byte: Parts that may begin at each byte before the checksum. A part that does not end before the
+            checksum is not used.
         sync_lengths: Possible lengths of the sync pattern, bytes; 0 if the frame has no sync pattern. If several
             lengths have the lowest score, the first of them is chosen.
         checksum_start: First byte that the checksum covers. It covers all bytes of a number or none.

@@ -63,7 +63,9 @@ class FrameDivision(NamedTuple):
     length: int
 
     def rows(self, distance: int = 0, next_bytes: int = 0) -> Bytes:
-        """Return the bytes of each frame that is not too close to the end, shape (frames, length + next_bytes).
+        """Return the bytes of each frame, shape (frames, length + next_bytes).
+
+        A frame is left out if it is too close to the end of the stream.
 
         Args:
             distance: Distance of the beginnings of the frames from `starts`, bytes.

@@ -19,6 +19,7 @@ from isocharge.serve.frames.frame_layout import PADDING, SYNC, Field, FrameLayou
 from isocharge.serve.frames.text import Layout, TextParser
 from isocharge.serve.recognition.fields import (
     CHANNEL,
+    LARGEST_SIZE,
     Part,
     Weights,
     identify,
@@ -95,16 +96,19 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
     stream_bytes = len(division.stream)
     covered_share = min(1.0, len(division.starts) * length / stream_bytes)  # share of the bytes inside frames
     frame_rate_Hz = stream_bytes / length / seconds  # as if all bytes of the stream belonged to frames
-    # Frames that begin at another byte have the same parts in another order, so the parts are listed only once.
-    parts_of_order = {order: possible_parts(division.rows(next_bytes=7), order, frame_rate_Hz) for order in ORDERS}
+    # The parts are listed once for frames that begin at `starts`. A frame that begins at a distance from there has the
+    # same parts, from this distance to the end and then from the beginning.
+    wide_rows = division.rows(next_bytes=LARGEST_SIZE)
+    parts_of_order = {order: possible_parts(wide_rows, order, frame_rate_Hz) for order in ORDERS}
     for order, (distance, check) in product(ORDERS, checks or unchecked):
         rows = rows_at[distance]
-        parts_at_each_byte = (2 * parts_of_order[order])[distance : distance + length - check.size]
+        parts = parts_of_order[order]
+        parts_at_each_byte = (parts[distance:] + parts[:distance])[: length - check.size]
         # The first byte always belongs to the pattern, even if a damaged frame among these rows hides that it is
         # constant.
         sync_lengths = range(1, max(1, count_leading(_may_be_sync(rows))) + 1) if has_sync else [0]
-        score, parts, sync_length = split_frame(parts_at_each_byte, sync_lengths, check.start)
-        if all(part.name != CHANNEL for part in parts):
+        score, best_parts, sync_length = split_frame(parts_at_each_byte, sync_lengths, check.start)
+        if all(part.name != CHANNEL for part in best_parts):
             continue
         sync = usual_bytes(rows)[0][:sync_length].tobytes()
         layout = FrameLayout(
@@ -115,7 +119,7 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
             checksum=check.name,
             checksum_from=check.start,
             checksum_order=check.order if check.order != order and check.size > 1 else None,
-            fields_and_padding=_fields(parts),
+            fields_and_padding=_fields(best_parts),
         )
         # Each byte outside of all frames contributes `Weights.noise` bits.
         yield covered_share * score / length + (1.0 - covered_share) * Weights.noise, layout

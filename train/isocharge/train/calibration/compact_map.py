@@ -9,7 +9,7 @@ The nodes of the map are films with other pretensions. Their charges are those o
 much as those of a nearly axisymmetric film between the pretension of the calibration and the other one. The changes
 along the directions are also computed for these films, because they depend on the pretension.
 
-Worker processes compute the charges of the films. This module does not import torch, so that they start quickly.
+Worker processes compute the charges of the films. This module does not import torch, so that the workers start quickly.
 """
 
 import logging
@@ -80,8 +80,8 @@ def compact_charges(
     films = [calibrated]
     if len(names) > len(CONTACT):  # three charges only determine the contact
         films = [calibrated.changed(change_MPa, executor) for change_MPa in _nodes(film)]
-    few_for_change = contact[:CHANGE_CONTACTS]
-    jobs = [partial(calibrated.charge, contact), *(partial(one.charge, few_for_change) for one in films)]
+    first_contacts = contact[:CHANGE_CONTACTS]
+    jobs = [partial(calibrated.charge, contact), *(partial(one.charge, first_contacts) for one in films)]
     film_charge, *changed_charges = in_order(executor, call, jobs)
     discrepancy = discrepancy_jacobian(film_charge, contact, charges.domain) @ film.values[film.layout.coefficients]
     charge = film_charge + discrepancy  # most probable charges without offset, shape (n, n_electrode)
@@ -209,10 +209,11 @@ def _node_charges(unit_contact: Array, charge: Array, changed_charge: Array, nod
     """Compute the charges of the calibrated film at the nodes from those of axisymmetric films.
 
     The relative change of the charges from the pretension of the calibration to each node is a smooth function of the
-    contact. A series is fitted to the changes for the first contacts, and evaluated for the other contacts. If all
-    charges have the same sign, the change is relative to the charge itself, because the ratio of two charges hardly
-    depends on the neglected properties of the film. Otherwise, some charges are nearly zero, so that the change is
-    relative to the size of the charges of all electrodes.
+    contact, and hardly depends on the neglected properties of the film. Only the changes of the first contacts are
+    given. A series that is fitted to them states the changes of the other contacts.
+
+    If all charges have the same sign, the change is relative to the charge itself. Otherwise, some charges are nearly
+    zero, and the change is relative to the root of the sum of the squared charges of all electrodes.
 
     Args:
         unit_contact: Contacts in unit coordinates, shape (n, 3).
@@ -227,6 +228,7 @@ def _node_charges(unit_contact: Array, charge: Array, changed_charge: Array, nod
     has_one_sign = np.ptp(np.sign(changed_charge)) == 0.0
 
     def size(charge: Array) -> Array:
+        """Return the values to which the changes of the charges of a film are relative."""
         return charge if has_one_sign else np.linalg.norm(charge, axis=2, keepdims=True)
 
     charge_before = changed_charge[:, node_MPa == 0.0]

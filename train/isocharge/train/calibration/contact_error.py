@@ -151,6 +151,9 @@ def next_presses(
 ) -> list[ProposedPress]:
     """Propose the presses that reduce the errors of later contacts most.
 
+    The presses are chosen one after the other. Each of them is the candidate that most reduces the sum of the squared
+    errors of later contacts after the presses before it.
+
     Args:
         problem: The calibration problem.
         charges: Charges of a film and of similar films.
@@ -158,13 +161,15 @@ def next_presses(
         film: Estimate of the film and of the noise; None before the first press.
         position_std_mm: Standard deviation of the positions, mm.
         force_std: Relative standard deviation of the forces.
+
+    Returns:
+        The presses in the order in which they are chosen, each with the errors that remain after it.
     """
     film = film or problem.film_before
     covariance = film.covariance
     candidates = _candidates(problem)
-    _, candidate_rows = _linearise_at(
-        film, charges, candidates, (position_std_mm, position_std_mm, force_std)
-    ).eliminated()
+    contact_std = (position_std_mm, position_std_mm, force_std)
+    _, candidate_rows = _linearise_at(film, charges, candidates, contact_std).eliminated()
     sensitivity = ContactSensitivity.of(film, charges, problem.domain)
 
     # Divide the errors of x, y and ln F by those that the noise causes, so that they can be added.

@@ -115,13 +115,8 @@ def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
     for cases in product(noises, POSITION_RATIOS, FORCE_SCATTERS, IMPERFECTION_SCALES, DISCREPANCY_SIZES, *session):
         sizes, probabilities = zip(*cases, strict=True)
         level, position_ratio, force_scatter, imperfections, discrepancy, *session_std = sizes
-        yield Hypothesis(
-            imperfections,
-            discrepancy,
-            tuple(session_std),
-            PressErrors(level, position_ratio, force_scatter),
-            float(np.prod(probabilities)),
-        )
+        errors = PressErrors(level, position_ratio, force_scatter)
+        yield Hypothesis(imperfections, discrepancy, tuple(session_std), errors, float(np.prod(probabilities)))
 
 
 TYPICAL = np.array([1.0, 1.0, 1.0, 0.01, *(one.stds[-1][0] for one in SESSION)])

@@ -155,8 +155,9 @@ def check_measured_presses(presses: MeasuredPresses) -> None:
 def _check_variation(name: str, charge: Array) -> None:
     """Raise an error if nearly all charges of a channel are equal, or if they are in ascending order.
 
-    Values in ascending order are times or numbers of the presses. Presses at neighbouring places often have similar
-    times, so the estimated errors of the model would be far too small.
+    A column in ascending order contains times or numbers of the presses instead of charges. Neighbouring places are
+    often pressed one after the other. A network could then read the place from the time, and the estimated errors of
+    the model would be far too small.
 
     Args:
         name: Name of the channel.

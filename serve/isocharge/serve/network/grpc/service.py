@@ -132,16 +132,16 @@ class Service:
         handler.traffic.open.labels("grpc").set_function(lambda: self._open_count)
 
     async def handle(self, name: str, _messages: object, context: grpc.aio.ServicerContext) -> None:
-        """Answer a call, count the call by its status, and log the call if there is a log.
+        """Answer a call of a client, count the call by its status, and log the call if there is a log.
 
-        If an error has occurred, the call is ended with the status and the message of the error.
+        If an error occurs, the client receives its status and its message.
 
         Args:
             name: Name of the method.
             _messages: Iterator over the messages. It is not used, because the messages are read from the context.
             context: Context of the call, from which messages are read and to which responses are written.
         """
-        # If the client disconnects, this coroutine is cancelled, and the status is not changed.
+        # If the client ends the call, this coroutine is cancelled, and the call is counted with this first status.
         call = Exchange("grpc", name, "CANCELLED", client=context.peer())
         start_ns = time.perf_counter_ns()
         message = ""
@@ -150,12 +150,14 @@ class Service:
             self._limit_open_calls()
             await self._answer(name, context, call)
             call.status = "OK"
-        except grpc.aio.InternalError as error:  # no message can be sent or read, as the client has ended the call
+        except grpc.aio.InternalError as error:  # the client ended the call while a message was read or sent
             raise asyncio.CancelledError from error
         except TimeoutError:
             call.status = "DEADLINE_EXCEEDED"
             call.error = "TimeoutError"
-            message = "the call waited too long for its client, others needed its place, or the server stops"
+            message = (
+                "the client sent or read nothing for too long, another call needed the place, or the server stopped"
+            )
         except Exception as error:  # every error is sent to the client
             _, call.status, message = refusal(error)
             call.error = type(error).__name__

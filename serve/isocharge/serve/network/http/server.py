@@ -188,6 +188,21 @@ class Connection(HttpToolsProtocol):
         self._allow(self._limits.header_seconds)
 
 
+def _within_open_files(limits: ServerLimits) -> ServerLimits:
+    """Let the process open as many files as the system permits, and return limits with so many connections at most.
+
+    Each connection needs an open file. An eighth of the files remains free, because a server without a free file could
+    not accept a connection, nor end another connection for it.
+    """
+    _, permitted = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with suppress(ValueError, OSError):  # macOS refuses an unlimited number
+        resource.setrlimit(resource.RLIMIT_NOFILE, (permitted, permitted))
+    max_open_files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if max_open_files == resource.RLIM_INFINITY:
+        return limits
+    return replace(limits, connections=min(limits.connections, max_open_files * 7 // 8))
+
+
 class HttpServer(uvicorn.Server):
     """HTTP server of an ASGI application.
 
@@ -211,19 +226,11 @@ class HttpServer(uvicorn.Server):
             InputError: If a TLS file cannot be used.
             ListenError: If the address is in use or cannot be used.
         """
-        limits = application.limits
         traffic = application.traffic
+        limits = _within_open_files(application.limits)
         tls_context = tls.context() if tls else None
         self._address = address
         self._socket = address.listen(limits.connections)
-        # Each connection needs an open file. The process is therefore allowed as many open files as the system permits.
-        # Without a free one, no connection could be accepted, nor one ended for it.
-        _, most_open_files = resource.getrlimit(resource.RLIMIT_NOFILE)
-        with suppress(ValueError, OSError):  # macOS refuses an unlimited number
-            resource.setrlimit(resource.RLIMIT_NOFILE, (most_open_files, most_open_files))
-        max_open_files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-        if max_open_files != resource.RLIM_INFINITY:
-            limits = replace(limits, connections=min(limits.connections, max_open_files * 7 // 8))
         connection: Any = partial(Connection, limits, traffic)
         config = uvicorn.Config(
             application,
