@@ -219,7 +219,7 @@ class Predictor:
         charges = as_charges(charge_pC, self.metadata.electrodes, is_batch=True)
         if self.noise is not self.metadata.noise:
             return self._predict_with_noise(charges)
-        return self._predict(charges)
+        return Contacts(*self.predict_rows(charges).T)
 
     def _predict_with_noise(self, charge_pC: Singles) -> Contacts:
         """Compute the contacts of n presses whose charges have more noise than those of the training.
@@ -232,29 +232,38 @@ class Predictor:
         Args:
             charge_pC: Touch charges, shape (n, electrodes), pC.
         """
-        contacts = self._predict(charge_pC)
+        contacts = self.predict_rows(charge_pC)
         model_variance = self.metadata.noise.variance(charge_pC.astype(float))
         extra_variance = np.maximum(self.noise.variance(charge_pC.astype(float)) - model_variance, 0.0)
         effects = []  # changes of x, mm, y, mm, and the force, N, each of shape (n, 3)
         for column, extra_std in enumerate(np.sqrt(extra_variance).T):
             step = np.zeros_like(charge_pC)
             step[:, column] = extra_std
-            raised, lowered = (np.asarray(self._predict(charge_pC + sign * step), float)[:, :3] for sign in (1, -1))
+            raised, lowered = (self.predict_rows(charge_pC + sign * step)[:, :3].astype(float) for sign in (1, -1))
             effects.append(0.5 * (raised - lowered))
         covariance = np.einsum("kni,knj->nij", effects, effects)
         relative_extra = extra_variance / np.maximum(model_variance, np.finfo(float).tiny)  # a model may have no noise
         noise_ratio = np.sqrt(1.0 + relative_extra.mean(axis=1))
-        misfit = (contacts.misfit / noise_ratio).astype(np.float32)
-        return Contacts(*add_covariance(np.asarray(contacts), covariance).T)._replace(misfit=misfit)
+        misfit = (contacts[:, COLUMNS["misfit"]] / noise_ratio[:, np.newaxis]).astype(np.float32)
+        return Contacts(*add_covariance(contacts, covariance).T)._replace(misfit=misfit[:, 0])
 
-    def _predict(self, charges: Singles) -> Contacts:
+    def predict_rows(self, charges: Singles) -> Singles:
         """Compute the contacts of n presses, with the standard deviations for the noise of the training.
+
+        The charges are not checked.
 
         Args:
             charges: Touch charges, shape (n, electrodes), pC.
+
+        Returns:
+            The ten numbers of each contact in the order of the attributes of `Contact`, shape (n, 10).
         """
+        if len(charges) == 1:
+            contact = np.empty((1, len(Contact._fields)), np.float32)
+            self.predict_into(charges[0], contact[0])  # is faster than `run`
+            return contact
         outputs = run(self._session, charges)
-        return Contacts(*np.concatenate([outputs[name] for name in COLUMNS], axis=1).T)
+        return np.concatenate([outputs[name] for name in COLUMNS], axis=1)
 
     def __repr__(self) -> str:
         """Return a text with the label, the sensor, the electrodes and the valid domain of the model."""

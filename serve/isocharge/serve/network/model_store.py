@@ -11,8 +11,6 @@ are refused, the old version remains available.
 
 import threading
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,30 +19,32 @@ from prometheus_client.core import GaugeMetricFamily
 
 from isocharge.common.errors import ModelError, ModelNotFound
 from isocharge.common.files import StrPath
-from isocharge.serve.model.contact import Validity
-from isocharge.serve.model.model_folder import Model, load_checked_model, model_names, repositories, version_folders
+from isocharge.serve.model.model_folder import model_names, repositories, version_folders
+from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.network.metrics import Statistics
 
 
-@dataclass(frozen=True)
-class LoadedVersion(Model):
+class LoadedVersion(Predictor):
     """Version of a model that is loaded and available for requests.
 
     Attributes:
+        version: Number of the version as a text.
         statistics: Counters of the requests to this version.
     """
 
-    statistics: Statistics
+    def __init__(self, folder: Path, statistics: Statistics) -> None:
+        """Load and check the version in a folder.
 
-    @cached_property
-    def version(self) -> str:
-        """Number of the version as a text."""
-        return str(self.metadata.version)
+        Args:
+            folder: Version folder.
+            statistics: Counters of the requests to this version.
 
-    @cached_property
-    def validity(self) -> Validity:
-        """Limits within which the contacts that the model estimates are valid."""
-        return Validity.of(self.metadata)
+        Raises:
+            ModelError: If the folder contains no valid model.
+        """
+        super().__init__(folder)
+        self.version = str(self.metadata.version)
+        self.statistics = statistics
 
 
 class Version(NamedTuple):
@@ -225,8 +225,7 @@ class ModelStore:
             rows[0] = Version(name, 0, reason=str(error))
         for number, version_folder in folders.items():
             try:
-                model = load_checked_model(version_folder)
-                loaded = LoadedVersion(**vars(model), statistics=self._statistics.of(name, number))
+                loaded = LoadedVersion(version_folder, self._statistics.of(name, number))
                 rows[number] = Version(name, number, loaded)
             except Exception as error:  # any error in one folder must not affect the other models
                 row = earlier.get(number, Version(name, number))

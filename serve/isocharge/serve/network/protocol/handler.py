@@ -178,7 +178,7 @@ class Handler(Application):
             transport="http",
             route=route.paths[0],  # all paths are counted under the first path
             status=response.status,
-            model=self.store.label(**model),
+            model=self.store.label(**model) if self.traffic.log else None,
             error=response.error,
             duration_us=(time.perf_counter_ns() - start_ns) / 1000,
             client=client,

@@ -18,7 +18,7 @@ from isocharge.common.arrays import Singles
 from isocharge.common.errors import RequestError, TooLarge
 from isocharge.common.structs import parse_json
 from isocharge.serve.model.contact import Contacts, as_float32
-from isocharge.serve.model.session import COLUMNS, INPUT, OUTPUTS, run
+from isocharge.serve.model.session import COLUMNS, INPUT, OUTPUTS
 from isocharge.serve.network.model_store import LoadedVersion
 
 Parameters = dict[str, Any] | None
@@ -142,17 +142,6 @@ def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...
     return as_float32(charges.reshape(shape), electrodes)
 
 
-def _flags(loaded: LoadedVersion, outputs: dict[str, Any]) -> list[str]:
-    """Return the flags of each press as one text with commas between the flags.
-
-    Args:
-        loaded: Version of the model that was run.
-        outputs: Outputs of the model for the presses by name, each of shape (n, width).
-    """
-    contacts = Contacts(*np.concatenate([outputs[name] for name in COLUMNS], axis=1).T)
-    return [",".join(flags) for flags in loaded.validity.batch_flags(contacts)]
-
-
 def infer(loaded: LoadedVersion, max_presses: int, body: InferBody, binary: bytes) -> dict[str, Any]:
     """Run a model on the presses of a request, and count the presses.
 
@@ -170,14 +159,16 @@ def infer(loaded: LoadedVersion, max_presses: int, body: InferBody, binary: byte
         IsochargeError: If the request does not fit the model, or if the model fails.
     """
     charge_pC = _read_charges(body.inputs[0], binary, loaded.metadata.electrodes, max_presses)
-    outputs = dict[str, Any](run(loaded.session, charge_pC))
+    contacts = loaded.predict_rows(charge_pC)
+    outputs: dict[str, Any] = {name: contacts[:, columns] for name, columns in COLUMNS.items()}
     alarm_count = np.count_nonzero(~(outputs["misfit"] <= loaded.validity.misfit_limit))  # also NaN
     loaded.statistics.presses.inc(len(charge_pC))
     loaded.statistics.alarms.inc(float(alarm_count))
 
     names = [output.name for output in body.outputs or ()] or OUTPUTS
     if FLAGS in names:
-        outputs[FLAGS] = _flags(loaded, outputs)
+        flags_of_presses = loaded.validity.batch_flags(Contacts(*contacts.T))
+        outputs[FLAGS] = [",".join(flags) for flags in flags_of_presses]
     content: dict[str, Any] = {"model_name": loaded.metadata.name, "model_version": loaded.version}
     if body.id:
         content["id"] = body.id
