@@ -180,12 +180,6 @@ def test_tare_follows_a_slow_drift_of_an_untouched_film(drift_pC_per_s):
     assert pressed.charge_pC == pytest.approx([500.0] * 3, abs=6.0)
 
 
-def test_noise_of_many_electrodes_is_no_touch():
-    """The noise is nearly the largest that a tare accepts."""
-    noise_pC = 4.5 * np.random.default_rng(0).standard_normal((3000, 8))
-    assert not any(contacts_of(StageRunner(8).run(noise_pC, RATE_HZ)))
-
-
 def test_contact_that_a_fast_drift_begins_has_the_flag_drift():
     """The tare cannot follow the drift of an untouched film. A press that follows another press has no flag."""
     drifting_pC = rest(2000) + 4.0 * np.arange(2000)[:, None] / RATE_HZ

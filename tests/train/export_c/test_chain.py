@@ -220,17 +220,13 @@ def test_contact_that_a_drift_begins_has_the_flag_drift_in_c_as_in_python(build)
     assert contact[-1]
 
 
-@pytest.fixture(scope="module")
-def restless_frames():
-    """Seventy frames of a film that is never at rest."""
-    return regular_frames(100.0 * np.random.default_rng(0).standard_normal((70, 3)))
-
-
 IMPATIENT_BOARD = device_from_table({"tare": {"frames": 20, "patience": 50}}, "board")
 """Board whose tare fails after 50 frames."""
 
 
-def test_failed_first_tare_is_reported_after_the_patience_of_the_board(build, restless_frames):
+def test_failed_first_tare_is_reported_after_the_patience_of_the_board(build):
+    """The film is never at rest."""
+    restless_frames = regular_frames(100.0 * np.random.default_rng(0).standard_normal((70, 3)))
     with pytest.raises(TareError):
         python_chain(IMPATIENT_BOARD, restless_frames, None)
     exported = build("three-25um-biaxial-student", IMPATIENT_BOARD)

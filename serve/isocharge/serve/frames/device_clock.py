@@ -58,7 +58,7 @@ class DeviceClock:
         """Start without a reading."""
         self.rate = 1.0
         self._latest_chunk: Chunk | None = None
-        self._monotonic_s = 0.0  # arrival of the latest chunk; it does not jump if the wall clock is set
+        self._monotonic_s = 0.0  # time of the latest chunk; it does not jump if the wall clock is set
         self.reset()
 
     def reset(self) -> None:
@@ -70,10 +70,6 @@ class DeviceClock:
         self._sent_us: int | None = None  # clock of the latest reading as the device sent it
         self._device_us = 0  # clock of the latest reading after the wraps were removed
         self._chunk_arrival_s: float | None = None  # arrival of the latest chunk
-
-        # Whether the present chunk arrived at another time than the previous chunk. All chunks of a file have the same
-        # arrival time, which contains no information. After the first chunk, it is not known whether this is a file.
-        self._is_new_arrival = False
 
         # According to the fit, the host time was `_fitted_host_s` when the clock of the device was `_fitted_us`. If
         # `_fitted_us` is None, there is no fit.
@@ -88,8 +84,8 @@ class DeviceClock:
 
         The clock of the device is converted to the time of the host by a straight line, which is called the fit. If the
         device sends no clock, the time since the previous chunk is divided evenly among the frames of the chunk, and
-        the last frame has the arrival time of the chunk. All chunks of a file arrive at the same time. The interval
-        `dt_s` of their frames is then assumed to be `FILE_INTERVAL_s`.
+        the last frame has the arrival time of the chunk. All chunks of a file arrive at the same time. The interval of
+        their frames in `dt_s` and `clock_s` is then assumed to be `FILE_INTERVAL_s`.
 
         Args:
             chunk: The bytes that contain the ends of the frames.
@@ -99,21 +95,22 @@ class DeviceClock:
         if not frames:  # the time is shared by the frames of the next chunk
             return
         is_first_chunk = self._chunk_arrival_s is None
-        elapsed_s = self._enter_chunk(chunk)
+        elapsed_s = self._enter_chunk(chunk, len(frames))
+        # Whether the chunk arrived at another time than the previous chunk. All chunks of a file have the same arrival
+        # time, which contains no information. After the first chunk, it is not known whether this is a file.
         self._is_new_arrival = self._chunk_arrival_s not in (None, chunk.timestamp)
         share_s = 0.0 if is_first_chunk else elapsed_s / len(frames)
         for n_later, frame in zip(reversed(range(len(frames))), frames, strict=True):
             if frame.t_us is None:
-                before_arrival_s = n_later * share_s
-                frame.host_s = chunk.timestamp - before_arrival_s
+                frame.host_s = chunk.timestamp - n_later * share_s
                 frame.dt_s = 0.0 if is_first_chunk else share_s or self.FILE_INTERVAL_s
-                frame.clock_s = self._monotonic_s - before_arrival_s
+                frame.clock_s = self._monotonic_s - n_later * frame.dt_s
             else:
                 self._stamp_with_device(frame, frame.t_us, modulus, chunk.timestamp)
         if len(chunk.data) < MAX_READ_BYTES:  # otherwise, the bytes may have waited to be read
             self._end_chunk(chunk.timestamp)
 
-    def _enter_chunk(self, chunk: Chunk) -> float:
+    def _enter_chunk(self, chunk: Chunk, n_frame: int) -> float:
         """Return the time from the previous chunk to this chunk, s, and advance the monotonic time of the host.
 
         If the wall clock was set between the chunks, all stored host times are changed by the same amount.
@@ -124,7 +121,7 @@ class DeviceClock:
             self._monotonic_s = chunk.timestamp
             return 0.0
         elapsed_s = chunk.elapsed_since(previous)
-        self._monotonic_s += elapsed_s
+        self._monotonic_s += elapsed_s or n_frame * self.FILE_INTERVAL_s
         wall_jump_s = chunk.timestamp - previous.timestamp - elapsed_s
         if abs(wall_jump_s) > MAX_DELAY_s:
             self._fitted_host_s += wall_jump_s

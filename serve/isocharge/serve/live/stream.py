@@ -255,7 +255,6 @@ class TouchStream(ReadingStream):
         self._stages = charge_stages + contact_stages
         self.sections = tuple(stage.section for stage in contact_stages)
         self.predictor = predictor
-        self._label = predictor.metadata.label
         self.frame_id = self._given_name or predictor.metadata.frame_id
 
     def use(self, predictor: Predictor) -> None:
@@ -310,7 +309,7 @@ class TouchStream(ReadingStream):
             tare_pC=self._by_electrode(frame.tare_pC),
             flags=in_order([*frame.flags, *frame.contact_flags]),
             latency_us=(time.perf_counter_ns() - chunk.clock_ns) / 1e3,  # includes the time that the stages have taken
-            model=self._label,
+            model=self.predictor.metadata.label,
             frame_id=self.frame_id,
             tracked=frame.tracked,
             event=frame.event,

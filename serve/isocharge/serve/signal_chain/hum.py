@@ -63,7 +63,7 @@ class Hum(Stage):
         self._rule = setup.device.rule(HumRule) or HumRule()
         self._phasor_pC: Complexes = np.zeros(len(setup.electrodes), dtype=complex)  # amplitude and phase by channel
         # The reference is the frame with which the next frame is compared: its unit phasor, its charges, and its age.
-        self._reference_phasor = 1.0 + 0.0j
+        self._reference_phasor = 0j
         self._reference_pC: Array | None = None
         self._elapsed_s = 0.0
 

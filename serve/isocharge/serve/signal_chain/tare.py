@@ -172,7 +172,7 @@ class Tare(Stage):
         """
         rule = self._rule
         if rule is None:
-            self._tare_pC = np.zeros(len(self._electrodes))
+            self._tare_pC = np.zeros_like(charge_pC)
             return
         stored_pC = np.vstack([self._latest_pC, charge_pC])
         self._latest_pC = stored_pC[-rule.frames :]  # at most as many frames as a tare needs

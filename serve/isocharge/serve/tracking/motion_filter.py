@@ -319,21 +319,21 @@ class ContactFilter:
             self.reset()
         self._latest_time_s = t_s
         measured, stated_covariance = _measured_values(contact)
-        variance_ratio = 1.0 - self._constant_share
+        model_covariance = (1.0 - self._constant_share) * stated_covariance
+        covariance = self._noise.relative_variance * model_covariance
         if WEAK_FLAGS.intersection(flags):
-            variance_ratio *= WEAK_VARIANCE_FACTOR
-        covariance = variance_ratio * stated_covariance
+            covariance *= WEAK_VARIANCE_FACTOR
 
         # Update the filter, or begin a new contact at the second frame that does not belong to the contact.
         belongs = False
         if self._filter is not None:
             self._filter.predict(dt_s)
-            belongs = self._filter.update(measured, self._noise.relative_variance * covariance)
+            belongs = self._filter.update(measured, covariance)
             self._is_outlier = not (belongs or self._is_outlier)
         if self._filter is None or not (belongs or self._is_outlier):
             self._filter = MotionFilter(measured, covariance)
         if not self._is_outlier:
-            self._noise.update(measured, covariance, t_s)
+            self._noise.update(measured, model_covariance, t_s)
 
         # Combine the modes, and add the constant errors.
         modes = self._filter

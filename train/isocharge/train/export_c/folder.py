@@ -39,7 +39,7 @@ def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: 
             that does not exist in C.
     """
     setup = Setup(electrodes, device, has_any_sign=has_any_sign)
-    if setup.device.has_currents:
+    if device.has_currents:
         raise DeviceError(f"{device.where}: front_end: {NOT_IN_C}")
     lines = [f"#define ISOCHARGE_SUM_TOLERANCE_S {_c_literal(SUM_TOLERANCE_s)}"]
     chain_source = source_text("isocharge_chain.c")
