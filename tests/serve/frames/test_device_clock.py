@@ -110,7 +110,7 @@ def test_readings_without_a_device_clock_share_the_time_between_chunks():
     for arrival_s, n_readings in ((0.0, 2), (0.01, 1), (0.015, 0), (1.01, 200)):
         times += read(clock, chunk_at(arrival_s), [None] * n_readings)
     assert {time.device_us for time in times} == {None}
-    assert [time.dt_s for time in times] == pytest.approx([0.0, 0.0, 0.01] + [0.005] * 200)
+    assert [time.dt_s for time in times] == pytest.approx([0.005, 0.005, 0.01] + [0.005] * 200)
     expected_s = START_S + np.arange(0.01, 1.0125, 0.005)
     for name in ("host_s", "clock_s"):
         np.testing.assert_allclose([getattr(time, name) for time in times[2:]], expected_s, rtol=0.0, atol=1e-6)

@@ -79,7 +79,7 @@ def test_charge_survives_a_damaged_frame_in_a_rise(damage, predictor):
 def test_many_missing_currents_cause_no_touch_and_give_a_touch_the_flag_gap():
     values = currents(100.0 * FORCE[:, None] * RATIOS)
     values[750:1250] = values[2000:2500] = math.nan  # at rest, and during the first press
-    frames = run(values, together=200)  # the frames of the tare arrive together, as from a file
+    frames = run(values, together=200)  # the frames of the tare have the same time
     assert not any(frame.is_contact for frame in frames[:1450])
     assert "gap" in frames[2900].flags
 

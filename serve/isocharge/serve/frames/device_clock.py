@@ -52,7 +52,7 @@ class DeviceClock:
     """
 
     FILE_INTERVAL_s = 0.005
-    """Assumed time between the frames of a file without a clock, s. Without it, the tare would not follow a drift."""
+    """Assumed time between frames without a clock in a file, and in the first chunk of a port, s."""
 
     def __init__(self) -> None:
         """Start without a reading."""
@@ -85,7 +85,7 @@ class DeviceClock:
         The clock of the device is converted to the time of the host by a straight line, which is called the fit. If the
         device sends no clock, the time since the previous chunk is divided evenly among the frames of the chunk, and
         the last frame has the arrival time of the chunk. All chunks of a file arrive at the same time. The interval of
-        their frames in `dt_s` and `clock_s` is then assumed to be `FILE_INTERVAL_s`.
+        their frames in `dt_s` and `clock_s`, and that in the first chunk of a port, is assumed to be `FILE_INTERVAL_s`.
 
         Args:
             chunk: The bytes that contain the ends of the frames.
@@ -94,16 +94,15 @@ class DeviceClock:
         """
         if not frames:  # the time is shared by the frames of the next chunk
             return
-        is_first_chunk = self._chunk_arrival_s is None
         elapsed_s = self._enter_chunk(chunk, len(frames))
         # Whether the chunk arrived at another time than the previous chunk. All chunks of a file have the same arrival
         # time, which contains no information. After the first chunk, it is not known whether this is a file.
         self._is_new_arrival = self._chunk_arrival_s not in (None, chunk.timestamp)
-        share_s = 0.0 if is_first_chunk else elapsed_s / len(frames)
+        share_s = 0.0 if self._chunk_arrival_s is None else elapsed_s / len(frames)
         for n_later, frame in zip(reversed(range(len(frames))), frames, strict=True):
             if frame.t_us is None:
                 frame.host_s = chunk.timestamp - n_later * share_s
-                frame.dt_s = 0.0 if is_first_chunk else share_s or self.FILE_INTERVAL_s
+                frame.dt_s = share_s or self.FILE_INTERVAL_s
                 frame.clock_s = self._monotonic_s - n_later * frame.dt_s
             else:
                 self._stamp_with_device(frame, frame.t_us, modulus, chunk.timestamp)

@@ -69,8 +69,8 @@ class Frame:
             clock, it is computed from the arrival time. The time decreases only if a clock was set.
         device_us: Clock of the device after the wraps were removed, us; None if the device sends no clock.
         is_clock_reset: Whether the clock of the device jumped back by more than a second before this frame.
-        dt_s: Time since the previous valid frame, s; 0 for the first frame after a start. It does not depend on the
-            wall clock of the host.
+        dt_s: Time since the previous valid frame, s; 0 for the first frame of a device with a clock. It does not depend
+            on the wall clock of the host.
         intervals: Number of sampling intervals since the previous valid frame: 1 without a gap, more if frames are
             missing or invalid, and 0 for a copy of the previous frame, and for a late frame, which has counted as
             missing. If the frames have no counter, no frame counts as missing.
@@ -87,8 +87,8 @@ class Frame:
         warming_pC: Part of the charges that is due to a warming of the film since the previous frame, shape
             (n_electrode,) or one number for all electrodes, pC. It was subtracted from `charge_pC`.
         base_relax_s: Time constant with which the charge out of contact decays to zero, s.
-        is_base_held: Whether a finger is touching or leaving the film. A positive base of the touch detection then does
-            not decay.
+        is_base_held: Whether the tare follows the charge at rest and the warming. The base of the touch detection then
+            does not decay while it is the remaining charge of a touch.
         contact: The computed contact; None if nothing touches the film, or if the frame is invalid.
         contact_flags: Flags that are the reasons why the contact may be wrong.
         film: Estimated film; None if the film is not followed.

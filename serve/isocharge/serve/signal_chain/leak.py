@@ -122,7 +122,7 @@ class Inflow:
         # averaging time is at least `dt_s`, so that the corrected inflow explains at most the whole surplus.
         self.learned_s += dt_s
         averaging_s = max(min(rule.settle_s, self.learned_s), dt_s)
-        if averaging_s > 0.0:  # the first frames may have arrived together, or within one count of a slow clock
+        if averaging_s > 0.0:  # frames may have come within one count of a slow clock
             self.pC_per_s = self.pC_per_s + clipped_surplus_pC / averaging_s
 
         # Replace the trusted inflow and the candidate if the candidate is old enough.
