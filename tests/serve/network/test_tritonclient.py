@@ -94,15 +94,7 @@ def test_tritonclient_load_refuses_a_configuration(client):
 
 def test_tritonclient_model_config(client):
     response = plain(client.get_model_config("linear"))
-    config = response.get("config", response)
-    assert config["max_batch_size"] == 4096
-    assert config["input"][0]["name"] == "charge_pC"
-    assert [output["name"] for output in config["output"]] == [
-        "contact",
-        "contact_std",
-        "contact_correlation",
-        "misfit",
-    ]
+    assert response.get("config", response)["max_batch_size"] == 4096
 
 
 def test_tritonclient_statistics(client, module, film):

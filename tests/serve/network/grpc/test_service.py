@@ -84,7 +84,6 @@ def test_charges_as_fp32_contents(serve, film, predictor, datatype):
                 message,
             )
             for contents, raw, message in [
-                ({"bool_contents": [True]}, [], "expected 3 numbers .* and 0 bytes"),
                 ({"fp64_contents": [1.0] * 3}, [], "expected 3 numbers .* and 0 bytes"),
                 ({"fp32_contents": [1.0] * 3}, [bytes(12)], r"of the shape \(3,\) and 12 bytes"),
                 ({}, [bytes(4), bytes(8)], "one input tensor, got 2"),
@@ -192,6 +191,20 @@ def test_stop_ends_a_stream_that_waits_for_its_next_message(store, start_grpc, s
         server.__exit__(None, None, None)
         assert time.monotonic() - start_s < 5.0
         assert call.code().name in ("DEADLINE_EXCEEDED", "OK")  # OK if the server did not wait yet
+
+
+def test_stop_answers_a_message_that_is_being_received(store):
+    context = Mock(write=AsyncMock())
+    service = Service(Handler(store))
+
+    async def receive():
+        service.end_streams()
+        await asyncio.sleep(0.01)
+        return b""
+
+    context.read = receive
+    asyncio.run(service.handle("ServerReady", None, context))
+    context.write.assert_called_once_with(b"\x08\x01")
 
 
 def test_silent_connection_is_closed(store, start_grpc):

@@ -3,6 +3,7 @@
 import asyncio
 import json
 from functools import partial
+from unittest.mock import AsyncMock
 
 import numpy as np
 import pytest
@@ -47,10 +48,24 @@ def test_asgi_app_mounted_in_starlette_answers_under_its_path_and_checks_token_s
     assert ask("POST", "/touch" + INFER, bytes((1 << 20) + 1), **bearer)[0] == 413
 
 
-def test_asgi_app_accepts_a_scope_without_the_optional_client(models):
-    sent = asyncio.Queue()
-    received = asyncio.Queue()
-    received.put_nowait({"type": "http.request"})
-    scope = {"type": "http", "method": "GET", "path": "/v2", "headers": [(b"host", b"localhost")]}
-    asyncio.run(asgi_app(str(models))(scope, received.get, sent.put))
-    assert sent.get_nowait()["status"] == 200
+@pytest.mark.parametrize(
+    ("scope", "received", "sent"),
+    [
+        (
+            {"type": "http", "method": "GET", "path": "/v2/health/live", "headers": []},  # without the optional client
+            ["http.request"],
+            ["http.response.start", "http.response.body"],
+        ),
+        ({"type": "websocket"}, ["websocket.connect"], ["websocket.close"]),
+        (
+            {"type": "lifespan"},
+            ["lifespan.startup", "lifespan.shutdown"],
+            ["lifespan.startup.complete", "lifespan.shutdown.complete"],
+        ),
+    ],
+)
+def test_asgi_app_answers_each_kind_of_scope(models, scope, received, sent):
+    receive = AsyncMock(side_effect=[{"type": name} for name in received])
+    send_event = AsyncMock()
+    asyncio.run(asgi_app(str(models))(scope, receive, send_event))
+    assert [call.args[0]["type"] for call in send_event.call_args_list] == sent

@@ -316,10 +316,22 @@ def test_loading_a_model_delays_no_other_request(server, slow_load):
         assert statuses(connection.recv(1000)) == [200]
 
 
+def ask_until_closed(server):
+    """Send requests on one connection until a response closes it. Without a response, an exception is raised."""
+    client = http.client.HTTPConnection(server.url.removeprefix("http://"), timeout=60)
+    connection = None
+    while connection != "close":
+        client.request("HEAD", "/v2")
+        with client.getresponse() as answer:
+            connection = answer.headers["connection"]
+
+
 def test_stop_finishes_requests_that_have_begun(server, slow_load):
-    """A load and an incomplete request are finished. Idle connections and later connections are refused."""
+    """A load, an incomplete request and requests in quick succession are finished. Idle connections are closed."""
     began, go_on = slow_load
-    with connect(server) as loads, connect(server) as begun, connect(server) as idle:
+    threads = ThreadPoolExecutor(1)
+    with threads, connect(server) as loads, connect(server) as begun, connect(server) as idle:
+        busy = threads.submit(ask_until_closed, server)
         loads.sendall(LOAD)
         begun.sendall(infer()[:-5])
         idle.sendall(b"GET /v2 HTTP/1.1\r\n\r\n")
@@ -327,6 +339,7 @@ def test_stop_finishes_requests_that_have_begun(server, slow_load):
         assert began.wait(30)
         server.stop()
         assert idle.recv(1000) == b""
+        busy.result()
         go_on.set()
         begun.sendall(infer()[-5:])
         for connection in (loads, begun):

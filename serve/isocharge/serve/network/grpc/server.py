@@ -12,7 +12,7 @@ import grpc.aio
 
 from isocharge.common.errors import ListenError
 from isocharge.common.files import read_whole
-from isocharge.serve.network.address import ServerLimits, Tls, url_host
+from isocharge.serve.network.address import Tls, url_host
 from isocharge.serve.network.grpc.service import METHODS, SERVICE, Service
 from isocharge.serve.network.protocol.handler import Handler
 
@@ -30,8 +30,8 @@ MIN_PING_MS = 5000
 async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) -> AsyncIterator[str]:
     """Return a context manager that runs a gRPC server in the present event loop until the `async with` block ends.
 
-    At the end of the block, the calls that have begun are finished. If the exit of the block is cancelled, the calls
-    are ended at once.
+    At the end of the block, the calls that have begun are finished, and grpcio cancels the calls that it has received,
+    but not begun. If the exit of the block is cancelled, all calls are ended at once.
 
     Args:
         handler: Handler of the HTTP server. The gRPC server uses its models, limits and token. Clients send the token
@@ -48,9 +48,19 @@ async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = 
     """
     limits = handler.limits
     address = f"{url_host(host)}:{port}"
+    options = [
+        ("grpc.max_receive_message_length", limits.body_bytes),
+        ("grpc.max_concurrent_streams", MAX_CALLS_PER_CONNECTION),
+        ("grpc.max_allowed_incoming_connections", limits.connections),
+        ("grpc.server_handshake_timeout_ms", round(1e3 * limits.header_seconds)),
+        ("grpc.max_connection_idle_ms", round(1e3 * limits.idle_seconds)),
+        ("grpc.http2.min_ping_interval_without_data_ms", MIN_PING_MS),
+        ("grpc.keepalive_permit_without_calls", 1),  # the client may also ping while it has no open call
+        ("grpc.so_reuseport", 0),
+    ]
     # The service limits the number of open calls to `connections`. If a new call exceeds this limit, the service ends a
     # waiting call instead of refusing the new call. grpcio would refuse the new call, so its own limit must be higher.
-    server = grpc.aio.server(options=_options(limits), maximum_concurrent_rpcs=2 * limits.connections)
+    server = grpc.aio.server(options=options, maximum_concurrent_rpcs=2 * limits.connections)
     service = Service(handler)
     methods = {name: grpc.stream_stream_rpc_method_handler(partial(service.handle, name)) for name in METHODS}
     server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, methods),))
@@ -75,17 +85,3 @@ async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = 
             await server.stop(limits.grace_seconds)
         finally:  # no effect unless the stop is cancelled
             await server.stop(None)
-
-
-def _options(limits: ServerLimits) -> list[tuple[str, int]]:
-    """Convert the limits of a server to options of the package grpcio."""
-    return [
-        ("grpc.max_receive_message_length", limits.body_bytes),
-        ("grpc.max_concurrent_streams", MAX_CALLS_PER_CONNECTION),
-        ("grpc.max_allowed_incoming_connections", limits.connections),
-        ("grpc.server_handshake_timeout_ms", round(1e3 * limits.header_seconds)),
-        ("grpc.max_connection_idle_ms", round(1e3 * limits.idle_seconds)),
-        ("grpc.http2.min_ping_interval_without_data_ms", MIN_PING_MS),
-        ("grpc.keepalive_permit_without_calls", 1),  # the client may also ping while it has no open call
-        ("grpc.so_reuseport", 0),
-    ]

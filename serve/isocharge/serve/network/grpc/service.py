@@ -283,10 +283,14 @@ class Service:
         oldest_timeout.reschedule(0.0)
 
     def end_streams(self) -> None:
-        """End the streams, because the server stops. A call that waits for a message ends at once."""
+        """End the calls that wait for a message, because the server stops.
+
+        The calls have another 0.1 s, because a client may have sent a message that has not been read yet.
+        """
         self._is_stopping = True
+        deadline = asyncio.get_running_loop().time() + 0.1
         for timeout in self._waiting:
-            timeout.reschedule(0.0)
+            timeout.reschedule(deadline)
 
     async def _next_message(self, context: grpc.aio.ServicerContext, timeout_s: float) -> Any:
         """Wait for the next message of a call.

@@ -47,6 +47,7 @@ class Connection(HttpToolsProtocol):
         self._limits = limits
         self._traffic = traffic
         self._is_reading = False  # whether a request has begun and is not complete
+        self._is_stopping = False  # whether the next response closes the connection, because the server stops
         self._pending_bytes = 0  # bytes since the latest complete head, part of a body, or complete request
 
     def _allow(self, seconds: float) -> None:
@@ -116,6 +117,8 @@ class Connection(HttpToolsProtocol):
         self._allow(self._limits.body_seconds)
         super().on_headers_complete()
         self.headers = []  # uvicorn adds trailers to this list, which the request no longer uses
+        if self._is_stopping:
+            self.shutdown()
 
     def on_body(self, body: bytes) -> None:
         """Pass a part of the body to the application, which limits the size of the body."""
@@ -149,6 +152,18 @@ class Connection(HttpToolsProtocol):
             self.refuse(408, "waited too long for the rest of the request")
         else:
             self.transport.abort()
+
+    def shutdown(self) -> None:
+        """Let the response to the open request close the connection. uvicorn calls this method when the server stops.
+
+        A connection without an open request stays open for another 0.1 s, because its client may have sent a request
+        that has not been read yet.
+        """
+        if self._is_stopping or not self.is_idle:
+            super().shutdown()
+        else:
+            self._is_stopping = True
+            self.loop.call_later(0.1, self.shutdown)
 
     def _close_after_responses(self) -> bool:
         """Let the response to the latest complete request close the connection.
@@ -231,10 +246,9 @@ class HttpServer(uvicorn.Server):
         tls_context = tls.context() if tls else None
         self._address = address
         self._socket = address.listen(limits.connections)
-        connection: Any = partial(Connection, limits, traffic)
         config = uvicorn.Config(
             application,
-            http=connection,
+            http=partial(Connection, limits, traffic),  # type: ignore[arg-type]
             lifespan="off",
             ws="none",
             log_config=None,

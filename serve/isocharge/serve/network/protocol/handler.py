@@ -55,6 +55,8 @@ class Application(ABC):
     ) -> None:
         """Answer one HTTP request. If the client disconnects before its request is complete, nothing is sent.
 
+        WebSockets are refused. The start and the end of the program need no work (lifespan of ASGI).
+
         A server that stops cancels requests that it cannot finish in time. The client of such a request is told so.
 
         Args:
@@ -62,6 +64,14 @@ class Application(ABC):
             receive: Function that returns the next part of the request.
             send: Function that sends a part of the response.
         """
+        if scope["type"] == "websocket":
+            await send({"type": "websocket.close"})
+            return
+        if scope["type"] == "lifespan":
+            for event in ("startup", "shutdown"):
+                await receive()
+                await send({"type": f"lifespan.{event}.complete"})
+            return
         try:
             # Stop reading as soon as the body is larger than allowed. The application then refuses the body.
             body = bytearray()

@@ -95,12 +95,9 @@ def read_infer(body: bytes, header_length: bytes | None) -> tuple[InferBody, byt
     return parse_json(body[:json_length], "", RequestError, InferBody), body[json_length:]
 
 
-def binary_outputs(body: InferBody) -> set[str]:
-    """Return the names of the outputs that a client of HTTP requests as binary tensors."""
-    is_default = (body.parameters or {}).get("binary_data_output")
-    outputs: dict[str, Parameters] = {output.name: output.parameters for output in body.outputs or ()}
-    outputs = outputs or dict.fromkeys(OUTPUTS)
-    return {name for name, parameters in outputs.items() if (parameters or {}).get("binary_data", is_default)}
+def requested_outputs(body: InferBody) -> list[OutputTensor]:
+    """Return the outputs that a client requests. If the request lists no outputs, it requests those of the model."""
+    return body.outputs or [OutputTensor(name) for name in OUTPUTS]  # type: ignore[arg-type]
 
 
 def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...], max_presses: int) -> Singles:
@@ -165,7 +162,7 @@ def infer(loaded: LoadedVersion, max_presses: int, body: InferBody, binary: byte
     loaded.statistics.presses.inc(len(charge_pC))
     loaded.statistics.alarms.inc(float(alarm_count))
 
-    names = [output.name for output in body.outputs or ()] or OUTPUTS
+    names = [output.name for output in requested_outputs(body)]
     if FLAGS in names:
         flags_of_presses = loaded.validity.batch_flags(Contacts(*contacts.T))
         outputs[FLAGS] = [",".join(flags) for flags in flags_of_presses]

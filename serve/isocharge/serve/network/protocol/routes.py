@@ -19,9 +19,9 @@ from isocharge.serve.network.metrics import CONTENT_TYPE, Traffic
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol.inference import (
     RepositoryBody,
-    binary_outputs,
     infer,
     read_infer,
+    requested_outputs,
     take_binary_tensor,
 )
 from isocharge.serve.network.protocol.response import Response, response_of
@@ -189,8 +189,12 @@ def _infer(request: Request) -> Response:
     with loaded.statistics.refused.count_exceptions(), loaded.statistics.latency.time():
         body, binary = read_infer(request.body, header_length)
         content = infer(loaded, request.limits.batch, body, binary)
-        binary_names = binary_outputs(body)
-        binary_tensors = [take_binary_tensor(tensor) for tensor in content["outputs"] if tensor["name"] in binary_names]
+        is_binary = (body.parameters or {}).get("binary_data_output")
+        binary_tensors = [
+            take_binary_tensor(tensor)
+            for output, tensor in zip(requested_outputs(body), content["outputs"], strict=True)
+            if (output.parameters or {}).get("binary_data", is_binary)
+        ]
         json_text = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
     if not binary_tensors:
         return response_of(200, b"application/json", json_text)
