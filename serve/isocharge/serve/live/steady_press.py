@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.serve.flags import RECONNECTED, RESTART, SATURATED, TARE
+from isocharge.serve.flags import RECONNECTED, RESTART, SATURATED, TARE, in_order
 from isocharge.serve.frames.frame import Frame
 
 PORT_LOST = "the port was lost or the board was restarted: do not touch the film until it is tared"
@@ -90,7 +90,7 @@ class PressWatch:
     """
 
     WINDOW_S = 0.5
-    """Length of the window, s."""
+    """Length of the window, s. If frames are rare, the window is longer and contains `MIN_FRAMES` frames."""
 
     MIN_FRAMES = 20
     """Smallest number of frames in a window."""
@@ -173,7 +173,7 @@ class PressWatch:
             The phase and, if a press is refused or not steady yet, the reason. The result contains an accepted press
             only for the reading with which the press was accepted.
         """
-        if RECONNECTED in frame.flags or RESTART in frame.flags:
+        if not {RECONNECTED, RESTART}.isdisjoint(frame.flags):
             # The charges and times before the interruption cannot be compared with later ones.
             self._frames.clear()
             self._end_s = -math.inf
@@ -211,7 +211,7 @@ class PressWatch:
             if held_s < self.MIN_HELD_S:
                 return WatchResult(Phase.settling)
             return WatchResult(Phase.refused, NO_REST_BEFORE_PRESS)
-        self._store(frame, self.WINDOW_S)
+        self._store(frame, self.WINDOW_S, self.MIN_FRAMES)
 
         # The window is examined several times within its length, but not in each frame, which would take too long.
         is_window_full = held_s >= self.WINDOW_S and len(self._frames) >= self.MIN_FRAMES
@@ -249,8 +249,8 @@ class PressWatch:
 
         reason = self._unsteady(mean_pC, scatter_pC, slope_pC_per_s, times_s[-1] - times_s[0], noise_pC)
         if not reason:
-            flags = dict.fromkeys(flag for frame in self._frames for flag in frame.flags)  # each flag once
-            return SteadyPress(mean_pC, self._end_s - self._begin_s, tuple(flags))
+            flags = in_order(flag for frame in self._frames for flag in frame.flags)
+            return SteadyPress(mean_pC, self._end_s - self._begin_s, flags)
         if scatter_pC.max() <= self._min_scatter_pC:
             self._min_scatter_pC = scatter_pC.max()
             self._reason = reason
@@ -291,10 +291,10 @@ class PressWatch:
             "leak of the amplifiers with isocharge serve doctor"
         )
 
-    def _store(self, frame: Frame, duration_s: float) -> None:
-        """Store a frame, and discard the frames that are older than `duration_s`."""
+    def _store(self, frame: Frame, duration_s: float, min_count: int = 1) -> None:
+        """Store a frame, and discard the frames that are older than `duration_s`, except the latest `min_count`."""
         self._frames.append(frame)
-        while self._frames[0].clock_s < frame.clock_s - duration_s:
+        while len(self._frames) > min_count and self._frames[0].clock_s < frame.clock_s - duration_s:
             self._frames.popleft()
 
     def _process_rest(self, frame: Frame) -> WatchResult:
