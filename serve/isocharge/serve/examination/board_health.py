@@ -145,7 +145,7 @@ def transmission_sentences(capture: Capture) -> Iterator[str]:
             "rate with --baud, end each line of text with a line feed, or describe the format in a device file "
             f"(--device); {advice}; a board without noise shows its channels only while the film is touched"
         )
-    elif capture.intact_share < CLEAN_SHARE:
+    elif capture.intact_share + 1.0 / len(capture.frames) < CLEAN_SHARE:  # the first frame may be incomplete
         damaged = f"{1.0 - capture.intact_share:.1%} of the bytes do not belong to good frames"
         if unread_line:
             damaged += (

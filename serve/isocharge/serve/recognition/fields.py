@@ -36,8 +36,9 @@ def identify(steps: Array, frame_rate_Hz: float, tolerance: float = 0.04) -> tup
     """Determine whether the values of consecutive frames are those of a frame counter or of a clock.
 
     A counter increases by 1. A clock has one of the usual tick rates of boards. At about 1000 frames per second, a
-    clock in ms also increases by 1, but it repeats at least 1 % of its values. A step is only used if it is close to
-    the median step. For example, a step across a lost frame is not used.
+    clock in ms also increases by 1, but it repeats some of its values. A step is only used if it is close to the median
+    step. If a number increases by a power of 256, its high bytes are a counter, and its low bytes belong to the channel
+    behind the counter.
 
     Args:
         steps: Differences of the values of consecutive frames, shape (n,).
@@ -51,16 +52,17 @@ def identify(steps: Array, frame_rate_Hz: float, tolerance: float = 0.04) -> tup
         Finally, how often the values wrap. A damaged value also causes a step back, but causes a step forwards, too.
     """
     median_step = np.median(steps)
-    large_step = 20.0 * median_step
+    large_step = 20.0 * (median_step or 1.0)
     wrap_count = int((steps < -large_step).sum() - (steps > large_step).sum())
-    regular_steps = steps[np.abs(steps - median_step) <= 0.7 * median_step]
-    if len(regular_steps) < INTACT_SHARE * len(steps):
+    regular_steps = steps[np.abs(steps - median_step) <= max(1.0, 0.7 * median_step)]
+    is_regular = len(regular_steps) >= INTACT_SHARE * len(steps) and regular_steps.min() >= 0.0
+    if not is_regular or np.mean(steps == 0.0) >= INTACT_SHARE:
         return False, None, wrap_count
-    ticks_per_frame = float(regular_steps.mean())
-    tick_rate_Hz = ticks_per_frame * frame_rate_Hz
-    deviation, nearest_tick_rate_Hz = min((abs(tick_rate_Hz / usual_Hz - 1.0), usual_Hz) for usual_Hz in CLOCKS)
-    clock = CLOCKS[nearest_tick_rate_Hz] if deviation < tolerance else None
-    is_counter = ticks_per_frame == 1.0 and (clock is None or bool(np.mean(steps == 0.0) < 0.01))
+    tick_rate_Hz = float(regular_steps.mean()) * frame_rate_Hz
+    usual_rates_Hz = [*CLOCKS, *(frame_rate_Hz * 256.0**size for size in (1, 2, 3))]  # size of the channel's bytes
+    deviation, nearest_rate_Hz = min((abs(tick_rate_Hz / usual_Hz - 1.0), usual_Hz) for usual_Hz in usual_rates_Hz)
+    clock = CLOCKS.get(nearest_rate_Hz) if deviation < tolerance else None
+    is_counter = np.mean(steps == 1.0) >= INTACT_SHARE and (clock is None or bool(steps.all()))
     return is_counter, clock, wrap_count
 
 
