@@ -199,7 +199,7 @@ NUMBERS = np.arange(FRAMES)
     ("number_format", "numbers", "rate_Hz", "field"),
     [
         ("B", NUMBERS % 256, RATE_HZ, {"name": "seq", "type": "u8"}),  # counter that wraps
-        ("I", NUMBERS + (NUMBERS % 10 == 3), 1000.0, {"name": "t_ms", "type": "u32"}),  # repeats milliseconds
+        ("I", NUMBERS + (NUMBERS == 3), 1000.0, {"name": "t_ms", "type": "u32"}),  # repeats a millisecond
         ("H", NUMBERS // 2, 2000.0, {"name": "t_ms", "type": "u16"}),
         ("d", 3.8e9 + 2 * NUMBERS, 0.5, {"name": "t_s", "type": "f64"}),  # seconds since 1904, as in LabVIEW
         ("I", 2.0**21 / RATE_HZ * NUMBERS, RATE_HZ, {"name": "ch1", "type": "i16"}),  # low bytes of a Unix time
