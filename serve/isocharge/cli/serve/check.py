@@ -49,10 +49,8 @@ def check_command(
         each_press = result.pop("each")
         summaries = {name: result.pop(name) for name in ("position_mm", "force_percent")}
         errors = {name: summary for name, summary in summaries.items() if summary is not None}
-        # The table contains the presses with the largest errors, in the order of the file. The squared errors of x, y
-        # and F are divided by their variances. An unknown error is NaN and does not count.
-        chi_squared = np.nansum(check.errors.squared_ratio, axis=1)  # shape (n,)
-        worst_indices = np.argsort(-chi_squared, kind="stable")[:MAX_ROWS]
+        # The table contains the presses with the largest errors, in the order of the file.
+        worst_indices = np.argsort(-check.errors.chi_squared, kind="stable")[:MAX_ROWS]
         if check.presses > MAX_ROWS:
             say(f"the table has the {MAX_ROWS} worst of {check.presses} presses; --json has all")
         rows = [{name: each_press[index][name] for name in SHOWN} for index in sorted(worst_indices)]

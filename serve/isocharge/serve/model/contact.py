@@ -137,6 +137,28 @@ def add_covariance(contacts: Singles, covariance: Array) -> Singles:
     return total.astype(np.float32)
 
 
+CORRELATION_RIDGE = 1e-5
+"""Number that is added to the diagonal of the correlations, which models compute in single precision.
+
+The smallest eigenvalue of the correlations of released models is between -5e-6 and 1.
+"""
+
+
+def correlation_matrices(contacts: ArrayLike) -> Array:
+    """Return the matrices of the correlations between the errors of x, y and the force, shape (..., 3, 3).
+
+    The correlations are made slightly smaller, so that all eigenvalues are positive in spite of rounding errors.
+
+    Args:
+        contacts: The ten numbers of each contact, shape (..., 10).
+    """
+    xy, xF, yF = range(len(Contact._fields))[CORRELATION_COLUMNS]
+    columns = [[0, xy, xF], [xy, 0, yF], [xF, yF, 0]]  # the column 0 on the diagonal is replaced
+    matrices = np.asarray(contacts, dtype=float)[..., columns] / (1.0 + CORRELATION_RIDGE)
+    matrices[..., range(3), range(3)] = 1.0
+    return matrices
+
+
 def write_finite(write: Callable[..., object], values: Any) -> bool:
     """Write the charges of one press as float32 numbers, and check that they are finite.
 

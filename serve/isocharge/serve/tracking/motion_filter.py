@@ -17,7 +17,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import BEYOND, MISFIT, SATURATED
-from isocharge.serve.model.contact import Contact
+from isocharge.serve.model.contact import Contact, correlation_matrices
 from isocharge.serve.record.record import TrackedContact
 
 VALUES = slice(0, 3)
@@ -87,12 +87,6 @@ LARGEST_STD = np.array([100.0, 100.0, 3.0])
 
 The first frames of a slow press may have much larger standard deviations. Without the limit, rounding errors could make
 eigenvalues of the covariance of the state negative.
-"""
-
-CORRELATION_RIDGE = 1e-5
-"""Number that is added to the diagonal of the correlations, which models compute in single precision.
-
-The smallest eigenvalue of the correlations of released models is between -5e-6 and 1.
 """
 
 NOISE_INTERVAL_s = 0.0045
@@ -358,6 +352,5 @@ def _measured_values(contact: Contact) -> tuple[Array, Array]:
     force_N = max(smallest_force_N, contact.force_N)
     stated_std = [contact.x_std_mm, contact.y_std_mm, contact.force_std_N / force_N]
     std = np.clip(stated_std, 1e-5 * LARGEST_STD, LARGEST_STD)
-    xy, xF, yF = contact.xy_correlation, contact.xF_correlation, contact.yF_correlation
-    correlation = np.array([[1.0, xy, xF], [xy, 1.0, yF], [xF, yF, 1.0]]) + CORRELATION_RIDGE * _IDENTITY
-    return np.array([contact.x_mm, contact.y_mm, math.log(force_N)]), correlation * np.outer(std, std)
+    covariance = correlation_matrices(contact) * np.outer(std, std)
+    return np.array([contact.x_mm, contact.y_mm, math.log(force_N)]), covariance
