@@ -113,13 +113,6 @@ def test_page_does_not_describe_methods_that_are_left_out():
         assert ("Triangulation" in text) == ("fitted to the other 48 presses" in text) == is_described
 
 
-def with_one_position(dataset):
-    """Move every second press to the centre, and the others out of the working area of the model."""
-    is_moved_out = np.arange(len(dataset.samples)) % 2
-    samples = dataset.samples
-    return with_samples(dataset, x_mm=is_moved_out * (20.0 + samples.x_mm), y_mm=is_moved_out * samples.y_mm)
-
-
 def measured(dataset, forces_N):
     """Return 300 measured presses at one place, of which 260 have the second force."""
     contact = np.repeat([[1.0, 1.0, force_N] for force_N in forces_N], [40, 260], axis=0)
@@ -139,7 +132,6 @@ UNSUITABLE = {
         "of its forces, 0.05 to 2 N, got none among 6000 presses",
     ),
     "forces of measured presses": (lambda d: measured(d, (1.0, 30.0)), NAME, "at least 50 presses .* got 40 of 300"),
-    "one position": (with_one_position, NAME, "50 positions, got 3000 at 1"),
 }
 """Changes of the dataset, the model, and the message that refuses them."""
 
@@ -166,6 +158,8 @@ def test_limit_of_an_inaccurate_series_is_left_out_with_the_reason(dataset, tmp_
     (reason,) = section["left_out"]
     assert re.match(r"Cramér-Rao limit: .* 24\d\d presses has an error of 0\.\d+ % of a charge", reason)
     assert f"Left out: {reason}." in (tmp_path / "out" / "report.md").read_text("utf-8")
+    monkeypatch.setattr(evaluation, "noise_of", lambda _: NoiseModel("larger", 30.0, 0.0))
+    assert evaluation.evaluate_dataset(few, find_model(NAME), SMALL).limits
 
 
 def test_existing_folder_is_refused(dataset, tmp_path):

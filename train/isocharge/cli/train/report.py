@@ -66,7 +66,7 @@ def report_command(
     if model and len(model) != len(datasets):
         raise InputError(f"--model: expected one model for each of {len(datasets)} datasets, got {len(model)}")
     for option, value in (("--sensor", sensor), ("--probe", probe)):
-        if value is not None and not any(path.is_file() for path in datasets):
+        if value is not None and all(path.is_dir() for path in datasets):
             raise InputError(f"{option} {value}: the dataset folders contain sensor and probes; leave {option} out")
     loaded_datasets = [_read_dataset(path, sensor, probe or DEFAULT_PROBE) for path in datasets]
     model_names = model or [dataset.sensor.name for dataset in loaded_datasets]

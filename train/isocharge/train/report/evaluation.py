@@ -244,7 +244,8 @@ def evaluate_dataset(dataset: Dataset, model_folder: Path, settings: Settings) -
         task = FittingTask(presses, charge_map, noise)
         methods += [build_method(task) for build_method in METHOD_BUILDERS]
         # The limit follows from the derivatives of the series, and the noise of measured presses is unknown.
-        if not measured and charge_map.charge_std >= noise.gain:
+        series_error_pC = charge_map.charges(validation.contact) - validation.charge
+        if not measured and rms(series_error_pC / noise.sigma(validation.charge)) >= 1.0:
             failure_reasons.append(
                 f"Cramér-Rao limit: a series that is fitted to {len(train)} presses has an error of "
                 f"{100.0 * charge_map.charge_std:.2g} % of a charge, more than the noise; simulate more presses"
