@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.stats import multivariate_normal
 
-from isocharge.common.errors import ConfigError, TrainingError
+from isocharge.common.errors import ConfigError, InputError, TrainingError
 from isocharge.common.progress import listening
 from isocharge.simulate import Domain, NoiseModel
 from isocharge.train import FitConfig, LabelledPresses, NetworkConfig, TrainingConfig, fit, load_config
@@ -107,6 +107,8 @@ def test_a_seed_gives_the_same_network_and_leaves_the_callers_state_alone(datase
 def test_settings_of_a_program_are_checked_like_those_of_a_file(dataset):
     with pytest.raises(ConfigError, match=r"training\.steps: expected a whole number from 1 .* got 0"):
         fit(dataset, settings(steps=0))
+    with pytest.raises(InputError, match="expected white noise above 0 pC, got that of 'mine'"):
+        fit(dataset, settings(noise=NoiseModel("mine", 0.0, 0.02)))
 
 
 def random_posterior(count, seed):
@@ -261,8 +263,7 @@ def test_the_default_file_states_the_defaults():
 
 def test_keys_left_out_keep_their_defaults(tmp_path):
     config = load_config(write(tmp_path, "[training]\nsteps = 7\n"))
-    assert config == FitConfig(network=NetworkConfig(), training=TrainingConfig(steps=7))
-    assert load_config(CONFIGS / "quick.toml").network == NetworkConfig()
+    assert config == FitConfig(training=TrainingConfig(steps=7))
 
 
 def test_focused_distance_is_a_mean_with_smaller_weights_for_long_targets(monkeypatch):

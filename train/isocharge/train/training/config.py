@@ -139,9 +139,13 @@ class TrainingConfig(Settings, frozen=True):
         """Noise model that the setting `noise` contains or names.
 
         Raises:
-            InputError: If the name is unknown.
+            InputError: If the name is unknown, or the noise is only proportional to the charge. Misfits are measured in
+                standard deviations of the noise, which must not be zero for a charge of zero.
         """
-        return noise_model(self.noise) if isinstance(self.noise, str) else self.noise
+        noise = noise_model(self.noise) if isinstance(self.noise, str) else self.noise
+        if noise.gain > 0.0:
+            noise.check_white()
+        return noise
 
 
 class FitConfig(Settings, frozen=True):
