@@ -173,7 +173,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
             raise WrongKey("electrodes", "names that differ", self.electrodes)
         displayed_texts = {"electrodes": self.electrodes, "probes": self.probes, "sensor.name": (sensor_name,)}
         for key, texts in displayed_texts.items():
-            if not all(is_printable(text) for text in texts):
+            if not all(map(is_printable, texts)):
                 raise WrongKey(key, "printable characters", texts)
         min_force_N, max_force_N = self.force_range_N
         if min_force_N > max_force_N:

@@ -60,9 +60,8 @@ class StdFactor(NamedTuple):
         Returns:
             The factor.
         """
-        is_known = np.isfinite(error)
-        degrees = is_known.sum(axis=1)
-        squared_size = np.sum(np.where(is_known, error / std, 0.0) ** 2, axis=1)[degrees > 0]
+        degrees = np.isfinite(error).sum(axis=1)
+        squared_size = np.nansum((error / std) ** 2, axis=1)[degrees > 0]
         scores = np.sort(np.sqrt(squared_size / np.take(REGION_QUANTILES, degrees[degrees > 0] - 1)))
         # The k-th smallest score is at least the quantile p of all scores if at most k - 1 of the n scores lie below
         # this quantile. The scores are independent, so the number below the quantile has a binomial distribution.

@@ -99,7 +99,7 @@ class ChannelNoise(GaussianNoise):
             Noise model with the white noise and the noise of the gain of each channel.
         """
         different_rows = np.unique(np.column_stack([unit_contact, charge]), axis=0)
-        unit_contact, charge = np.split(different_rows, [unit_contact.shape[1]], axis=1)
+        unit_contact, charge = np.split(different_rows, [3], axis=1)
         size, residual = _repeated_residuals(unit_contact, charge)
         # A channel that is silent at repeated contacts does not show its noise there.
         if np.count_nonzero(np.unique(size, axis=0), axis=0).min() < MIN_REPEATED_CONTACTS:
@@ -202,7 +202,7 @@ class LocalPlanes:
         neighbours = nearest[:, 1:]  # the nearest contact is the contact itself
         offsets = contact[neighbours] - contact[:, None]
         # The constant, the offsets of the neighbours, and their products, shape (n, number of neighbours, 10)
-        first, second = np.triu_indices(offsets.shape[2])
+        first, second = np.triu_indices(3)
         products = offsets[:, :, first] * offsets[:, :, second]
         columns = np.concatenate([np.ones_like(offsets[:, :, :1]), offsets, products], axis=2)
         # The pseudoinverse contains the weights of the neighbours in the least-squares solution.
@@ -210,7 +210,7 @@ class LocalPlanes:
         # The first coefficient is the value at the contact, and the next three are the slopes; shape (n, 10, k).
         coefficients = weights @ mean_value[neighbours]
         value = coefficients[:, 0]
-        slope = coefficients[:, 1 : 1 + offsets.shape[2]].swapaxes(1, 2)  # shape (n, k, 3)
+        slope = coefficients[:, 1:4].swapaxes(1, 2)  # shape (n, k, 3)
 
         # A residual contains the noise of the mean value and the noise of the plane.
         plane_variance = (weights[:, 0] ** 2 / press_count[neighbours]).sum(axis=1)
@@ -273,7 +273,7 @@ def _average_repeated(unit_contact: Array, values: Array) -> tuple[Array, Array,
     # Compute the mean of each coordinate and of each value over the presses of each contact.
     table = np.column_stack([unit_contact, values])
     sums = np.stack([np.bincount(contact_of_press, column) for column in table.T], axis=1)
-    contact, mean_value = np.split(sums / press_count[:, None], [unit_contact.shape[1]], axis=1)
+    contact, mean_value = np.split(sums / press_count[:, None], [3], axis=1)
     return contact, mean_value, press_count, contact_of_press
 
 
@@ -349,5 +349,5 @@ def misfit_noise(noise: AnyNoise) -> AnyNoise | NoiseModel:
 
     The result is the noise of the training or, if the training has no noise, the noise `reference`.
     """
-    has_noise = np.any(np.asarray(noise.white) > 0.0)
+    has_noise = np.any(noise.white)
     return noise if has_noise else noise_model("reference")

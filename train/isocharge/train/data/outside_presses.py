@@ -65,8 +65,9 @@ class OutsidePresses:
             contact = np.concatenate([pool.contact, outside.contact])
             pool = LabelledPresses(contact, np.concatenate([pool.charge, outside.charge]))
         pool = pool[np.random.default_rng(seed).permutation(len(pool))]
-        train = pool[: len(pool) // 2]
-        test = pool[len(pool) // 2 :]
+        half_count = len(pool) // 2
+        train = pool[:half_count]
+        test = pool[half_count:]
         _, max_force = domain.force_range
         test = test[test.contact[:, 2] >= max_force / FORCE_RATIO]
         if len(test) < N_NEIGHBOURS:
@@ -89,5 +90,5 @@ class OutsidePresses:
             from_mm=round(self.domain.radius, 4),
             to_mm=round(self.outer, 4),
             force_N=(rounded(smallest_force), rounded(max_force)),
-            share=tuple(tuple(ring) for ring in shares.tolist()),
+            share=tuple(map(tuple, shares.tolist())),
         )

@@ -222,8 +222,7 @@ def position_ranks(contact: Array) -> Array:
     rounded_position = np.round(contact[:, :2], 3) + 0.0  # the addition converts -0.0 into 0.0
     positions, position_of_press = np.unique(rounded_position, axis=0, return_inverse=True)
     order = np.argsort([sha256_of(position.tobytes()) for position in positions])
-    rank = np.empty(len(positions))
-    rank[order] = np.arange(len(positions)) / len(positions)
+    rank = np.argsort(order) / len(order)  # the inverse of a permutation is the order of its elements
     return rank[position_of_press.ravel()]  # some versions of NumPy return two axes
 
 
