@@ -162,13 +162,11 @@ def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
         charge: Charges, shape (n, n_electrode), pC.
 
     Returns:
-        Coefficients of the Chebyshev polynomials, shape (SIZE_DEGREE + 1,).
+        Coefficients of the Chebyshev polynomials, shape (n,) with n up to SIZE_DEGREE + 1.
     """
     size = np.maximum(np.linalg.norm(charge, axis=1), LOWEST_CHARGE)
     degree = determined_degree(unit_log_force, SIZE_DEGREE)
-    coefficients = np.zeros(SIZE_DEGREE + 1)
-    coefficients[: degree + 1] = chebyshev.chebfit(unit_log_force, np.log(size), degree)
-    return coefficients
+    return np.asarray(chebyshev.chebfit(unit_log_force, np.log(size), degree))
 
 
 def determined_degree(coordinate: Array, largest: int) -> int:

@@ -32,7 +32,7 @@ def c_array(name: str, values: NDArray[Any]) -> str:
     """
     number_type = {"int8": "signed char", "uint32": "unsigned"}.get(values.dtype.name, "float")
     as_text = c_float if number_type == "float" else str
-    literals = ", ".join(as_text(value) for value in values.ravel())
+    literals = ", ".join(map(as_text, values.ravel()))
     # While the lines are broken, a comma follows the last number, too. The last number then counts with the same length
     # as the other numbers. The last comma is removed afterwards. Lines are not broken after a minus sign.
     lines = wrap(f"{literals},", break_on_hyphens=False)

@@ -197,7 +197,7 @@ def _validity_literals(validity: Validity) -> dict[str, object]:
     has_yield_force = math.isfinite(validity.yield_force_N)
     return {name: c_float(value) for name, value in numbers.items()} | {
         "corner_count": len(validity.corners_mm),
-        "corners": ", ".join(c_float(coordinate) for coordinate in validity.corners_mm.ravel()),
+        "corners": ", ".join(map(c_float, validity.corners_mm.ravel())),
         "yield_force": c_float(validity.yield_force_N) if has_yield_force else "HUGE_VALF",
     }
 
