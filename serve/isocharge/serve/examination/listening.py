@@ -167,9 +167,13 @@ class Capture:
 
     @property
     def rate_Hz(self) -> float:
-        """Frame rate, Hz; 0 if there are fewer than two frames, or if the times of the frames do not increase."""
-        span_s = float(elapsed_times(self.frames).max(initial=0.0))
-        return (len(self.frames) - 1) / span_s if span_s > 0.0 else 0.0
+        """Frame rate in the second half of the frames, Hz; 0 if the times of these frames do not increase.
+
+        The times of the first frames are only assumed if the frames contain no time.
+        """
+        later_times_s = elapsed_times(self.frames)[len(self.frames) // 2 :]
+        span_s = float(np.ptp(later_times_s)) if self.frames else 0.0
+        return (len(later_times_s) - 1) / span_s if span_s > 0.0 else 0.0
 
     @property
     def names(self) -> tuple[str, ...]:
