@@ -38,8 +38,6 @@ def test_live_page_with_allow_host_shows_a_press_and_carries_out_requests(board,
     samples, state = follow(client, lambda samples, state: touched(samples, state) and state.get("rate_Hz"))
     is_contact = samples["contact"] == 1.0
     assert [np.median(samples[name][is_contact]) for name in ("x_mm", "force_N")] == pytest.approx([3.0, 1.0], abs=0.01)
-    assert state["counters"]["lost"] == 0
-    assert client.session()["film"]["model"] == "linear/1"
     for host in ("proxy.example", client.url.removeprefix("http://")):  # a proxy keeps or replaces the name in Host
         assert client.send("GET", "/session.json", Host=host, Origin="http://proxy.example")[0] == 200
 
