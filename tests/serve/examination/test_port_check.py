@@ -62,7 +62,7 @@ def test_check_of_a_healthy_board():
     assert "gain" not in examined(charges()).device
     report = examined(charges(), device=AT_REST, electrodes=FOUR[:3])
     assert (report.baud, report.format) == (115200, "binary frames of isocharge")
-    assert not (report.missing or report.missing_for_held_presses)
+    assert not {*report.missing, *report.missing_for_held_presses}
     assert (report.good, report.bad, report.lost, report.repeated, report.device_clock) == (400, 0, 0, 0, True)
     assert round(report.rate_Hz) == 200
     assert [round(channel.offset_pC) for channel in report.channels] == [5, -6, 7]

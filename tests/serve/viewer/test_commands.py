@@ -35,7 +35,7 @@ def test_live_page_with_allow_host_shows_a_press_and_carries_out_requests(board,
     monkeypatch.chdir(tmp_path)
     options = ("--output", "none", "--allow-host", "proxy.example")
     process, client = start_live("stream", "linear", "--port", board.url, *options)
-    samples, state = follow(client, lambda samples, state: touched(samples, state) and state.get("rate_Hz"))
+    samples, _ = follow(client, lambda samples, state: touched(samples, state) and state.get("rate_Hz"))
     is_contact = samples["contact"] == 1.0
     assert [np.median(samples[name][is_contact]) for name in ("x_mm", "force_N")] == pytest.approx([3.0, 1.0], abs=0.01)
     for host in ("proxy.example", client.url.removeprefix("http://")):  # a proxy keeps or replaces the name in Host
