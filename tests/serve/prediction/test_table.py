@@ -13,7 +13,7 @@ import pytest
 
 from isocharge.common.errors import ChargeError
 from isocharge.serve import Contact, Contacts, Predictor, Validity, read_charges, table_records, write_contacts
-from isocharge.serve.model.contact import MISFIT_LIMIT, inside_polygon
+from isocharge.serve.model.contact import MISFIT_LIMIT, disk_corners, inside_polygon
 
 NAMES = ("A", "B", "C")
 
@@ -145,6 +145,11 @@ def test_flags_outside_beyond_misfit_and_stress(film, changes, flags):
     contact = GOOD._replace(**changes)
     assert validity.flags(contact) == flags
     assert validity.batch_flags(Contacts(*np.float32([contact]).T)) == [flags]
+
+
+def test_only_a_disk_is_described_by_its_radius():
+    for step, text in ((1, "up to 8 mm from the centre"), (16, "from (-8.01, -8.01) to (8.01, 8.01) mm")):
+        assert Validity(disk_corners(8.0)[::step], (0.05, 2.0)).area_text == text
 
 
 def test_contacts_as_whole_numbers():

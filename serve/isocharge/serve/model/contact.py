@@ -247,10 +247,10 @@ The limit of the force is the largest force times this factor. The limit of the 
 area is the radius of the circle around the working area times this factor.
 """
 
-MAX_CENTRE_OFFSET = 0.05
-"""Largest distance between the origin and the centre of a working area that is called centred, dimensionless.
+MIN_ROUNDNESS = 0.95
+"""Smallest ratio of the largest circle inside a round working area to the smallest circle around it, dimensionless.
 
-The distance is relative to the radius of the area.
+The centre of both circles is the origin.
 """
 
 
@@ -337,11 +337,11 @@ class Validity:
     def area_text(self) -> str:
         """Description of the working area for messages.
 
-        The text states the radius of the area if its centre is close to the origin, and its bounding box otherwise.
+        The text states the radius of the area if it is a disk around the origin, and its bounding box otherwise.
         """
-        radius_mm = np.linalg.norm(self.corners_mm, axis=1).max()
-        is_centred = math.hypot(*self.centre_mm) < MAX_CENTRE_OFFSET * radius_mm
-        if is_centred:
+        radius_mm = math.sqrt(self.inscribed_radius_squared_mm2)
+        is_round = radius_mm > MIN_ROUNDNESS * np.linalg.norm(self.corners_mm, axis=1).max()
+        if is_round:
             return f"up to {radius_mm:.3g} mm from the centre"
         # The limits are the corners of the bounding box of the working area.
         left_mm, bottom_mm = self.corners_mm.min(axis=0)
