@@ -20,11 +20,21 @@ PRESSES = [(0.0, 0.0, 1.0), (6.0, 2.0, 0.5), (-5.0, 3.0, 2.0), (2.0, -6.0, 0.2),
 SHOWN = """[".x b", ".y b", ".force b"].map(
   (name) => Number(isocharge.page.film.find(name).textContent.replace("\\u2212", "-")))"""
 
-LATENCY = """() => {
-  const { film } = isocharge.page;
+LATENCY = """async () => {
+  const { film } = isocharge.page, { fetch } = window;
+  const wait = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
   film.ages = [-56, -50, -40];
   film.showHealth();
-  return film.find(".age").textContent;
+  const shown = film.find(".age").textContent;
+  window.fetch = async (...request) => {
+    await wait(500);
+    const answer = await fetch(...request);
+    await wait(500);
+    return answer;
+  };
+  await wait(2500);
+  window.fetch = fetch;
+  return `${shown}, ${film.ages.at(-1) > 450}`;
 }"""
 
 NOTE = """() => {
@@ -89,7 +99,7 @@ def test_live_page_shows_numbers_until_the_frames_stop_and_sends_requests(stream
     x, y, force = wait_for(page, f"isocharge.page.film.drawnKind === 'contact' && {SHOWN}")
     assert min(np.hypot(px - x, py - y) + abs(pressed - force) for px, py, pressed in PRESSES) < 0.3
     latency = page.evaluate(LATENCY)
-    assert latency == "6 ms"  # the board's clock is 56 ms ahead
+    assert latency == "6 ms, true"  # the board's clock is 56 ms ahead; a slow answer travels for 500 ms
     assert page.evaluate(NOTE) == "hot"  # the server's clock is a minute ahead
     page.get_by_role("button", name="Tare").click()
     wait_for(page, "isocharge.page.film.drawnKind === 'tare'")

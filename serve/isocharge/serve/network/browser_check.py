@@ -95,7 +95,8 @@ class AccessCheck:
         if origin and not self._is_own_page(origin, host):
             raise OriginError(
                 f"Origin: expected a page of this server, got a page of {shown(origin)}; open {shown(host)} "
-                "itself, or name the page's host by --allow-host (allowed_hosts of asgi_app)"
+                "itself, or allow a page of another host name (not of another port) by --allow-host (allowed_hosts of "
+                "asgi_app)"
             )
 
         # Without `Origin`, `Sec-Fetch-Site` decides. Browsers send `same-origin` if a page of this server sends the

@@ -38,12 +38,13 @@ export class Connection {
       const beginsAnew = first === null || isElsewhere;
       const most = beginsAnew ? MOST : Math.min(Math.max(Math.ceil(RATE_PER_MS * elapsedMs), 1), MOST);
       const answer = await this.post({ do: "read", first: beginsAnew ? null : first, until_s, version, most });
+      const travelMs = (performance.now() - nowMs) / 2; // of the answer: half of the time since the question
       first = Math.max(answer.first, beginsAnew ? 0 : first);
       this.pause = FIRST_PAUSE_MS;
       this.on.link("live", "live");
       if (answer.state) { version = answer.version; this.on.state(answer.state); }
       const samples = answer.samples.map((row) => decode(row, columns));
-      this.on.samples({ samples, beginsAnew, missed: answer.missed, sent_s: answer.sent_s });
+      this.on.samples({ samples, beginsAnew, missed: answer.missed, sent_s: answer.sent_s, travelMs });
       if (!samples.length) await new Promise((resolve) => setTimeout(resolve, IDLE_MS));
       await new Promise(requestAnimationFrame);
     }

@@ -50,7 +50,7 @@ export class FilmView {
     this.history.trim();
     this.missed += message.missed;
     this.ahead_s = message.sent_s - Date.now() / 1000;
-    if (message.samples.length) Object.assign(this, { arrivedMs: nowMs, sent_s: message.sent_s, receivedMs: nowMs, isNew: true });
+    if (message.samples.length) Object.assign(this, { arrivedMs: nowMs, sent_s: message.sent_s, sentMs: nowMs - message.travelMs, isNew: true });
   }
 
   update(state) {
@@ -161,10 +161,10 @@ export class FilmView {
   /** Present time by the server's clock, s. The clocks of the two machines may differ. */
   get server_s() { return Date.now() / 1000 + this.ahead_s; }
 
-  /** From the reading to this picture: to the sending by the server's clock, from the arrival by this one's. */
+  /** From the reading to this picture: to the sending by the server's clock, from the sending by this one's. */
   noteAge(sample, nowMs) {
     if (!sample) return;
-    this.ages.push((this.sent_s - sample.t) * 1000 + nowMs - this.receivedMs);
+    this.ages.push((this.sent_s - sample.t) * 1000 + nowMs - this.sentMs);
     if (this.ages.length > 600) this.ages.splice(0, 300);
   }
 }
