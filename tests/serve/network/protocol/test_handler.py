@@ -186,7 +186,7 @@ def test_bad_bodies_are_refused_with_the_reason(ask, case):
     assert re.search(message, error)
 
 
-@pytest.mark.parametrize("length", ["", "-1", "+5", "1_0", "1e3", "9999", "9" * 5000, "0x10", " 5", "٣"])
+@pytest.mark.parametrize("length", ["", "-1", "+5", "1_0", "9999", "9" * 5000, "٣"])
 def test_wrong_inference_header_content_length_is_refused(ask, length):
     body, _ = binary_request(np.float32(PRESS))
     status, error = refusal(ask("POST", INFER, body, inference_header_content_length=length))

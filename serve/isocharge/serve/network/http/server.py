@@ -157,10 +157,12 @@ class Connection(HttpToolsProtocol):
         """Let the response to the open request close the connection. uvicorn calls this method when the server stops.
 
         A connection without an open request stays open for another 0.1 s, because its client may have sent a request
-        that has not been read yet.
+        that has not been read yet. The connection is then ended without waiting for the client, which TLS would do.
         """
-        if self._is_stopping or not self.is_idle:
+        if not self.is_idle or self.transport.get_write_buffer_size() > 0:
             super().shutdown()
+        elif self._is_stopping:
+            self.transport.abort()
         else:
             self._is_stopping = True
             self.loop.call_later(0.1, self.shutdown)
