@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 from tests.simulate.conftest import COARSE
 
-from drawn_contacts import draw_contacts
 from isocharge.common.errors import SceneError, SolveError
 from isocharge.simulate import (
     Circle,
     ForwardMap,
     identify,
-    limits_at,
     load_sensor,
     noise_model,
     parse_probe,
@@ -52,13 +50,14 @@ def test_identification_to_dict_can_be_written_as_json(identification):
     assert picture.axes[2].lines[0].get_color() == COLOURS[0]
 
 
-def test_statistics_agree_with_random_positions(identification):
-    contacts = (draw_contacts(0, 800, 4.0, (force, force)) for force in (0.5, 1.0, 2.0))
-    limits = [limits_at(identification.charges, contact, REFERENCE) for contact in contacts]
-    rows = identification.to_dict()["limits_in_working_area"]
-    medians = [(row["position_median_mm"], row["force_median_percent"]) for row in rows]
-    expected = [(np.median(limit.position), 100.0 * np.median(limit.force)) for limit in limits]
-    np.testing.assert_allclose(medians, expected, rtol=0.05)
+def test_statistics_of_errors_that_equal_the_distance_are_those_of_a_disk(identification):
+    """The rms and the median of the distance from the centre of a disk are its radius divided by the root of two."""
+    limits = identification.inner_maps[1]
+    distance = np.linalg.norm(limits.rings.position, axis=2)
+    numbers = replace(limits, position=distance, relative_force=distance / 100.0).statistics()
+    for name in ("position_rms_mm", "force_rms_percent"):
+        assert numbers[name] == pytest.approx(4.0 / 2.0**0.5, rel=1e-4)
+    assert (numbers["force_N"], numbers["position_median_mm"]) == pytest.approx((1.0, 4.0 / 2.0**0.5), abs=0.04)
 
 
 def test_working_area_with_an_electrode_at_the_centre_is_small(film):

@@ -82,9 +82,11 @@ class LimitMap:
         The weight of a position is the area that it represents. Errors of the force are in percent of the force.
         """
         # The area that a position represents is proportional to its distance from the centre, and therefore to the
-        # number of its ring. In the median, the error of a position of ring k counts k times.
+        # number of its ring. The outermost ring represents half as much, because it is the edge of the disk. In the
+        # median, an error is repeated according to its area.
         n_ring, n_angle = self.position.shape
-        area = np.repeat(np.arange(1, n_ring + 1), n_angle)
+        ring_area = np.append(2 * np.arange(1, n_ring), n_ring)
+        area = np.repeat(ring_area, n_angle)
         statistics = {"force_N": self.force}
         for name, errors in (
             ("position_{}_mm", self.position.ravel()),
