@@ -19,6 +19,7 @@ Even without folds, two distant contacts may have the same charges. The search f
 the map.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -186,16 +187,18 @@ NO_PAIRS = AmbiguousPairs(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
 """Result without any pair."""
 
 
-def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float, places: int = 1000) -> AmbiguousPairs:
+def find_ambiguous_pairs(
+    charge_map: ChargeMap, noise: NoiseModel, forces: Sequence[float], places: int = 1000
+) -> AmbiguousPairs:
     """Find pairs of distant contacts whose charges cannot be distinguished because of the noise.
 
-    The first contact of a pair is a press with the given force at one of several positions. For each first contact, the
-    search for the nearest contact starts at distant contacts with similar charges.
+    The first contact of a pair is a press with one of the given forces at one of several positions. For each first
+    contact, the search for the nearest contact starts at distant contacts with similar charges.
 
     Args:
         charge_map: Map that computes the charges of contacts.
         noise: Noise of the readings.
-        force: Force of the first contact of each pair, N. The second contact may have any force of the map.
+        forces: Forces of the first contacts, N. The second contact of a pair may have any force of the map.
         places: Number of positions, which are distributed evenly over the disk.
 
     Returns:
@@ -203,7 +206,7 @@ def find_ambiguous_pairs(charge_map: ChargeMap, noise: NoiseModel, force: float,
     """
     # Choose the first contacts, and compute the distance above which a second contact counts as distant.
     position = INNER_RADIUS * charge_map.domain.radius * sunflower(places)
-    contact = contacts_at(position, force)
+    contact = np.concatenate([contacts_at(position, force) for force in forces])
     charge = charge_map.charges(contact)
     position_std = limits_at(charge_map, contact, noise).position
     smallest_distance = min(MIN_DISTANCE, MIN_RELATIVE_DISTANCE * charge_map.domain.radius)
@@ -288,8 +291,7 @@ class WorkingArea:
         """Sentences that describe the working area and the reason for its radius."""
         min_force, max_force = self.force_range
         sentences = [f"Working area: up to {self.radius:.3g} mm from the centre, {min_force:g} to {max_force:g} N."]
-        is_limited_by_error = self.error_radius < min(self.search_radius, self.fold_radius, self.pairs.radius)
-        if is_limited_by_error:
+        if self.bound == "error":
             if self.unambiguous_radius > self.radius:
                 sentences.append(f"Up to {self.unambiguous_radius:.3g} mm, the charges determine the contact uniquely.")
             sentences.append(
@@ -319,8 +321,9 @@ def working_area(
     error first exceeds its limit, the distance of the nearest fold, the radius of the nearest ambiguous pair, and the
     radius of the domain.
 
-    The error and the folds are computed at several forces, each at most 1.7 times the previous one. On a taut film, the
-    charges change their sign with increasing force, and a fold may lie near the centre at a single one of these forces.
+    The errors, folds and pairs are computed at several forces, each at most 1.7 times the previous one. On a taut film,
+    the charges change their sign with increasing force, and a fold or an ambiguous pair may exist at one of these
+    forces only.
 
     For forces from 0.05 to 2 N, the charge map is evaluated for about 500,000 contacts, or for about 200,000 contacts
     without the search for ambiguous pairs. Use a `ChargeSpline` instead of a forward map, which would take minutes.
@@ -358,15 +361,15 @@ def working_area(
     error_radius = search_radius
     if not is_within_limit.all():
         error_radius = float(np.append(0.0, rings.distance)[first_exceeding])
-    pairs = find_ambiguous_pairs(charge_map, noise, min_force) if search_pairs else NO_PAIRS
+    pairs = find_ambiguous_pairs(charge_map, noise, forces) if search_pairs else NO_PAIRS
 
-    # The smallest of the following radii bounds the working area. If the error never exceeds its limit, `error_radius`
-    # is the radius of the search, and the error is not a bound.
+    # The smallest of the following radii bounds the working area. The first of several equal radii is the bound: if the
+    # error never exceeds its limit, `error_radius` is the radius of the search.
     radii: dict[Bound, float] = {
         "searched": search_radius,
         "fold": fold_radius,
         "twins": pairs.radius,
-        "error": error_radius if error_radius < search_radius else np.inf,
+        "error": error_radius,
     }
     bound = min(radii, key=lambda reason: radii[reason])
     return WorkingArea(
