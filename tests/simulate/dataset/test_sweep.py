@@ -88,13 +88,11 @@ def test_presses_outside_the_radius_reach_up_to_the_clamp(small_dataset):
     assert distance.min() >= 8.0
     assert distance.max() == pytest.approx(42.8, abs=0.01)
     assert np.mean(distance < 25.0) == pytest.approx((25.0**2 - 8.0**2) / (42.8**2 - 8.0**2), abs=1e-3)
-    assert np.mean(outside.force_N < np.sqrt(0.05 * 2.0)) == pytest.approx(0.5, abs=1e-3)
     for i in np.flatnonzero(distance < 30.0)[:3]:
         expected = solved_charge(read.sensor, PROBE, (outside.x_mm[i], outside.y_mm[i]), outside.force_N[i])
         np.testing.assert_allclose(outside.charge_pC[i], expected, rtol=5e-3)
     about = read.manifest["outside"]
     assert (about["samples"], about["probe"], about["radius_mm"]) == (2048, "circle:1.0", [8.0, 42.8])
-    assert about["interpolation_error"] == 0.05
     assert read.manifest["yield_force_N"] == pytest.approx(0.873, rel=0.005)  # with a mesh of order 9
 
 
@@ -105,7 +103,7 @@ def test_a_sweep_without_presses_outside(changes):
 
 
 def test_run_sweep_writes_the_same_bytes_as_write_sweep_and_reports_progress(tmp_path):
-    """`run_sweep` stores its parts in a draft, and `write_sweep` does not. The datasets are equal."""
+    """`run_sweep` builds the forward map, and `write_sweep` uses a given map. The datasets are equal."""
     reports: dict[str, list] = {}
     with listening(lambda title, done, total, _: reports.setdefault(title, []).append((done, total))):
         drafted = run_sweep(tmp_path / "b" / "presses", SENSOR, (PROBE,), small(), COARSE)

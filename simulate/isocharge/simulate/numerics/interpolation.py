@@ -36,7 +36,7 @@ def lobatto_quadrature(order: int) -> Array:
 
     The Gauss-Lobatto rule with n + 1 nodes integrates every polynomial of degree 2 n - 1 or less exactly.
     """
-    return _read_only(np.asarray(2.0 / (order * (order + 1) * eval_legendre(order, lobatto_nodes(order)) ** 2)))
+    return _read_only(2.0 / (order * (order + 1) * eval_legendre(order, lobatto_nodes(order)) ** 2))
 
 
 @lru_cache(maxsize=32)

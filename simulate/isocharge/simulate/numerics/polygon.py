@@ -58,7 +58,7 @@ def is_convex(corners: Array) -> bool:
         return False
     # The convex hull of a polygon contains only the corners at which the polygon is strictly convex.
     n_hull_corner = len(shapely.get_coordinates(polygon.convex_hull)) - 1  # the first corner is repeated
-    return bool(n_hull_corner == len(corners))
+    return n_hull_corner == len(corners)
 
 
 def to_complex(corners: Array) -> Complexes:
