@@ -51,13 +51,12 @@ def test_identification_to_dict_can_be_written_as_json(identification):
 
 
 def test_statistics_of_errors_that_equal_the_distance_are_those_of_a_disk(identification):
-    """The rms and the median of the distance from the centre of a disk are its radius divided by the root of two."""
+    """The rms and the median of the distance from the centre are 4 mm divided by the root of two."""
     limits = identification.inner_maps[1]
     distance = np.linalg.norm(limits.rings.position, axis=2)
-    numbers = replace(limits, position=distance, relative_force=distance / 100.0).statistics()
-    for name in ("position_rms_mm", "force_rms_percent"):
-        assert numbers[name] == pytest.approx(4.0 / 2.0**0.5, rel=1e-4)
-    assert (numbers["force_N"], numbers["position_median_mm"]) == pytest.approx((1.0, 4.0 / 2.0**0.5), abs=0.04)
+    numbers = replace(limits, position=distance, relative_force=distance).statistics()
+    assert numbers["position_rms_mm"] == pytest.approx(8.0**0.5, rel=1e-4)
+    assert (numbers["force_N"], numbers["position_median_mm"]) == pytest.approx((1.0, 8.0**0.5), abs=0.04)
 
 
 def test_working_area_with_an_electrode_at_the_centre_is_small(film):
