@@ -1,6 +1,7 @@
 """Position of the mesh: areas, edges, load, and the location of points."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,9 +10,9 @@ from hypothesis import strategies as st
 
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, Ellipse, Film, Polygon, Probe, SolveSettings
-from isocharge.simulate.mesh.placed_mesh import place
+from isocharge.simulate.mesh.oval import oval_displacement
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.mesh.template import Template, locate_points, template_for
+from isocharge.simulate.mesh.template import Template, locate_points
 from isocharge.simulate.numerics.polygon import to_corners
 from isocharge.simulate.solver.load_case import LoadCase, choose_mesh
 
@@ -47,12 +48,12 @@ def presses(draw):
     angle = draw(st.floats(-np.pi, np.pi))
     distance = share * (RADIUS - probe.reach)
     at = (distance * np.cos(angle), distance * np.sin(angle))
+    film = replace(FILM, oval=draw(st.sampled_from([0.0, -0.05])))
     try:
-        case = LoadCase(FILM, probe, at, 1e-3, SolveSettings(layer=layer))
-        resolution = choose_mesh(case).resolution
+        placed = choose_mesh(LoadCase(film, probe, at, 1e-3, SolveSettings(layer=layer)))
     except SceneError:
         assume(False)
-    return probe, at, template_for(resolution, probe.topology), place(FILM, probe, at, resolution, layer)
+    return probe, at, placed.template, placed
 
 
 def exact_points(placement: Placement, mesh: Template, xi: np.ndarray, eta: np.ndarray) -> np.ndarray:
@@ -90,7 +91,9 @@ def test_locate_is_the_inverse_of_the_element_map(scene, seed):
     disk = np.sqrt(rng.random(120)) * np.exp(2j * np.pi * rng.random(120))
     near = placement.corners.mean() + 3.0 * probe.reach / RADIUS * disk[:100]
     rim = np.exp(2j * np.pi * rng.random(20))
-    film = np.concatenate([disk, near[np.abs(near) < 1.0], rim, placement.element_points(mesh).ravel()[::7]])
+    circular = np.concatenate([disk, near[np.abs(near) < 1.0], rim])
+    on_film = circular + oval_displacement(circular, placement.oval)
+    film = np.concatenate([on_film, placement.element_points(mesh).ravel()[::7]])
     if mesh.half:
         film = film.real + 1j * np.abs(film.imag)
     np.testing.assert_array_less(np.abs(found_again(placement, mesh, film) - film), accuracy(film, placement))

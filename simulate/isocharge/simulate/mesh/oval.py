@@ -2,15 +2,14 @@
 
 The shape of an oval clamp is the complex number e exp(2 i alpha). In the direction `angle`, the rim of the film lies at
 the distance 1 + e cos(2 (angle - alpha)) from the centre, in film radii. The shape of a circular clamp is 0.
+
+The class `placement.Placement` displaces the footprint without a deformation, and deforms only the rings of the mesh.
 """
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.simulate.sensor.film import Film
-
-UNDEFORMED_RADIUS = 0.5
-"""Radius within which the mesh of an oval film is the same as the mesh of a circular film, in film radii."""
 
 
 def film_oval(film: Film, direction: float | Array) -> Complexes:
@@ -23,58 +22,35 @@ def film_oval(film: Film, direction: float | Array) -> Complexes:
     return np.asarray(film.oval * np.exp(2j * (film.oval_axis - direction)))
 
 
-def to_oval(points: Complexes, oval: complex | Complexes) -> Complexes:
-    """Convert points of a circular film into points of an oval film.
+def oval_displacement(points: Complexes, oval: Complexes) -> Complexes:
+    """Return the displacement of points that deforms a circular film into an oval film.
 
-    Each point is displaced in the radial direction. Points within `UNDEFORMED_RADIUS` remain unchanged. The point of
-    the rim in the direction `angle` is displaced by e cos(2 (angle - alpha)) film radii.
+    Each point is displaced in the radial direction. The displacement increases with the fifth power of the distance
+    from the centre. The point of the rim in the direction `angle` is displaced by e cos(2 (angle - alpha)) film radii.
 
     Args:
         points: Points x + iy of the circular film, any shape, in film radii.
-        oval: Shape e exp(2 i alpha) of the clamp, a number or an array that broadcasts with the points.
+        oval: Shape of the clamp in the frame of the press, which broadcasts with the points.
 
     Returns:
-        Points x + iy of the oval film, same shape, in film radii.
+        Displacements x + iy, same shape, in film radii.
     """
-    radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)  # the displacement ratio is zero at `UNDEFORMED_RADIUS`
-    rim_displacement = (np.conj(oval) * (points / radius) ** 2).real  # e cos(2 (angle - alpha))
-    return points * (1.0 + _displacement_ratio(radius) * rim_displacement)
+    return np.asarray(points * np.abs(points) ** 2 * (np.conj(oval) * points**2).real)
 
 
-def from_oval(points: Complexes, oval: complex | Complexes) -> Complexes:
-    """Convert points of an oval film into points of a circular film. This function is the inverse of `to_oval`.
+def circular_distance(distance: Array, oval: Complexes, reach: float) -> Array:
+    """Compute the distance of a press from the centre of the circular film.
 
-    The radius of each point on the circular film is computed by Newton's method with an approximate slope.
+    A footprint that touches the rim of the oval film also touches the rim of the circular film. The displacement of the
+    footprint increases with the fifth power of the distance, up to that of the rim.
 
     Args:
-        points: Points x + iy of the oval film, any shape, in film radii.
-        oval: Shape e exp(2 i alpha) of the clamp, a number or an array that broadcasts with the points.
+        distance: Distance of the press from the centre of the oval film, any shape, in film radii.
+        oval: Shape of the clamp in the frame of the press, of the shape of `distance`.
+        reach: Distance from the centroid of the footprint to its farthest point, in film radii.
 
     Returns:
-        Points x + iy of the circular film, same shape, in film radii.
+        Distance before the displacement, same shape, in film radii.
     """
-    if not np.any(oval):
-        return points
-    oval_radius = np.maximum(np.abs(points), UNDEFORMED_RADIUS)
-    rim_displacement = (np.conj(oval) * (points / oval_radius) ** 2).real  # e cos(2 (angle - alpha))
-    radius = oval_radius
-    for _ in range(8):  # the error is then below 1e-10 for all accepted oval parameters
-        displacement_ratio = _displacement_ratio(radius)
-        residual = radius * (1.0 + displacement_ratio * rim_displacement) - oval_radius
-        # If d(r) is the displacement ratio at the radius r, the derivative of r d(r) is d + r d', which is 7 d at the
-        # rim. The factor 7 is used for all radii, because an approximate slope is sufficient for the convergence.
-        slope = 1.0 + 7.0 * rim_displacement * displacement_ratio
-        radius = radius - residual / slope
-    return points * (radius / oval_radius)
-
-
-def _displacement_ratio(radius: Array) -> Array:
-    """Compute the relative displacement at a radius, divided by the relative displacement of the rim.
-
-    A relative displacement is a displacement divided by the radius of the displaced point. The ratio increases with the
-    third power of the distance from `UNDEFORMED_RADIUS`, and is 1 at the rim.
-
-    Args:
-        radius: Radii of at least `UNDEFORMED_RADIUS`, any shape, in film radii.
-    """
-    return ((radius - UNDEFORMED_RADIUS) / (1.0 - UNDEFORMED_RADIUS)) ** 3
+    largest_distance = 1.0 + oval.real - reach  # of a footprint that touches the rim
+    return np.asarray(distance - oval.real * (distance / largest_distance) ** 5)

@@ -12,7 +12,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.simulate.mesh.blocks import Resolution
-from isocharge.simulate.mesh.oval import film_oval, from_oval
+from isocharge.simulate.mesh.oval import film_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.mesh.template import Template, template_for
 from isocharge.simulate.numerics.interpolation import (
@@ -107,8 +107,8 @@ class PlacedMesh:
         if not placement.probe.has_uniform_pressure:
             rule = _gauss_rule(self.resolution.order, PRESSURE_POINTS)
         nodal_points = self.points[template.footprint]
-        points = from_oval(nodal_points @ rule.values.T, placement.oval)  # on a circular film
-        points_from_centroid_mm = (points - placement.corners[-1]) / placement.rotation_and_scale
+        centroid = placement.corners[-1] + placement.footprint_displacement
+        points_from_centroid_mm = (nodal_points @ rule.values.T - centroid) / placement.rotation_and_scale
         pressure = placement.probe.pressure(points_from_centroid_mm)  # divided by the mean pressure
 
         # Integrate the pressure times each basis function.

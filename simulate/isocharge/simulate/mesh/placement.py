@@ -9,8 +9,9 @@ circle. The edges of a polygonal footprint remain straight, so the load is integ
 values of fields at the nodes are smooth functions of the position of the probe.
 
 The class `Placement` combines these steps for one or several presses on a circular film. If the clamp is oval, it then
-displaces the points by the functions of the module `oval`. The function `template.locate_points` finds the element that
-contains a film point.
+displaces the points. All points inside the innermost circle have the same displacement, so the footprint keeps its
+shape. In the rings, the displacement changes gradually into that of the rim (`oval.oval_displacement`). The function
+`template.locate_points` finds the element that contains a film point.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -28,7 +29,7 @@ from isocharge.simulate.mesh.conformal_map import (
     ring_edges,
     sector_angles,
 )
-from isocharge.simulate.mesh.oval import from_oval, to_oval
+from isocharge.simulate.mesh.oval import circular_distance, oval_displacement
 from isocharge.simulate.sensor.footprint import CurvedProbe, Probe
 
 
@@ -39,8 +40,8 @@ class Placement:
     Attributes:
         map_parameter: Parameter c of the conformal map, shape (...).
         template_radius: Radius of the innermost circle in the template plane, shape (...).
-        corners: Corners of the core polygon, followed by its centroid, as film points x + iy, in film radii, shape
-            (..., n_corner + 1).
+        corners: Corners of the core polygon, followed by its centroid, as points x + iy of the circular film, in film
+            radii, shape (..., n_corner + 1).
         circle_angles: Angles of the sides of the sectors on the innermost circle in the template plane, shape
             (..., n_sector + 1), rad.
         rim_angles: Angles of the sides of the sectors on the rim in the template plane, shape (..., n_sector + 1), rad.
@@ -50,6 +51,8 @@ class Placement:
             rotates the points by the additional rotation of the footprint, and converts them from mm to film radii.
         probe: The probe.
         oval: Shape of the clamp in the frame of the press, shape (...); see the module `oval`.
+        footprint_displacement: Displacement of the footprint from the circular film to the real film along the x axis,
+            shape (...), in film radii. It is zero if the clamp is circular.
     """
 
     map_parameter: Array
@@ -61,6 +64,7 @@ class Placement:
     rotation_and_scale: Complexes
     probe: Probe
     oval: Complexes
+    footprint_displacement: Array
 
     @classmethod
     def of(
@@ -89,7 +93,8 @@ class Placement:
         """
         # Corners of the core polygon on the circular film, followed by the centroid of the footprint. The centroid is a
         # real number, because the press lies on the x axis.
-        centroid = from_oval(np.asarray(distance / film_radius, dtype=complex), oval).real
+        real_centroid = distance / film_radius
+        centroid = circular_distance(real_centroid, np.asarray(oval), probe.reach / film_radius)
         rotation_factor: Complexes = np.exp(1j * np.broadcast_to(rotation, centroid.shape))
         core_corners = centroid[..., None] + probe.core() / film_radius * rotation_factor[..., None]
         corners = np.concatenate([core_corners, centroid[..., None]], axis=-1)
@@ -124,6 +129,7 @@ class Placement:
             rotation_and_scale=rotation_factor / film_radius,
             probe=probe,
             oval=np.asarray(oval),
+            footprint_displacement=real_centroid - centroid,
         )
 
     def __getitem__(self, indices: Integers | None) -> "Placement":
@@ -139,22 +145,22 @@ class Placement:
         return replace(self, **arrays)
 
     def to_film(self, z: Complexes) -> Complexes:
-        """Convert points of the template plane into film points by the conformal map.
+        """Convert points of the template plane into points of the circular film by the conformal map.
 
         Args:
             z: Points x + iy of the template plane, shape (..., n).
 
         Returns:
-            Film points, shape (..., n), in film radii.
+            Points of the circular film, shape (..., n), in film radii.
         """
         map_parameter = self.map_parameter[..., None]
         return (z + map_parameter) / (1.0 + map_parameter * z)
 
     def to_template(self, points: Complexes) -> Complexes:
-        """Convert film points into points of the template plane by the inverse of the conformal map.
+        """Convert points of the circular film into points of the template plane by the inverse of the conformal map.
 
         Args:
-            points: Film points x + iy, shape (..., n), in film radii.
+            points: Points x + iy of the circular film, shape (..., n), in film radii.
 
         Returns:
             Points of the template plane, shape (..., n).
@@ -162,14 +168,59 @@ class Placement:
         map_parameter = self.map_parameter[..., None]
         return (points - map_parameter) / (1.0 - map_parameter * points)
 
+    def depth(self, template_points: Complexes) -> Array:
+        """Compute the depths of points in the rings, from 0 on the innermost circle to 1 on the rim.
+
+        Args:
+            template_points: Points x + iy of the template plane, shape (..., n).
+
+        Returns:
+            Depths, shape (..., n). They are zero inside the innermost circle.
+        """
+        with np.errstate(divide="ignore"):  # at the origin, the logarithm is infinite, and the depth is clipped to 0
+            log_ratio = np.log(np.abs(template_points)) / np.log(self.template_radius)[..., None]
+        return np.clip(1.0 - log_ratio, 0.0, 1.0)
+
+    def displacement(self, points: Complexes, depth: Array) -> Complexes:
+        """Compute the displacements of points from the circular film to the real film.
+
+        Args:
+            points: Points x + iy of the circular film, shape (..., n), in film radii.
+            depth: Depths of the points in the rings, shape (..., n).
+
+        Returns:
+            Displacements x + iy, shape (..., n), in film radii.
+        """
+        of_footprint = self.footprint_displacement[..., None]
+        return of_footprint + depth * (oval_displacement(points, self.oval[..., None]) - of_footprint)
+
+    def to_circular_film(self, points: Complexes) -> Complexes:
+        """Convert points of the real film into points of the circular film by a fixed-point iteration.
+
+        Args:
+            points: Points x + iy of the real film, shape (..., n), in film radii.
+
+        Returns:
+            Points of the circular film, shape (..., n), in film radii.
+        """
+        circular_points = points - self.footprint_displacement[..., None]
+        if not self.oval.any():
+            return circular_points
+        for _ in range(1000):  # ten to twenty steps are typical
+            previous = circular_points
+            circular_points = points - self.displacement(previous, self.depth(self.to_template(previous)))
+            if np.abs(circular_points - previous).max(initial=0.0) < 1e-15:
+                break
+        return circular_points
+
     def boundary(self, parameter: Array) -> Complexes:
-        """Compute points of the boundary of a curved footprint on the film.
+        """Compute points of the boundary of a curved footprint on the circular film.
 
         Args:
             parameter: Boundary parameters of the points, from 0 to 2 pi, shape (..., n).
 
         Returns:
-            Film points x + iy, shape (..., n), in film radii.
+            Points x + iy of the circular film, shape (..., n), in film radii.
         """
         assert isinstance(self.probe, CurvedProbe)
         centroid = self.corners[..., -1:]
@@ -184,12 +235,12 @@ class Placement:
         Returns:
             Film points x + iy, shape (n_element, (order + 1)^2), in film radii.
         """
-        inner_points = self._inner_element_points(blocks)
+        inner_points = self._inner_element_points(blocks) + self.footprint_displacement
         ring_points = self._ring_element_points(blocks)
-        return to_oval(np.concatenate([inner_points, ring_points]), self.oval)
+        return np.concatenate([inner_points, ring_points])
 
     def _inner_element_points(self, blocks: Blocks) -> Complexes:
-        """Compute the film points of the nodes of the elements inside the innermost circle.
+        """Compute the points of the circular film at the nodes of the elements inside the innermost circle.
 
         The points of an element are interpolated linearly between its inner side and its outer side.
 
@@ -197,7 +248,7 @@ class Placement:
             blocks: The elements.
 
         Returns:
-            Film points x + iy, shape (n_inner, (order + 1)^2), in film radii.
+            Points x + iy of the circular film, shape (n_inner, (order + 1)^2), in film radii.
         """
         radial, angular = _unit_coordinates(blocks)
         placement_of_element = self[None][np.zeros(blocks.n_inner, dtype=np.intp)]
@@ -264,7 +315,8 @@ class Placement:
         angle = (1.0 - depth) * circle_angle + depth * rim_angle  # shape (n_ring, n_sector, n_local)
         log_radius = (1.0 - depth) * np.log(self.template_radius)
         template_points = np.exp(log_radius + 1j * angle)
-        return self.to_film(template_points).reshape(-1, radial.size)
+        circular_points = self.to_film(template_points)
+        return (circular_points + self.displacement(circular_points, depth)).reshape(-1, radial.size)
 
 
 def _unit_coordinates(blocks: Blocks) -> tuple[Array, Array]:

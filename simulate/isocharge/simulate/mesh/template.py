@@ -15,7 +15,6 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.simulate.mesh.blocks import Blocks, Resolution
-from isocharge.simulate.mesh.oval import from_oval
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.footprint import FootprintTopology
 from isocharge.simulate.sensor.probe import RoundProbe
@@ -109,7 +108,7 @@ def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tu
         shape (k, n).
     """
     # Convert the points into points of the meshed part of a circular film.
-    circular_points, is_reflected = blocks.into_meshed_half(from_oval(points, placement.oval[:, None]))
+    circular_points, is_reflected = blocks.into_meshed_half(placement.to_circular_film(points))
 
     # First locate all points as if they were in the rings. Then locate the points inside the innermost circle again.
     template_points = placement.to_template(circular_points)
@@ -140,11 +139,7 @@ def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Comp
     Returns:
         Index of the element, shape (k, n). Radial and angular coordinate in the element from 0 to 1, shape (2, k, n).
     """
-    # Depth of each point, from 0 on the innermost circle to 1 on the rim. At the origin, the logarithm is infinite, and
-    # the depth is clipped to 0.
-    with np.errstate(divide="ignore"):
-        log_ratio = np.log(np.abs(template_points)) / np.log(placement.template_radius)[:, None]
-    depth = np.clip(1.0 - log_ratio, 0.0, 1.0)
+    depth = placement.depth(template_points)
     ring, radial = _locate_in_intervals(placement.ring_depths.T[..., None], depth)
 
     # Angles at which the sides of the sectors lie at the depths of the points, shape (n_sector + 1, k, n). Along a

@@ -12,7 +12,7 @@ from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.theory import ACCURACY, WITH_BENDING, Theory, amplitude_squared, bending_length
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.conformal_map import CLEARANCE, map_stretch
-from isocharge.simulate.mesh.oval import film_oval, from_oval
+from isocharge.simulate.mesh.oval import circular_distance, film_oval
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh, place
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Film, check_range
@@ -168,9 +168,12 @@ def farthest_distance(film: Film, probe: Probe, at: tuple[float, float]) -> floa
         probe: The probe.
         at: Centroid (x, y) of the footprint, mm.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # the caller refuses a huge distance or NaN
-        centroid = film.radius * from_oval(np.array(complex(*at) / film.radius), film_oval(film, direction=0.0))
-    return probe.farthest_distance((float(centroid.real), float(centroid.imag)))
+    x, y = at
+    direction = math.atan2(y, x)
+    oval = film_oval(film, direction)
+    with np.errstate(all="ignore"):  # the caller refuses a huge distance or NaN
+        distance = circular_distance(np.hypot(x, y) / film.radius, oval, probe.reach / film.radius)
+    return probe.rotated(-direction).farthest_distance((film.radius * float(distance), 0.0))
 
 
 def layer_for(film: Film, force: float) -> float:

@@ -18,7 +18,6 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.mechanics.energy import ElasticFilm
-from isocharge.simulate.mesh.oval import from_oval
 from isocharge.simulate.solver.assembly import SolveTangent, assembly, factor_tangent
 
 STABILISING_TENSION = 0.4
@@ -79,7 +78,7 @@ def first_iterate(elastic: ElasticFilm) -> Array:
     """
     mesh = elastic.mesh
     groups = elastic.groups
-    circular_points = from_oval(mesh.node_points, mesh.placement.oval)
+    circular_points = mesh.placement.to_circular_film(mesh.node_points)
     template_distance = np.abs(mesh.placement.to_template(circular_points))
     # The square of the radius of the innermost circle is added, which rounds the tip of the deflection under the probe.
     rounding = float(mesh.placement.template_radius) ** 2
