@@ -30,6 +30,7 @@ file has no such section. An unknown key causes an error.
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from msgspec import defstruct, structs
 
 from isocharge.common.errors import DeviceError
@@ -70,7 +71,11 @@ def predictor_for(device: Device, predictor: Predictor) -> Predictor:
 
 
 class Prediction(Stage):
-    """Predicts the contact of each frame with the present model, for the noise that the device file states."""
+    """Predicts the contact of each frame with the present model, for the noise that the device file states.
+
+    If the noise at rest is much larger, the standard deviations are those for the noise at rest. A small difference has
+    no effect, because the tare measures this noise with few frames.
+    """
 
     section = "noise"
     rule_class = NoiseRule
@@ -89,7 +94,11 @@ class Prediction(Stage):
         """Predict the contact of a frame, unless nothing touches the film or the frame has no charges."""
         if frame.charge_pC is None or not frame.is_contact:
             return
-        frame.set_contact(self._predictor.predict(frame.charge_pC), self._predictor.validity)
+        predictor = self._predictor
+        noise = predictor.noise
+        if np.any(frame.noise_pC > 1.5 * np.asarray(noise.white_pC)):
+            predictor = predictor.with_noise(np.maximum(frame.noise_pC, noise.white_pC), noise.gain)
+        frame.set_contact(predictor.predict(frame.charge_pC), self._predictor.validity)
 
 
 STAGES: tuple[type[Stage], ...] = (
