@@ -80,7 +80,6 @@ def test_negative_charges_agree_with_direct_solves(problem, solved):
     values = film_values(prior, pretension=1.76)
     expected = solved_charges(*prior.film(values), CONTACT)
     change = expected - charges.charges(prior.mean, CONTACT)
-    assert expected.max() < 0.0 < np.abs(change).min()
     np.testing.assert_allclose(charges.charges(values, CONTACT), expected, atol=0.03 * np.abs(change).max())
 
 
@@ -95,8 +94,10 @@ def test_imperfections_of_the_sensor_file_are_changes_of_the_even_film(narrow_pr
     assert not _is_exact(charges, values, contact)
 
 
-def test_described_shear_modulus_is_solved_with_the_film(problem, solved):
+def test_uneven_tension_and_described_shear_modulus_are_solved_with_the_film(problem, solved):
+    """The uneven tension changes the charges by less than 3 %, but its effect is far from linear."""
     assert _is_exact(solved, solved.prior.mean, CONTACT)
+    assert not _is_exact(solved, film_values(solved.prior, tension_difference=0.2), CONTACT)
     sensor = with_film(problem.sensor, shear=900.0)
     assert not _is_exact(replace(solved, prior=FilmPrior(sensor, problem.probe)), solved.prior.mean, CONTACT)
 

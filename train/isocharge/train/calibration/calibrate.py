@@ -7,6 +7,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PressError
 from isocharge.serve.presses.measured_presses import MeasuredPresses
+from isocharge.simulate.sensor.film_properties import PRETENSION, UNEVEN_TENSIONS
 from isocharge.simulate.solver.assembly import single_threaded_blas
 from isocharge.train.calibration.contact_error import ContactSensitivity
 from isocharge.train.calibration.diagnosis import (
@@ -31,15 +32,13 @@ MAX_SOLVED_FILMS = 4
 SAME_FILM_STD = 0.3
 """Largest accepted distance of an estimated property from that of the solved film, in standard deviations."""
 
-VISIBLE_ASYMMETRY = 0.03
-"""Relative root-mean-square effect of the imperfections on the charges above which the uneven film itself is solved.
-
-The neglected second-order effect is about the square of this value.
-"""
+MAX_NEGLECTED_EFFECT = 0.001
+"""Second-order effect of the imperfections, relative to the charges, above which the uneven film itself is solved."""
 
 NOT_CONVERGED = (
-    f"the estimated film differs from the solved one by more than {100.0 * VISIBLE_ASYMMETRY:g} % of the charges, "
-    "so the model may err more than it states: describe the film better in the sensor file, or give more presses"
+    "the estimated film differs from the solved one, so its charges may err by more than "
+    f"{100.0 * MAX_NEGLECTED_EFFECT:g} %, and the model by more than it states: describe the film better in the sensor "
+    "file, or give more presses"
 )
 """Caution about an uneven film whose solution changes the estimate again and again."""
 
@@ -195,7 +194,9 @@ def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
     """Return whether the charges of the solved film hardly differ from those of the film with the given properties.
 
     The solved film may lack imperfections, and its probe may be round although the real probe is not. The lack of
-    imperfections may be neglected if their effects on the charges are small.
+    imperfections may be neglected if their second-order effect on the charges is small. The second-order effect is
+    about the square of the first-order effect. To this, an uneven tension with the share u of the mean tension adds the
+    effect of a mean tension that is smaller by up to u^2 / 2, although its first-order effect is small.
 
     Args:
         charges: The solved film, with its charges and their derivatives.
@@ -211,7 +212,12 @@ def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
     # Imperfections that change the stress may be missing in the solved film. The effects of all others are exact.
     is_missing = wanted.is_imperfection & wanted.changes_stress
     missing = np.where(is_missing, values - charges.values, 0.0)
-    return bool(np.linalg.norm(jacobian @ missing) < VISIBLE_ASYMMETRY * np.linalg.norm(charge))
+    charge_size = np.linalg.norm(charge)
+    squared_effect = (np.linalg.norm(jacobian @ missing) / charge_size) ** 2
+    tension = wanted.index(PRETENSION.name)
+    lost_tension = 0.5 * values[tension] * (missing[np.isin(wanted.names, UNEVEN_TENSIONS)] ** 2).sum()
+    tension_effect = lost_tension * np.linalg.norm(jacobian[:, :, tension]) / charge_size
+    return bool(squared_effect + tension_effect < MAX_NEGLECTED_EFFECT)
 
 
 def _is_uninformative(presses: MeasuredPresses) -> bool:
