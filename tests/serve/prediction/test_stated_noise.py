@@ -74,10 +74,10 @@ def test_smaller_noise_than_in_the_training_changes_nothing(released):
 def test_noise_of_a_device_file_and_at_rest_widens_the_contacts_of_a_stream_and_of_predict(released, tmp_path, command):
     device = device_from_table({"noise": {"gain": 0.015}}, "b")
     setup = Setup(released.metadata.electrodes, device, released)
-    (prediction,) = create_stages(setup, needs_contact=True)
     frame = Frame(None, None, (), charge_pC=PRESS_pC, is_contact=True)
     for rest_noise_pC, white_pC in ((3.0, 3.0), (1.4, 1.0)):
         frame.noise_pC = np.array(rest_noise_pC)
+        (prediction,) = create_stages(setup, needs_contact=True)
         prediction.step(frame)
         expected = released.with_noise(white_pC, 0.015).predict(PRESS_pC)
         assert frame.contact == expected

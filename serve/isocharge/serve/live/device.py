@@ -73,8 +73,8 @@ def predictor_for(device: Device, predictor: Predictor) -> Predictor:
 class Prediction(Stage):
     """Predicts the contact of each frame with the present model, for the noise that the device file states.
 
-    If the noise at rest is much larger, the standard deviations are those for the noise at rest. A small difference has
-    no effect, because the tare measures this noise with few frames.
+    If the noise at rest before a touch is much larger, the standard deviations of the touch are those for this noise. A
+    small difference has no effect, because the tare measures the noise with few frames.
     """
 
     section = "noise"
@@ -89,16 +89,20 @@ class Prediction(Stage):
         """
         self._predictor = predictor_for(setup.device, setup.model)
         setup.predictor = self._predictor
+        self._touch_predictor: Predictor | None = None  # for the noise before the present touch
 
     def step(self, frame: Frame) -> None:
         """Predict the contact of a frame, unless nothing touches the film or the frame has no charges."""
         if frame.charge_pC is None or not frame.is_contact:
+            self._touch_predictor = None
             return
-        predictor = self._predictor
-        noise = predictor.noise
-        if np.any(frame.noise_pC > 1.5 * np.asarray(noise.white_pC)):
-            predictor = predictor.with_noise(np.maximum(frame.noise_pC, noise.white_pC), noise.gain)
-        frame.set_contact(predictor.predict(frame.charge_pC), self._predictor.validity)
+        if self._touch_predictor is None:
+            self._touch_predictor = self._predictor
+            noise = self._predictor.noise
+            if np.any(frame.noise_pC > 1.5 * np.asarray(noise.white_pC)):
+                white_pC = np.maximum(frame.noise_pC, noise.white_pC)
+                self._touch_predictor = self._predictor.with_noise(white_pC, noise.gain)
+        frame.set_contact(self._touch_predictor.predict(frame.charge_pC), self._predictor.validity)
 
 
 STAGES: tuple[type[Stage], ...] = (

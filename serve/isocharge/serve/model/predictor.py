@@ -72,7 +72,7 @@ class Predictor:
         self._session = loaded.session
         self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
         self._press_lock = threading.Lock()  # held while a method uses the memory of `_press`
-        self._has_warned = False
+        self._has_warned = threading.Event()  # predictors for other noise share it
         self.noise = loaded.metadata.noise
 
     def with_noise(self, white_pC: ArrayLike, gain: ArrayLike) -> "Predictor":
@@ -132,8 +132,8 @@ class Predictor:
             contacts = self._predict_with_noise(as_charges(charge_pC, self.metadata.electrodes, is_batch=False))
             contact = Contact(*np.asarray(contacts, float)[0].tolist())
 
-        if not self._has_warned and BEYOND in self.flags(contact):
-            self._has_warned = True
+        if not self._has_warned.is_set() and BEYOND in self.flags(contact):
+            self._has_warned.set()
             log.warning(
                 "%s: the charges %s pC on %s are far from those of any press in the training, and %s cannot be a "
                 "measurement; check the unit, the gain and the tare, and with `isocharge serve doctor "
@@ -232,18 +232,20 @@ class Predictor:
         Args:
             charge_pC: Touch charges, shape (n, electrodes), pC.
         """
-        contacts = self.predict_rows(charge_pC)
         model_variance = self.metadata.noise.variance(charge_pC.astype(float))
         extra_variance = np.maximum(self.noise.variance(charge_pC.astype(float)) - model_variance, 0.0)
-        effects = []  # changes of x, mm, y, mm, and the force, N, each of shape (n, 3)
-        for column, extra_std in enumerate(np.sqrt(extra_variance).T):
-            step = np.zeros_like(charge_pC)
-            step[:, column] = extra_std
-            raised, lowered = (self.predict_rows(charge_pC + sign * step)[:, :3].astype(float) for sign in (1, -1))
-            effects.append(0.5 * (raised - lowered))
-        covariance = np.einsum("kni,knj->nij", effects, effects)
         relative_extra = extra_variance / np.maximum(model_variance, np.finfo(float).tiny)  # a model may have no noise
         noise_ratio = np.sqrt(1.0 + relative_extra.mean(axis=1))
+
+        # Charges without a change, and with each charge raised and lowered, shape (1 + 2 electrodes, n, electrodes)
+        n_electrode = charge_pC.shape[1]
+        steps = np.sqrt(extra_variance) * np.eye(n_electrode)[:, np.newaxis]
+        no_step = np.zeros_like(steps[:1])
+        changed_pC = (charge_pC + np.concatenate([no_step, steps, -steps])).astype(np.float32)
+        contacts, *changed = self.predict_rows(changed_pC.reshape(-1, n_electrode)).reshape(*changed_pC.shape[:2], 10)
+        raised, lowered = np.split(np.array(changed, float)[..., :3], 2)
+        effects = 0.5 * (raised - lowered)  # changes of x, mm, y, mm, and the force, N, shape (electrodes, n, 3)
+        covariance = np.einsum("kni,knj->nij", effects, effects)
         misfit = (contacts[:, COLUMNS["misfit"]] / noise_ratio[:, np.newaxis]).astype(np.float32)
         return Contacts(*add_covariance(contacts, covariance).T)._replace(misfit=misfit[:, 0])
 
