@@ -203,7 +203,6 @@ NUMBERS = np.arange(FRAMES)
         ("H", NUMBERS // 2, 2000.0, {"name": "t_ms", "type": "u16"}),
         ("d", 3.8e9 + 2 * NUMBERS, 0.5, {"name": "t_s", "type": "f64"}),  # seconds since 1904, as in LabVIEW
         ("I", 2.0**21 / RATE_HZ * NUMBERS, RATE_HZ, {"name": "ch1", "type": "i16"}),  # low bytes of a Unix time
-        ("I", 32768.0 / RATE_HZ * NUMBERS, RATE_HZ, {"name": "t_us", "type": "u32", "scale": 1e6 / 32768.0}),
     ],
 )
 def test_number_before_the_channels_is_a_counter_or_a_clock_with_a_usual_rate(number_format, numbers, rate_Hz, field):

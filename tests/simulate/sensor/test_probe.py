@@ -101,7 +101,6 @@ def test_thousands_of_corners_are_refused_at_once(end):
         (Polygon.of, np.array([(0, 0), (2, 0), (0.5, 0.5), (0, 2)]), "convex polygon"),
         (Polygon.of, np.array([(0, 0), (1, 0), (2, 0), (0, 1)]), "convex polygon"),
         (Polygon.of, HOUSE[:2], CORNERS),
-        (Polygon.of, np.stack([np.cos(np.arange(65) / 11), np.sin(np.arange(65) / 11)], axis=1), CORNERS),
         (Polygon.triangle(1.0).rotated, np.nan, "probe angle: expected a finite number, got nan"),
         (parse_probe, "ellipse:-1x2", "^probe width: expected at least 0.02 mm, got -1 mm"),
     ],

@@ -8,7 +8,8 @@ import torch
 from torch import nn
 from torch.optim.adam import adam
 
-from isocharge.train.training.descent import DECAY, Soap
+from isocharge.train.training.descent import DECAY, Soap, TrainingStage
+from isocharge.train.training.network import TrainablePerceptron
 
 SETTINGS = {"beta1": DECAY, "beta2": DECAY, "amsgrad": False, "weight_decay": 0, "eps": 1e-38, "maximize": False}
 
@@ -81,3 +82,20 @@ def test_rows_that_get_a_gradient_only_later_do_not_cause_long_steps(shape):
         optimiser.step(0.02)
         longest_step = max(longest_step, (weight.detach() - before).norm().item())
     assert longest_step <= 0.02 * np.sqrt(weight.numel()) * (1.0 + 1e-5)
+
+
+def test_training_continues_from_earlier_weights_if_some_steps_destroy_them():
+    torch.manual_seed(0)
+    network = TrainablePerceptron(1, (16,), 1)
+    losses = []
+
+    def loss(random):
+        if len(losses) == 750:
+            for parameter in network.parameters():
+                parameter.data.mul_(-3.0)
+        angle = torch.randn((64, 1), generator=random)
+        losses.append((network(angle) - angle.sin()).square().mean().log())
+        return losses[-1]
+
+    TrainingStage("sine", network, loss, steps=1000, rate=0.02, seed=0).run()
+    assert losses[-1] < -5.0

@@ -8,6 +8,7 @@ are updated every few steps by one orthogonal iteration.
 """
 
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -99,7 +100,14 @@ RATE_INCREASE_FRACTION = 0.1
 """Fraction of the steps during which the learning rate increases, dimensionless."""
 
 REPORT_EVERY = 200
-"""Number of steps between two progress reports."""
+"""Number of steps whose mean loss is reported and checked. The loss fluctuates from batch to batch."""
+
+MAX_LOSS_INCREASE = 1.0
+"""Increase of the mean loss above its smallest value after which a training continues from earlier weights.
+
+Loss functions are logarithms of a likelihood, or mean squares below 1. In a usual training, the mean loss increases by
+up to 0.2.
+"""
 
 
 @dataclass(frozen=True)
@@ -128,25 +136,44 @@ class TrainingStage:
         The learning rate increases to its largest value during the first tenth of the steps, and then decreases to zero
         along a cosine. Weights that require no gradient, such as rounded weights, are not trained.
 
+        Rarely, a few steps destroy what a network has learned, and the rest of the training does not repair it. If the
+        mean loss increases by more than `MAX_LOSS_INCREASE`, the training therefore continues from the weights before
+        the latest two reports, with half of the learning rate.
+
         Raises:
             TrainingError: If a loss is not finite.
         """
         parameters = [parameter for parameter in self.network.parameters() if parameter.requires_grad]
         optimisers = [Soap(parameter) for parameter in parameters]
         random = torch.Generator().manual_seed(self.seed)
+        largest_rate = self.rate
+        losses: list[float] = []  # since the latest report
+        smallest_mean_loss = math.inf
+        checkpoints: deque[list[Tensor]] = deque(maxlen=2)
         for step in range(self.steps):
             loss = self.loss(random)
-            if not torch.isfinite(loss):
+            losses.append(loss.item())
+            if not math.isfinite(losses[-1]):
                 raise TrainingError(
-                    f"the loss of the {self.name} network is {loss.item():g} at step {step + 1} of {self.steps}; lower "
+                    f"the loss of the {self.name} network is {losses[-1]:g} at step {step + 1} of {self.steps}; lower "
                     "training.learning_rate, or check the presses"
                 )
             self.network.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             for optimiser in optimisers:
-                optimiser.step(self.rate * relative_rate(step / self.steps))
-            if (step + 1) % REPORT_EVERY == 0 or step + 1 == self.steps:
-                report(f"training the {self.name} network", step + 1, self.steps, f"loss {loss.item():.3f}")
+                optimiser.step(largest_rate * relative_rate(step / self.steps))
+
+            if len(losses) == REPORT_EVERY or step + 1 == self.steps:
+                mean_loss = math.fsum(losses) / len(losses)
+                losses = []
+                report(f"training the {self.name} network", step + 1, self.steps, f"loss {mean_loss:.3f}")
+                if mean_loss > smallest_mean_loss + MAX_LOSS_INCREASE:
+                    largest_rate *= 0.5
+                    for parameter, earlier in zip(parameters, checkpoints[0], strict=True):
+                        parameter.data.copy_(earlier)
+                else:
+                    smallest_mean_loss = min(smallest_mean_loss, mean_loss)
+                    checkpoints.append([parameter.detach().clone() for parameter in parameters])
 
 
 def relative_rate(progress: float) -> float:
