@@ -268,9 +268,10 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
         )
     cautions.extend(film.session_cautions())
     cautions.extend(
-        f"{one.meaning}: {film.value(one.name):.3g} {one.unit}, which is unusually far from the sensor file: is the "
-        "origin of the stage the centre of the film, are its axes those of the film, are the forces in N and the "
-        "charges in pC, and has each channel the gain of the sensor file?"
+        f"{one.meaning}: {film.value(one.name):.3g} {one.unit}".removesuffix(" 1")  # the unit of a ratio
+        + ", which is unusually far from the sensor file: is the origin of the stage the centre of the film, are "
+        "its axes those of the film, are the forces in N and the charges in pC, and has each channel the gain of the "
+        "sensor file?"
         for one in film.layout.prior.properties
         if not one.is_imperfection and abs(film.value(one.name) - one.mean) > UNUSUAL_DEVIATION * one.std
     )

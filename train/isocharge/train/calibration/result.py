@@ -109,7 +109,7 @@ class CalibrationResult:
         identified = {name: one for name, one in self.properties.items() if one.identified}
         if identified:
             shown = [
-                f"{one.meaning} {one.value:.3g} +- {one.std:.2g}{'' if one.unit == '1' else ' ' + one.unit}"
+                f"{one.meaning} {one.value:.3g} +- {one.std:.2g} {one.unit}".removesuffix(" 1")  # the unit of a ratio
                 for one in identified.values()
             ]
             sentences.append(
