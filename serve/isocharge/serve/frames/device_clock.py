@@ -84,8 +84,9 @@ class DeviceClock:
 
         The clock of the device is converted to the time of the host by a straight line, which is called the fit. If the
         device sends no clock, the time since the previous chunk is divided evenly among the frames of the chunk, and
-        the last frame has the arrival time of the chunk. All chunks of a file arrive at the same time. The interval of
-        their frames in `dt_s` and `clock_s`, and that in the first chunk of a port, is assumed to be `FILE_INTERVAL_s`.
+        the last frame has the arrival time of the chunk. This time is unknown in the first chunk of a port and in all
+        chunks of a file, which arrive at the same time. In `dt_s` and `clock_s`, the interval between the frames is
+        then assumed to be `FILE_INTERVAL_s`.
 
         Args:
             chunk: The bytes that contain the ends of the frames.

@@ -319,7 +319,7 @@ def _unit_candidates(count: int) -> tuple[Array, Booleans]:
     """
     radius_sample, angle_sample, force_sample = scipy.stats.qmc.Sobol(3, scramble=False).random(count).T
     radius = np.sqrt(radius_sample)  # uniform over the area of the disk
-    # Each part of the sequence is evenly distributed. Every fourth point would be one with a small radius.
+    # The first quarter of the sequence is evenly distributed. In contrast, every fourth point has a small radius.
     radius[: count // 4] = 1.0  # on the edge
     angle = 2.0 * np.pi * angle_sample
     position = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])

@@ -195,8 +195,9 @@ def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
 
     The solved film may lack imperfections, and its probe may be round although the real probe is not. The lack of
     imperfections may be neglected if their second-order effect on the charges is small. The second-order effect is
-    about the square of the first-order effect. To this, an uneven tension with the share u of the mean tension adds the
-    effect of a mean tension that is smaller by up to u^2 / 2, although its first-order effect is small.
+    about the square of the first-order effect. An uneven tension has a further second-order effect, although its
+    first-order effect is small: if u is its ratio to the mean tension, the film behaves as if the mean tension were
+    smaller by up to u^2 / 2 of itself.
 
     Args:
         charges: The solved film, with its charges and their derivatives.
