@@ -333,8 +333,9 @@ def chi_squared_deviate(statistic: ArrayLike, degrees: ArrayLike) -> Array:
 def chi_squared_survival(statistic: float, degrees: int) -> float:
     """Compute the probability that a chi-squared variable exceeds a value.
 
-    The error of the probability is below 0.05 with one degree of freedom, and below 0.013 with more. The relative
-    error is below a fifth from 0.001 to 0.02. Smaller probabilities are overestimated, up to 2.5 times at 1e-5.
+    The error of the probability is below 0.05 with one degree of freedom, and below 0.013 with more. For probabilities
+    from 0.001 to 0.02, the relative error is below 20 %. Smaller probabilities are overestimated, up to 2.5 times at
+    1e-5.
 
     Args:
         statistic: The value, not negative.

@@ -146,7 +146,7 @@ class CsvTable:
         return columns
 
     def refuse_similar_names(self, columns: Iterable[str], names: Iterable[str]) -> None:
-        """Refuse a column whose name differs from that of a missing column by case, brackets, blanks or its unit.
+        """Refuse a column whose name is nearly that of a missing column, but has other case, brackets, blanks or units.
 
         Args:
             columns: Names of the columns of the file that are checked.

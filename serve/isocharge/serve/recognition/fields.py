@@ -67,10 +67,10 @@ def identify(steps: Array, frame_rate_Hz: float, tolerance: float = 0.04) -> tup
 
 
 class Weights:
-    """Contributions of the parts of a frame to the score of a division, in bits.
+    """Contributions to the score of a division of a frame into parts, in bits.
 
-    The fields, the padding and the checksum are parts of a frame. The division with the lowest score is chosen. The
-    weights were fitted to random boards.
+    The parts are the fields, the padding and the checksum. The division with the lowest score is chosen. The weights
+    were fitted to random boards.
 
     Attributes:
         channel_group: Contribution of a group of adjacent channels of one type.
@@ -100,7 +100,7 @@ class Part(NamedTuple):
         name: Name of the field in a device file, but `CHANNEL` for all channels; empty for padding.
         type_name: Type of the number, as in device files.
         size: Number of bytes.
-        score: Contribution of the part to the score of a division, bits. If the part begins a group of channels, the
+        score: Contribution to the score of a division into parts, bits. If the part begins a group of channels, the
             contribution of the group is not included.
         is_constant: Whether the part is a channel with a constant value. Such a channel does not begin a group.
         scale: Value of one tick of a clock, in the unit of its name.

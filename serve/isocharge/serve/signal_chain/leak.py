@@ -275,7 +275,7 @@ class Leak(Stage):
 class Integrator(Leak):
     """Integrates the currents of a board to charges, and estimates the offset of the currents.
 
-    The leak of the integral limits the charge that errors of the offset accumulate during a touch. Without a section
+    Because the integral leaks, an error of the offset adds only a limited charge during a touch. Without a section
     `[leak]`, the integral has no leak.
     """
 

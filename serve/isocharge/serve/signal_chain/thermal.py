@@ -95,7 +95,7 @@ class Warming(Stage):
         self._is_blind = False  # whether temperature could not be distinguished from force at the last estimate
 
     def step(self, frame: Frame) -> None:
-        """Estimate the warming of a frame in contact, subtract the charge of its change, and add the flags.
+        """Estimate the warming of a frame in contact, subtract the charge that its change causes, and add the flags.
 
         The tare has already subtracted the charge of the earlier changes, and reads the present change from the frame.
         While an amplifier is saturated, the warming is not estimated, because then the charges fit no contact for any

@@ -169,7 +169,7 @@ class FilmCharges:
         return value
 
     def _property_changes(self, values: Array) -> dict[str, float]:
-        """Return by how much properties differ from those of the solved film, by their names; see `_mechanics`."""
+        """Return the differences from the properties of the solved film, by name; see `_mechanics`."""
         solved, changed = self._mechanics(self.values), self._mechanics(values)
         return {name: changed[name] - solved[name] for name in changed}
 
