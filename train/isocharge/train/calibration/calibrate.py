@@ -215,9 +215,9 @@ def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
     missing = np.where(is_missing, values - charges.values, 0.0)
     charge_size = np.linalg.norm(charge)
     squared_effect = (np.linalg.norm(jacobian @ missing) / charge_size) ** 2
-    tension = wanted.index(PRETENSION.name)
-    lost_tension = 0.5 * values[tension] * (missing[np.isin(wanted.names, UNEVEN_TENSIONS)] ** 2).sum()
-    tension_effect = lost_tension * np.linalg.norm(jacobian[:, :, tension]) / charge_size
+    tension_index = wanted.index(PRETENSION.name)
+    lost_tension = 0.5 * values[tension_index] * (missing[np.isin(wanted.names, UNEVEN_TENSIONS)] ** 2).sum()
+    tension_effect = lost_tension * np.linalg.norm(jacobian[:, :, tension_index]) / charge_size
     return bool(squared_effect + tension_effect < MAX_NEGLECTED_EFFECT)
 
 

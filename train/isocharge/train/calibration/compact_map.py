@@ -130,18 +130,18 @@ class _ChangedFilm:
             executor: Executor that runs the solves; None for this process.
         """
         prior = self.charges.prior
-        tension = prior.index(PRETENSION.name)
-        uneven = [prior.index(name) for name in UNEVEN_TENSIONS]
+        tension_index = prior.index(PRETENSION.name)
+        uneven_indices = [prior.index(name) for name in UNEVEN_TENSIONS]
         values = self.values.copy()
-        values[tension] += change_MPa
+        values[tension_index] += change_MPa
         # The values contain the uneven parts of the tension as shares of the mean tension. In MPa, they do not change.
         # A film without tension has no shares. The smallest tension then avoids a division by zero.
-        tension_MPa = max(float(values[tension]), 1e-9)
-        share_ratio = self.values[tension] / tension_MPa
-        values[uneven] *= share_ratio
+        tension_MPa = max(float(values[tension_index]), 1e-9)
+        share_ratio = self.values[tension_index] / tension_MPa
+        values[uneven_indices] *= share_ratio
         by_calibrated = np.eye(values.size)
-        by_calibrated[uneven, uneven] = share_ratio
-        by_calibrated[uneven, tension] = self.values[uneven] * change_MPa / tension_MPa**2
+        by_calibrated[uneven_indices, uneven_indices] = share_ratio
+        by_calibrated[uneven_indices, tension_index] = self.values[uneven_indices] * change_MPa / tension_MPa**2
         even_charges = self.charges.even
         if change_MPa != 0.0:
             even_charges = FilmCharges.of_even_film(prior, values, self.charges.domain, executor)

@@ -223,14 +223,14 @@ class FilmEstimate:
         drift_std = np.zeros(len(self.values))
         drift_std[layout.film] = [one.drift for one in layout.prior.properties]
         drift_std[layout.coefficients] = COEFFICIENT_DRIFT
-        drift = np.diag(drift_std)  # a column contains the effects of the drift of one unknown on all unknowns
-        tension = layout.index(PRETENSION.name)
+        drift_effects = np.diag(drift_std)  # each column contains the effects of the drift of one unknown
+        tension_index = layout.index(PRETENSION.name)
         for name in UNEVEN_TENSIONS:
             # The limit avoids a very large change for a film that is nearly slack.
-            share_change_per_MPa = -self.value(name) / max(self.values[tension], PRETENSION.drift)
-            drift[layout.index(name), tension] = share_change_per_MPa * PRETENSION.drift
+            share_change_per_MPa = -self.value(name) / max(self.values[tension_index], PRETENSION.drift)
+            drift_effects[layout.index(name), tension_index] = share_change_per_MPa * PRETENSION.drift
         values = self.values.copy()
-        covariance = self.covariance + drift @ drift.T
+        covariance = self.covariance + drift_effects @ drift_effects.T
         session = layout.session
         values[session] = 0.0
         covariance[session] = covariance[:, session] = 0.0
