@@ -74,7 +74,7 @@ class Prediction(Stage):
     """Predicts the contact of each frame with the present model, for the noise that the device file states.
 
     If the noise at rest before a touch is much larger, the standard deviations of the touch are those for this noise. A
-    small difference has no effect, because the tare measures the noise with few frames.
+    small difference has no effect, because the tare measures the noise with few frames and therefore inaccurately.
     """
 
     section = "noise"

@@ -74,15 +74,15 @@ class PressErrors:
 
     @property
     def chi_squared(self) -> Array:
-        """Sums of the squared errors of x, y and the force in expected standard deviations, shape (n,).
+        """Squared Mahalanobis distance between each error (x, y, force) and zero, shape (n,).
 
-        The errors that noise causes are correlated, and the errors of the rig are independent. The sums are therefore
-        squared Mahalanobis distances. Unknown errors do not count.
+        The covariance of the errors is that of the noise, with the correlations that the model states, plus that of the
+        rig, whose errors are independent. Unknown errors do not count.
         """
         std = np.sqrt(self.variance)
-        noise_share = self.noise_std / std
+        noise_share = self.noise_std / std  # part of the standard deviation that noise causes
         noise_correlation = correlation_matrices(self.predicted) * noise_share[:, :, None] * noise_share[:, None, :]
-        correlation = np.nan_to_num(noise_correlation)
+        correlation = np.nan_to_num(noise_correlation)  # an unknown error has no correlations
         correlation[:, range(3), range(3)] = 1.0
         deviation = np.nan_to_num(self.error / std)[:, :, None]
         return np.asarray((deviation * np.linalg.solve(correlation, deviation)).sum(axis=(1, 2)))
