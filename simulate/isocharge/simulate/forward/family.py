@@ -280,7 +280,7 @@ class Family:
         stress_of_periods = []
         for period_index in range(symmetry_order):
             angle = 2.0 * np.pi * period_index / symmetry_order
-            rotated_elements = mesh.rotated(period_index, symmetry_order)
+            rotated_elements = mesh.rotated_elements(period_index, symmetry_order)
             reordered_stress = solved_period[..., rotated_elements, :, :]
             # The stress itself does not change, but its components refer to a frame that was rotated by `angle`.
             stress_of_periods.append(rotate_stress(reordered_stress, -angle))

@@ -73,7 +73,7 @@ class Blocks:
         half: Whether only the upper half of the film is meshed.
         n_corner: Number of corners of the core polygon.
         n_half_edge: Number of elements along half an edge of the core polygon.
-        n_meshed: Number of corners of the core polygon in the meshed part of the film.
+        n_meshed_corner: Number of corners of the core polygon in the meshed part of the film.
         n_sector: Number of elements around the innermost circle in the meshed part of the film.
         n_quad: Number of elements in the core polygon.
         n_layer: Number of layers between the core polygon and the innermost circle.
@@ -101,9 +101,9 @@ class Blocks:
         # element along the edges begins a sector outside the core polygon.
         self.n_corner = topology.n_corner
         self.n_half_edge = max(1, round(resolution.around / (2 * self.n_corner)))
-        self.n_meshed = self.n_corner // self.copies
-        self.n_sector = 2 * self.n_meshed * self.n_half_edge
-        self.n_quad = self.n_meshed * self.n_half_edge**2
+        self.n_meshed_corner = self.n_corner // self.copies
+        self.n_sector = 2 * self.n_meshed_corner * self.n_half_edge
+        self.n_quad = self.n_meshed_corner * self.n_half_edge**2
 
         # Count the elements inside the innermost circle, and then all elements including the rings. There are two
         # layers if the boundary of the footprint is a curve between the core polygon and the innermost circle.
@@ -148,11 +148,13 @@ class Blocks:
         corners = np.eye(self.n_corner + 1)[:-1]
         middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
 
-        # List the middles and the corners of the meshed part alternately in anticlockwise order, and divide each half
-        # edge, which connects a middle and a corner, into `n_half_edge` equal parts.
-        corners_and_middles = np.stack([corners, middles], axis=1)[: self.n_meshed].reshape(-1, self.n_corner + 1)
-        ends_of_half_edges = np.concatenate([middles[-1:], corners_and_middles])
-        return divide_intervals(ends_of_half_edges.T, self.n_half_edge).T
+        # Middles and corners alternate along the outline. The line between two of them is half an edge, which is
+        # divided into `n_half_edge` equal parts.
+        half_edge_ends = np.empty((2 * self.n_meshed_corner + 1, self.n_corner + 1))
+        half_edge_ends[0] = middles[-1]
+        half_edge_ends[1::2] = corners[: self.n_meshed_corner]
+        half_edge_ends[2::2] = middles[: self.n_meshed_corner]
+        return divide_intervals(half_edge_ends.T, self.n_half_edge).T
 
     @cached_property
     def inner_corner_weights(self) -> Array:
@@ -167,7 +169,7 @@ class Blocks:
         polygon up to the innermost circle.
         """
         weights = np.zeros((self.n_inner, 4, self.n_corner + 1))
-        weights[: self.n_quad] = self._core_elements()
+        weights[: self.n_quad] = self._core_element_corners()
 
         # The first layer has a straight inner side on the core polygon, and an outer side that may be curved. Both
         # sides of the second layer are curved.
@@ -176,7 +178,7 @@ class Blocks:
         first_layer[:, 1] = self.core_outline[1:]
         return weights
 
-    def _core_elements(self) -> Array:
+    def _core_element_corners(self) -> Array:
         """Return the corners of the elements in the core polygon.
 
         The elements that belong to a corner of the core polygon fill a quadrilateral between the corner, the centroid
@@ -197,10 +199,16 @@ class Blocks:
         inner_side = np.linspace(centroid, middles[1:], n_grid)
         outer_side = np.linspace(middles[:-1], corners, n_grid)
         grid = np.linspace(inner_side, outer_side, n_grid)
-        element_corners = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]], axis=3)
+
+        # Neighbouring points of the grid are the corners of an element.
+        inner_first = grid[:-1, :-1]
+        inner_last = grid[:-1, 1:]
+        outer_first = grid[1:, :-1]
+        outer_last = grid[1:, 1:]
+        element_corners = np.stack([inner_first, inner_last, outer_first, outer_last], axis=3)
         return np.moveaxis(element_corners, 2, 0).reshape(-1, 4, self.n_corner + 1)
 
-    def rotated(self, steps: int, steps_per_turn: int) -> Integers:
+    def rotated_elements(self, steps: int, steps_per_turn: int) -> Integers:
         """Return how the elements are renumbered by a rotation of the probe that maps the mesh onto itself.
 
         In the core polygon, all elements at one corner are numbered before those at the next corner. The sectors are
@@ -216,13 +224,13 @@ class Blocks:
         # The rotation maps corners onto corners, so it is a rotation by a whole number of corners.
         corner_shift = steps * self.n_corner // steps_per_turn
         sector_shift = 2 * self.n_half_edge * corner_shift
-        core_elements = np.arange(self.n_quad).reshape(self.n_meshed, -1)  # one row for each corner
+        core_elements = np.arange(self.n_quad).reshape(self.n_meshed_corner, -1)  # one row for each corner
         sectors = np.arange(self.n_quad, self.n_element).reshape(-1, self.n_sector)  # one row for each layer and ring
 
         # The place of an element is taken by the element that lies anticlockwise of it by the shift.
-        rotated_core_elements = np.roll(core_elements, -corner_shift, axis=0)
+        rotated_core = np.roll(core_elements, -corner_shift, axis=0)
         rotated_sectors = np.roll(sectors, -sector_shift, axis=1)
-        return np.concatenate([rotated_core_elements.ravel(), rotated_sectors.ravel()])
+        return np.concatenate([rotated_core.ravel(), rotated_sectors.ravel()])
 
     def into_meshed_half(self, points: Complexes) -> tuple[Complexes, Booleans]:
         """Reflect film points into the upper half of the film if only the upper half is meshed.
@@ -234,6 +242,6 @@ class Blocks:
             Points in the meshed part of the film, and whether each point was reflected. Both arrays have the shape of
             `points`.
         """
-        is_reflected = (points.imag < 0.0) & self.half
-        meshed_points = points.real + 1j * np.abs(points.imag) if self.half else points
-        return meshed_points, is_reflected
+        if not self.half:
+            return points, np.zeros(points.shape, dtype=bool)
+        return points.real + 1j * np.abs(points.imag), points.imag < 0.0

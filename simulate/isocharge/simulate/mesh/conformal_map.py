@@ -135,15 +135,12 @@ def sector_angles(
     """Compute the angles at which the sides of the sectors meet the innermost circle.
 
     The sectors divide the rings between the innermost circle and the rim. The sides of the sectors begin where rays
-    from the centroid of the footprint meet the circle. The last layer of elements inside the circle connects the circle
-    to an inner boundary. The directions of the rays are a compromise between evenly spaced directions and the
-    directions of given points on the inner boundary. If the gap between these points and the circle is narrow, the rays
-    must pass close to the points, because elements would fold otherwise.
+    from the centroid of the footprint meet the circle. The function `_ray_angles` chooses the directions of the rays.
 
     Args:
         blocks: The elements.
-        inner_points: Points x + iy on the inner boundary of the last layer, shape (..., 2 * n_meshed + 1), in film
-            radii. They belong to the corners of the core polygon and to the points half-way between the corners.
+        inner_points: Points x + iy on the inner boundary of the last layer, shape (..., 2 * n_meshed_corner + 1), in
+            film radii. They belong to the corners of the core polygon and to the points half-way between the corners.
         centroid: Position of the centroid of the footprint on the x axis, shape (...), in film radii.
         centre: Position of the centre of the circle on the x axis, shape (...), in film radii.
         radius: Radius of the circle, shape (...), in film radii.
@@ -153,15 +150,19 @@ def sector_angles(
     Returns:
         Angles in the template plane in increasing order, shape (..., n_sector + 1), rad.
     """
-    origin, centre, radius = (value[..., None] for value in (centroid, centre, radius))  # all rays have this origin
-    radius_ratio = radius / np.abs(inner_points - centre).max(axis=-1, keepdims=True)
-    ray = np.exp(1j * _ray_angles(blocks, inner_points - origin, radius_ratio))  # shape (..., n_sector + 1)
-    intersection = _intersections_with_circle(origin - centre, ray, radius)
+    # Add an axis for the points or the rays.
+    ray_origin = centroid[..., None]
+    circle_centre = centre[..., None]
+    circle_radius = radius[..., None]
 
-    # Angles of the intersections around the centre of the circle. The angles also increase where they pass pi.
-    film_angle = np.unwrap(np.angle(intersection))
+    # Compute the intersections of the rays with the circle, relative to the centre of the circle.
+    inner_radius = np.abs(inner_points - circle_centre).max(axis=-1, keepdims=True)
+    ray_angle = _ray_angles(blocks, inner_points - ray_origin, circle_radius / inner_radius)
+    ray = np.exp(1j * ray_angle)  # unit vectors, shape (..., n_sector + 1)
+    intersection = _intersections_with_circle(ray_origin - circle_centre, ray, circle_radius)
 
     # Convert the angles on the film into angles in the template plane.
+    film_angle = np.unwrap(np.angle(intersection))  # without jumps at pi
     return stretch_angles(film_angle, stretch)
 
 
@@ -186,8 +187,8 @@ def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) ->
     """Compute the directions of the rays that extend from the centroid of the footprint to the sides of the sectors.
 
     The last layer of elements inside the innermost circle connects the circle to an inner boundary. Each of the given
-    points on the inner boundary has a ray. The direction of the ray is the direction of the point, rotated by a limited
-    angle towards evenly spaced directions. All other rays divide the angle between two such rays into equal parts.
+    points on the inner boundary has a ray. The ray points to the point, and is then rotated a little so that the rays
+    become more evenly spaced. All other rays divide the angle between two such rays into equal parts.
 
     Args:
         blocks: The elements.
@@ -199,21 +200,25 @@ def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) ->
     Returns:
         Angles, shape (..., n_sector + 1), rad.
     """
-    # Angles with equal differences that have the same mean as the angles of the inner points, shape (..., n_point)
+    # Directions of the inner points, and evenly spaced directions with the same mean, each of shape (..., n_point)
     inner_angle = np.unwrap(np.angle(inner_points))
     angle_from_first = np.linspace(0.0, 2.0 * np.pi / blocks.copies, inner_angle.shape[-1])
-    even_angle = angle_from_first + np.mean((inner_angle - angle_from_first)[..., :-1], axis=-1, keepdims=True)
+    first_even_angle = np.mean((inner_angle - angle_from_first)[..., :-1], axis=-1, keepdims=True)
+    even_angle = first_even_angle + angle_from_first
 
-    # Rotate the direction of each inner point towards the even angle. The rotation is small if the circle is close to
-    # the inner points. The function `tanh` limits the rotation. With a larger limit, elements at corners that lie close
-    # together would fold. On an irregular polygon, some rays meet the middle of an edge at a small angle, and elements
-    # would also fold there. The limit decreases with the cosine of the smallest of these angles.
+    # Compute the largest rotation. Elements would fold where a ray meets the middle of an edge at a small angle, so the
+    # largest rotation decreases with the cosine of the smallest of these angles.
     middle = inner_points[..., :-1:2]
-    edge = inner_points[..., 1::2] - middle
-    cosine = np.abs(np.cos(np.angle(edge / middle))).max(axis=-1, keepdims=True)
-    max_rotation = 0.2 * (1.0 - cosine)  # rad
-    share = 0.5 * np.minimum((radius_ratio - 1.0) / CLEARANCE, 1.0)  # of the difference, from 0 to 0.5
-    rotation = max_rotation * np.tanh(share * (even_angle - inner_angle) / max_rotation)
+    half_edge = inner_points[..., 1::2] - middle
+    angle_at_middle = np.angle(half_edge / middle)
+    largest_cosine = np.abs(np.cos(angle_at_middle)).max(axis=-1, keepdims=True)
+    max_rotation = 0.2 * (1.0 - largest_cosine)  # rad
+
+    # Rotate each direction by up to half of the difference from the even direction. If the circle is close to the inner
+    # points, the rotation is small. The function `tanh` limits the rotation smoothly.
+    relative_gap = np.minimum((radius_ratio - 1.0) / CLEARANCE, 1.0)
+    unlimited_rotation = 0.5 * relative_gap * (even_angle - inner_angle)
+    rotation = max_rotation * np.tanh(unlimited_rotation / max_rotation)
 
     # Add the rays between the rays of the inner points.
     return divide_intervals(inner_angle + rotation, blocks.n_half_edge)

@@ -22,6 +22,7 @@ from isocharge.simulate.numerics.interpolation import (
     tensor_basis,
     tensor_rule,
 )
+from isocharge.simulate.numerics.polygon import cross_product
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.footprint import Probe
 
@@ -107,8 +108,9 @@ class PlacedMesh:
         if not placement.probe.has_uniform_pressure:
             rule = _gauss_rule(self.resolution.order, PRESSURE_POINTS)
         nodal_points = self.points[template.footprint]
+        quadrature_points = nodal_points @ rule.values.T
         centroid = placement.corners[-1] + placement.footprint_displacement
-        points_from_centroid_mm = (nodal_points @ rule.values.T - centroid) / placement.rotation_and_scale
+        points_from_centroid_mm = (quadrature_points - centroid) / placement.rotation_and_scale
         pressure = placement.probe.pressure(points_from_centroid_mm)  # divided by the mean pressure
 
         # Integrate the pressure times each basis function.
@@ -251,7 +253,7 @@ class _ElementRule(NamedTuple):
             points: Film points x + iy of the nodes of every element, shape (n_element, n_local), in film radii.
         """
         z_xi, z_eta = _point_derivatives(self.derivatives, points)
-        return np.asarray((np.conj(z_xi) * z_eta).imag * self.weights)
+        return np.asarray(cross_product(z_xi, z_eta) * self.weights)
 
 
 @lru_cache(maxsize=16)
@@ -278,10 +280,10 @@ def _film_gradient(derivatives: Array, points: Complexes) -> Array:
     Returns:
         Derivatives with respect to (X1, X2), shape (n_element, n_point, 2, n_local).
     """
-    # With the derivatives z_xi and z_eta of the film points z = x + iy, the determinant is the imaginary part of
-    # conj(z_xi) z_eta. The derivatives of a function f are f_x + i f_y = i (z_xi f_eta - z_eta f_xi) / determinant.
+    # With the derivatives z_xi and z_eta of the film points z = x + iy, the derivatives of a function f are
+    # f_x + i f_y = i (z_xi f_eta - z_eta f_xi) / determinant, where the determinant is that of the Jacobian of z.
     z_xi, z_eta = _point_derivatives(derivatives, points)
-    determinant = (np.conj(z_xi) * z_eta).imag
+    determinant = cross_product(z_xi, z_eta)
     f_xi, f_eta = derivatives
     complex_gradient = 1j * (z_xi[..., None] * f_eta - z_eta[..., None] * f_xi) / determinant[..., None]
     return np.stack([complex_gradient.real, complex_gradient.imag], axis=2)

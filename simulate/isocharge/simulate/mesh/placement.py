@@ -96,8 +96,13 @@ class Placement:
         real_centroid = distance / film_radius
         centroid = circular_distance(real_centroid, np.asarray(oval), probe.reach / film_radius)
         rotation_factor: Complexes = np.exp(1j * np.broadcast_to(rotation, centroid.shape))
-        core_corners = centroid[..., None] + probe.core() / film_radius * rotation_factor[..., None]
-        corners = np.concatenate([core_corners, centroid[..., None]], axis=-1)
+        rotation_and_scale = rotation_factor / film_radius
+
+        def on_film(footprint_points: Complexes) -> Complexes:
+            """Convert points relative to the centroid, mm, into points of the circular film, in film radii."""
+            return np.asarray(centroid[..., None] + rotation_and_scale[..., None] * footprint_points)
+
+        corners = np.concatenate([on_film(probe.core()), centroid[..., None]], axis=-1)
 
         # The innermost circle is the boundary of a circular footprint, or encloses the footprint with a gap. The last
         # layer of elements inside the circle connects the circle to an inner boundary. The inner boundary is the edge
@@ -108,11 +113,9 @@ class Placement:
             centre = centroid
             radius = np.full(centroid.shape, probe.reach / film_radius)
         else:
-            outline = centroid[..., None] + probe.outline / film_radius * rotation_factor[..., None]
-            centre, radius = enclosing_circle(outline, centroid)
+            centre, radius = enclosing_circle(on_film(probe.outline), centroid)
             if isinstance(probe, CurvedProbe) and probe.topology.is_curved:
-                boundary = probe.boundary(blocks.boundary_parameter[:: blocks.n_half_edge])
-                inner_points = centroid[..., None] + boundary / film_radius * rotation_factor[..., None]
+                inner_points = on_film(probe.boundary(blocks.boundary_parameter[:: blocks.n_half_edge]))
 
         # Compute the conformal map of the innermost circle, and the angles and depths of the elements around it.
         map_parameter, template_radius = automorphism_onto(centre, radius)
@@ -126,7 +129,7 @@ class Placement:
             circle_angles=circle_angles,
             rim_angles=rim_angles(circle_angles, map_parameter, template_radius),
             ring_depths=ring_edges(blocks.resolution, template_radius, template_thin_ring_width),
-            rotation_and_scale=rotation_factor / film_radius,
+            rotation_and_scale=rotation_and_scale,
             probe=probe,
             oval=np.asarray(oval),
             footprint_displacement=real_centroid - centroid,
@@ -191,8 +194,10 @@ class Placement:
         Returns:
             Displacements x + iy, shape (..., n), in film radii.
         """
-        of_footprint = self.footprint_displacement[..., None]
-        return of_footprint + depth * (oval_displacement(points, self.oval[..., None]) - of_footprint)
+        # Between the innermost circle and the rim, the displacement changes linearly with the depth.
+        rim_displacement = oval_displacement(points, self.oval[..., None])
+        displacement: Complexes = _interpolate(self.footprint_displacement[..., None], rim_displacement, depth)
+        return displacement
 
     def to_circular_film(self, points: Complexes) -> Complexes:
         """Convert points of the real film into points of the circular film by a fixed-point iteration.
@@ -208,7 +213,8 @@ class Placement:
             return circular_points
         for _ in range(1000):  # ten to twenty steps are typical
             previous = circular_points
-            circular_points = points - self.displacement(previous, self.depth(self.to_template(previous)))
+            depth = self.depth(self.to_template(previous))
+            circular_points = points - self.displacement(previous, depth)
             if np.abs(circular_points - previous).max(initial=0.0) < 1e-15:
                 break
         return circular_points
@@ -253,7 +259,8 @@ class Placement:
         radial, angular = _unit_coordinates(blocks)
         placement_of_element = self[None][np.zeros(blocks.n_inner, dtype=np.intp)]
         inner, outer = placement_of_element.sides(blocks, np.arange(blocks.n_inner), angular[None])
-        return (1.0 - radial) * inner + radial * outer
+        points: Complexes = _interpolate(inner, outer, radial)
+        return points
 
     def sides(self, blocks: Blocks, element: Integers, angular: Array) -> tuple[Complexes, Complexes]:
         """Compute points of the inner and the outer side of elements inside the innermost circle.
@@ -271,26 +278,26 @@ class Placement:
         # Straight sides. The weights of the corners of curved sides are zero.
         corners = np.einsum("nkc,nc->kn", blocks.inner_corner_weights[element], self.corners)
         inner_first, inner_last, outer_first, outer_last = corners[:, :, None]  # each of shape (n, 1)
-        inner = inner_first + angular * (inner_last - inner_first)
-        outer = outer_first + angular * (outer_last - outer_first)
+        inner = _interpolate(inner_first, inner_last, angular)
+        outer = _interpolate(outer_first, outer_last, angular)
 
         # The outer sides of the last layer lie on the innermost circle.
         in_last_layer = element >= blocks.n_inner - blocks.n_sector
-        sector = (element - blocks.n_quad) % blocks.n_sector  # not used for elements of the core polygon
-        first_angle = np.take_along_axis(self.circle_angles, sector[:, None], axis=1)
-        last_angle = np.take_along_axis(self.circle_angles, sector[:, None] + 1, axis=1)
-        circle_angle = first_angle + angular * (last_angle - first_angle)
-        circle = self.to_film(self.template_radius[:, None] * np.exp(1j * circle_angle))
-        outer[in_last_layer] = circle[in_last_layer]
+        sector = (element[:, None] - blocks.n_quad) % blocks.n_sector  # not used for elements of the core polygon
+        first_angle = np.take_along_axis(self.circle_angles, sector, axis=1)
+        last_angle = np.take_along_axis(self.circle_angles, sector + 1, axis=1)
+        circle_angle = _interpolate(first_angle, last_angle, angular)
+        circle_points = self.to_film(self.template_radius[:, None] * np.exp(1j * circle_angle))
+        outer[in_last_layer] = circle_points[in_last_layer]
 
         # If there are two layers, the boundary of the footprint separates them.
         if blocks.n_layer == 2:
             in_first_layer = (element >= blocks.n_quad) & ~in_last_layer
-            first_parameter = blocks.boundary_parameter[sector, None]
-            last_parameter = blocks.boundary_parameter[sector + 1, None]
-            boundary = self.boundary(first_parameter + angular * (last_parameter - first_parameter))
-            outer[in_first_layer] = boundary[in_first_layer]
-            inner[in_last_layer] = boundary[in_last_layer]
+            first_parameter = blocks.boundary_parameter[sector]
+            last_parameter = blocks.boundary_parameter[sector + 1]
+            boundary_points = self.boundary(_interpolate(first_parameter, last_parameter, angular))
+            outer[in_first_layer] = boundary_points[in_first_layer]
+            inner[in_last_layer] = boundary_points[in_last_layer]
         return inner, outer
 
     def _ring_element_points(self, blocks: Blocks) -> Complexes:
@@ -304,19 +311,27 @@ class Placement:
         """
         # Depths of the nodes, from 0 on the innermost circle to 1 on the rim
         radial, angular = _unit_coordinates(blocks)
-        inner_depth = self.ring_depths[:-1, None]
-        node_depth = inner_depth + radial * np.diff(self.ring_depths)[:, None]  # shape (n_ring, n_local)
-        depth = node_depth[:, None]  # shape (n_ring, 1, n_local)
+        inner_depth = self.ring_depths[:-1, None, None]
+        outer_depth = self.ring_depths[1:, None, None]
+        depth = _interpolate(inner_depth, outer_depth, radial)  # shape (n_ring, 1, n_local)
 
         # The angle of a node and the logarithm of its radius are interpolated linearly with respect to the depth,
         # between the innermost circle and the rim. On the rim, the logarithm of the radius is 0.
-        circle_angle = self.circle_angles[:-1, None] + angular * np.diff(self.circle_angles)[:, None]
-        rim_angle = self.rim_angles[:-1, None] + angular * np.diff(self.rim_angles)[:, None]
-        angle = (1.0 - depth) * circle_angle + depth * rim_angle  # shape (n_ring, n_sector, n_local)
+        circle_angle = _interpolate(self.circle_angles[:-1, None], self.circle_angles[1:, None], angular)
+        rim_angle = _interpolate(self.rim_angles[:-1, None], self.rim_angles[1:, None], angular)
+        angle = _interpolate(circle_angle, rim_angle, depth)  # shape (n_ring, n_sector, n_local)
         log_radius = (1.0 - depth) * np.log(self.template_radius)
         template_points = np.exp(log_radius + 1j * angle)
         circular_points = self.to_film(template_points)
         return (circular_points + self.displacement(circular_points, depth)).reshape(-1, radial.size)
+
+
+def _interpolate(start: Any, end: Any, share: Array) -> Any:
+    """Interpolate linearly between real or complex numbers: the share 0 yields `start`, and the share 1 yields `end`.
+
+    The three arguments are broadcast with each other.
+    """
+    return start + share * (end - start)
 
 
 def _unit_coordinates(blocks: Blocks) -> tuple[Array, Array]:

@@ -16,6 +16,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.simulate.mesh.blocks import Blocks, Resolution
 from isocharge.simulate.mesh.placement import Placement
+from isocharge.simulate.numerics.polygon import cross_product
 from isocharge.simulate.sensor.footprint import FootprintTopology
 from isocharge.simulate.sensor.probe import RoundProbe
 
@@ -115,12 +116,11 @@ def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tu
     element, coordinates = _locate_in_rings(placement, blocks, template_points)
     is_inside = np.abs(template_points) <= placement.template_radius[:, None]
     if np.any(is_inside):
-        placement_index, _ = np.nonzero(is_inside)
-        used_index, point_index = np.unique(placement_index, return_inverse=True)
-        corners = _inner_corners(placement[used_index], blocks)[point_index]
-        placement_of_point = placement[placement_index]  # one placement for each point inside the circle
+        row_of_point, _ = np.nonzero(is_inside)  # for each point inside the circle
+        used_rows, used_row_of_point = np.unique(row_of_point, return_inverse=True)
+        corners = _inner_corners(placement[used_rows], blocks)[used_row_of_point]
         element[is_inside], coordinates[:, is_inside] = _locate_inside(
-            placement_of_point, blocks, circular_points[is_inside], corners
+            placement[row_of_point], blocks, circular_points[is_inside], corners
         )
 
     # Convert the coordinates from the range from 0 to 1 to the range from -1 to 1.
@@ -201,14 +201,14 @@ def _locate_inside(
     coordinates = np.full((2, points.size), np.inf)
     for candidate in candidates.T:
         # Select the points whose element has not been found yet, apart from rounding errors of the coordinates.
-        selected = np.flatnonzero(_overshoot(coordinates) > 1e-9)
-        if selected.size == 0:
+        remaining = np.flatnonzero(_overshoot(coordinates) > 1e-9)
+        if remaining.size == 0:
             break
-        tried = candidate[selected]
-        new_coordinates = _local_coordinates(placement[selected], blocks, points[selected], tried)
-        is_better = _overshoot(new_coordinates) < _overshoot(coordinates[:, selected])
-        improved = selected[is_better]
-        element[improved] = tried[is_better]
+        tried_element = candidate[remaining]
+        new_coordinates = _local_coordinates(placement[remaining], blocks, points[remaining], tried_element)
+        is_better = _overshoot(new_coordinates) < _overshoot(coordinates[:, remaining])
+        improved = remaining[is_better]
+        element[improved] = tried_element[is_better]
         coordinates[:, improved] = new_coordinates[:, is_better]
     return element, coordinates
 
@@ -265,11 +265,10 @@ def _local_coordinates(
         radial_derivative = outer[:, 0] - inner[:, 0]
         angular_derivative = (after - before) / (2.0 * difference_step)
 
-        # Newton step for two unknowns by Cramer's rule. The determinant of two plane vectors is the imaginary part of
-        # the product of the conjugate of the first vector and the second vector.
-        determinant = (np.conj(radial_derivative) * angular_derivative).imag
-        radial_numerator = (np.conj(residual) * angular_derivative).imag
-        angular_numerator = (np.conj(radial_derivative) * residual).imag
+        # Newton step for two unknowns by Cramer's rule
+        determinant = cross_product(radial_derivative, angular_derivative)
+        radial_numerator = cross_product(residual, angular_derivative)
+        angular_numerator = cross_product(radial_derivative, residual)
         step = -np.stack([radial_numerator, angular_numerator]) / determinant
         new_coordinates = np.clip(coordinates + step, -0.1, 1.1)  # the point may leave the element a little
         largest_step = np.abs(new_coordinates - coordinates).max()
@@ -301,5 +300,4 @@ def _distance_to_left(start: Complexes, end: Complexes, points: Complexes) -> Ar
     """
     direction = end - start
     length = np.maximum(np.abs(direction), 1e-300)  # the limit avoids a division by zero
-    cross_product = ((points - start) * np.conj(direction)).imag
-    return cross_product / length
+    return cross_product(direction, points - start) / length

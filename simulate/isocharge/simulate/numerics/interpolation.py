@@ -264,9 +264,9 @@ class Turns:
         """
         largest_m = len(largest_harmonics) - 1 if has_directions else 0
         pairs: list[tuple[int, int]] = []  # (m, k) of each term
-        for m in _symmetric_range(largest_m):
+        for m in range(-largest_m, largest_m + 1):
             largest_k = largest_harmonics[abs(m)] if period else 0
-            pairs.extend((m, k) for k in _symmetric_range(largest_k))
+            pairs.extend((m, k) for k in range(-largest_k, largest_k + 1))
         harmonics = np.array(pairs)
         symmetry_order = round(2.0 * np.pi / period) if period else 1
         n_turn, step = _lattice(harmonics, symmetry_order)
@@ -300,11 +300,6 @@ class Turns:
         turn_phase = np.stack([self.direction, self.rotation], axis=1) @ self.harmonics.T  # shape (n_turn, n_term)
         terms = np.exp(1j * phase) @ np.exp(-1j * turn_phase).T
         return np.asarray(terms.real / self.rotation.size)
-
-
-def _symmetric_range(largest: int) -> range:
-    """Return the integers from -`largest` to `largest`."""
-    return range(-largest, largest + 1)
 
 
 def _lattice(harmonics: Integers, symmetry_order: int) -> tuple[int, int]:

@@ -71,6 +71,11 @@ def to_corners(z: Complexes) -> Array:
     return np.stack([z.real, z.imag], axis=-1)
 
 
+def cross_product(first: Complexes, second: Complexes) -> Array:
+    """Compute the cross products of plane vectors x + iy. They are positive if `second` is anticlockwise of `first`."""
+    return (np.conj(first) * second).imag
+
+
 def area_in_disk(corners: Complexes, centre: complex, radius: Array | float) -> Array:
     """Compute the area that a polygon has in common with each of several concentric disks.
 
@@ -94,7 +99,7 @@ def area_in_disk(corners: Complexes, centre: complex, radius: Array | float) -> 
     direction = (end - start) / np.abs(end - start)  # unit vector x + iy
     start_along = (start * np.conj(direction)).real
     end_along = (end * np.conj(direction)).real
-    across = (start * np.conj(direction)).imag  # negative if the centre lies on the left of the edge
+    across = cross_product(direction, start)  # negative if the centre lies on the left of the edge
 
     # The chord is the part of the edge within the circle. If the edge does not meet the circle, the length of the chord
     # is zero.
@@ -136,10 +141,9 @@ def gauss_quadrilaterals(corners: Complexes, line_area: Array, count: int) -> tu
     s_derivative = (z10 - z00) * (1.0 - t) + (z11 - z01) * t
     t_derivative = (z01 - z00) * (1.0 - s) + (z11 - z10) * s
     points = z00 * (1.0 - t) + z01 * t + s * s_derivative
-    # The determinant of the Jacobian is the cross product of the derivatives of the points.
-    determinant = (np.conj(s_derivative) * t_derivative).imag
-    weights = np.outer(line_weights, line_weights).ravel()  # of the unit square
-    return points, weights * (determinant + line_area[:, None])
+    determinant = cross_product(s_derivative, t_derivative)  # of the Jacobian of the points
+    square_weights = np.outer(line_weights, line_weights).ravel()
+    return points, square_weights * (determinant + line_area[:, None])
 
 
 def halve_quadrilaterals(corners: Complexes) -> Complexes:
@@ -151,15 +155,18 @@ def halve_quadrilaterals(corners: Complexes) -> Complexes:
     Returns:
         Corners x + iy, shape (2 n, 4): first one half of all quadrilaterals, and then the other half.
     """
-    # Renumber the corners such that one of the longest sides connects the first two corners or the last two corners.
-    sides = np.abs(np.roll(corners, -1, axis=1) - corners)
-    is_turned = sides[:, 1::2].max(axis=1) > sides[:, ::2].max(axis=1)
-    turned = np.where(is_turned[:, None], np.roll(corners, -1, axis=1), corners)
-    first, second, third, fourth = turned.T
+    # Renumber the corners such that the longest side connects the first two corners or the last two corners.
+    next_corners = np.roll(corners, -1, axis=1)
+    side_lengths = np.abs(next_corners - corners)
+    must_renumber = side_lengths[:, 1::2].max(axis=1) > side_lengths[:, ::2].max(axis=1)
+    first, second, third, fourth = np.where(must_renumber[:, None], next_corners, corners).T
+
+    # Divide the quadrilaterals between the middles of the two opposite sides.
     middle = 0.5 * (first + second)
     opposite_middle = 0.5 * (third + fourth)
-    halves = ((first, middle, opposite_middle, fourth), (middle, second, third, opposite_middle))
-    return np.concatenate([np.stack(half, axis=1) for half in halves])
+    first_half = np.stack([first, middle, opposite_middle, fourth], axis=1)
+    second_half = np.stack([middle, second, third, opposite_middle], axis=1)
+    return np.concatenate([first_half, second_half])
 
 
 def is_simple(corners: Array) -> bool:
