@@ -2,8 +2,7 @@
 
 Each exception also inherits from the built-in exception with the most similar meaning. A message states what was
 expected, what was given, where the error is, and what the user can do. `isocharge.cli.main` maps the exceptions to exit
-codes, which are 2 for wrong input and 1 for all other errors. `isocharge.serve.network.protocol.response` maps the
-exceptions to HTTP and gRPC statuses.
+codes, which are 2 for wrong input and 1 for all other errors. A server reports an error with its attribute `status`.
 
 A message may quote text from boards, files, models and recordings, which may contain characters that a terminal
 executes or hides. Examples are escape sequences that move the cursor or change the title of the window, marks that
@@ -91,7 +90,13 @@ def shown(value: object) -> str:
 
 
 class IsochargeError(Exception):
-    """Base class of all exceptions that isocharge defines."""
+    """Base class of all exceptions that isocharge defines.
+
+    Attributes:
+        status: HTTP status with which a server reports the error.
+    """
+
+    status = 500
 
     def __str__(self) -> str:
         """Return the message in printable characters.
@@ -103,6 +108,8 @@ class IsochargeError(Exception):
 
 class InputError(IsochargeError, ValueError):
     """An input, such as an argument or a file, is not valid."""
+
+    status = 400
 
 
 class SensorError(InputError):
@@ -144,45 +151,22 @@ class ModelError(InputError):
 class ModelNotFound(ModelError):
     """The server has no model with the requested name and version."""
 
+    status = 404
+
 
 class RequestError(InputError):
-    """A request to the server is not valid."""
+    """A request to a server is refused.
 
-
-class UnknownPath(RequestError):
-    """The server has no resource at the path of a request."""
-
-
-class WrongMethod(RequestError):
-    """The HTTP method of a request is not allowed for the path of the request.
-
-    Attributes:
-        allowed: Names of the allowed methods, for the header `Allow`.
+    Args:
+        message: The reason.
+        status: HTTP status of the response.
+        *headers: Name and value of each further header of the response.
     """
 
-    def __init__(self, path: str, method: str, allowed: str) -> None:
-        super().__init__(f"{path}: expected the method {allowed}, got {method[:20]}")
-        self.allowed = allowed
-
-
-class TooLarge(RequestError):
-    """A request is larger than the server allows."""
-
-
-class TooMany(RequestError):
-    """More calls are open than the server allows."""
-
-
-class UnknownEncoding(RequestError):
-    """The body of a request is compressed by a method that the server does not support."""
-
-
-class TokenError(IsochargeError, PermissionError):
-    """A request does not contain the token of the server."""
-
-
-class OriginError(IsochargeError, PermissionError):
-    """A request was sent by a web page of another site."""
+    def __init__(self, message: str, status: int = 400, *headers: tuple[bytes, bytes]) -> None:
+        super().__init__(message)
+        self.status = status
+        self.headers = headers
 
 
 class ListenError(IsochargeError, OSError):

@@ -66,7 +66,7 @@ def test_another_server_can_listen_on_the_port_of_a_killed_server(start):
         assert held.recv(12) == b"HTTP/1.1 200"
         process.kill()
         process.wait()
-        Address(port=port).listen(1).close()
+        Address(port=port).listen().close()
 
 
 def test_http_command_refuses_wrong_options_and_models(refused, film, models, tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from isocharge.serve.flags import MISFIT
 
 def scrape(handler):
     """Return the value of each sample by its name and its sorted labels."""
-    status, headers, text, _ = handler.answer("GET", "/metrics", [], b"")
+    status, headers, text = handler.answer("GET", "/metrics", [], b"")
     assert status == 200
     assert dict(headers)[b"content-type"].startswith(b"text/plain; version=0.0.4")
     samples = [sample for family in text_string_to_metric_families(text.decode()) for sample in family.samples]

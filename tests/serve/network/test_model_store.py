@@ -238,7 +238,7 @@ def test_log_has_a_line_for_each_grpc_call(app, lines, start_grpc):
     assert logged == [
         ("ModelReady", "OK", "linear/1", None),
         ("ModelInfer", "INVALID_ARGUMENT", "linear/2", "RequestError"),
-        ("ModelInfer", "UNAUTHENTICATED", None, "TokenError"),
+        ("ModelInfer", "UNAUTHENTICATED", None, "RequestError"),
     ]
     assert {json.loads(line)["client"][:15] for line in lines} == {"ipv4:127.0.0.1:"}
 

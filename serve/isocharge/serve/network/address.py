@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import InputError, ListenError
 from isocharge.common.files import read_whole
 
@@ -31,24 +30,19 @@ class Address:
     port: int = 0
     uds: Path | None = None
 
-    def listen(self, backlog: int) -> socket.socket:
+    def listen(self) -> socket.socket:
         """Open a Unix socket or a TCP socket that listens on this address, and return the socket.
 
-        Args:
-            backlog: Largest number of connections that wait to be accepted.
-
         Raises:
-            ListenError: If the address is in use or cannot be used. The message states what to do.
+        ListenError: If the address is in use or cannot be used. The message states what to do.
         """
         try:
             if self.uds is not None:
                 self.release()
-                return _listen_unix(self.uds, backlog)
+                return _listen_unix(self.uds)
             # create_server sets SO_REUSEADDR. The port of an earlier server can therefore be used again at once.
             family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
-            return socket.create_server(
-                (self.host, self.port), family=family, backlog=backlog, dualstack_ipv6=self.host == "::"
-            )
+            return socket.create_server((self.host, self.port), family=family, dualstack_ipv6=self.host == "::")
         except (OSError, ValueError) as error:  # a ValueError if the host name cannot be encoded, or without IPv6
             place = self.uds or f"{self.host}:{self.port}"
             raise ListenError(f"cannot listen on {place}: {error}; choose another address or port") from error
@@ -121,7 +115,6 @@ class ServerLimits:
     batch is sent as JSON and each number has all its digits.
 
     Attributes:
-        batch: Largest number of presses in one request.
         body_bytes: Largest size of the body of a request, bytes. The limit applies before and after the body is
             decompressed.
         header_bytes: Largest total size of the request line and the headers, bytes.
@@ -135,7 +128,6 @@ class ServerLimits:
         queued_requests: Largest number of requests of a connection that wait for the response to an earlier request.
     """
 
-    batch: int = MAX_BATCH
     body_bytes: int = 1 << 20
     header_bytes: int = 1 << 14
     header_seconds: float = 10.0
@@ -176,12 +168,11 @@ def check_exposure(address: Address, token: str | None) -> None:
         raise InputError(f"{address.host} lets other machines in: give --token TOKEN, which they then must send")
 
 
-def _listen_unix(path: Path, backlog: int) -> socket.socket:
+def _listen_unix(path: Path) -> socket.socket:
     """Open a listening Unix socket that only its owner can use, and return the socket.
 
     Args:
         path: Path of the socket, where no file exists.
-        backlog: Largest number of connections that wait to be accepted.
 
     Raises:
         OSError: If the socket cannot be created.
@@ -190,7 +181,7 @@ def _listen_unix(path: Path, backlog: int) -> socket.socket:
     try:
         listening.bind(str(path))
         path.chmod(0o600)  # before `listen`, the system refuses all connections
-        listening.listen(backlog)
+        listening.listen()
     except OSError:
         listening.close()
         raise

@@ -27,7 +27,7 @@ from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from urllib.parse import urlsplit
 
-from isocharge.common.errors import InputError, OriginError, RequestError, TokenError, shown
+from isocharge.common.errors import InputError, RequestError, shown
 from isocharge.serve.network.address import ip_address
 
 _TOKEN_PATTERN = re.compile(r"(?! )[ -$&-~]+(?<! )")
@@ -70,7 +70,7 @@ class AccessCheck:
         self._token = None if token is None else token.encode()
         self._any_host = any_host or token is not None
 
-    def check(self, method: str, headers: Mapping[bytes, bytes], *, needs_token: bool = True) -> None:
+    def check(self, method: str, headers: Mapping[str, str], *, needs_token: bool = True) -> None:
         """Check the headers of a request, and raise an error if the request is refused.
 
         Args:
@@ -79,61 +79,66 @@ class AccessCheck:
             needs_token: Whether the request must contain the token, if the server has one.
 
         Raises:
-            OriginError: If a page of another site has sent the request, or if `Host` is not a name of this server.
-            TokenError: If the token is missing or wrong.
+            RequestError: If a page of another site has sent the request, if `Host` is not a name of this server, or if
+                the token is missing or wrong.
         """
-        host = headers.get(b"host", b"").decode("latin-1").lower()
+        host = headers.get("host", "").lower()
         name = _name_in(host)
         is_served = self._any_host or name in self._host_names or ip_address(name) is not None
         if host and not is_served:  # HTTP/1.0 does not require the header, but browsers always send it
-            raise OriginError(
+            raise RequestError(
                 f"Host: expected an IP address or one of {', '.join(sorted(self._host_names))}, got {shown(host)}; use "
-                "the server's address, or name the host by --allow-host (allowed_hosts of asgi_app)"
+                "the server's address, or name the host by --allow-host (allowed_hosts of asgi_app)",
+                403,
             )
 
-        origin = headers.get(b"origin", b"").decode("latin-1").lower()
+        origin = headers.get("origin", "").lower()
         if origin and not self._is_own_page(origin, host):
-            raise OriginError(
+            raise RequestError(
                 f"Origin: expected a page of this server, got a page of {shown(origin)}; open {shown(host)} "
                 "itself, or allow a page of another host name (not of another port) by --allow-host (allowed_hosts of "
-                "asgi_app)"
+                "asgi_app)",
+                403,
             )
 
         # Without `Origin`, `Sec-Fetch-Site` decides. Browsers send `same-origin` if a page of this server sends the
         # request, and `none` if the user has typed the address. Other programs do not send the header. A link on
         # another site may open a page of this server, because the other site cannot read the response.
-        fetch_site = headers.get(b"sec-fetch-site", b"none").decode("latin-1").lower()
-        is_link = headers.get(b"sec-fetch-dest") == b"document" and method in ("GET", "HEAD")
+        fetch_site = headers.get("sec-fetch-site", "none").lower()
+        is_link = headers.get("sec-fetch-dest") == "document" and method in ("GET", "HEAD")
         if not (origin or is_link or fetch_site in ("same-origin", "none")):
-            raise OriginError(
+            raise RequestError(
                 f"Sec-Fetch-Site: expected a request by a page of this server, got {shown(fetch_site)}; open the page "
-                f"of {shown(host)}"
+                f"of {shown(host)}",
+                403,
             )
 
         if needs_token:
-            self.check_token(headers.get(b"authorization", b""))
+            self.check_token(headers.get("authorization", ""))
 
-    def check_token(self, authorization: bytes) -> None:
+    def check_token(self, authorization: str) -> None:
         """Check the token that a client has sent. If the server has no token, every client is accepted.
 
         Args:
-            authorization: Value of the header or the gRPC metadata `authorization`, such as b"Bearer TOKEN"; empty if
+            authorization: Value of the header or of the gRPC metadata `authorization`, such as "Bearer TOKEN"; empty if
                 the client has sent none. The word `Bearer` may be in upper case or lower case (RFC 9110, 11.1).
 
         Raises:
-            TokenError: If the token is missing or wrong.
+            RequestError: If the token is missing or wrong.
         """
         if self._token is None:
             return
-        scheme, _, token = authorization.partition(b" ")
+        scheme, _, token = authorization.partition(" ")
         # The duration of this comparison does not depend on the number of correct characters. A client therefore cannot
         # use it to guess the token character by character.
-        is_correct = hmac.compare_digest(token.lstrip(b" "), self._token)
-        if scheme.lower() != b"bearer" or not is_correct:
+        is_correct = hmac.compare_digest(token.lstrip(" ").encode(), self._token)
+        if scheme.lower() != "bearer" or not is_correct:
             received = "a wrong one" if authorization else "none"
-            raise TokenError(
+            raise RequestError(
                 "expected `Authorization: Bearer TOKEN` with this server's token, in a header or in the metadata of "
-                f"gRPC, got {received}"
+                f"gRPC, got {received}",
+                401,
+                (b"www-authenticate", b"Bearer"),
             )
 
     def _is_own_page(self, origin: str, host: str) -> bool:
@@ -160,7 +165,7 @@ class AccessCheck:
         return page_name in self._allowed_names and (page_name != _name_in(host) or is_port_removed)
 
 
-def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
+def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[str, str]:
     """Return the value of each header by its name. If a header is repeated, its last value is returned.
 
     Args:
@@ -169,10 +174,12 @@ def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
     Raises:
         RequestError: If `Host` (RFC 9112, 3.2) or `Origin` is repeated. A proxy could have checked the other value.
     """
-    values: dict[bytes, bytes] = {}
-    for name, value in headers:
-        if name in values and name in (b"host", b"origin"):
-            raise RequestError(f"{name.decode()}: expected one header, got {shown(values[name])} and {shown(value)}")
+    values: dict[str, str] = {}
+    for name_bytes, value_bytes in headers:
+        name = name_bytes.decode("latin-1")
+        value = value_bytes.decode("latin-1")
+        if name in values and name in ("host", "origin"):
+            raise RequestError(f"{name}: expected one header, got {shown(values[name])} and {shown(value)}")
         values[name] = value
     return values
 

@@ -10,7 +10,9 @@ log line, fill the disk with long lines, or create new counters.
 
 import json
 import logging
+import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -94,20 +96,20 @@ class Exchange:
     Attributes:
         transport: Transport of the request, which is "http" or "grpc".
         route: Name of the route, or "none" if the request could not be read.
-        status: HTTP status, or name of the gRPC status.
+        status: HTTP status, or name of the gRPC status. "CANCELLED" if the client has ended a call of gRPC.
         model: Label `name/version` of the requested model, or None if no loaded model was requested.
         error: Name of the type of the error, or None if no error occurred.
-        duration_us: Time from the complete request to the complete response, us; 0 if the time is unknown.
-        client: Address and port of the client, or a text that contains both.
+        duration_us: Time from the complete request to the complete response, us.
+        client: Address and port of the client.
     """
 
     transport: str
-    route: str
-    status: int | str
+    route: str = "none"
+    status: int | str = "CANCELLED"
     model: str | None = None
     error: str | None = None
     duration_us: float = 0.0
-    client: Client | str = None
+    client: str | None = None
 
 
 class RequestLog(logging.Handler):
@@ -165,11 +167,25 @@ class Traffic:
             "isocharge_log_lines_lost", "Lines of the log that could not be written.", registry=self.registry
         )
 
-    def count_and_log(self, exchange: Exchange) -> None:
-        """Count a request that was answered, possibly with an error, and log the request if there is a log."""
-        self._requests.labels(exchange.transport, exchange.route, exchange.status).inc()
-        if self.log is not None:
-            client = exchange.client
-            client_text = "%s:%d" % client if isinstance(client, tuple) else client  # noqa: UP031 - twice as fast
-            level = "error" if exchange.status in (500, "INTERNAL") else "info"  # internal errors of HTTP and of gRPC
-            self.log.write_line(level=level, event="request", **vars(exchange) | {"client": client_text})
+    @contextmanager
+    def exchange(self, transport: str, client: Client | str = None) -> Iterator[Exchange]:
+        """At the end of the `with` block, count the request that it answers or refuses, and log it if there is a log.
+
+        Args:
+            transport: Transport of the request, which is "http" or "grpc".
+            client: Address and port of the client, or a text that contains both.
+
+        Yields:
+            Properties of the request and of the response, which the block sets.
+        """
+        start_ns = time.perf_counter_ns()
+        exchange = Exchange(transport)
+        try:
+            yield exchange
+        finally:
+            self._requests.labels(transport, exchange.route, exchange.status).inc()
+            if self.log is not None:
+                exchange.duration_us = (time.perf_counter_ns() - start_ns) / 1000
+                exchange.client = "%s:%d" % client if isinstance(client, tuple) else client  # noqa: UP031 - fast
+                level = "error" if exchange.status in (500, "INTERNAL") else "info"  # errors of the server itself
+                self.log.write_line(level=level, event="request", **vars(exchange))

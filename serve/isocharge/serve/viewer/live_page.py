@@ -21,14 +21,14 @@ from typing import Annotated, Any
 
 from msgspec import Meta, Struct
 
-from isocharge.common.errors import RequestError, UnknownPath, WrongMethod, is_printable
+from isocharge.common.errors import RequestError, is_printable
 from isocharge.common.structs import Finite, WrongKey, parse_json
 from isocharge.serve.flags import MEANINGS
 from isocharge.serve.network.address import Address, ServerLimits, Tls
 from isocharge.serve.network.browser_check import AccessCheck
 from isocharge.serve.network.http.server import HttpServer
 from isocharge.serve.network.metrics import Traffic
-from isocharge.serve.network.protocol.handler import Application
+from isocharge.serve.network.protocol.handler import Application, check_method
 from isocharge.serve.network.protocol.response import Response, json_response, response_of
 from isocharge.serve.record.record import PredictionRecord
 from isocharge.serve.viewer.tape import (
@@ -165,7 +165,7 @@ class LivePage(Application):
         self._markers.append((time_s, text))
         self.update(markers=list(self._markers))
 
-    def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
+    def _check_and_answer(self, method: str, path: str, headers: Mapping[str, str], body: bytes) -> Response:
         """Check whether a request is allowed, and return the response. The files of the page need no token.
 
         Raises:
@@ -177,9 +177,8 @@ class LivePage(Application):
         if path == SESSION_PATH:
             return json_response(self._session)
         if path != REQUEST_PATH:
-            raise UnknownPath(f"nothing is served under {path[:200]!r}; the page is /")
-        if method != "POST":
-            raise WrongMethod(path, method, "POST")
+            raise RequestError(f"nothing is served under {path[:200]!r}; the page is /", 404)
+        check_method(path, method, "POST")
         request = parse_json(body, "", RequestError, Read | Action)  # type: ignore[arg-type]
         if isinstance(request, Read):
             return json_response(self._read(request))
@@ -266,8 +265,7 @@ def _page_files() -> dict[str, Response]:
     responses = {}
     for path in folder.rglob("*"):
         if path.suffix in CONTENT_TYPES:  # other files belong to the operating system, such as .DS_Store
-            response = response_of(200, CONTENT_TYPES[path.suffix], path.read_bytes())
-            response.headers.extend(PAGE_HEADERS)
+            response = response_of(200, CONTENT_TYPES[path.suffix], path.read_bytes(), *PAGE_HEADERS)
             responses[f"/{path.relative_to(folder).as_posix()}"] = response
     responses["/"] = responses["/index.html"]
     return responses

@@ -13,7 +13,6 @@ All other messages are converted from and to the JSON objects of the HTTP routes
 """
 
 import asyncio
-import time
 from importlib.resources import files
 from typing import Any
 
@@ -25,30 +24,25 @@ from google.protobuf.json_format import MessageToJson, ParseDict
 from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 
-from isocharge.common.errors import ModelError, RequestError, TooMany
+from isocharge.common.errors import ModelError, RequestError
 from isocharge.common.structs import convert
 from isocharge.serve.network.metrics import Exchange
 from isocharge.serve.network.protocol.handler import Handler
-from isocharge.serve.network.protocol.inference import InferBody, infer, take_binary_tensor
+from isocharge.serve.network.protocol.inference import InferBody, Json, infer, take_binary_tensor
 from isocharge.serve.network.protocol.response import refusal
 from isocharge.serve.network.protocol.routes import ROUTES, Request
 
-SERVICE = "inference.GRPCInferenceService"
+(_PROTOCOL_FILE,) = FileDescriptorSet.FromString(files(__package__).joinpath("inference.binpb").read_bytes()).file
+_DESCRIPTOR = (
+    DescriptorPool().AddSerializedFile(_PROTOCOL_FILE.SerializeToString()).services_by_name["GRPCInferenceService"]
+)
+
+SERVICE = _DESCRIPTOR.full_name
 """Full name of the gRPC service."""
-
-
-def _service_descriptor() -> Any:
-    """Read the compiled protocol file, and return the descriptor of the service."""
-    compiled = files(__package__).joinpath("inference.binpb").read_bytes()
-    (file_descriptor,) = FileDescriptorSet.FromString(compiled).file
-    pool = DescriptorPool()
-    pool.Add(file_descriptor)
-    return pool.FindServiceByName(SERVICE)
-
 
 METHODS = {
     method.name: (GetMessageClass(method.input_type), GetMessageClass(method.output_type))
-    for method in _service_descriptor().methods
+    for method in _DESCRIPTOR.methods
 }
 """Class of the request and class of the response, by the name of the method."""
 
@@ -82,26 +76,24 @@ def read_request(message: Any) -> tuple[InferBody, bytes]:
     return convert(content, InferBody, "", RequestError), b"".join(raw_contents)
 
 
-def write_response(content: dict[str, Any], *, is_raw: bool) -> Any:
+def write_response(content: Json, *, is_raw: bool) -> Any:
     """Convert the content of an HTTP response to a ModelInferResponse.
 
     Args:
         content: Content of the HTTP response, whose outputs contain their values.
         is_raw: Whether the values become raw contents instead of lists of numbers or texts.
     """
-    _, response_type = METHODS["ModelInfer"]
-    if is_raw:
-        raw_contents = [take_binary_tensor(tensor) for tensor in content["outputs"]]
-        for tensor in content["outputs"]:
-            del tensor["parameters"]  # the raw contents themselves have a length
-        return response_type(**content, raw_output_contents=raw_contents)
+    raw_contents = []
     for tensor in content["outputs"]:
-        values = tensor.pop("data")
-        if tensor["datatype"] == "BYTES":
-            tensor["contents"] = {"bytes_contents": [text.encode() for text in values]}
+        if is_raw:
+            raw_contents.append(take_binary_tensor(tensor))
+            del tensor["parameters"]  # the raw contents themselves have a length
+        elif tensor["datatype"] == "BYTES":
+            tensor["contents"] = {"bytes_contents": [text.encode() for text in tensor.pop("data")]}
         else:
-            tensor["contents"] = {"fp32_contents": values.tolist()}
-    return response_type(**content)
+            tensor["contents"] = {"fp32_contents": tensor.pop("data").tolist()}
+    _, response_type = METHODS["ModelInfer"]
+    return response_type(**content, raw_output_contents=raw_contents)
 
 
 ROUTE_OF_METHOD = {name: route for route in ROUTES for name in route.rpcs}
@@ -109,6 +101,20 @@ ROUTE_OF_METHOD = {name: route for route in ROUTES for name in route.rpcs}
 
 ANSWER_FIELDS = {"ModelConfig": "config", "RepositoryIndex": "models"}
 """Field of the response that contains the answer, by the name of the method. Other responses are the answer itself."""
+
+GRPC_STATUSES = {
+    400: "INVALID_ARGUMENT",
+    401: "UNAUTHENTICATED",
+    404: "NOT_FOUND",
+    408: "DEADLINE_EXCEEDED",
+    413: "RESOURCE_EXHAUSTED",
+    429: "RESOURCE_EXHAUSTED",
+    500: "INTERNAL",
+}
+"""Name of the gRPC status by the HTTP status with the same meaning."""
+
+TIMEOUT_MESSAGE = "the client sent or read nothing for too long, another call needed the place, or the server stopped"
+"""Message to a client whose call has taken too long."""
 
 STREAM_METHOD = "ModelStreamInfer"
 """Name of the method that receives and sends several messages in one call."""
@@ -141,30 +147,22 @@ class Service:
             _messages: Iterator over the messages. It is not used, because the messages are read from the context.
             context: Context of the call, from which messages are read and to which responses are written.
         """
-        # If the client ends the call, this coroutine is cancelled, and the call is counted with this first status.
-        call = Exchange("grpc", name, "CANCELLED", client=context.peer())
-        start_ns = time.perf_counter_ns()
         message = ""
         self._open_count += 1
-        try:
-            self._limit_open_calls()
-            await self._answer(name, context, call)
-            call.status = "OK"
-        except grpc.aio.InternalError as error:  # the client ended the call while a message was read or sent
-            raise asyncio.CancelledError from error
-        except TimeoutError:
-            call.status = "DEADLINE_EXCEEDED"
-            call.error = "TimeoutError"
-            message = (
-                "the client sent or read nothing for too long, another call needed the place, or the server stopped"
-            )
-        except Exception as error:  # every error is sent to the client
-            _, call.status, message = refusal(error)
-            call.error = type(error).__name__
-        finally:
-            self._open_count -= 1
-            call.duration_us = (time.perf_counter_ns() - start_ns) / 1000
-            self._handler.traffic.count_and_log(call)
+        with self._handler.traffic.exchange("grpc", context.peer()) as call:
+            call.route = name
+            try:
+                self._limit_open_calls()
+                await self._answer(name, context, call)
+                call.status = "OK"
+            except grpc.aio.InternalError as error:  # the client ended the call while a message was read or sent
+                raise asyncio.CancelledError from error
+            except Exception as error:  # every error is sent to the client
+                status, message = (408, TIMEOUT_MESSAGE) if isinstance(error, TimeoutError) else refusal(error)
+                call.status = GRPC_STATUSES[status]
+                call.error = type(error).__name__
+            finally:
+                self._open_count -= 1
         if message:
             await context.abort(grpc.StatusCode[str(call.status)], message)
 
@@ -187,7 +185,7 @@ class Service:
         """
         if ROUTE_OF_METHOD[name].needs_token:
             metadata = dict(context.invocation_metadata() or ())
-            self._handler.access.check_token(str(metadata.get("authorization", "")).encode())
+            self._handler.access.check_token(str(metadata.get("authorization", "")))
         timeout_s = self._handler.limits.header_seconds
         while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:
             if name.startswith("RepositoryModel"):  # loading a model takes a long time
@@ -200,7 +198,7 @@ class Service:
                 return
             timeout_s = self._handler.limits.idle_seconds
 
-    def _respond(self, name: str, data: bytes, call: Exchange) -> bytes:
+    def _respond(self, name: str, data: bytes, call: Exchange) -> Any:
         """Answer one message, and return the serialized response.
 
         Args:
@@ -232,9 +230,7 @@ class Service:
         else:
             # The body of the equivalent HTTP request has the same fields as the message.
             body = MessageToJson(request, preserving_proto_field_name=True).encode()
-            equivalent = Request(
-                self._handler.store, self._handler.limits, self._handler.traffic, {}, body, model_name, model_version
-            )
+            equivalent = Request(self._handler.store, self._handler.traffic, {}, body, model_name, model_version)
             try:
                 answer = ROUTE_OF_METHOD[name].respond(equivalent)
             except ModelError:
@@ -244,14 +240,13 @@ class Service:
             if name in ANSWER_FIELDS:
                 answer = {ANSWER_FIELDS[name]: answer}
             response = ParseDict(answer, response_type())
-        response_data: bytes = response.SerializeToString()
-        return response_data
+        return response.SerializeToString()
 
     def _infer(self, request: Any) -> Any:
         """Run a model on the charges of a ModelInferRequest, and return the ModelInferResponse."""
         loaded = self._handler.store.get(request.model_name, request.model_version)
         with loaded.statistics.refused.count_exceptions(), loaded.statistics.latency.time():
-            content = infer(loaded, self._handler.limits.batch, *read_request(request))
+            content = infer(loaded, *read_request(request))
             return write_response(content, is_raw=len(request.raw_input_contents) > 0)
 
     def _infer_in_stream(self, request: Any) -> Any:
@@ -263,20 +258,20 @@ class Service:
         try:
             return response_type(infer_response=self._infer(request))
         except Exception as error:  # every error is sent to the client
-            _, _, message = refusal(error)
+            _, message = refusal(error)
             return response_type(error_message=message)
 
     def _limit_open_calls(self) -> None:
         """If there are too many open calls, end the call that has waited longest for a message.
 
         Raises:
-            TooMany: If there are too many open calls, and none of them waits for a message.
+            RequestError: If there are too many open calls, and none of them waits for a message.
         """
         if self._open_count <= self._handler.limits.connections:
             return
         oldest_timeout = next(iter(self._waiting), None)  # the first element has waited longest
         if oldest_timeout is None:
-            raise TooMany(f"all {self._handler.limits.connections} calls are taken; try again later")
+            raise RequestError(f"all {self._handler.limits.connections} calls are taken; try again later", 429)
         # A timeout with a deadline in the past expires at once, and ends its call. The call counts as open until its
         # coroutine ends. The count may briefly exceed the limit.
         del self._waiting[oldest_timeout]

@@ -22,7 +22,7 @@ import uvloop
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 
 from isocharge.serve.network.address import Address, ServerLimits, Tls
-from isocharge.serve.network.metrics import Exchange, Traffic
+from isocharge.serve.network.metrics import Traffic
 from isocharge.serve.network.protocol.handler import Application
 
 
@@ -198,8 +198,8 @@ class Connection(HttpToolsProtocol):
             return
         body = orjson.dumps({"error": message})
         head = b"content-type: application/json\r\ncontent-length: %d\r\nconnection: close\r\n\r\n" % len(body)
-        exchange = Exchange("http", "none", status, client=self.client)
-        self._traffic.count_and_log(exchange)
+        with self._traffic.exchange("http", self.client) as exchange:
+            exchange.status = status
         self.transport.write(STATUS_LINE[status] + head + body)
         self.transport.close()
         self._allow(self._limits.header_seconds)
@@ -247,7 +247,7 @@ class HttpServer(uvicorn.Server):
         limits = _within_open_files(application.limits)
         tls_context = tls.context() if tls else None
         self._address = address
-        self._socket = address.listen(limits.connections)
+        self._socket = address.listen()
         config = uvicorn.Config(
             application,
             http=partial(Connection, limits, traffic),  # type: ignore[arg-type]

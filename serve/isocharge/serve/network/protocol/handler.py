@@ -13,23 +13,19 @@ request and the name of its counter.
 
 import asyncio
 import re
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
 from functools import lru_cache
 from typing import Any
 
-from isocharge.common.errors import TooLarge, UnknownPath, WrongMethod
+from isocharge.common.errors import RequestError
 from isocharge.common.files import StrPath
 from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.browser_check import AccessCheck, header_values
-from isocharge.serve.network.metrics import Client, Exchange, Traffic
+from isocharge.serve.network.metrics import Client, Traffic
 from isocharge.serve.network.model_store import ModelStore
-from isocharge.serve.network.protocol.response import Response, decompress, error_response, json_response
+from isocharge.serve.network.protocol.response import Header, Response, decompress, error_response, json_response
 from isocharge.serve.network.protocol.routes import ROUTES, UNKNOWN, Request, Route
-
-Headers = Iterable[tuple[bytes, bytes]]
-"""Headers of a request. The names are in lower case, and the values are unchanged."""
 
 Message = MutableMapping[str, Any]
 """Message or scope of ASGI."""
@@ -93,8 +89,8 @@ class Application(ABC):
         await send({"type": "http.response.start", "status": response.status, "headers": response.headers})
         await send({"type": "http.response.body", "body": response.body})
 
-    def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client = None) -> Response:  # noqa: ARG002
-        """Answer one request.
+    def answer(self, method: str, path: str, headers: Iterable[Header], body: bytes, client: Client = None) -> Response:
+        """Answer one request, count the request, and log the request if there is a log.
 
         Args:
             method: Method in capitals.
@@ -106,17 +102,28 @@ class Application(ABC):
         Returns:
             The response. If an error occurs, it is not raised, but the response contains its status and its message.
         """
-        try:
-            if len(body) > self.limits.body_bytes:
-                raise TooLarge(
-                    f"expected a body of at most {self.limits.body_bytes} bytes, got more; send smaller batches"
-                )
-            return self._check_and_answer(method, path, header_values(headers), body)
-        except Exception as error:  # every error is sent to the client
-            return error_response(error)
+        limit = self.limits.body_bytes
+        with self.traffic.exchange("http", client) as exchange:
+            try:
+                if len(body) > limit:
+                    raise RequestError(f"expected a body of at most {limit} bytes, got more; send smaller batches", 413)
+                response = self._check_and_answer(method, path, header_values(headers), body)
+            except Exception as error:  # every error is sent to the client
+                exchange.error = type(error).__name__
+                response = error_response(error)
+            exchange.status = response.status
+            exchange.route, exchange.model = self._identify(path)
+        return response
+
+    def _identify(self, path: str) -> tuple[str, str | None]:  # noqa: ARG002
+        """Return the name of the route of a path, and the label of the model in the path, for the counters and the log.
+
+        By default, all requests are counted together.
+        """
+        return "page", None
 
     @abstractmethod
-    def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
+    def _check_and_answer(self, method: str, path: str, headers: Mapping[str, str], body: bytes) -> Response:
         """Check whether a request is allowed, answer the request, and return the response.
 
         Args:
@@ -128,6 +135,17 @@ class Application(ABC):
         Raises:
             IsochargeError: If the request is refused.
         """
+
+
+def check_method(path: str, method: str, allowed: str) -> None:
+    """Check the method of a request.
+
+    Raises:
+        RequestError: If the method is not the only method that is allowed for the path.
+    """
+    if method != allowed:
+        message = f"{path}: expected the method {allowed}, got {method[:20]}"
+        raise RequestError(message, 405, (b"allow", allowed.encode()))
 
 
 _PATTERNS = [
@@ -179,37 +197,24 @@ class Handler(Application):
         self.traffic = traffic or Traffic()
         self.traffic.registry.register(store)
 
-    def answer(self, method: str, path: str, headers: Headers, body: bytes, client: Client = None) -> Response:
-        """Answer one request as `Application.answer`, count the request, and log the request if there is a log."""
-        start_ns = time.perf_counter_ns()
-        response = super().answer(method, path, headers, body)
+    def _identify(self, path: str) -> tuple[str, str | None]:
+        """Return the first path of the route, under which all paths of the route are counted, and the model's label."""
         route, model = match_path(path)
-        exchange = Exchange(
-            transport="http",
-            route=route.paths[0],  # all paths are counted under the first path
-            status=response.status,
-            model=self.store.label(**model) if self.traffic.log else None,
-            error=response.error,
-            duration_us=(time.perf_counter_ns() - start_ns) / 1000,
-            client=client,
-        )
-        self.traffic.count_and_log(exchange)
-        return response
+        return route.paths[0], self.store.label(**model) if self.traffic.log else None
 
-    def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
+    def _check_and_answer(self, method: str, path: str, headers: Mapping[str, str], body: bytes) -> Response:
         """Check a request, and answer it with the function of its route."""
         route, model = match_path(path)
         # The token is checked before unknown paths are refused. A client without the token therefore cannot find out
         # which paths exist.
         self.access.check(method, headers, needs_token=route.needs_token)
         if route is UNKNOWN:
-            raise UnknownPath(f"{path[:200]}: nothing is served under this path; see /openapi.json")
+            raise RequestError(f"{path[:200]}: nothing is served under this path; see /openapi.json", 404)
         # A HEAD request is answered like a GET request. The server then sends the response without its body.
-        answered_method = "GET" if method == "HEAD" else method
-        if answered_method != route.method:
-            raise WrongMethod(path, method, route.method)
-        body = decompress(body, headers.get(b"content-encoding", b"").lower(), self.limits.body_bytes)
-        answer = route.respond(Request(self.store, self.limits, self.traffic, headers, body, **model))
+        if (method, route.method) != ("HEAD", "GET"):
+            check_method(path, method, route.method)
+        body = decompress(body, headers.get("content-encoding", "").lower(), self.limits.body_bytes)
+        answer = route.respond(Request(self.store, self.traffic, headers, body, **model))
         return answer if isinstance(answer, Response) else json_response(answer)
 
 

@@ -15,13 +15,17 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from isocharge.common.arrays import Singles
-from isocharge.common.errors import RequestError, TooLarge
+from isocharge.common.defaults import MAX_BATCH
+from isocharge.common.errors import RequestError
 from isocharge.common.structs import parse_json
 from isocharge.serve.model.contact import Contacts, as_float32
 from isocharge.serve.model.session import COLUMNS, INPUT, OUTPUTS
 from isocharge.serve.network.model_store import LoadedVersion
 
-Parameters = dict[str, Any] | None
+Json = dict[str, Any]
+"""JSON object."""
+
+Parameters = Json | None
 """Parameters of a request, of an input or of an output. Unknown parameters are ignored, as in Triton."""
 
 
@@ -68,7 +72,7 @@ This output is only computed if the client requests it.
 """
 
 
-def read_infer(body: bytes, header_length: bytes | None) -> tuple[InferBody, bytes]:
+def read_infer(body: bytes, header_length: str | None) -> tuple[InferBody, bytes]:
     """Read a request for an inference from the body of an HTTP request.
 
     Args:
@@ -86,10 +90,10 @@ def read_infer(body: bytes, header_length: bytes | None) -> tuple[InferBody, byt
     if header_length is not None:
         # The characters are checked before the conversion, because int() also accepts signs, blanks and underscores,
         # and is slow for long texts.
-        if not header_length.isdigit() or len(header_length) > len(str(len(body))):
+        if not header_length.isdecimal() or len(header_length) > len(str(len(body))):
             raise RequestError(
                 f"Inference-Header-Content-Length: expected a whole number up to {len(body)}, the bytes of the body, "
-                f"got {header_length.decode('latin-1')!r:.50}"
+                f"got {header_length!r:.50}"
             )
         json_length = int(header_length)
     return parse_json(body[:json_length], "", RequestError, InferBody), body[json_length:]
@@ -100,19 +104,17 @@ def requested_outputs(body: InferBody) -> list[OutputTensor]:
     return body.outputs or [OutputTensor(name) for name in OUTPUTS]  # type: ignore[arg-type]
 
 
-def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...], max_presses: int) -> Singles:
+def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...]) -> Singles:
     """Return the charges of an input tensor, shape (n, electrodes), pC.
 
     Args:
         tensor: Input tensor of the request.
         binary: Binary tensor with the charges. It is empty if the input tensor itself contains the charges.
         electrodes: Names of the electrodes of the model, in the order of the charges.
-        max_presses: Largest number of presses in one request.
 
     Raises:
-        RequestError: If the shape or the data are not valid.
+        RequestError: If the shape or the data are not valid, or if there are too many presses.
         ChargeError: If a charge is not finite.
-        TooLarge: If the request contains more than `max_presses` presses.
     """
     shape = tensor.shape
     if len(shape) != 2 or shape[0] < 1 or shape[1] != len(electrodes):
@@ -120,8 +122,8 @@ def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...
             f"input {INPUT!r}: expected the shape [n, {len(electrodes)}] with n > 0, "
             f"a column for each of {electrodes}, got {shape!r:.100}"
         )
-    if shape[0] > max_presses:
-        raise TooLarge(f"input {INPUT!r}: expected at most {max_presses} presses in one request, got {shape[0]}")
+    if shape[0] > MAX_BATCH:
+        raise RequestError(f"input {INPUT!r}: expected at most {MAX_BATCH} presses in one request, got {shape[0]}", 413)
 
     count = math.prod(shape)
     dtype = np.dtype(DATATYPES[tensor.datatype])
@@ -139,12 +141,11 @@ def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...
     return as_float32(charges.reshape(shape), electrodes)
 
 
-def infer(loaded: LoadedVersion, max_presses: int, body: InferBody, binary: bytes) -> dict[str, Any]:
+def infer(loaded: LoadedVersion, body: InferBody, binary: bytes) -> Json:
     """Run a model on the presses of a request, and count the presses.
 
     Args:
         loaded: Version of the model that is run.
-        max_presses: Largest number of presses in one request.
         body: Content of the request.
         binary: Binary tensor with the charges, which is empty if the content contains the charges.
 
@@ -155,9 +156,9 @@ def infer(loaded: LoadedVersion, max_presses: int, body: InferBody, binary: byte
     Raises:
         IsochargeError: If the request does not fit the model, or if the model fails.
     """
-    charge_pC = _read_charges(body.inputs[0], binary, loaded.metadata.electrodes, max_presses)
+    charge_pC = _read_charges(body.inputs[0], binary, loaded.metadata.electrodes)
     contacts = loaded.predict_rows(charge_pC)
-    outputs: dict[str, Any] = {name: contacts[:, columns] for name, columns in COLUMNS.items()}
+    outputs: Json = {name: contacts[:, columns].ravel() for name, columns in COLUMNS.items()}
     alarm_count = np.count_nonzero(~(outputs["misfit"] <= loaded.validity.misfit_limit))  # also NaN
     loaded.statistics.presses.inc(len(charge_pC))
     loaded.statistics.alarms.inc(float(alarm_count))
@@ -166,26 +167,22 @@ def infer(loaded: LoadedVersion, max_presses: int, body: InferBody, binary: byte
     if FLAGS in names:
         flags_of_presses = loaded.validity.batch_flags(Contacts(*contacts.T))
         outputs[FLAGS] = [",".join(flags) for flags in flags_of_presses]
-    content: dict[str, Any] = {"model_name": loaded.metadata.name, "model_version": loaded.version}
+    content: Json = {"model_name": loaded.metadata.name, "model_version": loaded.version}
     if body.id:
         content["id"] = body.id
-    content["outputs"] = [_output_tensor(name, outputs[name]) for name in names]
+    content["outputs"] = [
+        {
+            "name": name,
+            "datatype": "BYTES" if name == FLAGS else "FP32",
+            "shape": [len(charge_pC), OUTPUTS.get(name, 1)],  # the output `flags` has one column
+            "data": outputs[name],
+        }
+        for name in names
+    ]
     return content
 
 
-def _output_tensor(name: str, values: Any) -> dict[str, Any]:
-    """Return the object that describes an output, with its values.
-
-    Args:
-        name: Name of the output.
-        values: Array of numbers, shape (n, width), or a list of n texts for the output `flags`.
-    """
-    if name == FLAGS:
-        return {"name": name, "datatype": "BYTES", "shape": (len(values), 1), "data": values}
-    return {"name": name, "datatype": "FP32", "shape": values.shape, "data": values.ravel()}
-
-
-def take_binary_tensor(tensor: dict[str, Any]) -> bytes:
+def take_binary_tensor(tensor: Json) -> bytes:
     """Replace the values in the object that describes an output by their size, and return them as a binary tensor.
 
     In a binary tensor, numbers are little-endian float32. Each text is preceded by its length in bytes, a 32-bit

@@ -8,23 +8,23 @@ from collections.abc import Callable, Mapping
 from importlib.resources import files
 from typing import Any, NamedTuple
 
-import orjson
 from prometheus_client import generate_latest
 
+from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import ModelError, RequestError, package_version
 from isocharge.common.structs import parse_json
 from isocharge.serve.model.session import INPUT, OUTPUTS
-from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.metrics import CONTENT_TYPE, Traffic
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol.inference import (
+    Json,
     RepositoryBody,
     infer,
     read_infer,
     requested_outputs,
     take_binary_tensor,
 )
-from isocharge.serve.network.protocol.response import Response, response_of
+from isocharge.serve.network.protocol.response import Response, json_response, response_of
 
 EXTENSIONS = (
     "binary_tensor_data",
@@ -45,7 +45,6 @@ class Request(NamedTuple):
 
     Attributes:
         store: Store of the models that the server uses.
-        limits: Limits of the size of a body and of a batch.
         traffic: Counters of the requests to the server.
         headers: Value of each header by the name of the header in lower case.
         body: Body of the request.
@@ -54,9 +53,8 @@ class Request(NamedTuple):
     """
 
     store: ModelStore
-    limits: ServerLimits
     traffic: Traffic
-    headers: Mapping[bytes, bytes]
+    headers: Mapping[str, str]
     body: bytes
     name: str = ""
     version: str = ""
@@ -91,7 +89,7 @@ def _show_openapi(_: Request) -> Response:
     return response_of(200, b"application/json", files(__package__).joinpath("openapi.json").read_bytes())
 
 
-def _show_server(_: Request) -> dict[str, Any]:
+def _show_server(_: Request) -> Json:
     """Return the name and the version of the server, and the extensions of the protocol that it supports."""
     return {"name": "isocharge", "version": package_version(), "extensions": list(EXTENSIONS)}
 
@@ -116,7 +114,7 @@ def _show_index(request: Request) -> list[dict[str, str]]:
     return [row for row in request.store.index() if row["state"] == "READY" or not body.ready]
 
 
-def _load(request: Request) -> dict[str, Any]:
+def _load(request: Request) -> Json:
     """Read the files of a model again, and return an empty object."""
     if parse_json(request.body or b"{}", "", RequestError, RepositoryBody).parameters:
         raise RequestError(
@@ -126,12 +124,12 @@ def _load(request: Request) -> dict[str, Any]:
     return {}
 
 
-def _unload(request: Request) -> dict[str, Any]:
+def _unload(request: Request) -> Json:
     request.store.unload(request.name)
     return {}
 
 
-def _show_statistics(request: Request) -> dict[str, Any]:
+def _show_statistics(request: Request) -> Json:
     """Return the counters of one version of a model, of all its versions, or of all versions of all models."""
     if request.name:
         _ = request.loaded  # raises ModelNotFound
@@ -142,7 +140,7 @@ def _show_statistics(request: Request) -> dict[str, Any]:
     return {"model_stats": rows}
 
 
-def _show_model(request: Request) -> dict[str, Any]:
+def _show_model(request: Request) -> Json:
     """Return the metadata of a model, and the names, number types and shapes of its tensors.
 
     The metadata are under the key `properties`. Each value of the metadata is a JSON text, as in the model file.
@@ -158,12 +156,12 @@ def _show_model(request: Request) -> dict[str, Any]:
     }
 
 
-def _tensor(name: str, width: int) -> dict[str, Any]:
+def _tensor(name: str, width: int) -> Json:
     """Return the description of a tensor that has any number of rows and `width` columns."""
     return {"name": name, "datatype": "FP32", "shape": [-1, width]}
 
 
-def _show_config(request: Request) -> dict[str, Any]:
+def _show_config(request: Request) -> Json:
     """Return the configuration of a model in the form that Triton uses."""
     metadata = request.loaded.metadata
     return {
@@ -171,7 +169,7 @@ def _show_config(request: Request) -> dict[str, Any]:
         "platform": PLATFORM,
         "backend": "onnxruntime",
         "version_policy": {"all": {}},
-        "max_batch_size": request.limits.batch,
+        "max_batch_size": MAX_BATCH,
         "input": [{"name": INPUT, "data_type": "TYPE_FP32", "dims": [len(metadata.electrodes)]}],
         "output": [{"name": name, "data_type": "TYPE_FP32", "dims": [OUTPUTS[name]]} for name in OUTPUTS],
     }
@@ -183,24 +181,23 @@ def _infer(request: Request) -> Response:
     The body of the response is a JSON text, which may be followed by binary tensors.
     """
     loaded = request.loaded
-    if not request.body and b"upgrade" in request.headers:  # uvicorn discards the body of a request for an upgrade
+    if not request.body and "upgrade" in request.headers:  # uvicorn discards the body of a request for an upgrade
         raise RequestError("Upgrade: this server reads no body after this header; set the client to HTTP/1.1")
-    header_length = request.headers.get(b"inference-header-content-length")
+    header_length = request.headers.get("inference-header-content-length")
     with loaded.statistics.refused.count_exceptions(), loaded.statistics.latency.time():
         body, binary = read_infer(request.body, header_length)
-        content = infer(loaded, request.limits.batch, body, binary)
+        content = infer(loaded, body, binary)
         is_binary = (body.parameters or {}).get("binary_data_output")
         binary_tensors = [
             take_binary_tensor(tensor)
             for output, tensor in zip(requested_outputs(body), content["outputs"], strict=True)
             if (output.parameters or {}).get("binary_data", is_binary)
         ]
-        json_text = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
+        response = json_response(content)
     if not binary_tensors:
-        return response_of(200, b"application/json", json_text)
-    response = response_of(200, b"application/octet-stream", b"".join([json_text, *binary_tensors]))
-    response.headers.append((b"inference-header-content-length", b"%d" % len(json_text)))
-    return response
+        return response
+    json_length = (b"inference-header-content-length", b"%d" % len(response.body))
+    return response_of(200, b"application/octet-stream", b"".join([response.body, *binary_tensors]), json_length)
 
 
 def _model_paths(ending: str = "") -> tuple[str, str]:
