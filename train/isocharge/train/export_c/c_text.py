@@ -1,9 +1,10 @@
 """Numbers, arrays and texts in the syntax of C99."""
 
+import math
 import re
 from importlib import resources
 from string import Template
-from textwrap import wrap
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,19 @@ def source_text(name: str, /, **values: object) -> str:
 
 
 def c_float(value: float) -> str:
-    """Return the shortest C literal of a finite number that is rounded to single precision."""
-    return str(np.float32(value)) + "f"
+    """Return the shortest C literal of a number that is rounded to single precision. The number may be infinite."""
+    return "HUGE_VALF" if math.isinf(value) else str(np.float32(value)) + "f"
+
+
+def c_type(values: NDArray[Any]) -> str:
+    """Return the C type of the numbers of an array, which is `float` except for int8 and uint32 numbers."""
+    return {"int8": "signed char", "uint32": "unsigned"}.get(values.dtype.name, "float")
+
+
+def c_numbers(values: NDArray[Any]) -> str:
+    """Return the numbers of an array of any shape as C literals with commas between them, row by row."""
+    as_text = c_float if c_type(values) == "float" else str
+    return ", ".join(map(as_text, values.ravel()))
 
 
 def c_array(name: str, values: NDArray[Any]) -> str:
@@ -27,17 +39,10 @@ def c_array(name: str, values: NDArray[Any]) -> str:
 
     Args:
         name: Name of the array.
-        values: Array of any shape, written row by row; int8 numbers become `signed char`, uint32 numbers `unsigned`,
-            and all others `float`, to which they are rounded.
+        values: Array of any shape, written row by row. Numbers of the type `float` are rounded to single precision.
     """
-    number_type = {"int8": "signed char", "uint32": "unsigned"}.get(values.dtype.name, "float")
-    as_text = c_float if number_type == "float" else str
-    literals = ", ".join(map(as_text, values.ravel()))
-    # While the lines are broken, a comma follows the last number, too. The last number then counts with the same length
-    # as the other numbers. The last comma is removed afterwards. Lines are not broken after a minus sign.
-    lines = wrap(f"{literals},", break_on_hyphens=False)
-    numbers = "\n    ".join(lines).rstrip(",")
-    return f"static const {number_type} {name}[{values.size}] = {{\n    {numbers}\n}};\n"
+    numbers = fill(c_numbers(values), initial_indent="    ", subsequent_indent="    ", break_on_hyphens=False)
+    return f"static const {c_type(values)} {name}[{values.size}] = {{\n{numbers}\n}};\n"
 
 
 def c_string(text: str) -> str:

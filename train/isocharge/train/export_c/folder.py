@@ -4,7 +4,6 @@ The folder is written completely or not at all.
 """
 
 import logging
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -41,26 +40,27 @@ def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: 
     setup = Setup(electrodes, device, has_any_sign=has_any_sign)
     if device.has_currents:
         raise DeviceError(f"{device.where}: front_end: {NOT_IN_C}")
-    lines = [f"#define ISOCHARGE_SUM_TOLERANCE_S {_c_literal(SUM_TOLERANCE_s)}"]
+    macros = {"ISOCHARGE_SUM_TOLERANCE_S": _c_literal(SUM_TOLERANCE_s)}
     chain_source = source_text("isocharge_chain.c")
-    sections_of_host = []
+    host_sections = []
     for stage in STAGES:
         is_on = stage.rule_class in device.rules
         prefix = f"ISOCHARGE_{stage.section.upper()}_"
         if prefix in chain_source:
             settings = {"on": is_on, **stage.c_settings(setup)}
-            lines += [f"#define {prefix}{name.upper()} {_c_literal(value)}" for name, value in settings.items()]
+            macros |= {prefix + name.upper(): _c_literal(value) for name, value in settings.items()}
+        elif stage.section and is_on and stage.needs_contact:
+            host_sections.append(stage.section)
         elif stage.section and is_on:
-            if not stage.needs_contact:
-                raise DeviceError(f"{device.where}: {stage.section}: {NOT_IN_C}")
-            sections_of_host.append(stage.section)
-    if sections_of_host:
+            raise DeviceError(f"{device.where}: {stage.section}: {NOT_IN_C}")
+    if host_sections:
         log.warning(
             "%s: %s: not exported, because only `isocharge serve stream` does this",
             device.where,
-            ", ".join(sections_of_host),
+            ", ".join(host_sections),
         )
-    return source_text("isocharge_device.h", origin=settings_origin(device), lines="\n".join(lines))
+    lines = "\n".join(f"#define {name} {literal}" for name, literal in macros.items())
+    return source_text("isocharge_device.h", origin=settings_origin(device), lines=lines)
 
 
 def settings_origin(device: Device) -> str:
@@ -84,12 +84,6 @@ def _c_literal(value: Any) -> str:
         return str(int(value))
     return repr(float(value))  # the shortest literal of a double
 
-
-SKETCH = "isocharge_sketch"
-"""Name of the Arduino sketch, of its folder and of the file in the folder."""
-
-BOARD_SOURCES = ("isocharge_chain.h", "isocharge_chain.c", "isocharge_frames.h", "isocharge_frames.c")
-"""Files that are the same for every model. The sketch contains copies of these files."""
 
 SINGLE_PRECISION = "/* This board computes the chain in single precision. */\n#define ISOCHARGE_CHAIN_FLOAT\n\n"
 """Text that switches the signal chain of the sketch to single precision."""
@@ -138,38 +132,30 @@ def c_files(model: Path, device: Device, command: str) -> dict[str, str]:
     path = loaded.folder / "model.onnx"
     metadata = loaded.metadata
     network = read_graph(path.read_bytes(), str(path))
+    n_electrode = len(metadata.electrodes)
     # The README contains the command between backticks, so the command itself must not contain any.
     command_in_one_line = " ".join(command.replace("`", "'").split())
-    example_charges = ["800.0f"] * len(metadata.electrodes)
-    files = {
+    sketch = {
         "isocharge_model.h": model_header(metadata, network),
         "isocharge_model.c": model_source(metadata, network),
         "isocharge_device.h": device_header(device, metadata.electrodes, has_any_sign=metadata.has_any_sign),
-        **{name: source_text(name) for name in (*BOARD_SOURCES, "host_example.c")},
+    }
+    for name in ("isocharge_chain.h", "isocharge_chain.c", "isocharge_frames.h", "isocharge_frames.c"):
+        sketch[name] = source_text(name)
+    files = {
+        **sketch,
+        "host_example.c": source_text("host_example.c"),
         "self_test.c": self_test(loaded.golden, metadata),
         "README.md": source_text(
             "README.md",
             label=metadata.label,
             command=command_in_one_line or "isocharge train export-c",
-            charges=", ".join(example_charges),
+            charges=", ".join(["800.0f"] * n_electrode),
             electrodes=c_comment(", ".join(metadata.electrodes)),
             origin=settings_origin(device),
         ),
     }
-    return files | _sketch_files(files, len(metadata.electrodes))
-
-
-def _sketch_files(files: Mapping[str, str], n_electrode: int) -> dict[str, str]:
-    """Return the texts of all files of the Arduino sketch, by their paths in the folder of the export.
-
-    The sketch has a folder of its own, which contains copies of the sources. It computes in single precision.
-
-    Args:
-        files: Text of the files of the export by name.
-        n_electrode: Number of electrodes, each of which has an analogue pin.
-    """
-    sketch = {name: files[name] for name in ("isocharge_model.h", "isocharge_model.c", *BOARD_SOURCES)}
-    sketch["isocharge_device.h"] = SINGLE_PRECISION + files["isocharge_device.h"]
-    pins = ", ".join(f"A{pin_index}" for pin_index in range(n_electrode))
-    sketch[f"{SKETCH}.ino"] = source_text("sketch.ino", pins=pins)
-    return {f"arduino/{SKETCH}/{name}": text for name, text in sketch.items()}
+    # The Arduino sketch has a folder of its own with copies of the sources. Each electrode has an analogue pin.
+    sketch["isocharge_device.h"] = SINGLE_PRECISION + sketch["isocharge_device.h"]
+    sketch["isocharge_sketch.ino"] = source_text("sketch.ino", pins=", ".join(f"A{pin}" for pin in range(n_electrode)))
+    return files | {f"arduino/isocharge_sketch/{name}": text for name, text in sketch.items()}

@@ -20,11 +20,11 @@ Layers
 ------
 
 A layer computes its outputs y = f(x W + c) from its inputs x. W are the weights, shape (inputs, outputs), c is the
-bias, and f is the hyperbolic tangent or the identity. The C function processes a few inputs at a time. Each input is
-multiplied by its row of W, which gives one product for each output. The product is added to the sum of this output. The
-inner loop of the C function runs over neighbouring outputs, and its number of iterations is constant. With -O2 or a
-higher level of optimisation, compilers therefore vectorise the loop without changing the order of any sum. Each weight
-that the training rounded to 8 bits is stored in one byte.
+bias, and f is the hyperbolic tangent or the identity. The C function processes four inputs at a time, so that it reads
+and writes each output less often. Each input is multiplied by its row of W, which gives one product for each output.
+The product is added to the sum of this output. The inner loop of the C function runs over neighbouring outputs, and its
+number of iterations is constant. With -O2 or a higher level of optimisation, compilers therefore vectorise the loop
+without changing the order of any sum. Each weight that the training rounded to 8 bits is stored in one byte.
 """
 
 import math
@@ -39,7 +39,15 @@ from isocharge.serve.model.contact import MISFIT_LIMIT, Contact, Contacts, Valid
 from isocharge.serve.model.metadata import ModelMetadata
 from isocharge.serve.model.session import COLUMNS, Golden
 from isocharge.train.data.channel_noise import LARGEST_LOGARITHM
-from isocharge.train.export_c.c_text import c_array, c_comment, c_float, c_string, source_text
+from isocharge.train.export_c.c_text import (
+    c_array,
+    c_comment,
+    c_float,
+    c_numbers,
+    c_string,
+    c_type,
+    source_text,
+)
 from isocharge.train.training.folded_network import (
     ANGLES,
     COSINES_TO_CORRELATIONS,
@@ -51,50 +59,42 @@ from isocharge.train.training.folded_network import (
     Perceptron,
 )
 
-N_ROWS = 4
-"""Number of rows of the weights whose products are added to the outputs at a time.
 
-The program then reads and writes each output only once for all of these rows."""
+def layer_source(name: str, weight: Array, bias: Array | None = None, activation: str = "") -> str:
+    """Return the C text of a layer: its constant arrays, and the function `void name(x, y)`.
 
-
-def layer_source(name: str, weight: Array, bias: Array | None = None, *, is_hidden: bool = False) -> str:
-    """Return the C text of a layer: its constant arrays, and the function `void name(x, c, y)`.
-
-    The arguments of the C function are the inputs x, the bias c and the outputs y. The function computes y = f(x W + c)
-    and adds c last. If a large c were added first, the intermediate sums would lose accuracy.
+    The C function computes the outputs y = f(x W + c) from the inputs x, and adds c last. If a large c were added
+    first, the intermediate sums would lose accuracy.
 
     Args:
         name: Name of the function.
         weight: Weights W, shape (inputs, outputs).
-        bias: Bias c, shape (outputs,), which is written as the array `name_bias`. None if c is not constant.
-        is_hidden: Whether f is the hyperbolic tangent. Otherwise, f is the identity.
+        bias: Bias c, shape (outputs,); None for no bias.
+        activation: Name of the C function f; empty for the identity.
     """
     n_input, n_output = weight.shape
-
-    # The arrays: the weights, the scales if the weights are integers, and the bias if it is constant
     values, scale = round_to_int8(weight.astype(np.float32))
     arrays = [c_array(f"{name}_weights", values)]
-    if scale is not None:
-        arrays.append(c_array(f"{name}_scale", scale))
-    if bias is not None:
-        arrays.append(c_array(f"{name}_bias", bias))
 
     # C expression for output j. At first, y[j] contains the sum of the products for this output. If the weights are
     # integers, the sum is multiplied by the scale of its column.
-    result = "y[j] + c[j]" if scale is None else f"y[j] * {name}_scale[j] + c[j]"
-    if is_hidden:
-        result = f"tanh_of({result})"
-
-    # The function sets the sums to zero, adds the products, and computes the outputs.
-    function = source_text(
+    result = "y[j]"
+    if scale is not None:
+        arrays.append(c_array(f"{name}_scale", scale))
+        result += f" * {name}_scale[j]"
+    if bias is not None:
+        arrays.append(c_array(f"{name}_bias", bias))
+        result += f" + {name}_bias[j]"
+    return source_text(
         "layer.c",
         name=name,
+        arrays="\n".join(arrays),
+        number_type=c_type(values),
         n_input=n_input,
+        n_grouped=n_input - n_input % 4,  # inputs that are processed four at a time
         n_output=n_output,
-        products=_product_source(name, values),
-        result=result,
+        result=f"{activation}({result})",
     )
-    return "\n".join([*arrays, function])
 
 
 def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
@@ -111,43 +111,9 @@ def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
     scale = np.abs(values).max(axis=0) / np.float32(LARGEST_INT8)
     nonzero_scale = np.where(scale > 0.0, scale, 1.0)  # a column of zeros has the scale 0
     multiples = np.round(values / nonzero_scale)
-    are_multiples = np.allclose(multiples * scale, values, atol=0.0)
-    if are_multiples:
+    if np.allclose(multiples * scale, values, atol=0.0):
         return multiples.astype(np.int8), scale
     return values, None
-
-
-def _product_source(name: str, values: NDArray[Any]) -> str:
-    """Return C loops that multiply the inputs x by weights, and add the products to the outputs y.
-
-    Each loop over the outputs adds the products of up to `N_ROWS` inputs, so that y is read and written less often.
-
-    Args:
-        name: Name of the layer.
-        values: Weights, shape (inputs, outputs), float32 or int8.
-    """
-    n_input, n_output = values.shape
-    is_int8 = values.dtype == np.int8
-    cast = "(float)" if is_int8 else ""
-
-    # Full groups of N_ROWS rows come first. The remaining rows form one smaller group.
-    n_grouped = n_input - n_input % N_ROWS
-    loops = ""
-    for begin, end in ((0, n_grouped), (n_grouped, n_input)):
-        rows = range(min(N_ROWS, end - begin))
-        if rows:
-            loops += source_text(
-                "products.c",
-                name=name,
-                begin=begin,
-                end=end,
-                n_row=len(rows),
-                n_output=n_output,
-                number_type="signed char" if is_int8 else "float",
-                inputs=", ".join(f"x{row} = x[{row} + i]" for row in rows),
-                products=" + ".join(f"x{row} * {cast}w[{row * n_output} + j]" for row in rows),
-            )
-    return loops
 
 
 FLAG_BITS = {OUTSIDE: 0x100, BEYOND: 0x200, MISFIT: 0x400, STRESS: 0x800}
@@ -163,6 +129,10 @@ def model_header(metadata: ModelMetadata, network: FoldedNetwork) -> str:
     """
     features = network.features
     is_logarithmic = features.mean is None
+    validity = Validity.of(metadata)
+    min_force_N, max_force_N = validity.force_range_N
+    centre_x_mm, centre_y_mm = validity.centre_mm
+    squared_distance_mm2, implausible_force_N = validity.implausible_limits
     return source_text(
         "isocharge_model.h",
         label=c_comment(metadata.label),
@@ -172,34 +142,19 @@ def model_header(metadata: ModelMetadata, network: FoldedNetwork) -> str:
         names=", ".join(map(c_string, metadata.electrodes)),
         fields=", ".join(f'"{name}"' for name in Contact._fields),
         numbers=len(Contact._fields),
-        **_validity_literals(Validity.of(metadata)),
+        corner_count=len(validity.corners_mm),
+        corners=c_numbers(validity.corners_mm),
+        min_force=c_float(min_force_N),
+        max_force=c_float(max_force_N),
+        misfit_limit=c_float(validity.misfit_limit),
+        yield_force=c_float(validity.yield_force_N),
+        centre_x=c_float(centre_x_mm),
+        centre_y=c_float(centre_y_mm),
+        beyond_mm=c_float(math.sqrt(squared_distance_mm2)),
+        beyond_N=c_float(implausible_force_N),
         low=f"{features.low_pC:g}" if is_logarithmic else "LOW",
         high=f"{features.high_pC:g}" if is_logarithmic else "HIGH (isocharge_model.c)",
     )
-
-
-def _validity_literals(validity: Validity) -> dict[str, object]:
-    """Return the limits of a model as C literals, by the names of their placeholders in `isocharge_model.h`.
-
-    Args:
-        validity: The working area and the limits of the model.
-    """
-    squared_distance_mm2, implausible_force_N = validity.implausible_limits
-    numbers = {
-        "min_force": validity.force_range_N[0],
-        "max_force": validity.force_range_N[1],
-        "misfit_limit": validity.misfit_limit,
-        "centre_x": validity.centre_mm[0],
-        "centre_y": validity.centre_mm[1],
-        "beyond_mm": math.sqrt(squared_distance_mm2),
-        "beyond_N": implausible_force_N,
-    }
-    has_yield_force = math.isfinite(validity.yield_force_N)
-    return {name: c_float(value) for name, value in numbers.items()} | {
-        "corner_count": len(validity.corners_mm),
-        "corners": ", ".join(map(c_float, validity.corners_mm.ravel())),
-        "yield_force": c_float(validity.yield_force_N) if has_yield_force else "HUGE_VALF",
-    }
 
 
 def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
@@ -209,26 +164,22 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
         metadata: Metadata of the model. The label of the model appears in a comment.
         network: The network.
     """
-    contact_layers, contact_calls = _perceptron_source("contact", network.contact, network.features, "answers")
-    misfit_answers = f"answers + {ANGLES.stop}"
-    misfit_layers, misfit_calls = _perceptron_source("misfit", network.misfit, network.features, misfit_answers)
-
     # The template of the file contains a placeholder for each of these arguments. The arguments `plane`, `logs`
     # and `known` are the numbers of outputs of the last layer up to the position, up to the standard deviations, and up
     # to the angles of the correlations.
+    features = network.features
     return source_text(
         "isocharge_model.c",
         label=c_comment(metadata.label),
-        features=_features_source(network.features),
-        layers="\n".join((*contact_layers, *misfit_layers)),
-        widest=max(bias.size for _, bias in (*network.contact.hidden, *network.misfit.hidden)),
-        calls="\n    ".join((*contact_calls, *misfit_calls)),
-        electrodes=network.features.n_electrode,
+        features=_features_source(features),
+        contact=_perceptron_source("contact", network.contact, features),
+        misfit=_perceptron_source("misfit", network.misfit, features),
+        electrodes=features.n_electrode,
         plane=POSITION.stop,
         logs=LOG_STD.stop,
         largest_logarithm=c_float(LARGEST_LOGARITHM),
         known=ANGLES.stop,
-        answers=ANGLES.stop + network.features.n_electrode,
+        answers=ANGLES.stop + features.n_electrode,
         table=c_array("COSINES", COSINES_TO_CORRELATIONS),
         cosines=len(COSINES_TO_CORRELATIONS),
         first=ANGLES.start,
@@ -236,20 +187,17 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
     )
 
 
-def _perceptron_source(
-    name: str, perceptron: Perceptron, features: ChargeFeatures, answers: str
-) -> tuple[list[str], list[str]]:
-    """Return the C texts of the layers of a perceptron, and the C calls of their functions.
+def _perceptron_source(name: str, perceptron: Perceptron, features: ChargeFeatures) -> str:
+    """Return the C text of the layers of a perceptron, and of the function `void name_answers(logs, answers)`.
 
-    The first hidden layer and the skip layer read the features from the buffer `logs`. The hidden layers write
-    alternately to two buffers, and each layer reads the buffer that the layer before it wrote. If the features are
-    logarithms, the weights of the first layer and of the skip layer are changed by `_convert_to_differences`.
+    The first hidden layer and the skip layer read the features from `logs`. The hidden layers write alternately to two
+    rows of a buffer, and each layer reads the row that the layer before it wrote. If the features are logarithms, the
+    weights of the first layer and of the skip layer are changed by `_convert_to_differences`.
 
     Args:
         name: Beginning of the names of the C functions.
         perceptron: The perceptron.
         features: Features of the network.
-        answers: C expression of the array to which the last layer writes.
     """
     (first_weight, first_bias), *later = perceptron.hidden
     skip_weight = perceptron.skip
@@ -259,19 +207,25 @@ def _perceptron_source(
 
     layers = []
     calls = []
-    buffer = "logs"
+    row = "logs"
     for index, (weight, bias) in enumerate([(first_weight, first_bias), *later]):
-        layers.append(layer_source(f"{name}_{index}", weight, bias, is_hidden=True))
-        next_buffer = f"rows[{index % 2}]"
-        calls.append(f"{name}_{index}({buffer}, {name}_{index}_bias, {next_buffer});")
-        buffer = next_buffer
+        layers.append(layer_source(f"{name}_{index}", weight, bias, activation="tanh_of"))
+        next_row = f"rows[{index % 2}]"
+        calls.append(f"{name}_{index}({row}, {next_row});")
+        row = next_row
 
     # The bias of the output layer is added with the skip layer.
     layers.append(layer_source(f"{name}_skip", skip_weight, perceptron.last.bias))
     layers.append(layer_source(f"{name}_last", perceptron.last.weight))
-    calls.append(f"{name}_skip(logs, {name}_skip_bias, skipped);")
-    calls.append(f"{name}_last({buffer}, skipped, {answers});")
-    return layers, calls
+    return source_text(
+        "perceptron.c",
+        name=name,
+        layers="\n".join(layers),
+        calls="\n    ".join(calls),
+        last_row=row,
+        widest=max(bias.size for _, bias in perceptron.hidden),
+        n_answer=perceptron.last.bias.size,
+    )
 
 
 def self_test(golden: Golden, metadata: ModelMetadata) -> str:

@@ -34,14 +34,16 @@ static float clip(float x, float low, float high)
 }
 
 $features
-$layers
+$contact
+$misfit
 /* What the last layer gives, still without the functions of `contact_of`. */
 static void answers_of(const float charge_pC[ISOCHARGE_ELECTRODES], float answers[$answers])
 {
-    float logs[$electrodes], rows[2][$widest], skipped[$answers];
+    float logs[$electrodes];
 
     features(charge_pC, logs);
-    $calls
+    contact_answers(logs, answers);
+    misfit_answers(logs, answers + $known);
 }
 
 static void contact_of(const float answers[$answers], float contact[7])
