@@ -14,7 +14,7 @@ import numpy as np
 
 from isocharge.common.arrays import LARGEST, Array
 from isocharge.common.errors import PortLost
-from isocharge.serve.frames.device_clock import DeviceClock
+from isocharge.serve.frames.device_clock import DeviceClock, elapsed_s
 from isocharge.serve.frames.frame import Frame, Parser
 from isocharge.serve.port.file_source import Chunk
 from isocharge.serve.port.serial_line import UDP_SCHEME, Request
@@ -64,7 +64,7 @@ class ReceivedData:
         """
         span_s = self.seconds
         if len(self.chunks) > 1:
-            first_to_last_s = self.chunks[-1].elapsed_since(self.chunks[0])
+            first_to_last_s = elapsed_s(self.chunks[0], self.chunks[-1])
             span_s = first_to_last_s * len(self.chunks) / (len(self.chunks) - 1)
         return max(span_s, np.finfo(float).eps)
 

@@ -42,6 +42,19 @@ A reading cannot arrive before it was taken, so the limit is smaller than that o
 """
 
 
+def elapsed_s(previous: Chunk, chunk: Chunk) -> float:
+    """Return the time between two chunks of one source, s. The result does not depend on the wall clock.
+
+    All chunks of a file have the same time of arrival, so the result is 0. If the caller that created the chunks states
+    no monotonic time, so that `clock_ns` is constant, the times of arrival are used.
+    """
+    wall_s = chunk.timestamp - previous.timestamp
+    monotonic_ns = chunk.clock_ns - previous.clock_ns
+    if wall_s == 0.0 or monotonic_ns == 0:
+        return max(0.0, wall_s)
+    return max(0.0, monotonic_ns * 1e-9)
+
+
 class DeviceClock:
     """Clock of one device, which is fitted to the time of the host.
 
@@ -58,35 +71,30 @@ class DeviceClock:
         """Start without a reading."""
         self.rate = 1.0
         self._latest_chunk: Chunk | None = None
-        self._monotonic_s = 0.0  # time of the latest chunk; it does not jump if the wall clock is set
+        self._monotonic_s: float | None = None  # time of the latest chunk of frames without a clock
         self.reset()
 
     def reset(self) -> None:
         """Treat the next reading as the first reading of a new connection.
 
-        The fit is a straight line that converts the clock of the device to the time of the host. The bytes that arrive
-        together at the host are called a chunk.
+        The fit is a straight line that converts the clock of the device to the time of the host. The fit begins with
+        the first reading.
         """
         self._sent_us: int | None = None  # clock of the latest reading as the device sent it
         self._device_us = 0  # clock of the latest reading after the wraps were removed
         self._chunk_arrival_s: float | None = None  # arrival of the latest chunk
+        self._is_new_arrival = False  # whether the present chunk arrived at another time than the latest chunk
 
-        # According to the fit, the host time was `_fitted_host_s` when the clock of the device was `_fitted_us`. If
-        # `_fitted_us` is None, there is no fit.
-        self._fitted_us: int | None = None
+        # According to the fit, the host time was `_fitted_host_s` when the clock of the device was `_fitted_us`.
+        self._fitted_us = 0
         self._fitted_host_s = 0.0
         self._fit_age_s = 0.0  # time since the beginning of the fit
         self._is_fit_provisional = True  # whether the fit relies on the arrival of only one chunk
-        self._latest_host_s = -math.inf  # host time of the latest reading
+        self._predicted_s = 0.0  # host time of the latest reading according to the fit
+        self._latest_host_s = -math.inf  # host time of the latest reading, which does not decrease
 
     def stamp(self, chunk: Chunk, frames: Sequence[Frame], modulus: int) -> None:
         """Write into the frames of a chunk the times at which they were taken, and adjust the clock to the chunk.
-
-        The clock of the device is converted to the time of the host by a straight line, which is called the fit. If the
-        device sends no clock, the time since the previous chunk is divided evenly among the frames of the chunk, and
-        the last frame has the arrival time of the chunk. This time is unknown in the first chunk of a port and in all
-        chunks of a file, which arrive at the same time. In `dt_s` and `clock_s`, the interval between the frames is
-        then assumed to be `FILE_INTERVAL_s`.
 
         Args:
             chunk: The bytes that contain the ends of the frames.
@@ -95,43 +103,62 @@ class DeviceClock:
         """
         if not frames:  # the time is shared by the frames of the next chunk
             return
-        elapsed_s = self._enter_chunk(chunk, len(frames))
-        # Whether the chunk arrived at another time than the previous chunk. All chunks of a file have the same arrival
-        # time, which contains no information. After the first chunk, it is not known whether this is a file.
+        previous_chunk = self._latest_chunk or chunk
+        self._latest_chunk = chunk
+        interval_s = elapsed_s(previous_chunk, chunk)
+        wall_jump_s = chunk.timestamp - previous_chunk.timestamp - interval_s
+        if abs(wall_jump_s) > MAX_DELAY_s:  # the wall clock was set
+            self._shift_host_times(wall_jump_s)
+
+        # All chunks of a file have the same arrival time, which contains no information. After the first chunk, it is
+        # not known whether this is a file.
         self._is_new_arrival = self._chunk_arrival_s not in (None, chunk.timestamp)
-        share_s = 0.0 if self._chunk_arrival_s is None else elapsed_s / len(frames)
-        for n_later, frame in zip(reversed(range(len(frames))), frames, strict=True):
-            if frame.t_us is None:
-                frame.host_s = chunk.timestamp - n_later * share_s
-                frame.dt_s = share_s or self.FILE_INTERVAL_s
-                frame.clock_s = self._monotonic_s - n_later * frame.dt_s
-            else:
+        if frames[0].t_us is None:
+            self._divide_interval(interval_s, chunk.timestamp, frames)
+        for frame in frames:
+            if frame.t_us is not None:
                 self._stamp_with_device(frame, frame.t_us, modulus, chunk.timestamp)
         if len(chunk.data) < MAX_READ_BYTES:  # otherwise, the bytes may have waited to be read
-            self._end_chunk(chunk.timestamp)
+            self._chunk_arrival_s = chunk.timestamp
+            if self._is_new_arrival and self._sent_us is not None:
+                self._fit_arrival(chunk.timestamp)
 
-    def _enter_chunk(self, chunk: Chunk, n_frame: int) -> float:
-        """Return the time from the previous chunk to this chunk, s, and advance the monotonic time of the host.
+    def _shift_host_times(self, jump_s: float) -> None:
+        """Add the jump of a wall clock that was set to all stored host times."""
+        self._fitted_host_s += jump_s
+        self._latest_host_s += jump_s
+        if self._chunk_arrival_s is not None:
+            self._chunk_arrival_s += jump_s
 
-        If the wall clock was set between the chunks, all stored host times are changed by the same amount.
+    def _divide_interval(self, interval_s: float, arrival_s: float, frames: Sequence[Frame]) -> None:
+        """Write times into frames without a clock. If later frames of the chunk have a clock, it replaces their times.
+
+        The time since the previous chunk is divided evenly among the frames of the chunk, and the last frame has the
+        arrival time of the chunk. This time is unknown in the first chunk of a port and in all chunks of a file, which
+        arrive at the same time. In `dt_s` and `clock_s`, the interval between the frames is then assumed to be
+        `FILE_INTERVAL_s`.
+
+        Args:
+            interval_s: Time since the previous chunk, s; 0 if it is unknown.
+            arrival_s: Arrival of the chunk, unix seconds.
+            frames: The frames of the chunk, which are changed in place.
         """
-        previous = self._latest_chunk
-        self._latest_chunk = chunk
-        if previous is None:
-            self._monotonic_s = chunk.timestamp
-            return 0.0
-        elapsed_s = chunk.elapsed_since(previous)
-        self._monotonic_s += elapsed_s or n_frame * self.FILE_INTERVAL_s
-        wall_jump_s = chunk.timestamp - previous.timestamp - elapsed_s
-        if abs(wall_jump_s) > MAX_DELAY_s:
-            self._fitted_host_s += wall_jump_s
-            self._latest_host_s += wall_jump_s
-            if self._chunk_arrival_s is not None:
-                self._chunk_arrival_s += wall_jump_s
-        return elapsed_s
+        if self._monotonic_s is None:
+            self._monotonic_s = arrival_s
+        else:
+            self._monotonic_s += interval_s or len(frames) * self.FILE_INTERVAL_s
+        share_s = 0.0 if self._chunk_arrival_s is None else interval_s / len(frames)
+        for n_later, frame in enumerate(reversed(frames)):
+            frame.host_s = arrival_s - n_later * share_s
+            frame.dt_s = share_s or self.FILE_INTERVAL_s
+            frame.clock_s = self._monotonic_s - n_later * frame.dt_s
 
     def _stamp_with_device(self, frame: Frame, t_us: int, modulus: int, arrival_s: float) -> None:
         """Compute the time of a frame from the clock of the device, and write it into the frame.
+
+        If the clock went back by at most `MAX_DELAY_s`, the reading arrived late: for example, another datagram has
+        overtaken it. If the clock went back by more, the device has restarted. A clock that went back by at least half
+        of its range seems to have wrapped.
 
         Args:
             frame: The frame, which is changed in place.
@@ -139,118 +166,89 @@ class DeviceClock:
             modulus: Time at which the clock wraps to 0, us.
             arrival_s: Arrival of the chunk that contains the reading, unix seconds.
         """
-        step_us = self._unwrap(frame, t_us, modulus)  # time since the previous reading
-        predicted_s = self._predict(self._device_us)
+        step_us = 0  # time since the previous reading
+        if self._sent_us is None:
+            self._begin_fit(t_us, arrival_s)
+        else:
+            # The modulo makes the step correct even if the clock has wrapped between the readings.
+            half_range_us = modulus // 2
+            step_us = (t_us - self._sent_us + half_range_us) % modulus - half_range_us
+            if step_us >= -min(MAX_DELAY_s * 1e6, self._device_us):
+                self._device_us += step_us
+            else:
+                frame.is_clock_reset = step_us < -MAX_DELAY_s * 1e6
+                self._begin_fit(t_us, arrival_s)
+            step_us = max(0, step_us)
+        self._sent_us = t_us
+        self._predicted_s = self._fitted_host_s + self.rate * (self._device_us - self._fitted_us) * 1e-6
 
         # A reading is taken before it arrives. If the predicted time is much later than the arrival, the fit is wrong.
         # The clock of the host or of the device may have been set. Or the program has paused: the readings that waited
         # for it arrived late, which the fit took for their time, and the readings after them were lost. A provisional
         # fit is not examined, because its times may be wrong by the length of a chunk.
-        has_fit = self._fitted_us is not None and not self._is_fit_provisional
-        if has_fit and self._is_new_arrival and predicted_s - arrival_s > MAX_LEAD_s:
-            self._fitted_us = None  # discards the fit
-            # Only a step in which the clock went back is larger than the clock value. `_unwrap` has taken this for a
-            # wrap. However, not enough time has passed for a wrap, so the device has restarted.
+        is_fit_examined = self._is_new_arrival and not self._is_fit_provisional
+        if is_fit_examined and self._predicted_s - arrival_s > MAX_LEAD_s:
+            # Only a step in which the clock went back is larger than the clock value. The step was taken for a wrap,
+            # but not enough time has passed for a wrap, so the device has restarted.
             if t_us < step_us:
                 frame.is_clock_reset = True
                 self._device_us = t_us
                 step_us = 0
-
-        # Without a fit, begin a provisional fit in which the host time of this reading is its arrival time, or the host
-        # time of the previous reading if that is later.
-        if self._fitted_us is None:
-            self._fitted_us = self._device_us
-            self._fitted_host_s = predicted_s = max(arrival_s, self._latest_host_s)
-            self._is_fit_provisional = True
+            self._begin_fit(self._device_us, arrival_s)
 
         # The host time must not decrease, even if a correction of the fit has moved the predicted host time back.
-        self._latest_host_s = max(self._latest_host_s, predicted_s)
+        self._latest_host_s = max(self._latest_host_s, self._predicted_s)
         frame.host_s = self._latest_host_s
         frame.device_us = self._device_us
         frame.dt_s = step_us * 1e-6
         frame.clock_s = self._device_us * 1e-6
 
-    def _end_chunk(self, arrival_s: float) -> None:
+    def _begin_fit(self, device_us: int, arrival_s: float) -> None:
+        """Begin a provisional fit with the present reading.
+
+        The host time of the reading is its arrival time, or the host time of the previous reading if that is later.
+
+        Args:
+            device_us: Clock of the reading, us.
+            arrival_s: Arrival of the chunk that contains the reading, unix seconds.
+        """
+        self._device_us = device_us
+        self._fitted_us = device_us
+        self._fitted_host_s = max(arrival_s, self._latest_host_s)
+        self._predicted_s = self._fitted_host_s
+        self._is_fit_provisional = True
+
+    def _fit_arrival(self, arrival_s: float) -> None:
         """Fit the clock of the device to the arrival time of a chunk, whose readings have been processed.
+
+        The fit is corrected with one step of a second-order delay-locked loop (Adriaensen 2005). The gain of the loop
+        is w = 2 pi * bandwidth * step_s, but at most `MAX_LOOP_GAIN`, because the loop would become unstable with a
+        larger gain. The correction adds sqrt(2) w delay_s to the predicted host time, and w^2 delay_s / step_s to the
+        rate of the clock. The bandwidth decreases with the age of the fit.
 
         Args:
             arrival_s: Arrival of the chunk, unix seconds.
         """
-        self._chunk_arrival_s = arrival_s
-        if self._fitted_us is None or not self._is_new_arrival:
-            return  # the provisional fit of `stamp` remains
-
-        delay_s = arrival_s - self._predict(self._device_us)  # positive if the chunk arrived later than predicted
+        delay_s = arrival_s - self._predicted_s  # positive if the chunk arrived later than predicted
+        step_s = (self._device_us - self._fitted_us) * 1e-6  # since the previous correction of the fit
+        self._fitted_us = self._device_us
         was_clock_set = abs(delay_s) > MAX_DELAY_s
         if was_clock_set and not self._is_fit_provisional:
             self._latest_host_s = -math.inf  # allows the host time of the next reading to be earlier
         # Readings that a board stored before the connection may have moved the host time far ahead of the arrival.
         self._latest_host_s = min(self._latest_host_s, arrival_s + MAX_LEAD_s)
+
         # A provisional fit relies on the arrival of only one chunk. A fit that begins at this arrival replaces it.
         if was_clock_set or self._is_fit_provisional:
             self._fitted_host_s = arrival_s
             self._fit_age_s = 0.0
             self.rate = 1.0
             self._is_fit_provisional = False
-        else:
-            step_s = (self._device_us - self._fitted_us) * 1e-6  # since the previous correction of the fit
-            self._continue_fit(delay_s, step_s)
-        self._fitted_us = self._device_us
+            return
 
-    def _continue_fit(self, delay_s: float, step_s: float) -> None:
-        """Correct the fit with one step of a second-order delay-locked loop (Adriaensen 2005).
-
-        The gain of the loop is w = 2 pi * bandwidth * step_s, but at most `MAX_LOOP_GAIN`, because the loop would
-        become unstable with a larger gain. The correction adds sqrt(2) w delay_s to the predicted host time, and
-        w^2 delay_s / step_s to the rate of the clock. The bandwidth decreases with the age of the fit.
-
-        Args:
-            delay_s: Arrival time minus predicted arrival time, s.
-            step_s: Time on the clock of the device since the previous correction, s. If it is 0, nothing is corrected.
-        """
         self._fit_age_s += step_s
         bandwidth_Hz = max(BANDWIDTH_Hz, FIRST_BANDWIDTH_Hz / (1.0 + self._fit_age_s))
         loop_gain = min(MAX_LOOP_GAIN, 2.0 * math.pi * bandwidth_Hz * step_s)
-        self._fitted_host_s = self._predict(self._device_us) + math.sqrt(2.0) * loop_gain * delay_s
-        if step_s > 0.0:
+        self._fitted_host_s = self._predicted_s + math.sqrt(2.0) * loop_gain * delay_s
+        if step_s > 0.0:  # otherwise, the rate is not corrected
             self.rate += loop_gain**2 * delay_s / step_s
-
-    def _predict(self, device_us: int) -> float:
-        """Return the host time, unix seconds, at which the clock of the device has the value `device_us`.
-
-        The result is only valid if there is a fit.
-        """
-        fitted_us = self._fitted_us or 0  # None without a fit
-        return self._fitted_host_s + self.rate * (device_us - fitted_us) * 1e-6
-
-    def _unwrap(self, frame: Frame, t_us: int, modulus: int) -> int:
-        """Remove the wraps from the clock value of the next reading, and store the resulting value in `_device_us`.
-
-        If the clock went back by at most `MAX_DELAY_s`, the reading arrived late: for example, another datagram has
-        overtaken it. If the clock went back by more, the device has restarted. The fit is then discarded. A clock that
-        went back by at least half of its range seems to have wrapped; `_stamp_with_device` recognises this restart.
-
-        Args:
-            frame: Frame of the reading, which stores whether the clock was reset.
-            t_us: Clock of the reading as the device sent it, us.
-            modulus: Time at which the clock wraps to 0, us.
-
-        Returns:
-            Time since the previous reading, us; 0 for the first reading, for a late reading, and after a restart of the
-            device.
-        """
-        previous_us = self._sent_us
-        self._sent_us = t_us
-        if previous_us is not None:
-            # The modulo makes the step correct even if the clock has wrapped between the readings.
-            half_range_us = modulus // 2
-            step_us = (t_us - previous_us + half_range_us) % modulus - half_range_us
-            frame.is_clock_reset = step_us < -MAX_DELAY_s * 1e6
-            if step_us >= -min(MAX_DELAY_s * 1e6, self._device_us):
-                self._device_us += step_us
-                return max(0, step_us)
-
-        # This is the first reading after a start of the device.
-        self._device_us = t_us
-        self._fitted_us = None  # discards the fit
-        return 0

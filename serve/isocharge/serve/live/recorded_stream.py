@@ -16,6 +16,7 @@ from functools import partial
 from msgspec import structs
 
 from isocharge.common.errors import InputError
+from isocharge.serve.frames.device_clock import elapsed_s
 from isocharge.serve.live.stream import RESTART_OUTAGE_s, TouchStream
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.file_source import Chunk
@@ -272,7 +273,7 @@ def replay(
         elif chunk is None:
             stream.tare()
         else:
-            due_s = due_s + chunk.elapsed_since(previous_chunk) if previous_chunk else time.monotonic()
+            due_s = due_s + elapsed_s(previous_chunk, chunk) if previous_chunk else time.monotonic()
             previous_chunk = chunk
             if real_time:
                 wait_s = max(0.0, due_s - time.monotonic())

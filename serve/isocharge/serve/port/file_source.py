@@ -51,18 +51,6 @@ class Chunk(NamedTuple):
     clock_ns: Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
     outage_s: Annotated[float, Meta(ge=0.0)] = 0.0
 
-    def elapsed_since(self, previous: "Chunk") -> float:
-        """Return the time since an earlier chunk of the same source, s. The result does not depend on the wall clock.
-
-        All chunks of a file have the same time of arrival, so the result is 0. If the caller that created the chunks
-        states no monotonic time, so that `clock_ns` is constant, the times of arrival are used.
-        """
-        wall_s = self.timestamp - previous.timestamp
-        monotonic_ns = self.clock_ns - previous.clock_ns
-        if wall_s == 0.0 or monotonic_ns == 0:
-            return max(0.0, wall_s)
-        return max(0.0, monotonic_ns * 1e-9)
-
 
 def check_bytes(name: str, head: bytes) -> None:
     """Raise an error if a file does not contain the bytes that a board sends.
