@@ -1,8 +1,11 @@
 """Connections to a board, and the requests that some boards need before they send a frame.
 
 A connection is called a line. A line is either a serial port, which pyserial opens, or a UDP socket. If the system has
-file descriptors for serial ports, each read from a serial port needs only two system calls. Each datagram of a socket
-is one chunk.
+file descriptors for serial ports, each read from a serial port needs only three system calls.
+
+If the program did not read a line for some time, many bytes wait. All of them are received at once, at least up to
+`MAX_READ_BYTES`, so that the time in which they arrived is divided among all their frames. Only datagrams of binary
+frames are received one by one, because the beginning of a datagram is the beginning of a frame.
 
 Some boards send a text without a line feed at the end in each datagram. A line feed is added to each datagram of such a
 board, because text parsers need the line feed. If a datagram of the board has ended with a line feed, nothing is added
@@ -50,11 +53,10 @@ class Request:
 
 
 MAX_READ_BYTES = 65536
-"""Largest number of bytes of one read. No more bytes are added to a chunk that has reached this size.
+"""Largest number of bytes of one read. No more bytes are added to received bytes that have reached this size.
 
 No datagram is larger.
 """
-
 
 READ_ERRORS = (OSError, termios.error)
 """Exceptions that reading a line can raise."""
@@ -77,9 +79,6 @@ class SerialLine:
     Many boards restart when the signal DTR of the port rises. The operating system sets the signal when a port is
     opened. If possible, the signal remains set when the line is closed, so that the next opening does not restart the
     board.
-
-    Attributes:
-        is_stream: Whether bytes may still wait after `receive`. They continue the bytes that were received before.
     """
 
     def __init__(self, url: str, baud: int) -> None:
@@ -106,7 +105,6 @@ class SerialLine:
         self._descriptor: int | None = None
         with suppress(AttributeError, io.UnsupportedOperation):
             self._descriptor = int(self._serial.fileno())
-        self.is_stream = self._descriptor is not None  # pyserial returns all bytes that have arrived
         # Make the system leave the signal DTR of a terminal set when the terminal is closed.
         if self._descriptor is not None and os.isatty(self._descriptor):
             attributes = termios.tcgetattr(self._descriptor)
@@ -132,22 +130,29 @@ class SerialLine:
             The bytes; empty if no byte arrives in time.
 
         Raises:
-            READ_ERRORS: If the line disappears.
+            READ_ERRORS: If the line disappears. If bytes have arrived before, the next call raises the error.
         """
         if self._descriptor is None:
             return self._receive_by_pyserial(timeout_s)
-        readable, _, _ = select.select([self._descriptor], [], [], timeout_s)
-        if not readable:
-            return b""
-        # `os.read` needs one system call. pyserial would need five, or one for each byte of a socket.
+        data = b""
         try:
-            data = os.read(self._descriptor, MAX_READ_BYTES)
-        except BlockingIOError:
-            data = b""
-        if not data:  # `select` also reports the end of a stream as readable
-            if os.isatty(self._descriptor):  # false if the terminal was unplugged
-                raise OtherReader
-            raise OSError("it is readable and has no data: it was unplugged, or the other end has closed")
+            while len(data) < MAX_READ_BYTES:  # a terminal returns at most 4 kB at a time
+                readable, _, _ = select.select([self._descriptor], [], [], 0.0 if data else timeout_s)
+                if not readable:
+                    break
+                # `os.read` needs one system call. pyserial would need five, or one for each byte of a socket.
+                received = os.read(self._descriptor, MAX_READ_BYTES)
+                if not received:  # `select` also reports the end of a stream as readable
+                    raise BlockingIOError(
+                        "it is readable and has no data: it was unplugged, or the other end has closed"
+                    )
+                data += received
+        except READ_ERRORS as error:
+            if data:
+                return data
+            if isinstance(error, BlockingIOError) and os.isatty(self._descriptor):  # false if it was unplugged
+                raise OtherReader from error
+            raise
         return data
 
     def _receive_by_pyserial(self, timeout_s: float) -> bytes:
@@ -168,13 +173,7 @@ class SerialLine:
 
 
 class Requester:
-    """Line to a board that sends a frame only on request. The line sends the requests, and removes their echoes.
-
-    Attributes:
-        is_stream: Always False, because such a board sends nothing more before the next request.
-    """
-
-    is_stream = False
+    """Line to a board that sends a frame only on request. The line sends the requests, and removes their echoes."""
 
     def __init__(self, line: SerialLine, request: Request) -> None:
         """Make the first request due at once.
@@ -272,12 +271,7 @@ _CONTROL_CHARACTER = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
 
 class UdpSocket:
-    """An open UDP socket that receives datagrams from a board.
-
-    Attributes:
-        is_stream: Whether the latest datagram is text, which is valid UTF-8 without control characters. Datagrams of
-            binary frames must not be joined, because the beginning of a datagram is the beginning of a frame.
-    """
+    """An open UDP socket that receives datagrams from a board."""
 
     def __init__(self, url: str) -> None:
         """Open the socket, and bind it to the address in the URL.
@@ -302,11 +296,25 @@ class UdpSocket:
             raise
         self._board_ends_lines = False  # whether the board ends its lines, although a line may need several datagrams
         self._datagrams_without_end = 0  # number of successive datagrams without a line feed
-        self.is_stream = False
+        self._is_text = False  # whether the latest datagram is text, which is valid UTF-8 without control characters
         self._peer: tuple[str, int] | None = None  # sender of the latest datagram
         self._has_warned = False  # whether a warning about a second sender was given
 
     def receive(self, timeout_s: float) -> bytes:
+        """Wait for a datagram, and return it, or return all datagrams that have arrived if they are text.
+
+        Args:
+            timeout_s: Longest time to wait, s.
+
+        Returns:
+            The datagrams; empty bytes if no datagram arrives in time.
+        """
+        data = self._receive_datagram(timeout_s)
+        while self._is_text and len(data) < MAX_READ_BYTES and (datagram := self._receive_datagram(0.0)):
+            data += datagram
+        return data
+
+    def _receive_datagram(self, timeout_s: float) -> bytes:
         """Wait for a datagram that is not empty, and return it.
 
         If the datagram is text and the board sends no line feeds, a line feed is added at the end.
@@ -330,7 +338,7 @@ class UdpSocket:
                 )
             if data:
                 is_utf8 = data.decode("utf-8", "replace").encode() == data  # decoding replaces invalid bytes
-                self.is_stream = is_utf8 and _CONTROL_CHARACTER.search(data.removesuffix(b"\0")) is None
+                self._is_text = is_utf8 and _CONTROL_CHARACTER.search(data.removesuffix(b"\0")) is None
                 return self._with_line_feed(data)
         return b""
 
@@ -357,4 +365,4 @@ class UdpSocket:
             self._board_ends_lines = False
         elif data.endswith(b"\n"):
             self._board_ends_lines = True
-        return data + b"\n" if self.is_stream and not self._board_ends_lines else data
+        return data + b"\n" if self._is_text and not self._board_ends_lines else data

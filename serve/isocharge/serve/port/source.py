@@ -190,24 +190,29 @@ class Port:
         full_chunks = 0  # number in succession
         while True:
             wait_start_s = time.monotonic()
-            outage_s = 0.0
             try:
-                data = self._read()
+                chunk = self.read(self._max_silence_s)
+                if chunk is None:
+                    speed_advice = f", and that {self._baud} baud is its speed" if has_speed(self.url) else ""
+                    raise PortLost(
+                        f"{self.url}: no data for {self._max_silence_s:g} s; check that the board is powered and sends"
+                        f"{speed_advice}"
+                    )
             except PortLost as error:
                 if not self._reconnect:
                     raise
                 log.warning("%s; trying again until it is back", error)
-                data = self._read_after_reconnecting()
-                outage_s = time.monotonic() - wait_start_s
+                chunk = self._read_after_reconnecting()._replace(outage_s=time.monotonic() - wait_start_s)
+            self._max_silence_s = self._silence_s
             if full_chunks < 2:
-                full_chunks = full_chunks + 1 if len(data) >= MAX_READ_BYTES else 0
+                full_chunks = full_chunks + 1 if len(chunk.data) >= MAX_READ_BYTES else 0
                 if full_chunks == 2:
                     log.warning(
                         "%s: the program reads more slowly than the board sends: records are late; do less for each "
                         "record, or lower the frame rate",
                         self.url,
                     )
-            yield Chunk(data, time.time(), time.perf_counter_ns(), outage_s)
+            yield chunk
 
     def read(self, timeout_s: float) -> Chunk | None:
         """Wait for bytes, and return them as a chunk.
@@ -237,45 +242,22 @@ class Port:
             ) from error
         return Chunk(data, time.time(), time.perf_counter_ns()) if data else None
 
-    def _read_after_reconnecting(self) -> bytes:
-        """Open the port repeatedly until bytes arrive, and return these bytes.
+    def _read_after_reconnecting(self) -> Chunk:
+        """Open the port repeatedly until bytes arrive, and return the first chunk.
 
         Opening a port restarts many boards. The pause before the next attempt is therefore doubled each time that an
         opened port sends nothing, up to `start_up_s`.
         """
         pause_s = RETRY_PAUSE_s
-        while True:
+        chunk: Chunk | None = None
+        while chunk is None:
             self._close()
             time.sleep(pause_s)
-            with contextlib.suppress(PortError):  # also PortLost, if no bytes have arrived after opening
+            with contextlib.suppress(PortError):  # also PortLost
                 self._open()
                 pause_s = min(2.0 * pause_s, self.start_up_s)
-                return self._read()
-
-    def _read(self) -> bytes:
-        """Wait for a byte, and return all bytes that have arrived.
-
-        If the program did not read the port for some time, many bytes wait. Up to `MAX_READ_BYTES` bytes form one
-        chunk, so that the time since the previous chunk is divided among all frames of these bytes.
-
-        Raises:
-            PortLost: If the port disappears, or no byte arrives in time.
-            PortError: If the port is not open.
-        """
-        chunk = self.read(self._max_silence_s)
-        if chunk is None:
-            speed_advice = f", and that {self._baud} baud is its speed" if has_speed(self.url) else ""
-            raise PortLost(
-                f"{self.url}: no data for {self._max_silence_s:g} s; check that the board is powered and sends"
-                f"{speed_advice}"
-            )
-        self._max_silence_s = self._silence_s
-        data = chunk.data
-        line = self._line
-        with contextlib.suppress(*READ_ERRORS):  # the next call reports the error
-            while line and line.is_stream and len(data) < MAX_READ_BYTES and (waiting := line.receive(0.0)):
-                data += waiting
-        return data
+                chunk = self.read(self.start_up_s)
+        return chunk
 
 
 @contextlib.contextmanager
