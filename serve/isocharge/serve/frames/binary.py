@@ -13,7 +13,6 @@ import struct
 from cobs import cobs
 
 from isocharge.serve.frames.frame import ChecksumError, Frame, StuffedParser
-from isocharge.serve.frames.transmission import cobs_decode
 
 FORMAT = "binary frames of isocharge"
 """Description of the format, for the user."""
@@ -60,9 +59,9 @@ def decode_frame(stuffed_frame: bytes) -> Frame:
 
     Raises:
         ChecksumError: If the CRC is wrong.
-        ValueError: If the bytes are not a frame of this version.
+        ValueError, cobs.DecodeError: If the bytes are not a frame of this version.
     """
-    data = cobs_decode(stuffed_frame)
+    data = cobs.decode(stuffed_frame)
     if len(data) < HEADER.size + CRC.size:
         raise ValueError("the frame is shorter than a frame without charges")
     body = data[: -CRC.size]  # header and charges

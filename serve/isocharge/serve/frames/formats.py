@@ -3,7 +3,8 @@
 Each format has a section class, which declares the keys of the format and creates the parser.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 
 from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.frames.frame import SEQ, TIMES_US, Frame, Parser
@@ -19,35 +20,43 @@ class AutoParser(Parser):
     Args:
         columns: Names for the columns of a CSV; see `TextParser`.
         meanings: Meaning (`seq`, `t_us`, `t_ms` or `t_s`) of each name that the board uses; see `TextParser`.
-
-    Attributes:
-        candidates: Parsers of all formats; only the parser of the recognised format after the recognition.
     """
 
     def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
-        """Begin with the parsers of all formats. The class describes the arguments."""
+        """Begin without a recognised format. The class describes the arguments."""
         super().__init__("nothing recognised yet")
-        self.candidates: tuple[Parser, ...] = (BinaryParser(), TextParser(columns, meanings))
+        self._binary = BinaryParser()
+        self._text: TextParser | None = None  # created when bytes arrive that are no binary frame
+        self._create_text_parser = partial(TextParser, columns, meanings)
+
+    def _candidates(self) -> Iterator[Parser]:
+        """Yield the parser of the recognised format, or the parsers of all formats until one of them is recognised."""
+        if self.recognised is not None:
+            yield self.recognised
+            return
+        yield self._binary
+        if self._text is None:
+            self._text = self._create_text_parser()
+        yield self._text
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that end within `data`.
 
         Until the format is recognised, the data are passed to the parsers of all formats. The first parser that finds a
-        frame receives all further data, and the other parsers are dropped. The description of the format and the moduli
-        of the counter and the clock are copied from the parser together with each frame, because the parser may
-        determine them only after many frames.
+        frame receives all further data. The description of the format and the moduli of the counter and the clock are
+        copied from the parser together with each frame, because the parser may determine them only after many frames.
         """
-        for parser in self.candidates:
+        for parser in self._candidates():
             frames = parser.feed(data)
             if frames:
-                self.candidates = (parser,)
+                self.recognised = parser
                 self.counts = parser.counts
                 self.format = parser.format
                 self.seq_modulus = parser.seq_modulus
                 self.t_us_modulus = parser.t_us_modulus
                 return frames
             self.unread_line = parser.unread_line or self.unread_line
-        if len(self.candidates) > 1:  # a recognised parser counts its bytes itself
+        if self.recognised is None:  # a recognised parser counts its bytes itself
             self.counts.bytes_dropped += len(data)
         return []
 
@@ -57,8 +66,8 @@ class AutoParser(Parser):
         A format that was recognised stays recognised.
         """
         super().reset()
-        for candidate in self.candidates:
-            candidate.reset()
+        for parser in self._candidates():
+            parser.reset()
 
 
 class TextFrames(FrameSection, tag="text", frozen=True):

@@ -12,6 +12,8 @@ from dataclasses import astuple, dataclass, field
 from operator import add, sub
 from typing import Any, TypeVar
 
+from cobs import cobs
+
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import GAP, REPEAT, RESTART
 from isocharge.serve.model.contact import Contact, Validity
@@ -175,14 +177,14 @@ class FrameCounts:
         """Return the difference of each counter."""
         return FrameCounts(*map(sub, astuple(self), astuple(other)))
 
-    def count_rejected(self, size: int, *, wrong_checksum: bool = False) -> None:
+    def count_rejected(self, size: int, error: Exception | None = None) -> None:
         """Count bytes that the parser expected to be one frame, but has rejected.
 
         Args:
             size: Number of rejected bytes, including the delimiter.
-            wrong_checksum: Whether the bytes were rejected because of their checksum.
+            error: Error that the attempt to decode the bytes has raised.
         """
-        if wrong_checksum:
+        if isinstance(error, ChecksumError):
             self.crc_errors += 1
         else:
             self.malformed += 1
@@ -277,6 +279,7 @@ class Parser(ABC):
         seq_modulus: Value at which the `seq` of a frame wraps to 0.
         t_us_modulus: Time at which the `t_us` of a frame wraps to 0, us.
         counts: Counters since the parser was created.
+        recognised: Parser that has recognised the format, and can take the place of this parser; None if there is none.
         unread_line: Latest line of text that does not have the layout of the frames; empty without such a line.
     """
 
@@ -290,6 +293,7 @@ class Parser(ABC):
         self.seq_modulus = SEQ_MODULUS
         self.t_us_modulus = T_US_MODULUS
         self.counts = FrameCounts()
+        self.recognised: Parser | None = None
         self.unread_line = ""
         self._tail = b""  # bytes of an unfinished frame
         self._previous_seq: int | None = None  # counter of the latest frame of the connection
@@ -367,7 +371,7 @@ class Parser(ABC):
         try:
             frame = decode(raw)
         except (ValueError, OverflowError) as error:
-            self.counts.count_rejected(dropped_size, wrong_checksum=isinstance(error, ChecksumError))
+            self.counts.count_rejected(dropped_size, error)
             return []
         self.counts.frames += 1
         return [frame]
@@ -402,19 +406,25 @@ class DelimitedParser(Parser):
         *pieces, tail = (self._tail + data).split(self._delimiter)
         frames = []
         for piece in pieces:
-            if len(piece) > self._max_length:
-                self.counts.count_rejected(len(piece) + 1)  # with the delimiter
-            else:
+            try:
+                if len(piece) > self._max_length:
+                    raise ValueError("the piece is too long")
                 frames += self._parse_piece(piece)
+            except (ValueError, OverflowError, cobs.DecodeError) as error:
+                self.counts.count_rejected(len(piece) + 1, error)  # with the delimiter
         self._tail = tail[: self._max_length + 1]
         self.counts.bytes_dropped += len(tail) - len(self._tail)
         return frames
 
     @abstractmethod
     def _parse_piece(self, piece: bytes) -> list[Frame]:
-        """Return the frames that the next piece completes. A piece consists of the bytes between two delimiters.
+        """Return the frames that the next piece completes, and count them.
 
-        Implementations of this method must count every piece that they reject.
+        Args:
+            piece: The bytes between two delimiters.
+
+        Raises:
+            ValueError, OverflowError, cobs.DecodeError: If the piece is rejected. The caller counts it.
         """
 
 
@@ -425,7 +435,8 @@ class StuffedParser(DelimitedParser):
         format: Description of the format, for the user.
         delimiter: The byte after each frame.
         max_length: Length of the longest stuffed frame, bytes.
-        decode: Function that decodes the bytes between two delimiters. It raises ValueError if they are not a frame.
+        decode: Function that decodes the bytes between two delimiters. It raises ValueError or `cobs.DecodeError` if
+            they are not a frame.
     """
 
     def __init__(self, format: str, delimiter: bytes, max_length: int, decode: Callable[[bytes], Frame]) -> None:
@@ -434,10 +445,9 @@ class StuffedParser(DelimitedParser):
         self._decode = decode
 
     def _parse_piece(self, piece: bytes) -> list[Frame]:
-        """Decode the bytes between two delimiters, and return a list that contains the frame.
-
-        The list is empty if there are no bytes, or if the bytes are not a frame.
-        """
+        """Decode the bytes between two delimiters, and return a list with the frame, which is empty without bytes."""
         if not piece:
             return []
-        return self._try_decode(self._decode, piece, dropped_size=len(piece) + 1)  # with the delimiter
+        frame = self._decode(piece)
+        self.counts.frames += 1
+        return [frame]

@@ -51,7 +51,7 @@ class RecordedStream:
         self.recorder = recorder
         self._latest_recorder = recorder  # recorder of the latest request, which may not have been executed yet
         self._opened_recorder = ExitStack()  # closes the present recorder if it was opened on request
-        # A chunk and its records that are not recorded yet
+        # The latest chunk and its records, which may not be recorded yet
         self._current_chunk: tuple[Chunk, list[PredictionRecord]] | None = None
         self._requests: deque[Callable[[], None]] = deque()
         self._preamble = b""  # chunks up to the one with the first frame, which show the layout of the frames
@@ -119,6 +119,7 @@ class RecordedStream:
         """
         try:
             for chunk in chunks:
+                self._current_chunk = None  # is recorded; a recording that begins now does not contain this chunk
                 while self._requests:
                     execute_request = self._requests.popleft()
                     execute_request()
@@ -134,21 +135,18 @@ class RecordedStream:
                 for record in self._stream.feed(chunk):
                     records.append(record)
                     yield record
-                self._record_chunk()
+                if self.recorder is not None:
+                    self._record_chunk()
             self._stream.finish()
         finally:
-            self._record_chunk()  # after an interruption, this records the present chunk; otherwise it does nothing
+            self._record_chunk()  # has an effect only after an interruption
             self._end_recording()
 
     def _record_chunk(self) -> None:
-        """Write the current chunk and its records to the recording, if they were not recorded yet.
-
-        Without a recording, they are discarded.
-        """
+        """Write the latest chunk and its records to the recording. A chunk that is recorded is not written again."""
         if self.recorder is not None and self._current_chunk is not None:
             chunk, records = self._current_chunk
             self.recorder.chunk(chunk, [record.to_json() for record in records])
-        self._current_chunk = None
 
     def _begin_recording(self, recorder: Recorder | None) -> None:
         """Begin a recording with an open recorder, or end the present recording if `recorder` is None.

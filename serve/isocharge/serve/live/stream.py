@@ -122,13 +122,28 @@ class ReadingStream:
             TareError: If the film is touched during the whole search for a tare.
             NoFramesError: If the stream has contained no intact frame in many bytes.
         """
+        for frame in self._receive(chunk):
+            for stage in self._stages:
+                stage.step(frame)
+            yield frame
+
+    def _receive(self, chunk: Chunk) -> list[Frame]:
+        """Return the frames whose last byte a chunk contains, with their times and the flags of their sequence.
+
+        If the chunk follows an outage of the port, the state before the outage is discarded first.
+
+        Raises:
+            NoFramesError: If the stream has contained no intact frame in many bytes.
+        """
         if chunk.outage_s > 0.0:
             self._reconnect(chunk.outage_s)
-        parser = self.parser
-        frames = parser.feed(chunk.data)
-        if frames:
-            self._dropped_at_frame = parser.counts.bytes_dropped
-        self._check_recognised()
+        frames = self.parser.feed(chunk.data)
+        if not frames:
+            self._check_recognised()
+            return frames
+        parser = self.parser.recognised or self.parser
+        self.parser = parser
+        self._dropped_at_frame = parser.counts.bytes_dropped
         self.clock.stamp(chunk, frames, parser.t_us_modulus)
         for frame in frames:
             lost_before = parser.counts.lost
@@ -139,9 +154,7 @@ class ReadingStream:
             self._previous_values = frame.values
             frame.flags = [*self._pending_flags, *sequence_flags]
             self._pending_flags = []
-            for stage in self._stages:
-                stage.step(frame)
-            yield frame
+        return frames
 
     def finish(self) -> None:
         """Finish the stream, for example at the end of a file.

@@ -177,10 +177,10 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
     section: dict[str, Any] | None = None
     if len(frames) >= MIN_FRAMES:
         section = {"format": "binary"}
-        (recognised_parser,) = parser.candidates  # since the first frame, only one parser is left
-        if isinstance(recognised_parser, TextParser) and recognised_parser.layout is not None:
+        text_parser = parser.recognised
+        if isinstance(text_parser, TextParser) and text_parser.layout is not None:
             frame_rate_Hz = len(all_frames) / seconds
-            section = {"format": "text"} | _text_keys(recognised_parser.layout, frames, frame_rate_Hz)
+            section = {"format": "text"} | _text_keys(text_parser.layout, frames, frame_rate_Hz)
     is_covered = parser.counts.bytes_dropped <= (1.0 - COVERED_SHARE) * len(data)
     if _is_text(data) or (section and is_covered):
         return section
