@@ -184,8 +184,8 @@ class Requester:
         """
         self._line = line
         self._request = request
-        self._requested_s = -float("inf")  # time of the latest request
-        self._received_s = -float("inf")  # time of the latest received byte of an answer
+        self._earliest_s = 0.0  # time at which the limit of the rate allows the next request
+        self._due_s = 0.0  # time at which the next request is due
         self._expects_echo = False  # whether the next bytes may be an echo of the request
         self._kept_bytes = b""  # first bytes after the request, which may be the beginning of its echo
 
@@ -222,17 +222,13 @@ class Requester:
         At least 1 / `rate_Hz` must pass between two requests. After a request without an answer, also at least
         `REPEAT_TIME_s` must pass. After the latest byte of an answer, also at least `QUIET_TIME_s` must pass.
         """
-        now_s = time.monotonic()
-        due_s = self._requested_s + 1.0 / self._request.rate_Hz
-        is_unanswered = self._received_s < self._requested_s
-        if is_unanswered:
-            due_s = max(due_s, self._requested_s + REPEAT_TIME_s)
-        quiet_end_s = self._received_s + QUIET_TIME_s  # bytes of the answer may arrive until then
-        return max(0.0, due_s - now_s, quiet_end_s - now_s)
+        return max(0.0, self._due_s - time.monotonic())
 
     def next_request(self) -> bytes:
         """Return the bytes of the next request, which the caller must send now."""
-        self._requested_s = time.monotonic()
+        now_s = time.monotonic()
+        self._earliest_s = now_s + 1.0 / self._request.rate_Hz
+        self._due_s = max(self._earliest_s, now_s + REPEAT_TIME_s)
         self._expects_echo = True
         self._kept_bytes = b""
         return self._request.data
@@ -254,7 +250,7 @@ class Requester:
             self._expects_echo = False
             received = self._kept_bytes.removeprefix(request)
         if received:
-            self._received_s = time.monotonic()
+            self._due_s = max(self._earliest_s, time.monotonic() + QUIET_TIME_s)
         return received
 
 
