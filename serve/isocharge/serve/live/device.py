@@ -102,7 +102,7 @@ class Prediction(Stage):
             if np.any(frame.noise_pC > 1.5 * np.asarray(noise.white_pC)):
                 white_pC = np.maximum(frame.noise_pC, noise.white_pC)
                 self._touch_predictor = self._predictor.with_noise(white_pC, noise.gain)
-        frame.set_contact(self._touch_predictor.predict(frame.charge_pC), self._predictor.validity)
+        frame.contact, frame.contact_flags = self._touch_predictor.predict_with_flags(frame.charge_pC)
 
 
 STAGES: tuple[type[Stage], ...] = (

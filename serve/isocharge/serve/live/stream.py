@@ -10,8 +10,8 @@ import math
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 
-from isocharge.common.arrays import Array
 from isocharge.common.errors import ModelError, NoFramesError, shown
 from isocharge.serve.flags import RECONNECTED, REPEAT, in_order
 from isocharge.serve.frames.device_clock import DeviceClock
@@ -19,7 +19,7 @@ from isocharge.serve.frames.frame import Frame, FrameCounts
 from isocharge.serve.live.device import ANY_BOARD, create_stages
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.file_source import Chunk
-from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, Charges, PredictionRecord
+from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, PredictionRecord
 from isocharge.serve.signal_chain.stage import Device, Setup
 
 RESTART_OUTAGE_s = 1e-6
@@ -268,6 +268,7 @@ class TouchStream(ReadingStream):
         self._stages = charge_stages + contact_stages
         self.sections = tuple(stage.section for stage in contact_stages)
         self.predictor = predictor
+        self._label = predictor.metadata.label
         self.frame_id = self._given_name or predictor.metadata.frame_id
 
     def use(self, predictor: Predictor) -> None:
@@ -297,8 +298,7 @@ class TouchStream(ReadingStream):
             TareError: If the film is touched during the whole search for a tare.
             PortError: If the stream has contained no intact frame in many bytes.
         """
-        for frame in self.frames(chunk):
-            yield self._record(chunk, frame)
+        return map(partial(self._record, chunk), self.frames(chunk))
 
     def _record(self, chunk: Chunk, frame: Frame) -> PredictionRecord:
         """Return the prediction record of a frame.
@@ -311,18 +311,26 @@ class TouchStream(ReadingStream):
             contact_fields = frame.contact._asdict()
         else:
             contact_fields = NO_CONTACT if frame.is_valid else UNKNOWN_CONTACT
+        electrodes = self._setup.electrodes
+        charge_pC, raw_pC, tare_pC = (
+            None if array is None else dict(zip(electrodes, array.tolist(), strict=True))
+            for array in (frame.charge_pC, frame.raw_pC, frame.tare_pC)
+        )
+        if raw_pC is not None and not frame.is_valid:  # the charges of an invalid frame may be no finite numbers
+            raw_pC = {name: charge if math.isfinite(charge) else None for name, charge in raw_pC.items()}
+        flags = {*frame.flags, *frame.contact_flags}
         return PredictionRecord(
             timestamp=frame.host_s,
             t_device_us=frame.device_us,
             seq=frame.seq,
             **contact_fields,
             contact=frame.is_contact,
-            charge_pC=self._by_electrode(frame.charge_pC),
-            charge_raw_pC=self._by_electrode(frame.raw_pC),
-            tare_pC=self._by_electrode(frame.tare_pC),
-            flags=in_order([*frame.flags, *frame.contact_flags]),
+            charge_pC=charge_pC,
+            charge_raw_pC=raw_pC,
+            tare_pC=tare_pC,
+            flags=in_order(flags) if flags else (),
             latency_us=(time.perf_counter_ns() - chunk.clock_ns) / 1e3,  # includes the time that the stages have taken
-            model=self.predictor.metadata.label,
+            model=self._label,
             frame_id=self.frame_id,
             tracked=frame.tracked,
             event=frame.event,
@@ -330,14 +338,3 @@ class TouchStream(ReadingStream):
             film=frame.film,
             sections=self.sections,
         )
-
-    def _by_electrode(self, charge_pC: Array | None) -> Charges | None:
-        """Return charges as a dictionary by electrode name. A charge that is not a finite number becomes None.
-
-        Args:
-            charge_pC: Charges in the order of the electrodes, shape (n_electrode,), pC; None for no charges.
-        """
-        if charge_pC is None:
-            return None
-        pairs = zip(self._setup.electrodes, charge_pC.tolist(), strict=True)
-        return {name: charge if math.isfinite(charge) else None for name, charge in pairs}

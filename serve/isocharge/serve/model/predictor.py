@@ -126,13 +126,34 @@ class Predictor:
         Raises:
             ChargeError: If the number of charges is wrong, or a charge is not finite.
         """
+        contact, _flags = self.predict_with_flags(charge_pC)
+        return contact
+
+    def predict_with_flags(self, charge_pC: ArrayLike) -> tuple[Contact, tuple[str, ...]]:
+        """Compute the contact of one press as `predict` does, and the flags of the contact as `flags` does.
+
+        Args:
+            charge_pC: Touch charges, shape (electrodes,), pC.
+
+        Raises:
+            ChargeError: If the number of charges is wrong, or a charge is not finite.
+        """
         if self.noise is self.metadata.noise:
-            contact = self._predict_one(charge_pC)
+            values = charge_pC.tolist() if isinstance(charge_pC, np.ndarray) else charge_pC
+            press = self._press
+            with self._press_lock:
+                # `write_finite` is fast. It returns False if it cannot convert the values, or if one is not finite.
+                if not write_finite(press.write, values):
+                    # `as_charges` is slower, accepts more number types, and raises errors that name the electrode.
+                    press.write(*as_charges(charge_pC, self.metadata.electrodes, is_batch=False)[0])
+                press.run()
+                contact = Contact(*press.read())
         else:
             contacts = self._predict_with_noise(as_charges(charge_pC, self.metadata.electrodes, is_batch=False))
             contact = Contact(*np.asarray(contacts, float)[0].tolist())
 
-        if not self._has_warned.is_set() and BEYOND in self.flags(contact):
+        flags = self.validity.flags(contact)
+        if BEYOND in flags and not self._has_warned.is_set():
             self._has_warned.set()
             log.warning(
                 "%s: the charges %s pC on %s are far from those of any press in the training, and %s cannot be a "
@@ -144,26 +165,7 @@ class Predictor:
                 " ".join(self.metadata.electrodes),
                 contact,
             )
-        return contact
-
-    def _predict_one(self, charge_pC: ArrayLike) -> Contact:
-        """Compute the contact of one press. Its standard deviations assume the noise of the training of the model.
-
-        Args:
-            charge_pC: Touch charges, shape (electrodes,), pC.
-
-        Raises:
-            ChargeError: If the number of charges is wrong, or a charge is not finite.
-        """
-        values = charge_pC.tolist() if isinstance(charge_pC, np.ndarray) else charge_pC
-        press = self._press
-        with self._press_lock:
-            # `write_finite` is fast. It returns False if it cannot convert the values, or if a charge is not finite.
-            if not write_finite(press.write, values):
-                # `as_charges` is slower, accepts more number types, and raises errors that name the electrode.
-                press.write(*as_charges(charge_pC, self.metadata.electrodes, is_batch=False)[0])
-            press.run()
-            return Contact(*press.read())
+        return contact, flags
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
         """Return the reasons why a contact may be wrong: `outside`, `beyond`, `misfit` and `stress`.

@@ -131,7 +131,8 @@ class WriterQueue(Generic[T]):
         Raises:
             Exception: The exception that `write` has raised in the thread, if there is one.
         """
-        self._raise_error()
+        if self._error is not None:
+            raise self._error
         if self._items.qsize() >= MAX_WAITING_ITEMS:
             with suppress(Empty):  # the thread has taken all items in the meantime
                 self._items.get_nowait()
@@ -145,7 +146,7 @@ class WriterQueue(Generic[T]):
         If the consumer accepts no item within `CLOSE_TIMEOUT_s`, the waiting items are dropped and counted as lost.
 
         Raises:
-            Exception: The exception that `write` has raised in the thread, unless `put` has raised it already.
+            Exception: The exception that `write` has raised in the thread, if there is one.
         """
         self._items.put(None)
 
@@ -160,14 +161,8 @@ class WriterQueue(Generic[T]):
         self._thread.join(CLOSE_TIMEOUT_s)
         if self._items.unfinished_tasks > 0:
             self.lost += self._items.unfinished_tasks - 1  # the last task is the None
-        self._raise_error()
-
-    def _raise_error(self) -> None:
-        """If the thread has ended with an exception, raise this exception, but only once."""
-        error = self._error
-        self._error = None  # the next call raises nothing
-        if error is not None:
-            raise error
+        if self._error is not None:
+            raise self._error
 
     def _run(self) -> None:
         """Write items until the queue is closed and empty, or until `write` raises an exception."""

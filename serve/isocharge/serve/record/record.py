@@ -6,7 +6,7 @@ unknown while nothing touches the film. The device clock is unknown if the charg
 """
 
 import json
-from functools import cache, cached_property
+from functools import cache
 from types import UnionType
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
@@ -166,32 +166,36 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
         """The fields that this record has, in their order."""
         return record_fields(self.sections)
 
-    @property
-    def json_values(self) -> dict[str, Any]:
-        """Values of the fields by name, as JSON contains them. Numbers are rounded to six decimals."""
-        json_values: dict[str, Any] = {}
-        for field in self.fields:
-            value = getattr(self, field.name)
-            if isinstance(value, float):
-                value = round(value, DECIMALS)
-            elif value and isinstance(value, (dict, Struct)):  # the charges by electrode, or a struct of numbers
-                numbers = value if isinstance(value, dict) else structs.asdict(value)
-                value = {key: None if number is None else round(number, DECIMALS) for key, number in numbers.items()}
-            json_values[field.name] = value
-        return json_values
-
-    @cached_property
-    def _json(self) -> str:
-        """The record as one line of JSON. The line is computed only once, and is then stored in the record."""
-        return _ENCODE(self.json_values)
-
     def to_json(self) -> str:
         """Return the record as one line of strictly valid JSON, in which numbers are rounded to six decimals.
+
+        The line is computed only once, and is then stored in the record.
 
         Raises:
             ValueError: If a number is not finite.
         """
-        return self._json
+        line: str | None = self.__dict__.get("line")
+        if line is None:
+            values: dict[str, Any] = {}
+            for field in record_fields(self.sections):
+                value = getattr(self, field.name)
+                if isinstance(value, float):
+                    value = round(value, DECIMALS)
+                elif value and field.json_type == "object":  # the charges by electrode, or a struct of numbers
+                    numbers = value if isinstance(value, dict) else structs.asdict(value)
+                    value = {
+                        name: None if number is None else round(number, DECIMALS) for name, number in numbers.items()
+                    }
+                values[field.name] = value
+            line = _ENCODE(values)
+            self.__dict__["line"] = line
+        return line
+
+    @property
+    def json_values(self) -> dict[str, Any]:
+        """Values of the fields by name, as JSON contains them."""
+        values: dict[str, Any] = json.loads(self.to_json())
+        return values
 
 
 RECORD_FIELDS: tuple[Field, ...] = fields_of(PredictionRecord)

@@ -140,17 +140,13 @@ class Leak(Stage):
 
     section = "leak"
     rule_class = LeakRule
+    front_end = "charge"
 
     def __init__(self, setup: Setup) -> None:
         """Store the settings. The state begins at the first frame after the tare."""
         self._rule = setup.device.rule(LeakRule) or LeakRule()
         self._tau_s = setup.for_each_electrode("leak.tau_s", self._rule.tau_s)
         self.reset()
-
-    @classmethod
-    def is_used(cls, setup: Setup) -> bool:
-        """Return whether the device file states the leak of charge amplifiers."""
-        return super().is_used(setup) and not setup.device.has_currents
 
     def reset(self) -> None:
         """Discard the state. A new state begins at the first frame after the next tare."""
@@ -280,11 +276,8 @@ class Integrator(Leak):
     """
 
     section = ""
-
-    @classmethod
-    def is_used(cls, setup: Setup) -> bool:
-        """Return whether the board sends currents."""
-        return setup.device.has_currents
+    is_required = True
+    front_end = "current"
 
     def reset(self) -> None:
         """Discard the state."""

@@ -185,6 +185,8 @@ class Stage(ABC):
         rule_class: Class of the settings.
         is_required: Whether each stream has the stage, even if the device file switches it off.
         is_default: Whether the stage is switched on, with default settings, if the device file has no such section.
+        front_end: Kind of board for which a stream has the stage; None for every board.
+        needs_model: Whether only a stream with a model has the stage.
         needs_contact: Whether the stage processes the contact of a record. Such a stage skips frames without a record,
             and is not part of an export to C.
     """
@@ -193,6 +195,8 @@ class Stage(ABC):
     rule_class: ClassVar[type[Rule]] = Rule
     is_required: ClassVar[bool] = False
     is_default: ClassVar[bool] = False
+    front_end: ClassVar[str | None] = None
+    needs_model: ClassVar[bool] = False
     needs_contact: ClassVar[bool] = False
 
     def __init__(self, setup: Setup) -> None:  # noqa: B027  # some stages have no settings
@@ -205,7 +209,10 @@ class Stage(ABC):
     @classmethod
     def is_used(cls, setup: Setup) -> bool:
         """Return whether a stream has this stage."""
-        return cls.is_required or cls.rule_class in setup.device.rules
+        is_on = cls.is_required or cls.rule_class in setup.device.rules
+        fits_board = cls.front_end in (None, setup.device.front_end)
+        has_model = setup.predictor is not None
+        return is_on and fits_board and (has_model or not cls.needs_model)
 
     @abstractmethod
     def step(self, frame: Frame) -> None:

@@ -74,6 +74,7 @@ class Warming(Stage):
 
     section = "common_mode"
     rule_class = ThermalRule
+    needs_model = True
 
     def __init__(self, setup: Setup) -> None:
         """Begin with an estimated warming of zero."""
@@ -81,11 +82,6 @@ class Warming(Stage):
         self._rule = setup.device.rule(ThermalRule) or ThermalRule()
         self._ratios = warming_ratios(setup)
         self.reset()
-
-    @classmethod
-    def is_used(cls, setup: Setup) -> bool:
-        """Return whether the device file switches the stage on, and the stream has a model."""
-        return super().is_used(setup) and setup.predictor is not None
 
     def reset(self) -> None:
         """Discard the warming, because a touch has ended."""

@@ -115,6 +115,9 @@ class Touch(Stage):
         self._setup = setup
         rule = setup.device.rule(TouchRule)
         self._rule = None if rule is None else rule.resolved(has_currents=setup.device.has_currents)
+        # Direction of the charges without an earlier touch, by whether they may have any sign; zero if they may
+        n_electrode = len(setup.electrodes)
+        self._rest_directions = {False: np.ones(n_electrode), True: np.zeros(n_electrode)}
         self._noise_pC: Array | None = None  # noise of the latest tare
         self._threshold_pC = np.zeros(0)  # touch thresholds of the electrodes with this noise
         self.reset()
@@ -123,19 +126,15 @@ class Touch(Stage):
         """Discard the touch."""
         no_charge = np.zeros(len(self._setup.electrodes))
         # Charges and sizes are relative to the touch thresholds. The size of charges is the norm of their vector.
-        self._touch_direction = self._rest_direction  # sum of the directions of the frames of the latest touch
+        self._touch_direction = no_charge  # sum of the directions of the frames of the latest touch
         self._base_charge = no_charge  # charges that are no touch
         self._previous_charge = no_charge  # charges of the previous frame
+        self._previous_size = 0.0
         self._idle_mean_charge = no_charge  # exponential mean of the charges out of contact
         self._may_have_drifted = False  # whether the charge at rest may have drifted before this touch
         self._is_contact = False
         self._peak_size = 0.0  # largest size in this touch
         self._rest_s = math.inf  # time for which the charges have been small
-
-    @property
-    def _rest_direction(self) -> Array:
-        """Direction of the charges without an earlier touch; zero if they may have any sign."""
-        return np.full(len(self._setup.electrodes), 0.0 if self._setup.has_any_sign else 1.0)
 
     def step(self, frame: Frame) -> None:
         """Determine whether something touches the film in this frame. A frame without charges is not changed."""
@@ -148,30 +147,32 @@ class Touch(Stage):
                 self._noise_pC = frame.noise_pC
                 self._threshold_pC = self._rule.threshold_pC(frame.noise_pC)
             charge = frame.charge_pC / self._threshold_pC
+            size = math.sqrt(charge @ charge)
             if self._is_contact:
-                self._continue(self._rule, charge)
+                self._continue(self._rule, charge, size)
             else:
-                self._await(frame, charge)
+                self._await(frame, charge, size)
             self._previous_charge = charge
+            self._previous_size = size
         frame.is_contact = self._is_contact
         if self._is_contact and self._may_have_drifted:
             frame.flags.append(DRIFT)
 
-    def _continue(self, rule: TouchRule, charge: Array) -> None:
+    def _continue(self, rule: TouchRule, charge: Array, size: float) -> None:
         """Update the present touch with the charges of a frame, or end the touch.
 
         Args:
             rule: Thresholds.
             charge: Charges relative to the touch thresholds, shape (n_electrode,), dimensionless.
+            size: Size of the charges.
         """
         # Update the peak, from which the release threshold follows.
-        size = _norm(charge)
-        held_size = min(size, _norm(self._previous_charge))  # a spike of a single frame is not a peak
+        held_size = min(size, self._previous_size)  # a spike of a single frame is not a peak
         self._peak_size = max(self._peak_size, held_size)
         release_size = max((rule.release_share or 0.0) * self._peak_size, 0.5)
 
         # End the touch if the charges are small, or have changed their sign.
-        reference = self._previous_charge if self._setup.has_any_sign else self._rest_direction
+        reference = self._previous_charge if self._setup.has_any_sign else self._rest_directions[False]
         is_reversed = charge @ reference < 0.0
         if size < release_size or is_reversed:
             self._is_contact = False
@@ -181,7 +182,7 @@ class Touch(Stage):
         else:
             self._touch_direction = self._touch_direction + charge / size
 
-    def _await(self, frame: Frame, charge: Array) -> None:
+    def _await(self, frame: Frame, charge: Array, size: float) -> None:
         """Update the base, which contains the charges that belong to no touch, or begin a touch.
 
         A touch begins if both the charges and the charges above the base exceed the threshold in the expected
@@ -192,32 +193,32 @@ class Touch(Stage):
         Args:
             frame: The frame.
             charge: Charges relative to the touch thresholds, shape (n_electrode,), dimensionless.
+            size: Size of the charges.
         """
         if self._rest_s >= RISE_S - SUM_TOLERANCE_s:
-            self._touch_direction = self._rest_direction
+            self._touch_direction = self._rest_directions[self._setup.has_any_sign]
         direction = self._touch_direction
-        opposing_limit = OPPOSING_COSINE * _norm(direction)
+        opposing_limit = OPPOSING_COSINE * math.sqrt(direction @ direction)
         # After a touch, the base is the charge that remains of it. While the finger leaves the film, the charge at rest
         # is held, and the base must not decay, because the finger still causes this charge.
         is_remainder = self._base_charge @ direction >= 0.0
         if not (frame.is_base_held and is_remainder):
             self._base_charge = self._base_charge * math.exp(-frame.dt_s / frame.base_relax_s)
-        size = _norm(charge)
         change = charge - self._base_charge
-        change_size = _norm(change)
+        change_size = math.sqrt(change @ change)
         if change @ direction < opposing_limit * change_size:
             self._base_charge = self._idle_mean_charge  # a release or a drift, and not the noise of a single frame
         elif min(size, change_size) > 1.0 and charge @ direction >= opposing_limit * size:  # a touch begins
             self._is_contact = True
-            self._peak_size = min(size, _norm(self._previous_charge))  # a spike of a single frame is not a peak
+            self._peak_size = min(size, self._previous_size)  # a spike of a single frame is not a peak
             self._touch_direction = charge / size
             # The sum of the noise of currents changes slowly. The mean of the latest charges still contains it.
             limit = 0.75 if self._setup.device.has_currents else 0.5
-            slow_rise = _norm(self._idle_mean_charge - self._base_charge)
+            slow_rise = self._idle_mean_charge - self._base_charge
             # The change is larger than the charges if the base was opposite to them.
-            self._may_have_drifted = max(slow_rise, change_size - size) > limit
+            self._may_have_drifted = max(math.sqrt(slow_rise @ slow_rise), change_size - size) > limit
             return
-        elif is_remainder and size < _norm(self._base_charge):
+        elif is_remainder and size < math.sqrt(self._base_charge @ self._base_charge):
             self._base_charge = charge  # the charge that remains of the latest touch becomes smaller
             self._idle_mean_charge = charge
 
@@ -232,8 +233,3 @@ class Touch(Stage):
         rule = cls(setup)._rule
         settings = {} if rule is None else structs.asdict(rule)
         return settings | {"any_sign": setup.has_any_sign, "rise_s": RISE_S}
-
-
-def _norm(vector: Array) -> float:
-    """Return the length of a vector."""
-    return math.sqrt(vector @ vector)
