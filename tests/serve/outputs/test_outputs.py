@@ -12,7 +12,7 @@ import pytest
 
 from isocharge.common.errors import InputError
 from isocharge.serve.outputs.output import WriterQueue
-from isocharge.serve.outputs.text_outputs import UdpOutput
+from isocharge.serve.outputs.udp import UdpOutput
 from isocharge.serve.record.formats import csv_header, csv_row
 from isocharge.serve.record.record import FollowedFilm, TrackedContact, record_fields
 

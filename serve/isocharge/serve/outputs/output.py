@@ -1,4 +1,4 @@
-"""Interface of all outputs of records, the declaration of a kind of output, and shared parts of outputs.
+"""Interface of all outputs of records, and the outputs that write lines of JSON or CSV.
 
 Every output implements the interface `Output`. An `OutputKind` declares which targets belong to a kind of output. The
 class `WriterQueue` keeps a slow output from delaying a live stream. `FileOutput` is the base class of outputs that
@@ -18,12 +18,13 @@ import threading
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from queue import Empty, Queue
+from queue import Empty, SimpleQueue
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 from isocharge.common.errors import IsochargeError, OutputError
 from isocharge.common.files import AtomicWriter, new_file
-from isocharge.serve.record.record import PredictionRecord
+from isocharge.serve.record.formats import csv_header, csv_row
+from isocharge.serve.record.record import PredictionRecord, record_fields
 
 
 class Output(Protocol):
@@ -111,7 +112,8 @@ class WriterQueue(Generic[T]):
         """
         self.lost = 0
         self._write = write
-        self._items: Queue[T | None] = Queue()  # None ends the thread
+        self._items: SimpleQueue[T | None] = SimpleQueue()  # None ends the thread
+        self._written_count = 0
         self._is_abandoned = False  # whether the thread must write no further item
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)  # a write may hang forever
@@ -136,7 +138,6 @@ class WriterQueue(Generic[T]):
         if self._items.qsize() >= MAX_WAITING_ITEMS:
             with suppress(Empty):  # the thread has taken all items in the meantime
                 self._items.get_nowait()
-                self._items.task_done()
                 self.lost += 1
         self._items.put(item)
 
@@ -151,16 +152,15 @@ class WriterQueue(Generic[T]):
         self._items.put(None)
 
         # Wait as long as the thread completes at least one item within each timeout.
-        earlier_count = 0
-        while self._thread.is_alive() and self._items.unfinished_tasks != earlier_count:
-            earlier_count = self._items.unfinished_tasks
+        earlier_count = -1
+        while self._thread.is_alive() and self._written_count != earlier_count:
+            earlier_count = self._written_count
             self._thread.join(CLOSE_TIMEOUT_s)
 
-        # End the thread, and count the remaining items as lost.
+        # End the thread. If it has not taken the final None, the item that it took last is lost, too.
         self._is_abandoned = True
         self._thread.join(CLOSE_TIMEOUT_s)
-        if self._items.unfinished_tasks > 0:
-            self.lost += self._items.unfinished_tasks - 1  # the last task is the None
+        self.lost += self._items.qsize()
         if self._error is not None:
             raise self._error
 
@@ -172,9 +172,8 @@ class WriterQueue(Generic[T]):
                     return
                 if self._write(item) is False:
                     self.lost += 1
-                self._items.task_done()
-            self._items.task_done()
-        except Exception as error:  # `put` or `close` raises it again in the thread of the caller
+                self._written_count += 1
+        except Exception as error:  # `put` and `close` raise it again in the thread of the caller
             self._error = error
 
 
@@ -237,3 +236,81 @@ def is_file_with(suffix: str) -> Callable[[str], bool]:
     A target with a scheme, such as `mqtt://host/touch.csv`, is not a file.
     """
     return lambda target: target.endswith(suffix) and "://" not in target
+
+
+class JsonLines:
+    """Output that writes each record as a line of JSON, such as to standard output."""
+
+    def __init__(self, write_text: Callable[[str], object], _: OutputContext) -> None:
+        """Store the function that writes a text."""
+        self._write_text = write_text
+
+    def write(self, record: PredictionRecord) -> None:
+        """Write the line of a record."""
+        self._write_text(record.to_json() + "\n")
+
+    def close(self) -> None:
+        """Leave standard output open."""
+
+
+class CsvLines(JsonLines):
+    """Output that writes each record as a line of CSV with the columns that the stream needs."""
+
+    def __init__(self, write_text: Callable[[str], object], context: OutputContext) -> None:
+        """Write the header."""
+        super().__init__(write_text, context)
+        self._electrodes = context.electrodes
+        write_text(csv_header(context.electrodes, record_fields(context.sections)) + "\n")
+
+    def write(self, record: PredictionRecord) -> None:
+        """Write the line of a record."""
+        self._write_text(csv_row(record, self._electrodes) + "\n")
+
+
+class TextFile(FileOutput):
+    """Output that writes one line to a new file for each record.
+
+    Attributes:
+        write: Function that writes the line of a record. It raises an `OSError` if the disk is full.
+    """
+
+    def __init__(self, path: Path, lines: type[JsonLines], context: OutputContext) -> None:
+        """Create the file, and write the header if there is a header.
+
+        Args:
+            path: Path of the file, which must not exist yet.
+            lines: Class of the output, for the form of the lines.
+            context: Properties of the stream.
+
+        Raises:
+            OutputExists: If the file exists already.
+            OSError: If the file cannot be created.
+        """
+        super().__init__(path, is_live=context.is_live)
+        self.write = lines(lambda text: self._file.write(text.encode()), context).write
+
+
+def _text_kinds(name: str, suffix: str, lines: type[JsonLines]) -> tuple[OutputKind, OutputKind]:
+    """Return the kinds of outputs that write lines to standard output and to a file.
+
+    Args:
+        name: Target of standard output.
+        suffix: End of the names of files.
+        lines: Class of the output.
+    """
+    standard_output = OutputKind(
+        form=name,
+        accepts=name.__eq__,
+        open=lambda _, context: lines(context.write_stdout, context),
+        is_standard_output=True,
+    )
+    file = OutputKind(
+        form=f"FILE{suffix}",
+        accepts=is_file_with(suffix),
+        open=lambda target, context: TextFile(Path(target), lines, context),
+    )
+    return standard_output, file
+
+
+STDOUT_JSON, JSON_FILE = _text_kinds("json", ".jsonl", JsonLines)
+STDOUT_CSV, CSV_FILE = _text_kinds("csv", ".csv", CsvLines)

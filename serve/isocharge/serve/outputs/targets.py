@@ -9,6 +9,10 @@ from typing import Any, Self
 
 from isocharge.common.errors import InputError, shown
 from isocharge.serve.outputs.output import (
+    CSV_FILE,
+    JSON_FILE,
+    STDOUT_CSV,
+    STDOUT_JSON,
     FileOutput,
     Output,
     OutputContext,
@@ -17,7 +21,7 @@ from isocharge.serve.outputs.output import (
     is_file_with,
     output_error,
 )
-from isocharge.serve.outputs.text_outputs import CSV_FILE, JSON_FILE, STDOUT_CSV, STDOUT_JSON, UDP
+from isocharge.serve.outputs.udp import UDP
 from isocharge.serve.record.record import PredictionRecord
 
 ROS2_SUFFIX = ".ros2.mcap"
