@@ -20,7 +20,7 @@ from serial.tools.list_ports_common import ListPortInfo
 
 from boards import TcpBoard, interrupt, taps
 from isocharge.serve import Recording, Script, VirtualSensor, load_device
-from isocharge.serve.signal_chain.gain import GainRule
+from isocharge.serve.signal_chain.channels import GainRule
 from isocharge.serve.virtual_sensor.sensor import PseudoPort
 from processes import finished
 

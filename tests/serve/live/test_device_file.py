@@ -20,8 +20,7 @@ from isocharge.serve.frames.formats import Frames
 from isocharge.serve.frames.text import TextParser
 from isocharge.serve.live.device import ANY_BOARD
 from isocharge.serve.port.serial_line import Request
-from isocharge.serve.signal_chain.channels import Channels
-from isocharge.serve.signal_chain.gain import Gain, GainRule, SaturationRule
+from isocharge.serve.signal_chain.channels import Channels, Gain, GainRule, SaturationRule
 from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.serve.signal_chain.leak import Leak, LeakRule
 from isocharge.serve.signal_chain.stage import Device, Setup
@@ -95,8 +94,7 @@ def test_device_without_a_file_has_tare_and_touch(device):
 def test_offset_is_subtracted_before_the_gain(device, offset, zero):
     """The offset is one number, such as half of the range of a converter, or one number for each electrode."""
     board = device(f"[gain]\noffset = {offset}\npC_per_unit = {{A = 0.5, B = -0.5, C = 1}}\n")
-    frame = Frame(None, None, ())
-    frame.sent = np.array(zero) + 10.0
+    frame = Frame(None, None, tuple(value + 10.0 for value in zero))
     Gain(Setup(ELECTRODES, board)).step(frame)
     assert frame.charge_pC.tolist() == [5.0, -5.0, 10.0]
 
@@ -174,7 +172,7 @@ def charges_sent(names, channels):
     """Return the charges of the electrodes A, B and C if the channels with these names send 1, 2, 3 and so on, pC."""
     header = tuple(names.split(",")) if names else ()
     frame = Frame(0, 0, tuple(range(1, 1 + (len(header) or 3))), names=header)
-    Channels(Setup(ELECTRODES, Device(channels=channels, where="board.toml"))).step(frame)
+    Gain(Setup(ELECTRODES, Device(channels=channels, where="board.toml"))).step(frame)
     return frame.sent.tolist()
 
 
@@ -226,7 +224,7 @@ def test_unknown_channels_are_refused(names, channels, message):
 def test_advice_for_the_channels_is_a_valid_device_file():
     electrodes = ("Pad 1", "Pad/2", "ü", "A")
     with pytest.raises(ChargeError) as error:
-        Channels(Setup(electrodes)).step(Frame(0, 0, (1.0, 2.0)))
+        Channels(Setup(electrodes)).channel_indices(Frame(0, 0, (1.0, 2.0)))
     advice = str(error.value).partition("[channels] ")[2]
     assert tuple(tomllib.loads(advice.replace(", ", "\n"))) == electrodes
 

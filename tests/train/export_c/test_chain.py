@@ -14,7 +14,7 @@ from isocharge.serve.flags import BLIND, DRIFT, GAP, INVALID, NEGATIVE, SATURATE
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import T_US_MODULUS, Frame
 from isocharge.serve.port.file_source import Chunk
-from isocharge.serve.signal_chain.gain import Gain
+from isocharge.serve.signal_chain.channels import Gain
 from isocharge.serve.signal_chain.hum import Hum
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.signal_chain.thermal import ThermalRule

@@ -19,7 +19,7 @@ from isocharge.serve.frames.frame import Frame
 from isocharge.serve.live.steady_press import PressWatch
 from isocharge.serve.live.stream import ReadingStream
 from isocharge.serve.port.source import Port
-from isocharge.serve.signal_chain.gain import GainRule
+from isocharge.serve.signal_chain.channels import GainRule
 from isocharge.serve.signal_chain.stage import Device, Rule
 from isocharge.serve.signal_chain.tare import TareRule
 from isocharge.serve.signal_chain.touch import TouchRule

@@ -27,8 +27,7 @@ from isocharge.serve.examination.proposal import propose, recognised_frames, uni
 from isocharge.serve.live.device import ANY_BOARD, device_from_table
 from isocharge.serve.port.serial_line import Request
 from isocharge.serve.recognition.framing import INTACT_SHARE
-from isocharge.serve.signal_chain.channels import Channels, channel_index
-from isocharge.serve.signal_chain.gain import Gain, GainRule
+from isocharge.serve.signal_chain.channels import Channels, Gain, GainRule, channel_index
 from isocharge.serve.signal_chain.stage import Device, Setup
 
 

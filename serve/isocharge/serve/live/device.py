@@ -38,8 +38,7 @@ from isocharge.common.files import StrPath
 from isocharge.common.structs import convert, read_toml
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.predictor import Predictor
-from isocharge.serve.signal_chain.channels import Channels
-from isocharge.serve.signal_chain.gain import Gain, Saturation
+from isocharge.serve.signal_chain.channels import Gain, Saturation
 from isocharge.serve.signal_chain.hum import Hum
 from isocharge.serve.signal_chain.leak import Integrator, Leak
 from isocharge.serve.signal_chain.stage import Board, Device, Rule, Setting, Setup, Share, Stage
@@ -106,7 +105,6 @@ class Prediction(Stage):
 
 
 STAGES: tuple[type[Stage], ...] = (
-    Channels,
     Gain,
     Hum,
     Tare,

@@ -1,25 +1,63 @@
-"""Assignment of the channels of a frame to the electrodes."""
+"""Conversion of the values of a board to charges, and detection of presses in which an amplifier was at its limit.
 
+The names or the order of the channels of a board determine which channel belongs to which electrode.
+"""
+
+import math
 import re
 from collections.abc import Sequence
 from json import dumps
 from operator import itemgetter
 from os.path import commonprefix
+from typing import Any
 
 import numpy as np
 
+from isocharge.common.arrays import Array
 from isocharge.common.errors import ChargeError, DeviceError, cut, shown
+from isocharge.common.structs import Finite, WrongKey
 from isocharge.common.toml_text import toml_key
-from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, Frame
-from isocharge.serve.signal_chain.gain import GainRule
-from isocharge.serve.signal_chain.stage import Setup, Stage
+from isocharge.serve.flags import INVALID, SATURATED
+from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, SATURATED_BIT, Frame
+from isocharge.serve.signal_chain.stage import LARGEST, Rule, Setting, Setup, Stage
 
 _CHANNEL_NUMBER = re.compile(r"(?:ch)?([1-9][0-9]{0,3})")
 """Number of a channel, such as `2` or `ch2`."""
 
 
-class Channels(Stage):
-    """Selects the values in a frame that belong to the electrodes.
+class GainRule(Rule, frozen=True, kw_only=True):
+    """Settings that convert the unit of a board to charge.
+
+    Each setting is either a single number for all electrodes or a separate number for each electrode.
+
+    Attributes:
+        pC_per_unit: Charge of one unit, pC. For a board that sends volts, it is the feedback capacitance of the
+            amplifiers in pF.
+        offset: Value that the board sends without charge, in the unit of the board.
+    """
+
+    pC_per_unit: Finite | dict[str, Finite]
+    offset: Finite | dict[str, Finite] = 0.0
+
+    def __post_init__(self) -> None:
+        """Check that the gain is not 0.
+
+        Raises:
+            WrongKey: If the gain of an electrode is 0.
+        """
+        gains = self.pC_per_unit.values() if isinstance(self.pC_per_unit, dict) else [self.pC_per_unit]
+        if 0.0 in gains:
+            raise WrongKey("pC_per_unit", "a finite number that is not 0, or one for each electrode", self.pC_per_unit)
+
+    def charge_pC(self, electrode: str, values: Array) -> Array:
+        """Convert values of one electrode, of any shape, to charges, pC. An unstated gain is 1."""
+        gain_pC = self.pC_per_unit.get(electrode, 1.0) if isinstance(self.pC_per_unit, dict) else self.pC_per_unit
+        offset = self.offset.get(electrode, 0.0) if isinstance(self.offset, dict) else self.offset
+        return (values - offset) * gain_pC
+
+
+class Channels:
+    """Assignment of the channels of a board to the electrodes.
 
     The section `[channels]` of the device file states the name or the number of the channel of each electrode. Without
     this section, the first of these rules that applies assigns the channels:
@@ -30,8 +68,6 @@ class Channels(Stage):
     - If there are as many channels as electrodes, both have the same order. Numbers in the names of the channels must
       then increase.
     """
-
-    is_required = True
 
     def __init__(self, setup: Setup, *, any_unit: bool = False) -> None:
         """Store which channel the device file assigns to each electrode.
@@ -55,26 +91,6 @@ class Channels(Stage):
                     "correct or remove the key; a key outside of all sections belongs above the first section"
                 )
         self._setup = setup
-        # Names and number of values of the previous frame, and its channel indices. `step` uses the indices again.
-        self._previous_layout: tuple[tuple[str, ...], int] | None = None  # None before the first frame
-        self._channel_indices: tuple[int, ...] = ()
-
-    def step(self, frame: Frame) -> None:
-        """Store the values of a frame in the order of the electrodes, in the unit of the device.
-
-        If the previous frame had the same names and the same number of values, its channel indices are used again.
-
-        Raises:
-            ChargeError: If the frame has no value for an electrode.
-        """
-        layout = (frame.names, len(frame.values))
-        if layout != self._previous_layout:
-            self._channel_indices = self.channel_indices(frame)
-            self._previous_layout = layout
-        # With several indices, `itemgetter` returns a tuple. With a single index, it returns a number, which `reshape`
-        # converts to an array with one element.
-        values = itemgetter(*self._channel_indices)(frame.values)
-        frame.sent = np.array(values, dtype=float).reshape(-1)
 
     def channel_indices(self, frame: Frame) -> tuple[int, ...]:
         """Return, for each electrode, the index of its channel in `frame.values`.
@@ -256,3 +272,109 @@ def _unit_advice(names: Sequence[str]) -> str:
         if unit not in ("", "pC"):
             return f"; channel {shown(name)} is in {unit}: convert it to pC, or state the charge of a unit in [gain]"
     return ""
+
+
+class Gain(Stage):
+    """Converts the values of the electrodes to charges in pC, with the offset, the sign and the gain of each channel.
+
+    A frame with a value that cannot be a charge gets the flag `invalid`, and no charges. After invalid frames, the time
+    step of the next frame begins at the last valid frame.
+
+    Attributes:
+        gain_pC: Charge per unit of the device, with sign, shape (n_electrode,), pC.
+        zero: Values of the device without charge, shape (n_electrode,), in the unit of the device.
+        largest: Largest magnitude of a valid value, in the unit of the device.
+    """
+
+    section = "gain"
+    is_required = True
+    rule_class = GainRule
+
+    def __init__(self, setup: Setup) -> None:
+        """Set the conversion. Without settings, the values are charges in pC."""
+        self._channels = Channels(setup)
+        self._layout: tuple[tuple[str, ...], int] | None = None  # names and number of values of the previous frame
+        self._select: itemgetter[Any] = itemgetter(
+            0
+        )  # function that returns the values of the electrodes in frames of this layout
+        rule = setup.device.rule(GainRule) or GainRule(pC_per_unit=1.0)
+        self.gain_pC = setup.for_each_electrode("gain.pC_per_unit", rule.pC_per_unit)
+        self.zero = setup.for_each_electrode("gain.offset", rule.offset)
+        self.largest = LARGEST / float(np.abs(self.gain_pC).max(initial=np.finfo(float).tiny))
+        self._skipped_s = 0.0  # duration of the invalid frames since the last valid frame
+        self._skipped_intervals = 0
+
+    def step(self, frame: Frame) -> None:
+        """Convert the values of a frame to charges, and mark the frame if a value cannot be a charge.
+
+        Raises:
+            ChargeError: If the frame has no value for an electrode.
+        """
+        layout = (frame.names, len(frame.values))
+        if layout != self._layout:
+            self._select = itemgetter(*self._channels.channel_indices(frame))
+            self._layout = layout
+        # With a single index, `itemgetter` returns a number, which `reshape` converts to an array with one element.
+        frame.sent = np.array(self._select(frame.values), dtype=float).reshape(-1)
+        with np.errstate(over="ignore"):  # a value may be so large that its conversion overflows
+            frame.raw_pC = (frame.sent - self.zero) * self.gain_pC
+        magnitude = math.hypot(*frame.sent.tolist())  # at least the largest absolute value; NaN if a value is NaN
+        if not magnitude <= self.largest:  # the condition is negated, so that it is true for NaN
+            self._skipped_s += frame.dt_s
+            self._skipped_intervals += frame.intervals
+            frame.is_valid = False
+            frame.flags.append(INVALID)
+            return
+        frame.dt_s += self._skipped_s
+        frame.intervals += self._skipped_intervals
+        self._skipped_s = 0.0
+        self._skipped_intervals = 0
+        frame.charge_pC = frame.raw_pC
+
+    @classmethod
+    def c_settings(cls, setup: Setup) -> dict[str, Any]:
+        """Return the offset and the gain of each channel, and the largest valid value, by name."""
+        gain = cls(setup)
+        return {"zero": gain.zero, "pC": gain.gain_pC, "largest": gain.largest}
+
+
+class SaturationRule(Rule, frozen=True, kw_only=True):
+    """Section `[saturation]` of a device file.
+
+    Attributes:
+        limit_pC: Largest charge that the converter can represent, pC.
+    """
+
+    limit_pC: Setting
+
+
+class Saturation(Stage):
+    """Adds the flag `saturated` to the frames of a press in which an amplifier is, or has been, at its limit.
+
+    An amplifier is at its limit if the device reports this, or if the magnitude of a charge reaches the limit of the
+    converter. All later frames of the press keep the flag.
+    """
+
+    section = "saturation"
+    is_required = True
+    rule_class = SaturationRule
+
+    def __init__(self, setup: Setup) -> None:
+        """Begin without a press."""
+        rule = setup.device.rule(SaturationRule)
+        self._limit_pC = math.inf if rule is None else rule.limit_pC
+        self._is_saturated = False
+
+    def step(self, frame: Frame) -> None:
+        """Add the flag to a frame, unless the frame is invalid."""
+        if not frame.is_valid:
+            return
+        largest_pC = max(map(abs, frame.raw_pC.tolist()))
+        is_at_limit = bool(frame.bits & SATURATED_BIT) or largest_pC >= self._limit_pC
+        self._is_saturated = is_at_limit or (self._is_saturated and frame.is_contact)
+        if self._is_saturated:
+            frame.flags.append(SATURATED)
+
+    def reset(self) -> None:
+        """Discard the press."""
+        self._is_saturated = False
