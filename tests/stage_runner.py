@@ -6,10 +6,11 @@ import numpy as np
 from msgspec import structs
 
 from isocharge.serve import Chunk, Frame, TouchStream, Validity, device_from_table, encode_frame
-from isocharge.serve.flags import INVALID, in_order
+from isocharge.serve.flags import INVALID
 from isocharge.serve.frames.frame import SATURATED_BIT
 from isocharge.serve.live.device import create_stages
 from isocharge.serve.model.contact import disk_corners
+from isocharge.serve.record.record import flags_in_order
 from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.tracking.tracker import Tracker, TrackRule
 
@@ -38,7 +39,7 @@ class StageRunner:
         frame.flags = list(flags)
         for stage in self.stages:
             stage.step(frame)
-        frame.flags = in_order(frame.flags)
+        frame.flags = flags_in_order(frame.flags)
         return frame
 
     def run(self, rows, rate_Hz, together=0):

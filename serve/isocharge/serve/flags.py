@@ -1,7 +1,5 @@
 """Names of the flags that the field `flags` of a record can contain, and the meaning of each flag."""
 
-from collections.abc import Iterable
-
 TARE = "tare"
 OUTSIDE = "outside"
 BEYOND = "beyond"
@@ -38,9 +36,3 @@ MEANINGS = {
     FILM: "no pretension explains the last touches (a wrong gain, warm fingers): the film is not followed now",
 }
 """Meaning of each flag, in the order in which a record contains the flags."""
-
-
-def in_order(flags: Iterable[str]) -> tuple[str, ...]:
-    """Return each of the flags once, in the order of `MEANINGS`."""
-    present = set(flags)
-    return tuple(flag for flag in MEANINGS if flag in present)

@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.serve.flags import RECONNECTED, RESTART, SATURATED, TARE, in_order
+from isocharge.serve.flags import RECONNECTED, RESTART, SATURATED, TARE
 from isocharge.serve.frames.frame import Frame
+from isocharge.serve.record.record import flags_in_order
 
 PORT_LOST = "the port was lost or the board was restarted: do not touch the film until it is tared"
 """Reason for which a press is refused after an interruption."""
@@ -249,7 +250,7 @@ class PressWatch:
 
         reason = self._unsteady(mean_pC, scatter_pC, slope_pC_per_s, times_s[-1] - times_s[0], noise_pC)
         if not reason:
-            flags = in_order(flag for frame in self._frames for flag in frame.flags)
+            flags = flags_in_order(flag for frame in self._frames for flag in frame.flags)
             return SteadyPress(mean_pC, self._end_s - self._begin_s, flags)
         if scatter_pC.max() <= self._min_scatter_pC:
             self._min_scatter_pC = scatter_pC.max()

@@ -13,13 +13,13 @@ from dataclasses import replace
 from functools import partial
 
 from isocharge.common.errors import ModelError, NoFramesError, shown
-from isocharge.serve.flags import RECONNECTED, REPEAT, in_order
+from isocharge.serve.flags import RECONNECTED, REPEAT
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.frame import Frame, FrameCounts
 from isocharge.serve.live.device import ANY_BOARD, create_stages
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.file_source import Chunk
-from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, PredictionRecord
+from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, PredictionRecord, flags_in_order
 from isocharge.serve.signal_chain.stage import Device, Setup
 
 RESTART_OUTAGE_s = 1e-6
@@ -328,7 +328,7 @@ class TouchStream(ReadingStream):
             charge_pC=charge_pC,
             charge_raw_pC=raw_pC,
             tare_pC=tare_pC,
-            flags=in_order(flags) if flags else (),
+            flags=flags_in_order(flags) if flags else (),
             latency_us=(time.perf_counter_ns() - chunk.clock_ns) / 1e3,  # includes the time that the stages have taken
             model=self._label,
             frame_id=self.frame_id,

@@ -12,7 +12,7 @@ import io
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from isocharge.serve.record.record import DECIMALS, RECORD_FIELDS, Field, PredictionRecord
+from isocharge.serve.record.record import DECIMALS, RECORD_FIELDS, Field, PredictionRecord, record_fields
 
 
 def csv_header(electrodes: Sequence[str], fields: Sequence[Field]) -> str:
@@ -37,7 +37,7 @@ def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
         electrodes: Names of the electrodes, in the order of the header.
     """
     cells: list[str] = []
-    for name, part in _columns(electrodes, record.fields):
+    for name, part in _columns(electrodes, record_fields(record.sections)):
         value = getattr(record, name)
         if part is not None and value is not None:
             value = value[part] if isinstance(value, dict) else getattr(value, part)

@@ -6,12 +6,14 @@ unknown while nothing touches the film. The device clock is unknown if the charg
 """
 
 import json
+from collections.abc import Iterable
 from functools import cache
 from types import UnionType
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
 from msgspec import Struct, structs
 
+from isocharge.serve.flags import MEANINGS
 from isocharge.serve.model.contact import Contact
 
 Charges = dict[str, float | None]
@@ -161,11 +163,6 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     film: Annotated[FollowedFilm | None, "Estimated film for which the model answered.", "follow"] = None
     sections: tuple[str, ...] = ()
 
-    @property
-    def fields(self) -> tuple[Field, ...]:
-        """The fields that this record has, in their order."""
-        return record_fields(self.sections)
-
     def to_json(self) -> str:
         """Return the record as one line of strictly valid JSON, in which numbers are rounded to six decimals.
 
@@ -206,6 +203,12 @@ UNKNOWN_CONTACT: dict[str, Any] = dict.fromkeys(Contact._fields)
 
 NO_CONTACT: dict[str, Any] = UNKNOWN_CONTACT | {"force_N": 0.0}
 """Values of the fields of a contact if nothing touches the film."""
+
+
+def flags_in_order(flags: Iterable[str]) -> tuple[str, ...]:
+    """Return each of the flags once, in the order of `MEANINGS`, in which a record contains them."""
+    present = set(flags)
+    return tuple(flag for flag in MEANINGS if flag in present)
 
 
 @cache

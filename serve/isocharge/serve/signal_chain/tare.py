@@ -5,6 +5,7 @@ follows a slow drift of the charge at rest.
 """
 
 import math
+from collections import deque
 from typing import Annotated, Any
 
 import numpy as np
@@ -100,9 +101,9 @@ class Tare(Stage):
         self._tare_pC: Array | None = None  # charge at rest
         self._noise_pC = np.zeros(len(setup.electrodes))  # standard deviation of the charge at rest
         self._previous: Frame | None = None  # previous frame
-        self._latest_pC = np.empty((0, len(setup.electrodes)))  # charges from which the tare is measured
-        patience = 0 if self._rule is None else self._rule.patience
-        self._remaining_frames = patience or math.inf  # number of frames after which the search ends with an error
+        rule = self._rule or TareRule()
+        self._latest_pC: deque[Array] = deque(maxlen=rule.frames)  # charges from which the tare is measured
+        self._remaining_frames = rule.patience or math.inf  # number of frames after which the search ends with an error
 
     def step(self, frame: Frame) -> None:
         """Subtract the tare from a frame. While there is no tare, search for it, and remove the charges from the frame.
@@ -138,7 +139,7 @@ class Tare(Stage):
         """
         self._tare_pC = None
         self._previous = None
-        self._latest_pC = self._latest_pC[:0]  # without any frame
+        self._latest_pC.clear()
         self._remaining_frames = math.inf
 
     def _change_pC(self, frame: Frame) -> Array | float:
@@ -174,13 +175,13 @@ class Tare(Stage):
         if rule is None:
             self._tare_pC = np.zeros_like(charge_pC)
             return
-        stored_pC = np.vstack([self._latest_pC, charge_pC])
-        self._latest_pC = stored_pC[-rule.frames :]  # at most as many frames as a tare needs
+        self._latest_pC.append(charge_pC)
         self._remaining_frames -= 1
         if len(self._latest_pC) < rule.frames:
             return
-        mean_pC = self._latest_pC.mean(axis=0)
-        noise_pC = self._latest_pC.std(axis=0)
+        latest_pC = np.array(self._latest_pC)  # shape (frames, n_electrode)
+        mean_pC = latest_pC.mean(axis=0)
+        noise_pC = latest_pC.std(axis=0)
         reason = rule.unrest(mean_pC, noise_pC)
         if not reason:
             self._tare_pC = mean_pC
