@@ -174,14 +174,11 @@ def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[str, str]:
     Raises:
         RequestError: If `Host` (RFC 9112, 3.2) or `Origin` is repeated. A proxy could have checked the other value.
     """
-    values: dict[str, str] = {}
-    for name_bytes, value_bytes in headers:
-        name = name_bytes.decode("latin-1")
-        value = value_bytes.decode("latin-1")
-        if name in values and name in ("host", "origin"):
-            raise RequestError(f"{name}: expected one header, got {shown(values[name])} and {shown(value)}")
-        values[name] = value
-    return values
+    for name in (b"host", b"origin"):
+        values = [value.decode("latin-1") for other_name, value in headers if other_name == name]
+        if len(values) > 1:
+            raise RequestError(f"{name.decode()}: expected one header, got {shown(values)}")
+    return {name.decode("latin-1"): value.decode("latin-1") for name, value in headers}
 
 
 _HOST_NAME_PATTERN = re.compile(r"[a-z0-9_-][a-z0-9_.-]*")

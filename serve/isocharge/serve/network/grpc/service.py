@@ -193,13 +193,13 @@ class Service:
             else:
                 response = self._respond(name, data, call)
             async with asyncio.timeout(self._handler.limits.body_seconds):
-                await context.write(response)
+                await context.write(response.SerializeToString())
             if name != STREAM_METHOD or self._is_stopping:
                 return
             timeout_s = self._handler.limits.idle_seconds
 
     def _respond(self, name: str, data: bytes, call: Exchange) -> Any:
-        """Answer one message, and return the serialized response.
+        """Answer one message, and return the response.
 
         Args:
             name: Name of the method.
@@ -224,23 +224,26 @@ class Service:
         call.model = self._handler.store.label(model_name, model_version)
 
         if name == STREAM_METHOD:
-            response = self._infer_in_stream(request)
-        elif name == "ModelInfer":
-            response = self._infer(request)
-        else:
-            # The body of the equivalent HTTP request has the same fields as the message.
-            body = MessageToJson(request, preserving_proto_field_name=True).encode()
-            equivalent = Request(self._handler.store, self._handler.traffic, {}, body, model_name, model_version)
             try:
-                answer = ROUTE_OF_METHOD[name].respond(equivalent)
-            except ModelError:
-                if name not in ("ServerReady", "ModelReady"):
-                    raise
-                answer = {"ready": False}  # gRPC has no status for this answer
-            if name in ANSWER_FIELDS:
-                answer = {ANSWER_FIELDS[name]: answer}
-            response = ParseDict(answer, response_type())
-        return response.SerializeToString()
+                return response_type(infer_response=self._infer(request))
+            except Exception as error:  # every error is sent to the client, and does not end the stream
+                _, message = refusal(error)
+                return response_type(error_message=message)
+        if name == "ModelInfer":
+            return self._infer(request)
+
+        # The body of the equivalent HTTP request has the same fields as the message.
+        body = MessageToJson(request, preserving_proto_field_name=True).encode()
+        equivalent = Request(self._handler.store, self._handler.traffic, {}, body, model_name, model_version)
+        try:
+            answer = ROUTE_OF_METHOD[name].respond(equivalent)
+        except ModelError:
+            if name not in ("ServerReady", "ModelReady"):
+                raise
+            answer = {"ready": False}  # gRPC has no status for this answer
+        if name in ANSWER_FIELDS:
+            answer = {ANSWER_FIELDS[name]: answer}
+        return ParseDict(answer, response_type())
 
     def _infer(self, request: Any) -> Any:
         """Run a model on the charges of a ModelInferRequest, and return the ModelInferResponse."""
@@ -248,18 +251,6 @@ class Service:
         with loaded.statistics.refused.count_exceptions(), loaded.statistics.latency.time():
             content = infer(loaded, *read_request(request))
             return write_response(content, is_raw=len(request.raw_input_contents) > 0)
-
-    def _infer_in_stream(self, request: Any) -> Any:
-        """Return the response to one request of a stream.
-
-        If an error occurs, the response contains the error message. An error therefore does not end the stream.
-        """
-        _, response_type = METHODS[STREAM_METHOD]
-        try:
-            return response_type(infer_response=self._infer(request))
-        except Exception as error:  # every error is sent to the client
-            _, message = refusal(error)
-            return response_type(error_message=message)
 
     def _limit_open_calls(self) -> None:
         """If there are too many open calls, end the call that has waited longest for a message.

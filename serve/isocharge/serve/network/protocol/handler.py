@@ -30,6 +30,9 @@ from isocharge.serve.network.protocol.routes import ROUTES, UNKNOWN, Request, Ro
 Message = MutableMapping[str, Any]
 """Message or scope of ASGI."""
 
+Channel = Callable[..., Awaitable[Any]]
+"""Function of ASGI that receives or sends a message."""
+
 
 class Application(ABC):
     """ASGI application: the handler of models or the live page. An application can be mounted under any path of another
@@ -46,9 +49,7 @@ class Application(ABC):
     traffic: Traffic
     blocking_paths: tuple[str, ...] = ()
 
-    async def __call__(
-        self, scope: Message, receive: Callable[[], Awaitable[Message]], send: Callable[[Message], Awaitable[None]]
-    ) -> None:
+    async def __call__(self, scope: Message, receive: Channel, send: Channel) -> None:
         """Answer one HTTP request. If the client disconnects before its request is complete, nothing is sent.
 
         WebSockets are refused. The start and the end of the program need no work (lifespan of ASGI).
