@@ -310,27 +310,27 @@ def _describe_schema(schema: Mapping[str, Any]) -> str:
         schema: JSON schema that msgspec has derived from a type. If the annotation of the type contains a description,
             the schema contains this description, and the function returns it.
     """
-    if "description" in schema:
-        return str(schema["description"])
-    if "enum" in schema:
-        return f"one of {', '.join(map(str, schema['enum']))}"
-    if "anyOf" in schema and "discriminator" not in schema:  # with a discriminator, all members are tables
-        descriptions = [_describe_schema(member) for member in schema["anyOf"] if member.get("type") != "null"]
-        return " or ".join(dict.fromkeys(descriptions))  # `fromkeys` removes repeated descriptions
-
-    noun = _noun(schema)
-    minimum_length = schema.get("minItems", 0)
-    item, *_ = schema.get("prefixItems", [schema.get("items")])  # all items have the same type
-    if item is not None:
-        items = f"{_noun(item)}s"
-        if minimum_length == schema.get("maxItems"):
-            return f"a list of {minimum_length} {items}"
-        return f"a list of {items}, {minimum_length} or more" if minimum_length else f"a list of {items}"
-    if "maxLength" in schema:
-        return f"a text of 1 to {schema['maxLength']} characters"
-    if noun in ("number", "whole number"):
-        return _describe_number(noun, schema)
-    return "true or false" if noun == "truth value" else f"a {noun}"
+    match schema:
+        case {"description": description}:
+            return str(description)
+        case {"enum": values}:
+            return f"one of {', '.join(map(str, values))}"
+        case {"anyOf": members} if "discriminator" not in schema:  # with a discriminator, all members are tables
+            descriptions = [_describe_schema(member) for member in members if member.get("type") != "null"]
+            return " or ".join(dict.fromkeys(descriptions))  # `fromkeys` removes repeated descriptions
+        case {"prefixItems": [item, *_]} | {"items": item}:  # all items have the same type
+            items = f"{_noun(item)}s"
+            minimum = schema.get("minItems", 0)
+            if minimum == schema.get("maxItems"):
+                return f"a list of {minimum} {items}"
+            return f"a list of {items}, {minimum} or more" if minimum else f"a list of {items}"
+        case {"maxLength": length}:
+            return f"a text of 1 to {length} characters"
+        case {"type": "number" | "integer"}:
+            return _describe_number(_noun(schema), schema)
+        case {"type": "boolean"}:
+            return "true or false"
+    return f"a {_noun(schema)}"
 
 
 _NOUNS = {

@@ -147,24 +147,22 @@ class Traffic:
 
     def __init__(self, log: RequestLog | None = None) -> None:
         """Create the metrics of a server that has not received any request."""
-        self.log = log
-        self.registry = CollectorRegistry()
-        ProcessCollector(registry=self.registry)
-        Info("isocharge", "Version of the server.", registry=self.registry).info({"version": package_version()})
+        registry = CollectorRegistry()
+        ProcessCollector(registry=registry)
+        Info("isocharge", "Version of the server.", registry=registry).info({"version": package_version()})
         self._requests = Counter(
             "isocharge_requests",
             "Requests that were answered or refused.",
             ("transport", "route", "status"),
-            registry=self.registry,
+            registry=registry,
         )
+        self.log = log
+        self.registry = registry
         self.open = Gauge(
-            "isocharge_open",
-            "Open connections of HTTP and open calls of gRPC.",
-            ("transport",),
-            registry=self.registry,
+            "isocharge_open", "Open connections of HTTP and open calls of gRPC.", ("transport",), registry=registry
         )
         self.lost_lines = Gauge(
-            "isocharge_log_lines_lost", "Lines of the log that could not be written.", registry=self.registry
+            "isocharge_log_lines_lost", "Lines of the log that could not be written.", registry=registry
         )
 
     @contextmanager

@@ -66,10 +66,8 @@ async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = 
     server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, methods),))
     try:
         if tls is None:
-            scheme = "grpc"
             actual_port = server.add_insecure_port(address)
         else:
-            scheme = "grpcs"
             credentials = grpc.ssl_server_credentials([(read_whole(tls.key), read_whole(tls.certificate))])
             actual_port = server.add_secure_port(address, credentials)
     except RuntimeError as error:
@@ -78,7 +76,7 @@ async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = 
         ) from error
     await server.start()
     try:
-        yield f"{scheme}://{url_host(host)}:{actual_port}"
+        yield f"{'grpcs' if tls else 'grpc'}://{url_host(host)}:{actual_port}"
     finally:
         service.end_streams()
         try:
