@@ -322,7 +322,7 @@ class UdpSocket:
             The datagram; empty bytes if no datagram arrives in time.
         """
         deadline_s = time.monotonic() + timeout_s
-        while self._is_ready(max(0.0, deadline_s - time.monotonic())):
+        while select.select([self._socket], [], [], max(0.0, deadline_s - time.monotonic()))[0]:
             previous_peer = self._peer
             data, self._peer = self._socket.recvfrom(MAX_READ_BYTES)
             if previous_peer not in (None, self._peer) and not self._has_warned:
@@ -341,11 +341,6 @@ class UdpSocket:
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
-
-    def _is_ready(self, timeout_s: float) -> bool:
-        """Return whether a datagram has already arrived, or arrives within `timeout_s` seconds."""
-        readable, _, _ = select.select([self._socket], [], [], timeout_s)
-        return bool(readable)
 
     def _with_line_feed(self, data: bytes) -> bytes:
         """Return a datagram of text with a line feed at its end.
