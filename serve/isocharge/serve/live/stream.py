@@ -115,19 +115,17 @@ class ReadingStream:
     def frames(self, chunk: Chunk) -> Iterator[Frame]:
         """Process a chunk, pass each frame whose last byte it contains through all stages, and yield the frame.
 
-        If the chunk follows an outage of the port, the state before the outage is discarded first.
-
         Raises:
             ChargeError: If a frame has no value for an electrode.
             TareError: If the film is touched during the whole search for a tare.
             NoFramesError: If the stream has contained no intact frame in many bytes.
         """
-        for frame in self._receive(chunk):
+        for frame in self._received_frames(chunk):
             for stage in self._stages:
                 stage.step(frame)
             yield frame
 
-    def _receive(self, chunk: Chunk) -> list[Frame]:
+    def _received_frames(self, chunk: Chunk) -> list[Frame]:
         """Return the frames whose last byte a chunk contains, with their times and the flags of their sequence.
 
         If the chunk follows an outage of the port, the state before the outage is discarded first.
@@ -298,15 +296,17 @@ class TouchStream(ReadingStream):
             TareError: If the film is touched during the whole search for a tare.
             PortError: If the stream has contained no intact frame in many bytes.
         """
-        return map(partial(self._record, chunk), self.frames(chunk))
+        return map(partial(self._record, chunk), self._received_frames(chunk))
 
     def _record(self, chunk: Chunk, frame: Frame) -> PredictionRecord:
-        """Return the prediction record of a frame.
+        """Pass a frame through all stages, and return its prediction record.
 
         Args:
             chunk: The chunk that contains the last byte of the frame.
-            frame: The frame after all stages.
+            frame: The frame before the stages.
         """
+        for stage in self._stages:
+            stage.step(frame)
         if frame.contact is not None:
             contact_fields = frame.contact._asdict()
         else:
