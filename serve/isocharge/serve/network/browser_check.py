@@ -177,7 +177,7 @@ def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[str, str]:
     for name in (b"host", b"origin"):
         values = [value.decode("latin-1") for other_name, value in headers if other_name == name]
         if len(values) > 1:
-            raise RequestError(f"{name.decode()}: expected one header, got {shown(values)}")
+            raise RequestError(f"{name.decode()}: expected one header, got {' and '.join(map(shown, values))}")
     return {name.decode("latin-1"): value.decode("latin-1") for name, value in headers}
 
 

@@ -158,7 +158,8 @@ class Service:
             except grpc.aio.InternalError as error:  # the client ended the call while a message was read or sent
                 raise asyncio.CancelledError from error
             except Exception as error:  # every error is sent to the client
-                status, message = (408, TIMEOUT_MESSAGE) if isinstance(error, TimeoutError) else refusal(error)
+                is_late = isinstance(error, TimeoutError)
+                status, message = refusal(RequestError(TIMEOUT_MESSAGE, 408) if is_late else error)
                 call.status = GRPC_STATUSES[status]
                 call.error = type(error).__name__
             finally:
