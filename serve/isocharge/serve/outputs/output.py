@@ -102,6 +102,7 @@ class WriterQueue(Generic[T]):
 
     Attributes:
         lost: Number of items that were dropped without being written, or that could not be written.
+        error: Exception with which `write` has ended the thread; None if there is none, or if `put` has raised it.
     """
 
     def __init__(self, write: Callable[[T], object]) -> None:
@@ -115,7 +116,7 @@ class WriterQueue(Generic[T]):
         self._items: SimpleQueue[T | None] = SimpleQueue()  # None ends the thread
         self._written_count = 0
         self._is_abandoned = False  # whether the thread must write no further item
-        self._error: Exception | None = None
+        self.error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)  # a write may hang forever
         self._thread.start()
 
@@ -133,8 +134,10 @@ class WriterQueue(Generic[T]):
         Raises:
             Exception: The exception that `write` has raised in the thread, if there is one.
         """
-        if self._error is not None:
-            raise self._error
+        error = self.error
+        if error is not None:
+            self.error = None  # the error is reported only once
+            raise error
         if self._items.qsize() >= MAX_WAITING_ITEMS:
             with suppress(Empty):  # the thread has taken all items in the meantime
                 self._items.get_nowait()
@@ -145,9 +148,6 @@ class WriterQueue(Generic[T]):
         """Write the waiting items as long as the consumer accepts items, and close the queue.
 
         If the consumer accepts no item within `CLOSE_TIMEOUT_s`, the waiting items are dropped and counted as lost.
-
-        Raises:
-            Exception: The exception that `write` has raised in the thread, if there is one.
         """
         self._items.put(None)
 
@@ -161,8 +161,6 @@ class WriterQueue(Generic[T]):
         self._is_abandoned = True
         self._thread.join(CLOSE_TIMEOUT_s)
         self.lost += self._items.qsize()
-        if self._error is not None:
-            raise self._error
 
     def _run(self) -> None:
         """Write items until the queue is closed and empty, or until `write` raises an exception."""
@@ -173,8 +171,8 @@ class WriterQueue(Generic[T]):
                 if self._write(item) is False:
                     self.lost += 1
                 self._written_count += 1
-        except Exception as error:  # `put` and `close` raise it again in the thread of the caller
-            self._error = error
+        except Exception as error:  # `put` raises it again in the thread of the caller
+            self.error = error
 
 
 class FileOutput:
@@ -214,14 +212,15 @@ class FileOutput:
         self._stack.__exit__(EOFError, EOFError(), None)  # `new_file` removes the file after an error
 
 
-def output_error(error: Exception, target: str) -> Exception:
+def output_error(error: BaseException, target: str) -> BaseException:
     """Return an error of an output as an error that states its cause and the target.
 
     Args:
-        error: The error. An `IsochargeError` states its cause already. A broken pipe is not an error of the output.
+        error: The error. An `IsochargeError` states its cause already. A broken pipe and Ctrl-C are no errors of the
+            output, and are returned unchanged.
         target: Target of the output.
     """
-    if isinstance(error, IsochargeError | BrokenPipeError):
+    if isinstance(error, IsochargeError | BrokenPipeError) or not isinstance(error, Exception):
         return error
     output_failure = OutputError(f"{target}: the output failed ({type(error).__name__}: {error})")
     if isinstance(error, OSError):

@@ -144,9 +144,7 @@ class Outputs:
             except BaseException as error:
                 self._is_discarded = True
                 self._stack.close()
-                if isinstance(error, Exception):
-                    raise output_error(error, target)  # noqa: B904  # the cause is set
-                raise
+                raise output_error(error, target)  # noqa: B904  # the cause is set
             # A live stream must not wait for a slow consumer, so its records are written by another thread.
             queue = WriterQueue(output.write) if self._context.is_live else None
             self._writers[target] = output.write if queue is None else queue.put
@@ -217,7 +215,11 @@ class Outputs:
         """
         try:
             if queue is not None:
-                self._close_queue(target, queue)
+                queue.close()
+                if queue.error is not None:
+                    self._handle_error(target, queue.error)
+                if queue.lost > 0:
+                    self.not_written.setdefault(target, queue.lost)
                 if queue.is_stuck:  # the thread is still in `write` of the output, which therefore cannot be closed
                     return
             has_failed = target not in self._writers
@@ -238,12 +240,3 @@ class Outputs:
                 self._handle_error(target, error)
         if self._is_discarded:
             self.not_written[target] = None  # the number of missing records is unknown
-
-    def _close_queue(self, target: str, queue: WriterQueue[PredictionRecord]) -> None:
-        """Write the records that wait in the queue of an output, and count those that its consumer does not accept."""
-        try:
-            queue.close()
-        except Exception as error:
-            self._handle_error(target, error)
-        if queue.lost > 0:
-            self.not_written.setdefault(target, queue.lost)
