@@ -65,13 +65,15 @@ def test_no_folder_is_left_of_what_cannot_be_written(refused, tmp_path):
     data[2000] ^= 1
     (damaged / "model.onnx").write_bytes(data)
     (tmp_path / "board.toml").write_text("[leak]\ntau_s = {X = 1.0}\n")
+    (tmp_path / "wires.toml").write_text('[channels]\nA = "1"\nfront_end = "current"\n')
     for words, message in [
         ((damaged,), "expected sha256"),
         (("no-such-model",), "no model 'no-such-model'"),
         (("three-25um-biaxial", "--device", tmp_path / "board.toml"), "one for each of the electrodes"),
+        (("three-25um-biaxial", "--device", tmp_path / "wires.toml"), "channels.front_end: expected one of the"),
     ]:
         refused("train", "export-c", *words, "-o", tmp_path / "c", message=message)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["board.toml", "damaged"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["board.toml", "damaged", "wires.toml"]
 
 
 def test_the_readme_says_what_works(exports, run_commands, installed, tmp_path, compile_c):
