@@ -260,9 +260,9 @@ class TouchStream(ReadingStream):
         contact_stages = create_stages(new_setup, needs_contact=True)
         self._setup.use(new_setup.model)
         charge_stages = [stage for stage in self._stages if not stage.needs_contact]
-        previous_stages = {type(stage): stage for stage in self._stages}
-        for stage in contact_stages:
-            stage.continue_touch(previous_stages.get(type(stage), stage))
+        previous_stages = self._stages[len(charge_stages) :]  # empty when the stream begins
+        for stage, previous_stage in zip(contact_stages, previous_stages, strict=False):
+            stage.continue_touch(previous_stage)
         self._stages = charge_stages + contact_stages
         self.sections = tuple(stage.section for stage in contact_stages)
         self.predictor = predictor
@@ -312,10 +312,10 @@ class TouchStream(ReadingStream):
         else:
             contact_fields = NO_CONTACT if frame.is_valid else UNKNOWN_CONTACT
         electrodes = self._setup.electrodes
-        charge_pC, raw_pC, tare_pC = (
+        charge_pC, raw_pC, tare_pC = [
             None if array is None else dict(zip(electrodes, array.tolist(), strict=True))
             for array in (frame.charge_pC, frame.raw_pC, frame.tare_pC)
-        )
+        ]
         if raw_pC is not None and not frame.is_valid:  # the charges of an invalid frame may be no finite numbers
             raw_pC = {name: charge if math.isfinite(charge) else None for name, charge in raw_pC.items()}
         flags = {*frame.flags, *frame.contact_flags}

@@ -144,6 +144,10 @@ The smallest eigenvalue of the correlations of released models is between -5e-6 
 """
 
 
+CORRELATION_PAIRS = np.array([[-1, 0, 1], [0, -1, 2], [1, 2, -1]])
+"""Number of the correlation of two errors among the correlations xy, xF and yF; -1 for an error with itself."""
+
+
 def correlation_matrices(contacts: ArrayLike) -> Array:
     """Return the matrices of the correlations between the errors of x, y and the force, shape (..., 3, 3).
 
@@ -152,11 +156,9 @@ def correlation_matrices(contacts: ArrayLike) -> Array:
     Args:
         contacts: The ten numbers of each contact, shape (..., 10).
     """
-    xy, xF, yF = range(len(Contact._fields))[CORRELATION_COLUMNS]
-    columns = [[0, xy, xF], [xy, 0, yF], [xF, yF, 0]]  # the column 0 on the diagonal is replaced
-    matrices = np.asarray(contacts, dtype=float)[..., columns] / (1.0 + CORRELATION_RIDGE)
-    matrices[..., range(3), range(3)] = 1.0
-    return matrices
+    correlations = np.asarray(contacts, dtype=float)[..., CORRELATION_COLUMNS]
+    matrices = correlations.take(CORRELATION_PAIRS, axis=-1) / (1.0 + CORRELATION_RIDGE)
+    return np.where(CORRELATION_PAIRS < 0, 1.0, matrices)
 
 
 def write_finite(write: Callable[..., object], values: Any) -> bool:
