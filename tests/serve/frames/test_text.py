@@ -13,7 +13,7 @@ from isocharge.serve import AutoParser
 from isocharge.serve.frames.device_clock import DeviceClock
 from isocharge.serve.frames.line_notation import clean_text
 from isocharge.serve.frames.text import TextParser
-from isocharge.serve.frames.text_lines import line_values, parse_line, skeleton_pattern
+from isocharge.serve.frames.text_lines import line_values, parse_line
 from isocharge.serve.port.file_source import Chunk
 
 README_OF_TELEPLOT = [
@@ -30,7 +30,7 @@ README_OF_TELEPLOT = [
 
 def names_and_values(text):
     line = parse_line(clean_text(text))
-    return line.names, line_values(skeleton_pattern(line), line.text)
+    return line.names, line_values(line.pattern, line.text)
 
 
 @pytest.mark.parametrize(
@@ -175,6 +175,7 @@ NAMED_NOTATIONS = [
     "{a} A, {b} B, {c} C",
     "{a},A,{b},B,{c},C",
     "12:34:56,A,{a},B,{b},C,{c}",
+    "12:34:56 {a} A, {b} B, {c} C",
     "A,{a}\nB,{b}\nC,{c}",
     "12:34:56;A;{a}\n12:34:56;B;{b}\n12:34:56;C;{c}",
     "Sensor A: {a}, Sensor B: {b}, Sensor C: {c}",
@@ -222,6 +223,7 @@ DECIMAL_COMMAS = [
     "{a} {b}\t{c}",
     "A:  {a}, B: {b}, C: {c}",
     "(A: {a}; B: {b}; C: {c})",
+    '"A",{a},"B",{b},"C",{c}',
 ]
 """Notations that are also read with decimal commas."""
 

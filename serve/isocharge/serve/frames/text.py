@@ -37,6 +37,7 @@ from typing import Literal
 
 import numpy as np
 
+from isocharge.common.arrays import Array
 from isocharge.common.errors import printable
 from isocharge.serve.frames.frame import (
     SEQ,
@@ -48,7 +49,7 @@ from isocharge.serve.frames.frame import (
     Frame,
 )
 from isocharge.serve.frames.line_notation import clean_text
-from isocharge.serve.frames.text_lines import Line, header_names, line_values, parse_line, skeleton_pattern
+from isocharge.serve.frames.text_lines import Line, header_names, line_values, parse_line
 
 MAX_LINE_LENGTH = 4096
 """Length of the longest line that is parsed, bytes."""
@@ -73,34 +74,28 @@ class Layout:
     """Arrangement of the values of a frame in one line, or in a cycle of several lines.
 
     Attributes:
-        first_line: The first line, with which headers are compared.
+        lines: The lines of a frame. Headers are compared with the first line.
         patterns: Regular expression of each line of a frame, in which the numbers are groups.
         names: Names of all values; empty for a value without a name.
         unnamed: Indices of the values that have no names in the lines. A header or a device file may name them.
         columns: Meanings of the values as frame counter, clock or channels.
     """
 
-    def __init__(self, lines: Sequence[Line]) -> None:
-        """Determine the layout from the lines of one frame."""
-        self.first_line = lines[0]
-        self.patterns = [skeleton_pattern(line) for line in lines]
-        names = [name for line in lines for name in line.names]
-        self._words = tuple(word for line in lines for word in line.words)
-        self.unnamed = [index for index, name in enumerate(names) if not name]
-        self.set_names(names)
+    def __init__(self, lines: Sequence[Line], new_names: Sequence[str] = ()) -> None:
+        """Determine the layout from the lines of one frame.
 
-    def set_names(self, names: Sequence[str]) -> None:
-        """Store the names of all values, and find the columns of the frame counter, the clock and the channels."""
-        self.names = names
-        self.columns = Columns(names, (1.0,) * len(names), words=self._words)  # values in text have no scale
-
-    def name_unnamed(self, names: Sequence[str]) -> bool:
-        """Name the values without a name. Return False if there are none, or if their number is not that of `names`."""
-        if all(self.names) or len(names) != len(self.unnamed):
-            return False
-        new_names = dict(zip(self.unnamed, names, strict=True))
-        self.set_names([new_names.get(index, name) for index, name in enumerate(self.names)])
-        return True
+        Args:
+            lines: The lines.
+            new_names: Names for the values that have no names in the lines; empty if they are not known.
+        """
+        self.lines = lines
+        self.patterns = [line.pattern for line in lines]
+        self.names = [name for line in lines for name in line.names]
+        self.unnamed = [index for index, name in enumerate(self.names) if not name]
+        for index, name in zip(self.unnamed, new_names, strict=False):
+            self.names[index] = name
+        words = tuple(word for line in lines for word in line.words)
+        self.columns = Columns(self.names, (1.0,) * len(self.names), words=words)  # values in text have no scale
 
 
 class TextParser(DelimitedParser):
@@ -122,7 +117,6 @@ class TextParser(DelimitedParser):
         self.layout: Layout | None = None
         self._columns = columns
         self._meanings = dict(meanings or {})
-        self._counters = (SEQ, *self._meanings)
         self._headers: deque[str] = deque(maxlen=MAX_CYCLE_LINES)  # lines and comments without numbers
         self.seq_modulus = SEQ_MODULI[0]
         self._last_seq = 0
@@ -160,11 +154,10 @@ class TextParser(DelimitedParser):
         is_first_line = self._is_first_line
         self._is_first_line = False
         try:
-            line = _decoded(piece.strip(CONTROL_CHARACTERS))
+            line = _decoded(piece.strip(CONTROL_CHARACTERS)).strip()
             text = clean_text(line)
             if not text:
-                self.unread_line = line.strip() or self.unread_line
-                self._store_comment(line.strip())
+                self._store_comment(line)
                 return []
             # The beginning of the first line may be missing. For example, "801.2" may have become the number "1.2".
             if is_first_line and parse_line(text).starts[:1] == (0,):
@@ -176,105 +169,23 @@ class TextParser(DelimitedParser):
     def _store_comment(self, text: str) -> None:
         """Store a comment without numbers, such as `# t_ms,A,B,C`, as a possible header until a layout is recognised.
 
+        Args:
+            text: The comment, or an empty text for a blank line.
+
         Raises:
             ValueError: If the comment contains characters that are not printable.
         """
+        self.unread_line = text or self.unread_line
         if self.layout is None and text and not parse_line(text).names:
             self._headers.append(text)
-
-    def _with_meanings(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Replace the names that the device uses for its counter and its clock by their meanings."""
-        return tuple(self._meanings.get(name, name) for name in names)
 
     def _reject(self, size: int) -> list[Frame]:
         """Count a rejected line, and return an empty list, because a rejected line completes no frame."""
         self.counts.count_rejected(size)
         return []
 
-    def _examine_line(self, text: str, size: int) -> list[Frame]:
-        """Examine a line that does not have the recognised layout, and return the frames that become readable.
-
-        Until a layout is recognised, lines with numbers are collected, and other lines are stored as possible headers.
-        Once `MAX_CYCLE_LINES` possible headers are stored, further lines without numbers are counted as rejected, too.
-        Later, a line is rejected unless it is a header that names the columns without names.
-
-        Args:
-            text: The line.
-            size: Number of bytes of the line.
-
-        Raises:
-            ValueError: If the line cannot be parsed.
-        """
-        line = parse_line(text, counters=self._counters)
-        self.unread_line = text
-        layout = self.layout
-        if layout is not None:
-            names = self._with_meanings(header_names(text, layout.first_line))
-            if line.names or not layout.name_unnamed(names):  # it contains numbers, or is no header
-                return self._reject(size)
-            self._describe_layout(layout)
-            return []
-
-        if not line.names:  # it contains no numbers
-            self._headers.append(text)
-            return self._reject(size) if len(self._headers) == MAX_CYCLE_LINES else []
-        if self._headers:
-            line_below_header = parse_line(text, has_header=True, counters=self._counters)
-            if any(header_names(header, line_below_header) for header in self._headers):
-                line = line_below_header
-        return self._recognise_layout(line, size)
-
-    def _describe_layout(self, layout: Layout) -> None:
-        """Set the attribute `format`, which describes the recognised layout, and the modulus of the clock."""
-        unit_us = round(layout.columns.clock_unit_us)
-        is_time_of_day = unit_us == TIMES_US["t_s"]  # a day has 86400 s; other clocks count ms or us
-        self.t_us_modulus = (86_400 if is_time_of_day else T_US_MODULUS) * unit_us
-        names = [name for name in layout.names if name]
-        if len(names) < len(layout.names):
-            names.append(f"{len(layout.names) - len(names)} columns without names")
-        self.format = f"text: {printable(', '.join(names))}"
-
-    def _recognise_layout(self, line: Line, size: int) -> list[Frame]:
-        """Add a line to the collected lines. If the layout can now be recognised, return the frames in the lines.
-
-        Args:
-            line: The next line.
-            size: Number of bytes of the line.
-
-        Returns:
-            The frames in the collected lines; an empty list if no layout is recognised yet.
-        """
-        self._collected_lines.append((line._replace(names=self._with_meanings(line.names)), size))
-        repeats = MESSAGE_REPEATS if line.is_prose else RECOGNITION_REPEATS
-        lines = [line for line, _ in self._collected_lines]
-        frame_lines = _frame_lines(lines, repeats)
-        layout = self._named_layout(frame_lines) if frame_lines else None
-        if layout is None or _has_channel_number(layout, lines):
-            # Keep as many lines as the longest cycles need, and reject the older lines.
-            while len(self._collected_lines) > RECOGNITION_REPEATS * MAX_CYCLE_LINES:
-                self._reject(self._collected_lines.pop(0)[1])
-            return []
-
-        self.layout = layout
-        self._describe_layout(layout)
-        collected_lines = self._collected_lines
-        self._collected_lines = []
-        return [frame for line, line_size in collected_lines for frame in self._read_line(line.text, line_size)]
-
-    def _named_layout(self, frame_lines: Sequence[Line]) -> Layout | None:
-        """Return the layout of the lines of a frame, with names from the device file or from the latest header.
-
-        The result is None if the device file names more or fewer columns, and no header names the columns.
-        """
-        layout = Layout(frame_lines)
-        names_in_headers = [header_names(header, layout.first_line) for header in reversed(self._headers)]
-        for names in (self._columns, *names_in_headers):
-            layout.name_unnamed(self._with_meanings(names))
-        has_other_columns = self._columns and len(self._columns) != len(layout.unnamed)
-        return None if has_other_columns and "" in layout.names else layout
-
     def _read_line(self, text: str, size: int) -> list[Frame]:
-        """Return the frames that a line completes. If a line of a cycle is lost, reject the other lines of the cycle.
+        """Return the frames that a line completes.
 
         Args:
             text: The line.
@@ -285,25 +196,45 @@ class TextParser(DelimitedParser):
         """
         layout = self.layout
         if layout is None:
-            return self._examine_line(text, size)
+            return self._collect_line(text, size)
         for position, pattern in enumerate(layout.patterns):
             values = line_values(pattern, text)
-            if values is None:
-                continue
-            if position != len(self._cycle):  # a line of a cycle is lost
-                self._drop_cycle()
-                if position > 0:
-                    return self._reject(size)
-            self._cycle.append((values, size))
-            if len(self._cycle) < len(layout.patterns):
-                return []
-            values_of_lines, sizes = zip(*self._cycle, strict=True)
-            self._cycle = []
-            frames = self._try_decode(layout.columns.frame, sum(values_of_lines, ()), dropped_size=sum(sizes))
-            for frame in frames:
-                self._update_seq_modulus(frame.seq or 0)
-            return frames
-        return self._examine_line(text, size)
+            if values is not None:
+                return self._add_values(layout, position, values, size)
+
+        # The line has another layout. It may be a header that names the columns without names.
+        line = parse_line(text)
+        self.unread_line = text
+        names = header_names(text, layout.lines[0])
+        if line.names or not names or all(layout.names):
+            return self._reject(size)
+        self._set_layout(self._named_layout(layout.lines, names))
+        return []
+
+    def _add_values(self, layout: Layout, position: int, values: tuple[float, ...], size: int) -> list[Frame]:
+        """Add the values of a line to the present cycle, and return the frame if the cycle is complete.
+
+        If a line of the cycle is lost, the other lines of the cycle are rejected.
+
+        Args:
+            layout: Layout of the lines.
+            position: Position of the line in its cycle.
+            values: Numbers in the line.
+            size: Number of bytes of the line.
+        """
+        if position != len(self._cycle):  # a line of a cycle is lost
+            self._drop_cycle()
+            if position > 0:
+                return self._reject(size)
+        self._cycle.append((values, size))
+        if len(self._cycle) < len(layout.patterns):
+            return []
+        values_of_lines, sizes = zip(*self._cycle, strict=True)
+        self._cycle = []
+        frames = self._try_decode(layout.columns.frame, sum(values_of_lines, ()), dropped_size=sum(sizes))
+        for frame in frames:
+            self._update_seq_modulus(frame.seq or 0)
+        return frames
 
     def _drop_cycle(self) -> None:
         """Drop the lines of an unfinished cycle, and count them as rejected."""
@@ -319,6 +250,75 @@ class TextParser(DelimitedParser):
             self.seq_modulus = largest_seq + 1
         elif seq >= self.seq_modulus:
             self.seq_modulus = SEQ_MODULI[0] if seq < SEQ_MODULI[0] else SEQ_MODULUS
+
+    def _collect_line(self, text: str, size: int) -> list[Frame]:
+        """Collect a line until a layout is recognised, and then return the frames in the collected lines.
+
+        A line without numbers is stored as a possible header. Once `MAX_CYCLE_LINES` possible headers are stored,
+        further lines without numbers are counted as rejected, too.
+
+        Args:
+            text: The line.
+            size: Number of bytes of the line.
+
+        Raises:
+            ValueError: If the line cannot be parsed.
+        """
+        line = parse_line(text, meanings=self._meanings)
+        self.unread_line = text
+        if not line.names:
+            self._headers.append(text)
+            return self._reject(size) if len(self._headers) == MAX_CYCLE_LINES else []
+        if self._headers:
+            line_below_header = parse_line(text, has_header=True, meanings=self._meanings)
+            if any(header_names(header, line_below_header) for header in self._headers):
+                line = line_below_header
+        self._collected_lines.append((line, size))
+        layout = self._recognised_layout([line for line, _ in self._collected_lines])
+        if layout is None:
+            # Keep as many lines as the longest cycles need, and reject the older lines.
+            while len(self._collected_lines) > RECOGNITION_REPEATS * MAX_CYCLE_LINES:
+                self._reject(self._collected_lines.pop(0)[1])
+            return []
+
+        self._set_layout(layout)
+        collected_lines = self._collected_lines
+        self._collected_lines = []
+        return [frame for line, line_size in collected_lines for frame in self._read_line(line.text, line_size)]
+
+    def _recognised_layout(self, lines: Sequence[Line]) -> Layout | None:
+        """Return the layout of the frames, with names from the device file or from the latest header.
+
+        The result is None if the layout cannot be recognised yet, or if the device file names more or fewer columns and
+        no header names the columns.
+
+        Args:
+            lines: The lines since the beginning.
+        """
+        frame_lines = _frame_lines(lines, MESSAGE_REPEATS if lines[-1].is_prose else RECOGNITION_REPEATS)
+        if not frame_lines:
+            return None
+        unnamed_count = frame_lines[0].names.count("")  # in a cycle of several lines, all values have names
+        headers = [header_names(header, frame_lines[0]) for header in reversed(self._headers)]
+        new_names = next((names for names in (self._columns, *headers) if len(names) == unnamed_count), ())
+        layout = self._named_layout(frame_lines, new_names)
+        has_other_columns = self._columns and "" in layout.names
+        return None if has_other_columns or _has_channel_number(layout, lines) else layout
+
+    def _named_layout(self, frame_lines: Sequence[Line], new_names: Sequence[str]) -> Layout:
+        """Return the layout of the lines of a frame, whose values without names get the meanings of the new names."""
+        return Layout(frame_lines, [self._meanings.get(name, name) for name in new_names])
+
+    def _set_layout(self, layout: Layout) -> None:
+        """Set the layout, the attribute `format`, which describes the layout, and the modulus of the clock."""
+        self.layout = layout
+        unit_us = round(layout.columns.clock_unit_us)
+        is_time_of_day = unit_us == TIMES_US["t_s"]  # a day has 86400 s; other clocks count ms or us
+        self.t_us_modulus = (86_400 if is_time_of_day else T_US_MODULUS) * unit_us
+        names = [name for name in layout.names if name]
+        if len(names) < len(layout.names):
+            names.append(f"{len(layout.names) - len(names)} columns without names")
+        self.format = f"text: {printable(', '.join(names))}"
 
 
 def _decoded(line: bytes) -> str:
@@ -362,11 +362,9 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
     lines = lines[-repeats * cycle_length :]
     cycle = lines[:cycle_length]
     has_equal_lines = len(set(skeletons[-cycle_length:])) < cycle_length
-    if has_equal_lines:  # for example, three frames and then a temperature
+    if has_equal_lines or cycle_length == 1:  # for example, three frames and then a temperature
         most_frequent_line = max(cycle, key=lambda line: skeletons.count(line.skeleton))
         return [most_frequent_line]
-    if cycle_length == 1:
-        return cycle
     if all(all(line.names) for line in cycle):
         first = _first_line(lines, cycle_length)
         return lines[first : first + cycle_length]
@@ -402,17 +400,28 @@ def _has_channel_number(layout: Layout, lines: Sequence[Line]) -> bool:
     columns = np.array(rows).T  # shape (columns, lines)
     decreases = np.any(columns != np.sort(columns), axis=1)  # whether each column decreases at least once
     varies = np.ptp(columns, axis=1) > 0.0
-    for name, column, column_decreases in zip(layout.names, columns, decreases, strict=True):
-        numbers, ranks = np.unique(column, return_inverse=True)  # the different numbers, and the index of each line's
-        leads_to_next = np.diff(ranks) % len(numbers) == 1
-        are_consecutive = np.diff(numbers) == 1.0
-        are_channels = 3 <= len(numbers) <= 8 and numbers[0] in range(100) and are_consecutive.all()
-        only_this_column_varies = varies.sum() == 1 and len(columns) > 3
-        may_be_frame = decreases.sum() - column_decreases >= 3 or only_this_column_varies
-        has_other_meaning = name in {SEQ, *ascii_uppercase}
-        if are_channels and leads_to_next.mean() >= 0.5 and not (may_be_frame or has_other_meaning):
-            return True
-    return False
+    if varies.sum() == 1 and len(columns) > 3:
+        return False
+    return any(
+        name not in {SEQ, *ascii_uppercase}
+        and decreases.sum() - decreases[index] < 3
+        and _counts_up_repeatedly(columns[index])
+        for index, name in enumerate(layout.names)
+    )
+
+
+def _counts_up_repeatedly(column: Array) -> bool:
+    """Return whether a column contains the numbers of channels, as described in `_has_channel_number`.
+
+    Args:
+        column: Numbers in the column, shape (lines,).
+    """
+    numbers, ranks = np.unique(column, return_inverse=True)  # the different numbers, and the index of each line's
+    if not 3 <= len(numbers) <= 8 or numbers[0] not in range(100):
+        return False
+    are_consecutive = np.all(np.diff(numbers) == 1.0)
+    leads_to_next = np.diff(ranks) % len(numbers) == 1
+    return bool(are_consecutive and leads_to_next.mean() >= 0.5)
 
 
 def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
@@ -427,7 +436,7 @@ def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
         cycle_length: Number of lines in a cycle.
     """
     fields_of_lines = [
-        dict(zip(line.names, line_values(skeleton_pattern(line), line.text) or (), strict=False)) for line in lines
+        dict(zip(line.names, line_values(line.pattern, line.text) or (), strict=False)) for line in lines
     ]
 
     def sort_key(first: int) -> tuple[float, bool, str]:
@@ -451,10 +460,9 @@ def encode_text(frame: Frame, notation: Literal["csv", "json"]) -> bytes:
         notation: Whether the line is a CSV row that contains only the channels, or a JSON object that also contains the
             frame counter and the clock.
     """
-    values = [f"{value:.7g}" for value in frame.values]
+    numbers = [f"{value:.7g}" for value in frame.values]
     if notation == "csv":
-        return (",".join(values) + "\n").encode()
-    names = frame.names or ascii_uppercase
-    fields = {SEQ: frame.seq, "t_us": frame.t_us, **dict(zip(names, values, strict=False))}
-    members = (f"{json.dumps(name)}: {value}" for name, value in fields.items() if value is not None)
-    return ("{" + ", ".join(members) + "}\n").encode()
+        return (",".join(numbers) + "\n").encode()
+    values = dict(zip(frame.names or ascii_uppercase, map(float, numbers), strict=False))
+    fields = {SEQ: frame.seq, "t_us": frame.t_us} | values
+    return f"{json.dumps({name: value for name, value in fields.items() if value is not None})}\n".encode()

@@ -19,47 +19,78 @@ line, except units of charge and voltage. Quotes around a number have no meaning
 
 import math
 import re
-from collections.abc import Collection, Container
-from itertools import pairwise, takewhile
+from collections.abc import Container, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, SEQ, TIMES_US
 
-_INDEX = r"\[\w*\](?!\s*[,;]?\s*(?:$|[^\W\d]))"  # not the value in `C[7] A[3]`, which stands before a name or the end
-
-_WORD = rf"(?>\w+(?:[./-]\w+)*(?:{_INDEX})*)"
-
 _QUOTED = r'"(?:[^"\\]|\\.)*"' + r"|(?<!\w)'[^']*'(?!\w)"
 
-_DATE = r"[0-9]{1,4}[-/.][0-9]{1,2}[-/.][0-9]{1,4}[T ,;]+"
+_KEY = r"""(?:[0-9]+(?=[^\W\d_]))?(?![0-9()\[\]+.*$|&/-]|#[0-9])(?>(?:[^\s:=,;{}"'<>()]|\([^\s()]*\))+)"""
 
-_SECONDS = r"[0-9]{2}(?:\.[0-9]+(?:,[0-9]{3}(?=\]))?|,[0-9]{3}(?=\s)|,[0-9]+(?=;))?"
-"""Regular expression of the seconds of a time, such as 56, 56.789, 56.789,012], 56,789 before a blank, or 56,7;."""
+_INDEX = r"\[\w*\](?!\s*[,;]?\s*(?:$|[^\W\d]))"  # not the value in `C[7] A[3]`, which stands before a name or the end
 
-_ZONE = r"(?:Z|[-+][0-9]{2}:?[0-9]{2}(?![\w.]))?"
+_TIME = (
+    r"(?<![\w.:])(?:[0-9]{1,4}[-/.][0-9]{1,2}[-/.][0-9]{1,4}[T ,;]+)?"  # a date
+    r"[0-9]{1,2}:[0-9]{2}:[0-9]{2}"
+)
 
-_TIME = rf"(?:{_DATE})?([0-9]{{1,2}}:[0-9]{{2}}:{_SECONDS}){_ZONE}"
+_FRACTION = r"(?:\.[0-9]+(?:[.,][0-9]{3}(?=\]))?|,[0-9]{3}(?=\s)|,[0-9]+(?=;))"
+"""Regular expression of the fraction of a second, as in 56.789, 56.789,012], 56,789 before a blank, or 56,7;."""
 
+_ZONE = r"(?:Z|[-+][0-9]{2}:?[0-9]{2}(?![\w.]))?(?![\w:])"
 
-def _number_pattern(decimal_marks: str) -> str:
-    """Return the regular expression of a decimal number, which also matches `nan`, `inf` and the `ovf` of Arduino."""
-    digits = rf"[0-9]+(?:[{decimal_marks}][0-9]*)?|[{decimal_marks}][0-9]+"
-    return rf"((?>[-+]?(?:(?:{digits})(?:[eE][-+]?[0-9]+)?|(?<!<)(?i:nan|inf(?:inity)?|ovf)(?!\w))))"
-
+_NUMBER = r"(?>[-+]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|(?<!<)(?i:nan|inf(?:inity)?|ovf)(?!\w)))"
+"""Regular expression of a decimal number, which also matches `nan`, `inf` and the `ovf` of Arduino."""
 
 _PATTERNS = {
-    "time": _TIME,
-    "whole seconds": rf"(?:{_DATE})?[0-9:]{{7,8}}{_ZONE}",
-    "uptime": "([0-9]+)",
-    "hexadecimal": "([-+]?0[xX][0-9A-Fa-f]{1,16})",
-    "number": _number_pattern("."),
-    "number with a decimal comma": _number_pattern(".,"),
+    "time": f"{_TIME}{_FRACTION}{_ZONE}",
+    "coarse_time": f"{_TIME}{_ZONE}",  # whole seconds, which are too coarse for a clock
+    "uptime": r"(?<=\b[EWIDV]\s\()[0-9]+(?=\))",
+    "key": rf"(?<=^\$)\w+|(?:{_KEY}|{_QUOTED})(?=\s*[:=])",
     "quoted": f"(?:{_QUOTED})",
-    "word": _WORD,
-    "blanks": r"\s++",
-    "optional blanks": r"\s*+",
+    "hexadecimal": r"(?<![\w.])[-+]?0[xX][0-9A-Fa-f]{1,16}(?!\w)",
+    "number": rf"(?<!\w)(?<!\w\.){_NUMBER}(?!\.[0-9])(?=[^\W\d_]*(?!\w))",
+    "word": rf"(?>\w+(?:[./-]\w+)*(?:{_INDEX})*)",
+    "mark": r"\.{2,}|\S",
 }
-"""Regular expressions of the parts of a line that may change from line to line. Numbers are in groups."""
+"""Regular expression of each kind of part of a line, in the order in which the kinds are tried."""
+
+_PART = re.compile("|".join(f"(?P<{kind}>{pattern})" for kind, pattern in _PATTERNS.items()))
+"""Regular expression of a part of a line. The name of the group that matches is the kind of the part."""
+
+_SYMBOLS = {
+    "time": "t",
+    "coarse_time": " ",
+    "uptime": "t",
+    "key": "k",
+    "quoted": "q",
+    "hexadecimal": "0",
+    "number": "0",
+    "word": "w",
+}
+"""Symbol that stands for a part of a line in the shape of the line, such as `k=0,k=0`, by the kind of the part.
+
+A mark stands for itself. The symbol of a word or key that is a unit of charge or voltage is u.
+"""
+
+_NAMES_OF_TIMES = {"time": "t_s", "uptime": "t_ms"}
+"""Names of a time of day, in seconds since midnight, and of the time in a log prefix such as `I (1234)`."""
+
+_WORD_BEFORE = r"(?P<word>[kquw])\W*(?P<number>[0t])"
+"""Regular expression, for the shape of a line, of the last word before a number."""
+
+_WORD_BEHIND = r"(?P<number>[0t])\W*(?P<word>[kquw])"
+"""Regular expression, for the shape of a line, of the first word behind a number."""
+
+_SAME_COLUMN = r"(?:q|[^\w,;|\[(])*"
+"""Regular expression, for the shape of a line, of parts that neither separate columns nor begin a list."""
+
+_NEAREST_NAME = rf"(?P<word>[kuw]){_SAME_COLUMN}(?P<number>[0t])"
+_SECOND_NAME = rf"(?P<word>[kuw]){_SAME_COLUMN}[kuw]{_SAME_COLUMN}(?P<number>[0t])"
+_UNIT_BEHIND = r"(?P<number>[0t])[:=]*(?P<word>[kuw])"
+_UNIT_BEFORE = r"[kquw]\W*(?P<word>[kquw])\W*(?P<number>[0t])"
 
 _IGNORED_AT_END = ",; \t"
 """Marks without a meaning at the end of a line."""
@@ -74,51 +105,25 @@ _SEPARATING_COMMA = (
 )
 """Regular expression of a text that shows that the commas of a line are separators."""
 
-_NUMBER_KINDS = ("time", "uptime", "hexadecimal", "number")
+_DECIMAL_COMMA = r"(?<!:[0-9]{2}:[0-9]{2})(?<=[0-9]),(?=[0-9])"
+"""Regular expression of a comma between digits that is not part of a time."""
 
-_NAMES_OF_TIMES = {"time": "t_s", "uptime": "t_ms"}
-"""Names of a time of day, in seconds since midnight, and of the time in a log prefix such as `I (1234)`."""
-
-_CHARGE_UNITS = {unit for unit in OTHER_CHARGE_UNITS if unit != "C"}  # C may be the name of an electrode
-
-_ALL_CHARGE_UNITS = {"pC", *_CHARGE_UNITS}
+_CHARGE_UNITS = {*OTHER_CHARGE_UNITS, "pC"} - {"C"}  # C may be the name of an electrode
 
 
-def _token_pattern(number: str) -> re.Pattern[str]:
-    """Return the regular expression of a part of a line.
+class _Part(NamedTuple):
+    """Part of a line: a number, a name, a key before a colon or an equals sign, a text in quotes, a word, or a mark.
 
-    Args:
-        number: Regular expression of a decimal number.
+    Attributes:
+        kind: Kind of the part, a key of `_PATTERNS`.
+        symbol: Character that stands for the part in the shape of a line; see `_SYMBOLS`.
+        content: Text of the part.
+        start: Position in the line at which the part begins.
+        is_after_blank: Whether a blank stands before the part.
     """
-    key = r"""(?:[0-9]+(?=[^\W\d_]))?(?![0-9()\[\]+.*$|&/-]|#[0-9])(?>(?:[^\s:=,;{}"'<>()]|\([^\s()]*\))+)"""
-    return re.compile(
-        rf"(?P<time>(?<![\w.:]){_TIME}(?![\w:]))"
-        r"|(?P<uptime>(?<=\b[EWIDV]\s\()[0-9]+(?=\)))"
-        rf"|(?P<key>(?<=^\$)\w+|(?:{key}|{_QUOTED})(?=\s*[:=]))"
-        rf"|(?P<quoted>{_QUOTED})"
-        r"|(?P<hexadecimal>(?<![\w.])[-+]?0[xX][0-9A-Fa-f]{1,16}(?!\w))"
-        rf"|(?P<number>(?<!\w)(?<!\w\.){number}(?!\.[0-9])(?=[^\W\d_]*(?!\w)))"
-        rf"|(?P<word>{_WORD})"
-        r"|(?P<mark>\.{2,}|\S)"
-    )
-
-
-_TOKENS = {kind: _token_pattern(_PATTERNS[kind]) for kind in ("number", "number with a decimal comma")}
-"""Regular expressions of a part of a line, by the kind of the numbers in the line."""
-
-_SEPARATORS = ",;|[("
-"""Marks that separate columns or begin a list. A word before such a mark does not name the number after the mark."""
-
-_SHAPES = {"number": "0", "hexadecimal": "0", "word": "w", "key": "k", "quoted": "k"} | dict.fromkeys(
-    ("time", "whole seconds", "uptime"), ""
-)
-"""Character that stands for a part of a line in its shape, by the kind of the part. A mark stands for itself."""
-
-
-class _Token(NamedTuple):
-    """Part of a line: a number, a name, a key before a colon or an equals sign, a text in quotes, a word, or a mark."""
 
     kind: str
+    symbol: str
     content: str
     start: int
     is_after_blank: bool
@@ -130,12 +135,8 @@ class _Token(NamedTuple):
 
     @property
     def is_number(self) -> bool:
-        """Whether the part is a number or a time."""
-        return self.kind in _NUMBER_KINDS
-
-
-_EDGE = _Token("", "", 0, False)
-"""Token that stands for the beginning and the end of a line."""
+        """Whether the part is a number or a time that is fine enough for a clock."""
+        return self.symbol in "0t"
 
 
 class Line(NamedTuple):
@@ -158,8 +159,13 @@ class Line(NamedTuple):
     is_prose: bool
     words: tuple[str, ...]
 
+    @property
+    def pattern(self) -> re.Pattern[str]:
+        """Regular expression of all lines with the skeleton of the line. Each number is a group."""
+        return re.compile("".join(self.skeleton) + r"[\s,;]*+")
 
-def parse_line(text: str, *, has_header: bool = False, counters: Collection[str] = (SEQ,)) -> Line:
+
+def parse_line(text: str, *, has_header: bool = False, meanings: Mapping[str, str] = MappingProxyType({})) -> Line:
     """Take the numbers out of a line of text.
 
     A line with an unclear minus is returned without numbers.
@@ -167,68 +173,29 @@ def parse_line(text: str, *, has_header: bool = False, counters: Collection[str]
     Args:
         text: The line, as `clean_text` returns it.
         has_header: Whether a header names the numbers, so that words that alternate with the numbers are not names.
-        counters: Names of counters and clocks. They are names even if no other number of the line has one.
+        meanings: Meanings of names of counters and clocks. Such a name is a name even if no other number has one.
 
     Raises:
         ValueError: If the line contains characters that are not printable.
     """
     if not text.replace("\t", " ").isprintable():
         raise ValueError(f"expected printable characters, got {text[:100]!r}")
-    number_kind = "number with a decimal comma" if _has_decimal_commas(text) else "number"
-    tokens = [] if re.search(_UNCLEAR_SIGN, text) else _tokens(text.rstrip(_IGNORED_AT_END), number_kind)
-    gaps = _gaps(tokens)
-    times = [_NAMES_OF_TIMES.get(token.kind, "") for token in tokens if token.is_number]
-    # A single word and a single number, as in `A,3.5`, are a name and its value even below a header with two columns.
-    is_pair = re.fullmatch("[,;]?w[,;|]0w?", _shape(tokens)) is not None
-    may_alternate = is_pair or (times.count("") > 1 and not has_header)
-    names = _alternating_names(times, gaps) if may_alternate else []
-    if not names:
-        names = _preceding_names(times, gaps, counters)
-    starts = tuple(token.start for token in tokens if token.is_number)
-    words = tuple(token.name for gap in gaps for token in gap if token.kind != "mark")
-    skeleton = _skeleton(tokens, names, number_kind)
-    return Line(text, skeleton, tuple(_with_units(names, gaps)), starts, _is_prose(tokens), words)
-
-
-def _skeleton(tokens: list[_Token], names: list[str], number_kind: str) -> tuple[str, ...]:
-    """Return the skeleton of a line; see `Line`.
-
-    Args:
-        tokens: Parts of the line.
-        names: Names of the numbers.
-        number_kind: Kind of the numbers in the line, a key of `_TOKENS`.
-    """
-    fixed_words = {*names, *_ALL_CHARGE_UNITS}  # a line with another unit has another layout
-    patterns = []
-    for previous, token in pairwise([_EDGE, *tokens]):
-        if "mark" in (previous.kind, token.kind):
-            patterns.append(_PATTERNS["optional blanks"])
-        elif token.is_after_blank:
-            patterns.append(_PATTERNS["blanks"])
-        if token.kind in ("key", "mark") or (token.name in fixed_words and not token.is_number):
-            patterns.append(re.escape(token.content))
-        else:
-            patterns.append(_PATTERNS[number_kind if token.kind == "number" else token.kind])
-    return tuple(patterns)
-
-
-def _is_prose(tokens: list[_Token]) -> bool:
-    """Return whether a line resembles a message of a board instead of a frame.
-
-    A message has at least as many words as numbers, as in `Channel 3 is ready`. Units of charge, words that follow a
-    comma or another mark, and the key of a single number are not counted. A line with a hexadecimal number may be a
-    message, too. For example, boards print the address and the size of each part of their program when they start.
-
-    Args:
-        tokens: Parts of the line.
-    """
-    number_kinds = [token.kind for token in tokens if token.is_number]
-    word_kinds = ("word", "key") if len(number_kinds) > 1 else ("word",)
-    word_count = sum(
-        token.kind in word_kinds and previous.kind != "mark" and token.content not in _ALL_CHARGE_UNITS
-        for previous, token in pairwise([_EDGE, *tokens])
+    number_pattern = _NUMBER
+    text_with_points = text
+    if _has_decimal_commas(text):
+        number_pattern = _NUMBER.replace(r"\.[0-9]*", r"(?:\.[0-9]*|,[0-9]+)")
+        text_with_points = re.sub(_DECIMAL_COMMA, ".", text)
+    parts = _parts(text_with_points)
+    names = _alternating_names(parts, has_header=has_header) or _preceding_names(parts, {SEQ, *meanings})
+    names_with_units = _with_units(parts, names)
+    return Line(
+        text,
+        _skeleton(parts, names, number_pattern),
+        tuple(meanings.get(name, name) for name in names_with_units),
+        tuple(part.start for part in parts if part.is_number),
+        _is_prose(parts),
+        tuple(part.name for part in parts if part.symbol in "kquw"),
     )
-    return "hexadecimal" in number_kinds or word_count >= len(number_kinds)
 
 
 def _has_decimal_commas(text: str) -> bool:
@@ -241,41 +208,41 @@ def _has_decimal_commas(text: str) -> bool:
     - Nothing else separates two numbers. In `A:4,3`, it is a decimal comma, because a name belongs to one number.
     - The line has brackets, and not every number has a name with a colon or an equals sign before it.
     """
-    text = re.sub(_TIME, "", text)
-    numbers = re.findall("[0-9]+(?:,[0-9]+)?", text)
-    comma_count = sum("," in number for number in numbers)
-    are_named = 1 < comma_count == len(re.findall(r"[:=]\s*[-+]?[0-9]+,", text))
-    has_one_name = re.fullmatch(r"[^:=]+[:=]\s*[-+]?[0-9]+,[0-9]+\D*", text) is not None
-    return (
-        comma_count > 0
-        and (len(numbers) > 1 or has_one_name)
-        and (are_named or re.search(r"[\[({]", text) is None)
-        and re.search(_SEPARATING_COMMA, text) is None
-    )
+    text = re.sub(f"{_TIME}{_FRACTION}?", "", text)
+    number_count = len(re.findall("[0-9]+(?:,[0-9]+)?", text))
+    comma_count = len(re.findall("[0-9],[0-9]", text))
+    named_count = len(re.findall(r"[:=]\s*[-+]?[0-9]+,[0-9]", text))
+    if comma_count == 0 or re.search(_SEPARATING_COMMA, text):
+        return False
+    if number_count == 1:
+        return named_count == 1
+    are_named = 1 < comma_count == named_count
+    return are_named or re.search(r"[\[({]", text) is None
 
 
-def _tokens(text: str, number_kind: str) -> list[_Token]:
-    """Divide a line into its parts.
-
-    Args:
-        text: The line.
-        number_kind: Kind of the numbers in the line, a key of `_TOKENS`.
-    """
-    tokens = []
-    for match in _TOKENS[number_kind].finditer(text):
+def _parts(text: str) -> list[_Part]:
+    """Divide a line into its parts; empty for a line with an unclear minus."""
+    if re.search(_UNCLEAR_SIGN, text):
+        return []
+    parts = []
+    for match in _PART.finditer(text.rstrip(_IGNORED_AT_END)):
         kind = str(match.lastgroup)
-        content = match[2] or match[0]  # the second group is a time without its date
-        if kind == "time" and content[-3] == ":":  # such a time is too coarse for a clock
-            kind = "whole seconds"
+        content = match[0]
         start = match.start()
-        tokens.append(_Token(kind, content.strip(), start, text[start - 1 : start].isspace()))
+        is_unit = kind in ("word", "key") and content in _CHARGE_UNITS
+        symbol = "u" if is_unit else _SYMBOLS.get(kind, content[0])
+        parts.append(_Part(kind, symbol, content, start, text[start - 1 : start].isspace()))
+    for position in _index_positions(parts):
+        parts[position] = parts[position]._replace(kind="key", symbol="k")
+    return parts
 
-    for position in _index_positions(tokens):
-        tokens[position] = tokens[position]._replace(kind="key")
-    return tokens
+
+def _shape(parts: list[_Part]) -> str:
+    """Return the symbols of the parts of a line; see `_SYMBOLS`."""
+    return "".join(part.symbol for part in parts)
 
 
-def _index_positions(tokens: list[_Token]) -> list[int]:
+def _index_positions(parts: list[_Part]) -> list[int]:
     """Return the positions of the numbers that are not values but indices of channels. An index is the name of a value.
 
     If a line ends with pairs of numbers, the first number of each pair is an index in these cases:
@@ -284,56 +251,89 @@ def _index_positions(tokens: list[_Token]) -> list[int]:
       no other numbers.
     - There are several pairs. Their first numbers count up from 0 or 1, and the same word or mark precedes each,
       as in `pad #1 801 pad #2 799` and `[1] 801 [2] 799`.
-
-    Args:
-        tokens: Parts of the line.
     """
-    shape = _shape(tokens)
-    numbers = [position for position, token in enumerate(tokens) if _SHAPES.get(token.kind) == "0"]
+    shape = _shape(parts)
+    numbers = [position for position, symbol in enumerate(shape) if symbol == "0"]
 
     def first_numbers(pair: str) -> list[int]:  # the pattern of a shape, in which 0 is a number and w is a word
         """Find the pairs of the given shape at the end of the line, and return the position of each first number."""
         pairs = re.search(rf"(?:[^0]*{pair})+[^0]*$", shape)
         return [] if pairs is None else numbers[-pairs[0].count("0") :: 2]
 
-    # The first number, a colon or an equals sign, and the second number
     indices = first_numbers(r"0[)\]]?[:=]0")
     if len(indices) > 1 or 2 * len(indices) == len(numbers):
         return indices
 
-    # A word or a mark, the first number, and the second number
-    indices = first_numbers(r"[w#(\[=]0[)\]>(\[]?0")
-    contents = [tokens[position].content for position in indices]
+    indices = first_numbers(r"[uw#(\[=]0[)\]>(\[]?0")
     counts = list(map(str, range(len(indices) + 1)))
-    are_counts = len(indices) > 1 and contents in (counts[:-1], counts[1:])
-    previous_contents = {tokens[position - 1].content for position in indices}
-    return indices if are_counts and len(previous_contents) == 1 else []
+    contents = [parts[position].content for position in indices]
+    previous_contents = {parts[position - 1].content for position in indices}
+    is_counted = len(previous_contents) == 1 < len(indices) and contents in (counts[:-1], counts[1:])
+    return indices if is_counted else []
 
 
-def _shape(tokens: list[_Token]) -> str:
-    """Return one character for each part of a line, as in `k=0,k=0`: 0 for a number, w for a word, k for a key."""
-    return "".join(_SHAPES.get(token.kind, token.content) for token in tokens)
-
-
-def _gaps(tokens: list[_Token]) -> list[list[_Token]]:
-    """Divide a line at its numbers, and return the parts before the first number and after each number.
+def _skeleton(parts: list[_Part], names: list[str], number_pattern: str) -> tuple[str, ...]:
+    """Return the skeleton of a line; see `Line`.
 
     Args:
-        tokens: Parts of the line.
-
-    Returns:
-        One list for each number, and a further list with the parts after the last number.
+        parts: Parts of the line.
+        names: Names of the numbers.
+        number_pattern: Regular expression of a decimal number.
     """
-    gaps: list[list[_Token]] = [[]]
-    for token in tokens:
-        if token.is_number:
-            gaps.append([])
+    fixed_words = {*names, *_CHARGE_UNITS}  # a line with another unit has another layout
+    patterns = []
+    previous_kind = ""
+    for part in parts:
+        if "mark" in (previous_kind, part.kind):
+            patterns.append(r"\s*+")
+        elif part.is_after_blank:
+            patterns.append(r"\s++")
+        if part.is_number:
+            pattern = number_pattern if part.kind == "number" else _PATTERNS[part.kind]
+            patterns.append(f"({pattern})")
+        elif part.kind in ("key", "mark") or part.name in fixed_words:
+            patterns.append(re.escape(part.content))
         else:
-            gaps[-1].append(token)
-    return gaps
+            patterns.append(_PATTERNS[part.kind])
+        previous_kind = part.kind
+    return tuple(patterns)
 
 
-def _alternating_names(times: list[str], gaps: list[list[_Token]]) -> list[str]:
+def _is_prose(parts: list[_Part]) -> bool:
+    """Return whether a line resembles a message of a board instead of a frame.
+
+    A message has at least as many words as numbers, as in `Channel 3 is ready`. Units of charge, words that follow a
+    comma or another mark, and the key of a single number are not counted. A line with a hexadecimal number may be a
+    message, too. For example, boards print the address and the size of each part of their program when they start.
+    """
+    shape = _shape(parts)
+    number_count = len(re.findall("[0t]", shape))
+    words = re.findall(r"(?<!\W)[kw]" if number_count > 1 else r"(?<!\W)w", shape)
+    return len(words) >= number_count or any(part.kind == "hexadecimal" for part in parts)
+
+
+def _words(parts: list[_Part], pattern: str) -> list[str]:
+    """Return the name of each time, and the word that belongs to each other number; empty for a number without a word.
+
+    Args:
+        parts: Parts of the line.
+        pattern: Regular expression for the shape of the line, in which the groups `word` and `number` are a word and
+            the number to which it belongs.
+    """
+    words = {match.start("number"): parts[match.start("word")].name for match in re.finditer(pattern, _shape(parts))}
+    return [
+        _NAMES_OF_TIMES.get(part.kind) or words.get(position, "")
+        for position, part in enumerate(parts)
+        if part.is_number
+    ]
+
+
+def _unique(names: list[str]) -> list[str]:
+    """Replace every name that occurs several times by an empty name, except the names of clocks."""
+    return [name if name in TIMES_US or names.count(name) == 1 else "" for name in names]
+
+
+def _alternating_names(parts: list[_Part], *, has_header: bool) -> list[str]:
     """Return the names of the numbers in a line in which names and numbers alternate; empty for another line.
 
     The name of a number is the word that is next to the number, either before each number, as in `C,7,A,3` and
@@ -342,20 +342,21 @@ def _alternating_names(times: list[str], gaps: list[list[_Token]]) -> list[str]:
     too.
 
     Args:
-        times: Name of each number that is a time; empty for the other numbers.
-        gaps: Parts between the numbers.
+        parts: Parts of the line.
+        has_header: Whether a header names the numbers.
     """
-    words = [[token.name for token in gap if token.kind != "mark"] for gap in gaps]
-    words_before = [gap[-1] if gap else "" for gap in words[:-1]]
-    words_behind = [gap[0] if gap else "" for gap in words[1:]]
-    for next_words in (words_before, words_behind):
-        names = [time or word for time, word in zip(times, next_words, strict=True)]
-        if all(_unique(names)) and _CHARGE_UNITS.isdisjoint(names):  # each number has a name of its own
-            return names
+    shape = _shape(parts)
+    # A single word and a single number, as in `A,3.5`, are a name and its value even below a header with two columns.
+    is_pair = re.fullmatch("[t ,;]*[uw][,;|]0[uw]?", shape) is not None
+    if is_pair or (shape.count("0") > 1 and not has_header):
+        for pattern in (_WORD_BEFORE, _WORD_BEHIND):
+            names = _words(parts, pattern)
+            if all(_unique(names)) and _CHARGE_UNITS.isdisjoint(names):
+                return names
     return []
 
 
-def _preceding_names(times: list[str], gaps: list[list[_Token]], counters: Collection[str]) -> list[str]:
+def _preceding_names(parts: list[_Part], counters: Container[str]) -> list[str]:
     """Return the names of the numbers. A number without a name has an empty text.
 
     The name of a number is the nearest word or key before the number, as in `A: 3.5`, `A -> 3.5` and `<A>3.5</A>`. The
@@ -369,29 +370,19 @@ def _preceding_names(times: list[str], gaps: list[list[_Token]], counters: Colle
       their names.
 
     Args:
-        times: Name of each number that is a time; empty for the other numbers.
-        gaps: Parts between the numbers.
+        parts: Parts of the line.
         counters: Names of counters and clocks.
     """
-    # Choose the nearest name before each number or, if several numbers have the same nearest name, the second nearest.
-    nearest_names = []
-    second_names = []
-    for time, gap in zip(times, gaps[:-1], strict=True):
-        parts = takewhile(lambda token: token.content not in _SEPARATORS, reversed(gap))
-        candidates = [token.name for token in parts if token.kind in ("word", "key")]
-        nearest_name, second_name, *_ = *candidates, "", ""
-        nearest_names.append(time or nearest_name)
-        second_names.append(second_name)
-    names = [nearest or second for nearest, second in zip(_unique(nearest_names), _unique(second_names), strict=True)]
-
-    # Remove words that are units.
-    words = {token.name for gap in gaps for token in gap if token.kind == "word"}
-    kinds_behind = [token.kind for token in gaps[-1] if token.kind != "mark"]
+    nearest_names = _unique(_words(parts, _NEAREST_NAME))
+    second_names = _unique(_words(parts, _SECOND_NAME))
+    names = [nearest or second for nearest, second in zip(nearest_names, second_names, strict=True)]
+    words = {part.name for part in parts if part.kind == "word"}
     channels = [index for index, name in enumerate(names) if name not in TIMES_US]
-    if channels and not names[channels[0]] and kinds_behind[-1:] == ["word"]:
+
+    ends_with_word = re.search(r"[uw]\W*$", _shape(parts)) is not None
+    if channels and not names[channels[0]] and ends_with_word:
         names = ["" if name in words else name for name in names]
 
-    # Remove the only name if it is the label of the whole line.
     named = [index for index in channels if names[index]]
     if len(channels) > 1 and len(named) == 1:
         (index,) = named
@@ -401,44 +392,33 @@ def _preceding_names(times: list[str], gaps: list[list[_Token]], counters: Colle
     return names
 
 
-def _with_units(names: list[str], gaps: list[list[_Token]]) -> list[str]:
+def _with_units(parts: list[_Part], names: list[str]) -> list[str]:
     """Add the unit of charge or voltage of each number to its name, as in `A_nC` for `A = 3.5 nC`.
 
     The unit stands directly behind the number, or between the name and the number. The unit pC is not added.
 
     Args:
+        parts: Parts of the line.
         names: Name of each number; empty for a number without a name.
-        gaps: Parts between the numbers.
     """
-    following_words = [next((token.content for token in gap if token.content not in ":="), "") for gap in gaps[1:]]
+    words_behind = _words(parts, _UNIT_BEHIND)
+    words_before = _words(parts, _UNIT_BEFORE)
     # The word `C` may be the name of an electrode, but a word behind several numbers is not a name.
-    known_units = OTHER_CHARGE_UNITS if following_words.count("C") > 1 else _CHARGE_UNITS
+    units = {*OTHER_CHARGE_UNITS} if words_behind.count("C") > 1 else _CHARGE_UNITS - {"pC"}
     names_with_units = []
-    for number, (name, following_word, gap) in enumerate(zip(names, following_words, gaps, strict=False), 1):
-        # The first word after the previous number is a name, or the unit of the previous number.
-        later_words = [token.name.strip("[]") for token in gap if token.kind != "mark"][1:]
-        unit = next((word for word in (following_word, *later_words) if word in known_units), "")
+    for number, (name, *words) in enumerate(zip(names, words_behind, words_before, strict=True), 1):
+        unit = next((word.strip("[]") for word in words if word.strip("[]") in units), "")
         ending = "coulomb" if unit == "C" else unit  # `A_C` would be an electrode with the name C
         is_added = unit and ending not in names
         names_with_units.append(f"{name or f'ch{number}'}_{ending}" if is_added else name)
     return names_with_units
 
 
-def _unique(names: list[str]) -> list[str]:
-    """Replace every name that occurs several times by an empty name, except the names of clocks."""
-    return [name if name in TIMES_US or names.count(name) == 1 else "" for name in names]
-
-
-def skeleton_pattern(line: Line) -> re.Pattern[str]:
-    """Return the regular expression of all lines with the skeleton of a line. Each number is a group."""
-    return re.compile("".join(line.skeleton) + r"[\s,;]*+")
-
-
 def line_values(pattern: re.Pattern[str], text: str) -> tuple[float, ...] | None:
     """Return the numbers in a line; None if the line has another skeleton.
 
     Args:
-        pattern: Result of `skeleton_pattern`.
+        pattern: The `pattern` of a line with the skeleton.
         text: The line.
     """
     match = pattern.fullmatch(text)
@@ -452,10 +432,9 @@ def line_values(pattern: re.Pattern[str], text: str) -> tuple[float, ...] | None
 
 def _value(number: str) -> float:
     """Return the value of a number, or the seconds from midnight to a time of day. The value of `ovf` is NaN."""
-    if ":" in number:  # a time of day
-        hours, minutes, seconds = number.split(":")
-        whole_seconds, *fractions = re.split("[.,]", seconds)
-        return 3600.0 * int(hours) + 60.0 * int(minutes) + float(f"{whole_seconds}.{''.join(fractions)}")
+    if ":" in number:  # a time of day, with or without a date and a time zone
+        ((hours, minutes, seconds, fraction),) = re.findall("([0-9]+):([0-9]+):([0-9]+)[.,]([0-9,]+)", number)
+        return 3600.0 * int(hours) + 60.0 * int(minutes) + float(f"{seconds}.{fraction.replace(',', '')}")
     if "x" in number.lower():  # a hexadecimal number
         return float(int(number, 16))
     if number[-3:].lower() == "ovf":
