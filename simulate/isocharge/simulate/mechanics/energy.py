@@ -42,7 +42,7 @@ class ElasticFilm:
         groups: Dimensionless groups of the press.
         membrane: Stretching energy.
         bending: Bending energy; None if the theory omits bending.
-        back: Energy of the pressure on the whole film; None without static pressure and trapped air.
+        back_pressure: Energy of the pressure on the whole film; None without static pressure and trapped air.
         probe_force: Force of the probe along (U1, U2, W) at each node, shape (n_node, 3).
     """
 
@@ -52,7 +52,7 @@ class ElasticFilm:
         self.membrane = Membrane(mesh, groups)
         self.bending = Bending(mesh, groups.bending) if groups.bending > 0.0 else None
         has_back_pressure = groups.static_pressure != 0.0 or groups.compression != 0.0
-        self.back = BackPressure(mesh, groups) if has_back_pressure else None
+        self.back_pressure = BackPressure(mesh, groups) if has_back_pressure else None
         self.probe_force = np.outer(mesh.load, [*groups.side_load, groups.load])
 
     @property
@@ -70,8 +70,8 @@ class ElasticFilm:
         stored_energy = self.membrane.energy(field)
         if self.bending is not None:
             stored_energy += self.bending.energy(deflection)
-        if self.back is not None:
-            stored_energy += self.back.energy(deflection)
+        if self.back_pressure is not None:
+            stored_energy += self.back_pressure.energy(deflection)
         return stored_energy - float(np.sum(self.probe_force * field))
 
     def residual(self, field: Array) -> Array:
@@ -101,10 +101,9 @@ class ElasticFilm:
         residual = np.stack([self.mesh.gather(element_forces[..., i]) for i in range(3)], axis=1)
         residual -= self.probe_force
 
-        # `back.forces` is the derivative of the energy, which is the negative force of the pressure on the whole film.
-        # Therefore the derivative is added.
-        if self.back is not None:
-            residual[:, 2] += self.back.forces(field[:, 2])
+        # The derivative of the energy is minus the force of the pressure on the film. Therefore it is added.
+        if self.back_pressure is not None:
+            residual[:, 2] += self.back_pressure.forces(field[:, 2])
         return residual
 
     @property
@@ -113,9 +112,9 @@ class ElasticFilm:
 
         The load is the force of the probe, or the static pressure if there is no probe.
         """
-        if self.back is None or self.groups.load != 0.0:
+        if self.back_pressure is None or self.groups.load != 0.0:
             return self.probe_force[:, 2]
-        return abs(self.groups.static_pressure) * self.back.weights
+        return abs(self.groups.static_pressure) * self.back_pressure.weights
 
     def tangent(self, field: Array, added_tension: float = 0.0) -> Array:
         """Compute the tangent matrix of each element, without the stiffness of trapped air.
@@ -273,19 +272,20 @@ class Membrane:
         weighted_stress = _symmetric_matrix(total_stress * mesh.weights[..., None])
         weighted_stiffness = self._material_stiffness(deformation) * mesh.weights[..., None, None, None, None]
 
-        # Compute one block for each pair (i, j) of displacement components. A block consists of the material part and,
-        # for i = j, of the part that is caused by the stress. The matrix is symmetric, so the blocks below the diagonal
-        # are transposed copies of the blocks above the diagonal.
+        # Compute one block of the matrix for each pair (i, j) of displacement components. The matrix is symmetric, so
+        # the blocks below the diagonal are transposed copies of the blocks above the diagonal.
         n_element, _, _, n_local = gradient.shape
         transposed_gradient = np.ascontiguousarray(mesh.stacked_gradient.transpose(0, 2, 1))
         matrix = np.zeros((n_element, unknowns_per_node, n_local, unknowns_per_node, n_local))
         for i, j in combinations_with_replacement(range(3), 2):
-            block = weighted_stiffness[..., i, :, j].copy()
+            # Second derivatives with respect to the slopes. The stress contributes only to the diagonal blocks.
+            slope_stiffness = weighted_stiffness[..., i, :, j].copy()
             if i == j:
-                block += self._slope_weights[i] * weighted_stress  # the weights are A^2 for U1 and U2, and 1 for W
+                slope_stiffness += self._slope_weights[i] * weighted_stress
 
-            # Compute gradient' block gradient, summed over the quadrature points and the two derivatives at each point.
-            stacked_product = (block @ gradient).reshape(n_element, -1, n_local)
+            # Compute gradient' slope_stiffness gradient, summed over the quadrature points and the two derivatives at
+            # each point.
+            stacked_product = (slope_stiffness @ gradient).reshape(n_element, -1, n_local)
             np.matmul(transposed_gradient, stacked_product, out=matrix[:, i, :, j])
             if i != j:
                 matrix[:, j, :, i] = matrix[:, i, :, j].transpose(0, 2, 1)
@@ -381,14 +381,16 @@ class Bending:
         mesh = self.mesh
         mass = np.eye(mesh.mass.shape[1]) * mesh.mass[:, None]  # M
         coupling = np.sqrt(self.stiffness) * (self._laplace - BENDING_SHIFT * mass)  # sqrt(beta) (L - s M), symmetric
+        shifted_laplace = 2.0 * BENDING_SHIFT * self._laplace - BENDING_SHIFT**2 * mass  # 2 s L - s^2 M
+        deflection_block = self.stiffness * shifted_laplace
 
         # Eliminate the unknowns mu of interior nodes. Their block -M is diagonal.
         interior = mesh.template.is_interior
         interior_coupling = coupling[:, interior]  # shape (n_element, n_interior, n_local)
-        schur_complement = interior_coupling.transpose(0, 2, 1) @ (interior_coupling / mesh.mass[:, interior, None])
+        interior_mass = mesh.mass[:, interior, None]
+        deflection_block += interior_coupling.transpose(0, 2, 1) @ (interior_coupling / interior_mass)
         coupling[:, interior] = 0.0
-        shifted_laplace = 2.0 * BENDING_SHIFT * self._laplace - BENDING_SHIFT**2 * mass  # 2 s L - s^2 M
-        return self.stiffness * shifted_laplace + schur_complement, coupling.transpose(0, 2, 1), -mass
+        return deflection_block, coupling.transpose(0, 2, 1), -mass
 
     def laplacian(self, deflection: Array) -> Array:
         """Compute the Laplacian m = -M^-1 L W of the deflection W.

@@ -38,9 +38,10 @@ def tension_change(film: Film, film_warming_K: float, ring_warming_K: float) -> 
     if film.expansion is None:
         return np.zeros(3)
     free_strain = np.array(film.expansion) * film_warming_K  # along the axes 1 and 2 of the film
-    elastic_strain = np.append(film.ring_expansion * ring_warming_K - free_strain, 0.0)
-    # The sum of the products is the same in both directions if the expansion and the stiffness are, unlike a matrix
-    # product, which may round both sums differently.
+    ring_strain = film.ring_expansion * ring_warming_K
+    elastic_strain = np.append(ring_strain - free_strain, 0.0)  # (E11, E22, 2 E12)
+    # A matrix product may round the stresses along both axes differently, even if the film is isotropic. This sum of
+    # products rounds them equally.
     change_in_film_axes = film.young * (elastic_strain * elasticity(film, film.axis)).sum(axis=1)
     return rotate_stress(change_in_film_axes, film.axis)
 
@@ -61,10 +62,7 @@ def warmed(sensor: Sensor, film_warming_K: float, ring_warming_K: float = 0.0) -
     """
     film = sensor.film
     change_11, change_22, change_12 = tension_change(film, film_warming_K, ring_warming_K).tolist()
-    # The deviator of the pretension consists of half of the difference between the pretensions along x and y, and of
-    # the shear.
-    half_difference, shear = film.deviator
+    pretension = film.pretension + 0.5 * (change_11 + change_22)  # the mean of T11 and T22
+    half_difference, shear = film.deviator  # (T11 - T22) / 2 and T12
     deviator = (half_difference + 0.5 * (change_11 - change_22), shear + change_12)
-    return replace(
-        sensor, film=replace(film, pretension=film.pretension + 0.5 * (change_11 + change_22), deviator=deviator)
-    )
+    return replace(sensor, film=replace(film, pretension=pretension, deviator=deviator))

@@ -167,11 +167,11 @@ class Film:
         """
         for attribute, number in FILM_NUMBERS.items():
             value = getattr(self, attribute)
-            for component in value if isinstance(value, tuple) else (value,):
-                if component is not None:  # an optional property
-                    limits = (number.smallest, number.largest)
-                    value_in_file = component * number.factor
-                    check_range(f"film.{number.key}", value_in_file, limits, number.unit, SensorError)
+            if value is None:  # an optional property
+                continue
+            limits = (number.smallest, number.largest)
+            for value_in_file in np.atleast_1d(np.multiply(value, number.factor)).tolist():
+                check_range(f"film.{number.key}", value_in_file, limits, number.unit, SensorError)
         if self.thickness > 0.1 * self.radius:
             raise SensorError(
                 f"film.thickness_um: expected at most a tenth of the radius ({self.radius:g} mm), "
@@ -264,17 +264,24 @@ def check_range(what: str, value: float, allowed: tuple[float, float], unit: str
         return
     hint = ""
     other_unit, factor = OTHER_UNITS.get(unit, ("", math.nan))
-    if low <= factor * value <= high:
-        hint = f"; {value:.6g} {other_unit} are {factor * value:.6g} {unit}"
+    converted_value = factor * value
+    if low <= converted_value <= high:
+        hint = f"; {value:.6g} {other_unit} are {converted_value:.6g} {unit}"
     expected = f"at least {low:g}" if high == math.inf else f"{low:g} to {high:g}"
     space = " " if unit else ""
     raise error(f"{what}: expected {expected}{space}{unit}, got {value:.6g}{space}{unit}{hint}")
 
 
-def increased(size: float, axis: float, addition: complex) -> tuple[float, float]:
-    """Add a complex number to size * exp(2 i axis), and return the new size and axis. The size is not negative.
+def add_axial(size: float, axis: float, addition: complex) -> tuple[float, float]:
+    """Add to a property that has a size and an axis, such as an oval clamp, and return the new size and axis.
 
-    The axis does not change if the addition is zero, or if the new size is zero within the rounding errors.
+    The property is the complex number size * exp(2 i axis), because it is the same after half a turn. The axis does not
+    change if the addition is zero, or if the new size is zero within the rounding errors.
+
+    Args:
+        size: Size of the property. The new size is not negative.
+        axis: Angle of the axis from the x axis, rad.
+        addition: Complex number that is added to the property.
     """
     if addition == 0.0:
         return size, axis

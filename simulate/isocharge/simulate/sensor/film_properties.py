@@ -22,7 +22,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import SceneError, SensorError
-from isocharge.simulate.sensor.film import Film, increased
+from isocharge.simulate.sensor.film import Film, add_axial
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Calibration, Sensor, outermost_corner
@@ -165,10 +165,10 @@ def _changed_mechanics(film: Film, value: Mapping[str, float]) -> Film:
     """Change the mechanical properties of a film; see `changed_film`."""
     pretension = value[PRETENSION.name]
     difference, shear = film.deviator
-    log_ratio, axis = increased(
-        math.log(film.young_ratio), film.axis, complex(value["stiffness_x"], value["stiffness_xy"])
-    )
-    oval, oval_axis = increased(film.oval, film.oval_axis, complex(value["oval_x"], value["oval_xy"]))
+    stiffness_change = complex(value["stiffness_x"], value["stiffness_xy"])
+    log_ratio, axis = add_axial(math.log(film.young_ratio), film.axis, stiffness_change)
+    oval_change = complex(value["oval_x"], value["oval_xy"])
+    oval, oval_axis = add_axial(film.oval, film.oval_axis, oval_change)
     return replace(
         film,
         pretension=pretension,
@@ -231,24 +231,24 @@ class FilmPrior:
             "oval_x": largest_oval,
             "oval_xy": largest_oval,
         }
-        film_properties = []
+        properties = []
         for film_property in FILM_PROPERTIES:
             largest = largest_of.get(film_property.name, math.inf)
             if largest < film_property.limits[1]:
-                film_property = replace(film_property, bounds=(-largest, largest))
-            film_properties.append(film_property)
+                properties.append(replace(film_property, bounds=(-largest, largest)))
+            else:
+                properties.append(film_property)
 
-        probe_properties = []
+        # The radius of the probe and the gains of the electrodes follow.
         if isinstance(self.probe, Circle):
             radius = self.probe.radius
             bounds = (-MAX_RADIUS_DEVIATION * radius, MAX_RADIUS_DEVIATION * radius)
             std = min(0.3, 0.3 * radius)
-            probe_properties.append(FilmProperty("probe_radius", "radius of the probe", "mm", std, 0.01, bounds=bounds))
-        gains = [
-            FilmProperty(f"gain {name}", f"ln of the gain of {name}", "1", 0.05, 0.005, bounds=(-1.5, 1.5))
-            for name in self.sensor.electrode_names
-        ]
-        return (*film_properties, *probe_properties, *gains)
+            properties.append(FilmProperty("probe_radius", "radius of the probe", "mm", std, 0.01, bounds=bounds))
+        for name in self.sensor.electrode_names:
+            gain = FilmProperty(f"gain {name}", f"ln of the gain of {name}", "1", 0.05, 0.005, bounds=(-1.5, 1.5))
+            properties.append(gain)
+        return tuple(properties)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -286,9 +286,11 @@ class FilmPrior:
 
         Properties of the electrodes and of the piezoelectric coefficients do not change the stress.
         """
+        # In each row, one property differs from its mean.
+        changed_values = np.clip(self.mean + np.diag(self.std), *self.bounds)
         mean_sensor, mean_probe = self.film(self.mean)
         changes = []
-        for values in np.clip(self.mean + np.diag(self.std), *self.bounds):  # one property differs from its mean
+        for values in changed_values:
             sensor, probe = self.film(values)
             changes.append(sensor.film != mean_sensor.film or probe != mean_probe)
         return np.array(changes)
@@ -296,27 +298,29 @@ class FilmPrior:
     def even(self, values: Array) -> Array:
         """Return the values of the film with the same mean properties and no imperfections, shape (n_property,).
 
-        The values also remove the imperfections that the sensor file describes, except for a described shear modulus.
+        A value of an imperfection is its deviation from the sensor file. The returned values therefore cancel the
+        imperfections that the sensor file describes. A described shear modulus remains.
 
         Args:
             values: Values, shape (n_property,).
         """
         # Collect the imperfections of the described film, in the units of the properties.
         film = self.sensor.film
-        described = dict.fromkeys(self.names, 0.0)
-        pretension = values[self.index(PRETENSION.name)]
-        if pretension > 0.0:
-            described |= dict(zip(UNEVEN_TENSIONS, np.divide(film.deviator, pretension), strict=True))
         stiffness = cmath.rect(math.log(film.young_ratio), 2.0 * film.axis)
         oval = cmath.rect(film.oval, 2.0 * film.oval_axis)
-        described |= {
+        described = {
             "stiffness_x": stiffness.real,
             "stiffness_xy": stiffness.imag,
             "oval_x": oval.real,
             "oval_xy": oval.imag,
         }
-        # A deviation of the opposite size cancels an imperfection that the sensor file describes.
-        return np.where(self.is_imperfection, [-described[name] for name in self.names], values)
+        pretension = values[self.index(PRETENSION.name)]
+        if pretension > 0.0:
+            described |= dict(zip(UNEVEN_TENSIONS, np.divide(film.deviator, pretension), strict=True))
+
+        # A deviation of the opposite size cancels an imperfection.
+        cancelling_values = [-described.get(name, 0.0) for name in self.names]
+        return np.where(self.is_imperfection, cancelling_values, values)
 
     def film(self, values: Array) -> tuple[Sensor, Probe]:
         """Return the sensor and the probe with the given values of the properties.

@@ -327,10 +327,11 @@ class Polygon(Probe):
         # which is an n-th part of all corners ahead.
         corners = to_complex(np.array(self.corners))
         for order in range(corners.size, 1, -1):
+            if corners.size % order != 0:
+                continue
             corners_ahead = np.roll(corners, -(corners.size // order))
             rotated_corners = corners * np.exp(2j * np.pi / order)
-            is_same = np.allclose(corners_ahead, rotated_corners, rtol=0.0, atol=1e-9 * self.reach)
-            if corners.size % order == 0 and is_same:
+            if np.allclose(corners_ahead, rotated_corners, rtol=0.0, atol=1e-9 * self.reach):
                 return math.tau / order
         return math.tau  # only a full turn maps the polygon onto itself
 
@@ -390,13 +391,14 @@ def parse_probe(text: str) -> Probe:
         SceneError: If the text is not the notation of a probe, or no such footprint can exist.
     """
     for notation, create in PROBE_SHAPES.items():
-        with_corners = notation.replace(";X,Y;X,Y", "(?:;X,Y)+")
-        pattern = re.sub("[A-Z]+", lambda _: NUMBER_PATTERN, with_corners)
-        match = re.fullmatch(f"({pattern})(?:@({NUMBER_PATTERN}))?", text.strip())
+        # A polygon may have more corners. Each word of capital letters stands for a number.
+        with_more_corners = notation.replace(";X,Y;X,Y", "(?:;X,Y)+")
+        shape_pattern = re.sub("[A-Z]+", lambda _: NUMBER_PATTERN, with_more_corners)
+        match = re.fullmatch(f"({shape_pattern})(?:@({NUMBER_PATTERN}))?", text.strip())
         if match is not None:
-            lengths = list(map(float, re.findall(NUMBER_PATTERN, match[1])))
-            degrees = float(match[2] or 0.0)
-            return create(*lengths).rotated(float(np.deg2rad(degrees)))
+            shape, degrees = match.groups()
+            lengths = map(float, re.findall(NUMBER_PATTERN, shape))
+            return create(*lengths).rotated(math.radians(float(degrees or 0.0)))
     forms = [f"'{notation}'" for notation in PROBE_SHAPES]
     raise SceneError(
         f"probe {cut(text)!r}: expected {_join_with_or(forms)} in mm, each optionally rotated as in 'triangle:4.0@30' "

@@ -159,8 +159,8 @@ class Electrode:
         """
         if self.more or self.back or len(self.corners) != 4:
             return None
-        (left, _), (right, _), *_ = self.corners
-        side = right - left
+        (lower_left, lower_right, *_) = self.corners
+        side = lower_right[0] - lower_left[0]
         square = Electrode.of_square(self.name, self.centre, side)
         is_square = side > 0.0 and np.allclose(self.corners, square.corners, rtol=0.0, atol=1e-9 * side)
         return side if is_square else None
@@ -312,7 +312,8 @@ class Sensor:
                 raise SensorError(f"expected one of {options}, got {value!r}")
         names = self.electrode_names
         gains = self.calibration.gain
-        if not (1 <= len(names) <= MAX_ELECTRODES and len(set(names)) == len(names)):
+        has_duplicates = len(set(names)) < len(names)
+        if has_duplicates or not 1 <= len(names) <= MAX_ELECTRODES:
             raise SensorError(
                 f"electrodes: expected 1 to {MAX_ELECTRODES} different names, got {len(names)}: {cut(str(names))}"
             )
@@ -322,9 +323,9 @@ class Sensor:
             raise SensorError(f"calibration gain: expected positive numbers, got {shown(gains)}")
         limits = (-MAX_CROSSTALK, MAX_CROSSTALK)
         check_range("calibration crosstalk", self.calibration.crosstalk, limits, "", SensorError)
-        if not set(gains) <= set(names):
-            unknown = sorted(set(gains) - set(names))
-            raise SensorError(f"calibration gain: no electrode named {shown(unknown)}, have {cut(str(names))}")
+        unknown_names = sorted(set(gains) - set(names))
+        if unknown_names:
+            raise SensorError(f"calibration gain: no electrode named {shown(unknown_names)}, have {cut(str(names))}")
 
         # Check the shapes and positions of the electrodes.
         _check_layout(self.electrodes)

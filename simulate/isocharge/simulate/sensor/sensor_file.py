@@ -263,17 +263,16 @@ def film_to_dict(film: Film) -> dict[str, Any]:
     Args:
         film: Film to be converted.
     """
-    half_difference, shear_tension = film.deviator
-    tension = (film.pretension + half_difference, film.pretension - half_difference, shear_tension)
+    values = dict(vars(film))
+    if any(film.deviator):
+        half_difference, shear_tension = film.deviator
+        values["pretension"] = (film.pretension + half_difference, film.pretension - half_difference, shear_tension)
+    if film.young_ratio != 1.0:
+        # If E is the geometric mean of the moduli and r^2 = E1 / E2, the moduli are E1 = E r and E2 = E / r.
+        root_of_ratio = math.sqrt(film.young_ratio)
+        values["young"] = (film.young * root_of_ratio, film.young / root_of_ratio)
 
-    # If E is the geometric mean of the moduli and r^2 = E1 / E2, the moduli are E1 = E r and E2 = E / r.
-    root_of_ratio = math.sqrt(film.young_ratio)
-    moduli = (film.young * root_of_ratio, film.young / root_of_ratio)
-    values = {
-        **vars(film),
-        "young": film.young if film.young_ratio == 1.0 else moduli,
-        "pretension": tension if any(film.deviator) else film.pretension,
-    }
+    # Convert all values into the units of the file, and omit those that are equal to their default.
     table = {
         number.key: _tidy_all(np.multiply(values[attribute], number.factor).tolist())
         for attribute, number in FILM_NUMBERS.items()
@@ -380,9 +379,13 @@ def _film(table: FilmTable) -> Film:
     young_1, young_2 = _along_axes(table.young_GPa)
     values["young_GPa"] = math.sqrt(young_1 * young_2)
 
-    # Components of the pretension, of which T12 may be left out, and the mean of the components along x and y
-    tension_11, tension_22, tension_12, *_ = [*_along_axes(table.pretension_MPa), 0.0]
+    # Components of the pretension, and the mean of the components along x and y
+    tension = table.pretension_MPa
+    tension_11, tension_22, tension_12 = tension if isinstance(tension, list) else (tension, tension, 0.0)
     values["pretension_MPa"] = 0.5 * (tension_11 + tension_22)
+    deviator = (0.5 * (tension_11 - tension_22), tension_12)
+
+    # Convert all numbers into the units of `Film`.
     numbers = {
         attribute: values[number.key] / number.factor
         for attribute, number in FILM_NUMBERS.items()
@@ -391,7 +394,6 @@ def _film(table: FilmTable) -> Film:
     if table.expansion_ppm_per_K is not None:
         along, across = _along_axes(table.expansion_ppm_per_K)
         numbers["expansion"] = (along / 1e6, across / 1e6)
-    deviator = (0.5 * (tension_11 - tension_22), tension_12)
     return Film(**numbers, deviator=deviator, young_ratio=young_1 / young_2)
 
 

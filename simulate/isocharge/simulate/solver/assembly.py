@@ -93,7 +93,8 @@ class Assembly:
         # skeleton matrix and a dominant diagonal, because such a matrix needs no pivoting.
         pattern = self._skeleton_matrix(np.ones(self._indices.size))
         dominant_matrix = csc_matrix(pattern + pattern.sum() * eye_array(pattern.shape[0]))
-        self.skeleton = self.skeleton[np.argsort(_factorise(dominant_matrix, "MMD_AT_PLUS_A").perm_c)]
+        new_number = _factorise(dominant_matrix, "MMD_AT_PLUS_A").perm_c
+        self.skeleton = self.skeleton[np.argsort(new_number)]
         self._set_pattern()
 
     def _set_pattern(self) -> None:
@@ -104,32 +105,33 @@ class Assembly:
         by column (compressed sparse column format). The method stores the position of each entry of each element matrix
         in this array. Entries that belong to a fixed unknown get the position after the last nonzero entry.
         """
-        # Row and column of each entry of the element matrices in the skeleton matrix. Fixed unknowns have the number
-        # -1.
+        # Number the unknowns of the skeleton matrix. Fixed unknowns have the number -1.
+        n_skeleton = self.skeleton.size
         skeleton_number = np.full(self.free.size, -1, dtype=np.intp)
-        skeleton_number[self.skeleton] = np.arange(self.skeleton.size)
-        skeleton_numbers = skeleton_number[self.side_unknowns]
-        n_element, n_side = skeleton_numbers.shape
+        skeleton_number[self.skeleton] = np.arange(n_skeleton)
+
+        # Row and column of each entry of the element matrices in the skeleton matrix
+        side_numbers = skeleton_number[self.side_unknowns]
+        n_element, n_side = side_numbers.shape
         shape = (n_element, n_side, n_side)
-        size = self.skeleton.size
-        row = np.broadcast_to(skeleton_numbers[:, :, None], shape)
-        column = np.broadcast_to(skeleton_numbers[:, None, :], shape)
+        row = np.broadcast_to(side_numbers[:, :, None], shape)
+        column = np.broadcast_to(side_numbers[:, None, :], shape)
         is_free = (row >= 0) & (column >= 0)
 
         # Combine the row and the column of each entry into one code. In the compressed sparse column format, the
         # entries are ordered by their columns and then by their rows, which is the order of the codes.
-        entry_codes = column[is_free] * size + row[is_free]
-        codes, pattern_position = np.unique(entry_codes, return_inverse=True)
-        position_of_fixed = codes.size
-        positions = np.full(shape, position_of_fixed, dtype=np.intp)
+        entry_codes = column[is_free] * n_skeleton + row[is_free]
+        pattern_codes, pattern_position = np.unique(entry_codes, return_inverse=True)
+        positions = np.full(shape, pattern_codes.size, dtype=np.intp)
         positions[is_free] = pattern_position
         self._entry_positions = positions.ravel()
 
         # Compute the row of each nonzero entry, and the position of the first nonzero entry of each column. Both arrays
         # are part of the compressed sparse column format.
-        self._indices = (codes % size).astype(np.int32)
-        entries_per_column = np.bincount(codes // size, minlength=size)
-        self._indptr = np.concatenate([[0], np.cumsum(entries_per_column)]).astype(np.int32)
+        pattern_column, pattern_row = np.divmod(pattern_codes, n_skeleton)
+        entries_per_column = np.bincount(pattern_column, minlength=n_skeleton)
+        self._indices = pattern_row.astype(np.int32)
+        self._indptr = np.append(0, np.cumsum(entries_per_column)).astype(np.int32)
 
     def factor(self, matrix: Array) -> SolveTangent:
         """Factorise the matrix of the mesh, which is the sum of the matrices of its elements.
@@ -274,18 +276,19 @@ def factor_tangent(
     """
     solver = assembly(elastic.mesh.template, elastic.unknowns_per_node, odd)
     solve_film = solver.factor(elastic.tangent(field, added_tension))
-    back = elastic.back
-    if back is None or elastic.groups.compression == 0.0 or odd:  # odd fields do not compress the air
+    back_pressure = elastic.back_pressure
+    if back_pressure is None or elastic.groups.compression == 0.0 or odd:  # odd fields do not compress the air
         return solve_film
 
     # The air changes a solution x by -c / (1 + c v . y) (v . x) y, where y = K^-1 v is the response of the film to a
     # uniform pressure.
-    weights = back.weights  # v
+    weights = back_pressure.weights  # v
     uniform_pressure = np.zeros_like(field)
     uniform_pressure[:, 2] = weights
     response = solve_film(uniform_pressure)  # y
-    air_stiffness = back.stiffness(field[:, 2])
-    pressure_per_volume = air_stiffness / (1.0 + air_stiffness * float(weights @ response[:, 2]))
+    response_volume = float(weights @ response[:, 2])  # v . y
+    air_stiffness = back_pressure.stiffness(field[:, 2])  # c
+    pressure_per_volume = air_stiffness / (1.0 + air_stiffness * response_volume)
 
     def solve_with_air(right: Array) -> Array:
         """Solve for the displacements at the nodes; see `SolveTangent`."""

@@ -206,17 +206,19 @@ def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
     Returns:
         Smallest and largest principal stress, MPa, tension positive.
     """
-    # Compute the scaled principal stresses without the mean pretension. The deviator of the pretension is added before,
-    # because it changes the directions of the principal stresses.
-    groups = equilibrium.groups
-    pressed = replace(equilibrium, rest=None)  # with the stress before the contact
-    surfaces: tuple[Surface, ...] = ("middle", "top", "bottom") if equilibrium.theory.bending else ("middle",)
-    extremes = [principal_stresses(nodal_stress(pressed, surface) + groups.uneven_tension) for surface in surfaces]
-    smallest, _ = extremes[0]
-    largest = max(largest_at_surface for _, largest_at_surface in extremes)
+    # Compute the scaled principal stresses without the mean pretension. The uneven part of the pretension is added
+    # before, because it changes the directions of the principal stresses.
+    uneven_tension = equilibrium.groups.uneven_tension
+    with_rest_stress = replace(equilibrium, rest=None)  # includes the stress before the contact
+    smallest, largest = principal_stresses(nodal_stress(with_rest_stress) + uneven_tension)
+    if equilibrium.theory.bending:
+        outer_surfaces: tuple[Surface, ...] = ("top", "bottom")
+        for surface in outer_surfaces:
+            _, largest_at_surface = principal_stresses(nodal_stress(with_rest_stress, surface) + uneven_tension)
+            largest = max(largest, largest_at_surface)
 
     # Convert the stresses to MPa, and add the mean pretension, which is the same in all directions.
-    stress_unit = equilibrium.film.young * groups.squared_amplitude
+    stress_unit = equilibrium.film.young * equilibrium.groups.squared_amplitude
     mean_pretension = equilibrium.film.pretension
     return stress_unit * smallest + mean_pretension, stress_unit * largest + mean_pretension
 
@@ -312,7 +314,5 @@ def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, A
 
     # `locate_points` expects one row of points for each placement. Here, there is a single placement.
     mesh = equilibrium.mesh
-    (element,), (xi,), (eta,), (is_reflected,) = locate_points(
-        mesh.placement[None], mesh.template, rotated_points[None]
-    )
-    return element, xi, eta, is_reflected
+    element, xi, eta, is_reflected = locate_points(mesh.placement[None], mesh.template, rotated_points[None])
+    return element[0], xi[0], eta[0], is_reflected[0]

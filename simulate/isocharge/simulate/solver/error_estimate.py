@@ -66,7 +66,7 @@ def highest_mode_share(mesh: PlacedMesh, slope: Array) -> float:
         Mean of the shares in all elements, weighted with the areas of the elements and the squares of the slopes.
     """
     # Convert the values on the square grid of nodes into coefficients of products of Legendre polynomials in xi and
-    # eta, shape (n_element, 2, n_node, n_node).
+    # eta, shape (n_element, 2, n_node, n_node). The number `n_node` is that of nodes along a side of an element.
     n_node = mesh.resolution.order + 1
     nodes_to_modes = modal_matrix(mesh.resolution.order)
     nodal_slope = slope.transpose(0, 2, 1).reshape(len(slope), 2, n_node, n_node)
@@ -78,11 +78,11 @@ def highest_mode_share(mesh: PlacedMesh, slope: Array) -> float:
     power = (coefficients**2 * np.outer(mean_square, mean_square)).sum(axis=1)  # shape (n_element, n_node, n_node)
     total_power = power.sum(axis=(1, 2))
     lower_power = power[:, :-1, :-1].sum(axis=(1, 2))  # of modes without the highest degree in xi and in eta
-    highest_power = total_power - lower_power
+    highest_power = np.maximum(total_power - lower_power, 0.0)
 
     # The share of an element is sqrt(highest power / total power), and its weight is area * total power.
     area = mesh.weights.sum(axis=1)
-    weighted_share = area * np.sqrt(np.maximum(highest_power, 0.0) * total_power)
+    weighted_share = area * np.sqrt(highest_power * total_power)
     total_weight = max(np.sum(area * total_power), 1e-300)  # the limit avoids a division by zero
     return float(np.sum(weighted_share) / total_weight)
 
@@ -216,10 +216,9 @@ def _patch_charges(equilibrium: Equilibrium, centres: Complexes) -> Array:
     stress = np.zeros((len(points), 3))
     stress[is_on_film] = touch_stress(equilibrium, points[is_on_film])
 
-    # Mean over the integration points p, for each ring r, patch a and stress component c. The weights of the reference
-    # square are divided by their sum, which is 4.
-    patch_stress = stress.reshape(*centres.shape, -1, 3)
-    mean_stress = np.einsum("rapc,p->rac", patch_stress, 0.25 * weights)
+    # Compute the mean stress of each patch. The sum of the weights of the integration points is 4.
+    patch_stress = stress.reshape(*centres.shape, -1, 3)  # shape (n_ring, n_patch, n_point, 3)
+    mean_stress = 0.25 * (weights @ patch_stress)
 
     # The coefficients d31 and d32 of a biaxial film are equal. On a uniaxial film, d31 is about ten times d32.
     coefficients = np.array([[1.0, 10.0], [1.0, 1.0]])  # one column for each kind of film

@@ -292,11 +292,26 @@ def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:
 def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
     """Generate the resolutions that are tried for a press, from coarse to fine.
 
+    For presses in the inner half of the film, the first resolution is sufficient.
+
+    Args:
+        case: The press and the required accuracy.
+    """
+    first_resolution = _first_resolution(case)
+    for order_increase, around_factor in REFINEMENTS:
+        order = first_resolution.order + order_increase
+        around = first_resolution.around * around_factor
+        yield replace(first_resolution, order=order, around=around)
+
+
+def _first_resolution(case: LoadCase) -> Resolution:
+    """Choose the coarsest resolution that is tried for a press.
+
     The mesh is created in a unit disk, which a conformal map maps onto the film. A circle in the disk encloses the
     footprint, and rings of elements lie between this circle and the rim. A small probe needs more rings. A press close
     to the rim needs more rings and more elements around the circle, because the conformal map stretches the mesh.
     Trapped air or a static pressure also bends the film between the probe and the rim, in narrow strips that need more
-    rings. For presses in the inner half of the film, the first resolution is sufficient.
+    rings.
 
     Args:
         case: The press and the required accuracy.
@@ -321,7 +336,7 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
     # factors).
     rings_for_stretch = min(2.0 * math.log(map_stretch(placement.map_parameter, 1.0)), 4.0)
     rings = math.ceil(-1.3 * math.log(float(placement.template_radius)) + rings_for_stretch)
-    first_resolution = Resolution(
+    resolution = Resolution(
         order=first_order + extra_order,
         around=16 if is_crowded or _is_very_uneven(film, case.force) else 8,
         rings=max(3, rings) + extra_order // 2,
@@ -329,11 +344,8 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
     )
     if film.has_back_pressure:
         # Without these rings, the error of a charge of a slack film on a cavity is 0.5 % even with order 8.
-        first_resolution = replace(first_resolution, rings=first_resolution.rings + 6, rim=first_resolution.rim + 2)
-    for order_increase, around_factor in REFINEMENTS:
-        order = first_resolution.order + order_increase
-        around = first_resolution.around * around_factor
-        yield replace(first_resolution, order=order, around=around)
+        resolution = replace(resolution, rings=resolution.rings + 6, rim=resolution.rim + 2)
+    return resolution
 
 
 def _is_very_uneven(film: Film, force: float) -> bool:
@@ -361,11 +373,11 @@ def _thin_ring_count(placement: Placement, total_width: float) -> int:
     # limit of 1 / 8 keeps the thin rings near the rim.
     stretch = float(map_stretch(placement.map_parameter, 1.0))
     log_range = -float(np.log(placement.template_radius))
-    largest_width = min(total_width * stretch / log_range, 1.0 / 8.0)
-    smallest_width = min(min(total_width, 0.2) / stretch / log_range, 1.0 / 8.0)
+    max_width = 1.0 / 8.0
+    largest_width = min(total_width * stretch / log_range, max_width)
+    smallest_width = min(min(total_width, 0.2) / stretch / log_range, max_width)
 
-    # The logarithm to the base 3 is the number of rings between both widths. Two rings are needed even if the widths
-    # are equal. With only one ring, the charge of an electrode that ends 1 mm from the rim of a film of 25 um is wrong
-    # by up to 0.4 %, and all charges are wrong by 0.02 to 0.24 % if the strip is 0.12 to 0.7 film radii wide. With two
-    # rings, these errors are 0.003 and 0.002 %.
-    return max(2, 1 + math.floor(THIN_RINGS_PER_FACTOR * math.log(largest_width / smallest_width, 3.0)))
+    # Each further ring is narrower by a factor of three. At least two rings are needed: with a single ring, the error
+    # of a charge reaches 0.4 %.
+    factors_of_three = math.log(largest_width / smallest_width, 3.0)
+    return max(2, 1 + math.floor(THIN_RINGS_PER_FACTOR * factors_of_three))

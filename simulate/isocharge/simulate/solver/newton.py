@@ -64,11 +64,10 @@ class NewtonResult:
 def first_iterate(elastic: ElasticFilm) -> Array:
     """Compute the first iterate of Newton's method: an approximate deflection under the probe and the static pressure.
 
-    Schwerin's deflection of a membrane is W = (3 / pi)^(1/3) (1 - r^(2/3)), where r is the distance from the origin of
-    the template plane. Schwerin's deflection is exact for a membrane without pretension under a point load if Poisson's
-    ratio is 1/3 (Schwerin 1929). In the first iterate, the estimated height of the film under the probe replaces the
-    factor (3 / pi)^(1/3). The deflection under the static pressure is a paraboloid, which is added. The deflection of a
-    load that is missing has the height zero. The in-plane displacements are zero.
+    The deflection under the probe is proportional to 1 - r^(2/3), where r is the distance from the origin of the
+    template plane. This is the shape of a membrane without pretension under a point load if Poisson's ratio is 1/3
+    (Schwerin 1929). The deflection under the static pressure is a paraboloid, which is added. The in-plane
+    displacements are zero.
 
     Args:
         elastic: Discrete model of the film.
@@ -80,9 +79,10 @@ def first_iterate(elastic: ElasticFilm) -> Array:
     groups = elastic.groups
     circular_points = mesh.placement.to_circular_film(mesh.node_points)
     template_distance = np.abs(mesh.placement.to_template(circular_points))
-    # The square of the radius of the innermost circle is added, which rounds the tip of the deflection under the probe.
-    rounding = float(mesh.placement.template_radius) ** 2
-    probe_shape = np.cbrt(1.0 + rounding) - np.cbrt(template_distance**2 + rounding)
+    # The cube root of r^2 has a sharp tip at r = 0. The squared radius of the innermost circle is added to r^2, which
+    # makes the tip round.
+    squared_radius = float(mesh.placement.template_radius) ** 2
+    probe_shape = np.cbrt(1.0 + squared_radius) - np.cbrt(template_distance**2 + squared_radius)
     pressure_shape = 1.0 - np.abs(circular_points) ** 2
     field = np.zeros((circular_points.size, 3))
     field[:, 2] = groups.height * probe_shape + groups.static_height * pressure_shape
@@ -309,11 +309,10 @@ def _line_search(iterate: _Iterate, step: Array) -> _Iterate | None:
     for _ in range(30):
         next_iterate = iterate.after(step_length * step)
         energy_change = elastic.energy(next_iterate.field) - energy
-        lowers_energy = energy_change <= 1e-4 * step_length * energy_slope
+        if energy_change <= 1e-4 * step_length * energy_slope:
+            return next_iterate
         is_round_off = abs(energy_change) <= 1e-12 * abs(energy)
-        if lowers_energy or is_round_off:
-            lowers_residual = np.linalg.norm(next_iterate.residual[iterate.free]) < residual_norm
-            if lowers_energy or lowers_residual:
-                return next_iterate
+        if is_round_off and np.linalg.norm(next_iterate.residual[iterate.free]) < residual_norm:
+            return next_iterate
         step_length *= 0.5
     return None

@@ -142,8 +142,7 @@ def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equi
         finer_equilibrium = _solve(case, finer_mesh, solved)
         iterations = solved.iterations + finer_equilibrium.iterations
         if finer_equilibrium.status != "converged":
-            only_one_mesh_is_solved = solved.proven_error is None
-            if only_one_mesh_is_solved:  # the error of this mesh is unknown
+            if solved.proven_error is None:  # only one mesh is solved, so that its error is unknown
                 return replace(finer_equilibrium, iterations=iterations)
             break  # the equilibrium on the previous mesh is the result
         error = relative_difference(solved, finer_equilibrium)
@@ -154,12 +153,8 @@ def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equi
     # If the charges differ very much, the two meshes have different equilibria.
     if solved.proven_error is not None and solved.proven_error > DIFFERENT_EQUILIBRIUM:
         order = solved.mesh.resolution.order
-        return replace(
-            solved,
-            status="failed",
-            message=f"a mesh of order {order - 1} and one of order {order} find charges that differ by "
-            f"{solved.proven_error:.0%}",
-        )
+        message = f"a mesh of order {order - 1} and one of order {order} find charges that differ by "
+        return replace(solved, status="failed", message=f"{message}{solved.proven_error:.0%}")
     return solved
 
 
@@ -177,8 +172,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
     Raises:
         SceneError: If an element of the mesh is folded.
     """
-    has_folded_element = np.isinf(mesh.shape_error)
-    if has_folded_element:
+    if np.isinf(mesh.shape_error):  # an element is folded
         raise too_near_the_rim(case, mesh.resolution)
     elastic = _elastic_film(case, mesh, case.force)
 
@@ -326,12 +320,11 @@ def _first_field(start: Equilibrium | None, elastic: ElasticFilm) -> Array:
     if start_blocks != (template.topology, template.half, template.resolution):
         return first_iterate(elastic)
 
-    # Interpolate to the nodes of the elements, which may have a new order. The weights of the nodes of an element have
-    # the shape (n_local, n_start_local). A node of several elements is assigned several times. The field is continuous,
-    # so the values are equal.
-    weights = tensor_values(start_template.resolution.order, template.xi, template.eta)
+    # Evaluate the field of each element at the nodes of its new order. A node of several elements is assigned several
+    # times, with equal values, because the field is continuous.
+    basis_values = tensor_values(start_template.resolution.order, template.xi, template.eta)
     field = np.empty((template.n_node, 3))
-    field[template.nodes] = weights @ start.field[start_template.nodes]
+    field[template.nodes] = basis_values @ start.field[start_template.nodes]
     return field
 
 

@@ -47,7 +47,7 @@ from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.theory import elasticity, side_force_unit
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.sensor.film import Surface, increased
+from isocharge.simulate.sensor.film import Surface, add_axial
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.probe import RoundProbe
 from isocharge.simulate.solver.assembly import SolveTangent, factor_tangent, single_threaded_blas
@@ -107,7 +107,7 @@ def _add_stiffness(solved: Equilibrium, log_ratio: float, angle: float) -> Equil
     # to axis 1. The sum of both numbers is the new anisotropy.
     film = solved.film
     addition = cmath.rect(log_ratio, 2.0 * (solved.direction + angle))
-    new_log_ratio, axis = increased(math.log(film.young_ratio), film.axis, addition)
+    new_log_ratio, axis = add_axial(math.log(film.young_ratio), film.axis, addition)
     changed_film = replace(film, young_ratio=math.exp(new_log_ratio), axis=axis)
     groups = replace(solved.groups, elasticity=elasticity(changed_film, solved.direction))
     return replace(solved, groups=groups)
@@ -197,17 +197,21 @@ def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
     # factorised once for all even fields, and once for all odd fields.
     with single_threaded_blas():
         elastic = solved.elastic
-        solves = [factor_tangent(elastic, solved.field, odd=odd) for odd in (False, True)]
+        solve_even = factor_tangent(elastic, solved.field)
+        solve_odd = factor_tangent(elastic, solved.field, odd=True)
         # The two halves of the film displace opposite amounts of air in an odd change, so the pressure of trapped air
         # remains constant.
         solved_for_odd = solved
-        if elastic.back is not None:
-            groups = elastic.back.at_constant_pressure(solved.field[:, 2])
+        if elastic.back_pressure is not None:
+            groups = elastic.back_pressure.at_constant_pressure(solved.field[:, 2])
             solved_for_odd = replace(solved, groups=groups)
-        changes = [
-            _change_of_stress(solved_for_odd if field.odd else solved, field.add, solves[field.odd], surface)
-            for field in FILM_FIELDS
-        ]
+
+        changes = []
+        for field in FILM_FIELDS:
+            if field.odd:
+                changes.append(_change_of_stress(solved_for_odd, field.add, solve_odd, surface))
+            else:
+                changes.append(_change_of_stress(solved, field.add, solve_even, surface))
         return np.stack(changes, axis=2)
 
 
@@ -227,11 +231,11 @@ def _change_of_stress(solved: Equilibrium, add_change: AddChange, solve: SolveTa
     positive_press = add_change(solved, STEP)
     negative_press = add_change(solved, -STEP)
 
-    # Compute the change of the displacements that restores the equilibrium after one positive step. The change of the
-    # residual by one step is half of the difference between both residuals.
+    # Compute the change of the displacements that restores the equilibrium after one positive step.
     positive_residual = positive_press.elastic.residual(positive_press.field)
     negative_residual = negative_press.elastic.residual(negative_press.field)
-    displacement_change = -0.5 * solve(positive_residual - negative_residual)
+    residual_change = 0.5 * (positive_residual - negative_residual)  # by one step
+    displacement_change = -solve(residual_change)
 
     # Compute the derivative of the stress by a central difference.
     positive_equilibrium = replace(positive_press, field=positive_press.field + displacement_change)
