@@ -97,14 +97,13 @@ def differences(
         Derivatives with respect to (x, y, ln F), shape (n, k, 3), in the unit of the values per mm, per mm and per 1;
         fewer along the last axis if `variables` selects fewer.
     """
-    # Step each variable up and down, and evaluate the function once. The axes are direction, variable and contact.
-    variable_steps = np.array(steps)
-    changes = np.stack([np.diag(variable_steps), -np.diag(variable_steps)])[:, variables, None]
-    stepped = with_log_force(contact) + changes
+    # Step each variable up and down, and evaluate the function once.
+    step_matrix = np.diag(steps)[variables, None]  # shape (n_variable, 1, 3)
+    stepped = with_log_force(contact) + np.stack([step_matrix, -step_matrix])  # shape (2, n_variable, n, 3)
     stepped[..., 2] = np.exp(stepped[..., 2])
     stepped_values = function(stepped.reshape(-1, 3))
     values_up, values_down = stepped_values.reshape(*stepped.shape[:-1], stepped_values.shape[1])
-    distance = 2.0 * variable_steps[variables]
+    distance = 2.0 * np.asarray(steps)[variables]
     derivatives = (values_up - values_down) / distance[:, None, None]  # shape (n_variable, n, k)
     return np.moveaxis(derivatives, 0, 2)
 

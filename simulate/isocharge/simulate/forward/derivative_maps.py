@@ -97,11 +97,13 @@ class FilmSlopes:
         solved_map = ForwardMap.build_unchecked(
             sensor, probe, domain, count, settings, read=_stress_and_changes, executor=executor
         )
-        table = solved_map.table
-        fields = table.reshape(len(table), -1, 1 + len(FILM_FIELDS), 3)  # the stress is the first field
-        stress, changes = (part.reshape(len(part), -1) for part in np.split(fields, [1], axis=2))
-        # Single precision is enough for derivatives, and halves the time in which they are interpolated.
-        return cls(replace(solved_map, table=stress), replace(solved_map, table=changes.astype(np.float32)))
+        # The first field is the stress, and the other fields are its changes. Single precision is enough for
+        # derivatives, and halves the time in which they are interpolated.
+        n_press = len(solved_map.table)
+        fields = solved_map.table.reshape(n_press, -1, 1 + len(FILM_FIELDS), 3)
+        stress = fields[:, :, 0].reshape(n_press, -1)
+        changes: np.ndarray = fields[:, :, 1:].reshape(n_press, -1).astype(np.float32)
+        return cls(replace(solved_map, table=stress), replace(solved_map, table=changes))
 
     def jacobian(self, contact: Array) -> dict[str, Array]:
         """Compute the derivatives of the charges with respect to the properties of the film.
@@ -128,13 +130,12 @@ class FilmSlopes:
 
         # The axes of an even field are along and across the direction of the press, at the angle t from the x axis.
         # The axes of an odd field are rotated by 45 degrees from them. Rotate both to the axes x and y.
-        directed = field_charge[:, SCALAR_FIELDS:]
-        even, odd = directed[:, ::2], directed[:, 1::2]
-        twice_angle = 2.0 * np.arctan2(contact[:, 1], contact[:, 0])[:, None, None]
-        cosine = np.cos(twice_angle)
-        sine = np.sin(twice_angle)
-        components = np.stack([cosine * even - sine * odd, sine * even + cosine * odd], axis=2)
-        directed[:] = components.reshape(directed.shape)
+        directed = field_charge[:, SCALAR_FIELDS:]  # pairs of an even and an odd field
+        even_and_odd = directed[:, ::2] + 1j * directed[:, 1::2]
+        direction = np.arctan2(contact[:, 1], contact[:, 0])[:, None, None]  # t
+        components = even_and_odd * np.exp(2j * direction)
+        directed[:, ::2] = components.real
+        directed[:, 1::2] = components.imag
         names = [field.name for field in FILM_FIELDS]
         return dict(zip(names, np.moveaxis(field_charge, 1, 0), strict=True))
 

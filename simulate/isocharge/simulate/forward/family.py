@@ -159,7 +159,8 @@ class Family:
 
         period = probe.period
         is_oriented = orientation == "fixed" and not film.is_axisymmetric and not probe.is_axisymmetric
-        if is_oriented:  # film and probe together repeat after the period of both; the film repeats after half a turn
+        if is_oriented:
+            # The period of the film is half a turn, and the period of film and probe together is a multiple of both.
             symmetry_order = round(2.0 * np.pi / period)
             period = 2.0 * np.pi / math.gcd(symmetry_order, 2)
         has_directions = not film.is_axisymmetric and not is_oriented
@@ -183,11 +184,10 @@ class Family:
             the sum over the nodes of the weight of a node times the value at this node.
         """
         # Interpolation weights along each axis
-        distance_nodes = distance_coordinate(self.distance / self.film_radius)
+        node_coordinates = distance_coordinate(self.distance / self.film_radius)
         press_coordinates = distance_coordinate(np.abs(position) / self.film_radius)
-        distance_weights = lagrange_values(distance_nodes, press_coordinates)
-        force_nodes = np.log(self.force)
-        force_weights = lagrange_values(force_nodes, np.log(force))
+        distance_weights = lagrange_values(node_coordinates, press_coordinates)
+        force_weights = lagrange_values(np.log(self.force), np.log(force))
         turn_weights = self.turns.weights(np.angle(position) + rotation, rotation)
 
         # The weight of a node is the product of its weights along the axes (press, distance, force, turn).
@@ -219,10 +219,11 @@ class Family:
             `unfold` extends stresses to all rotations.
         """
         turns = self.turns.solved
-        places = [(float(distance), turn) for distance in self.distance for turn in turns]
-        solve = partial(self._solve_chain, sensor, probe, settings, read)
-        solved = np.stack(list(track(in_order(executor, solve, places), "solving the film", len(places))))
-        return solved.reshape(self.distance.size, len(turns), self.force.size, -1).swapaxes(1, 2)
+        places = [(distance, turn) for distance in self.distance.tolist() for turn in turns]
+        solve_place = partial(self._solve_chain, sensor, probe, settings, read)
+        values_of_places = track(in_order(executor, solve_place, places), "solving the film", len(places))
+        values = np.stack(list(values_of_places)).reshape(self.distance.size, len(turns), self.force.size, -1)
+        return values.swapaxes(1, 2)
 
     def _solve_chain(
         self,
@@ -258,7 +259,7 @@ class Family:
         return np.stack(values_of_forces)
 
     def unfold(self, solved: Array, mesh: Template) -> Array:
-        """By symmetry, extend the stress from the rotations within one period of the probe to all rotations.
+        """Copy the stress from the rotations within one period of the probe to all rotations.
 
         A period is the smallest rotation that maps the probe onto itself. A rotation of the probe by one period does
         not change the press, but rotates the mesh. The stress of each further period is therefore the stress of the
@@ -319,7 +320,8 @@ def spread_check_presses(domain: Domain, count: int) -> tuple[Array, Array]:
     # The golden angle (2.4 rad) distributes the directions evenly. The rotation of the probe changes by a different
     # angle, so that the rotation and the direction are independent.
     position = distance * np.exp(2.4j * number)
-    return np.column_stack([position.real, position.imag, force]), 0.7 * number
+    rotation = 0.7 * number
+    return np.column_stack([position.real, position.imag, force]), rotation
 
 
 def check_domain(domain: Domain) -> None:

@@ -313,27 +313,32 @@ class ForwardMap:
         Returns:
             Charges, shape (n_force, n, n_electrode, n_field), pC.
         """
+        # Divide the forces of the family into groups, of which each has one map.
         family = self.family
         n_map = family.force.size if self.probe.grows else 1
         precision = np.float64 if self.probe.grows else np.float32
         shape = (family.distance.size, family.force.size, family.turns.rotation.size, -1, is_odd.size * 3)
+        map_tables = np.split(self.table.reshape(shape), n_map, axis=1)
+        map_forces = np.split(family.force, n_map)
+
         charges = []
-        for table, force in zip(
-            np.split(self.table.reshape(shape), n_map, axis=1), np.split(family.force, n_map), strict=True
-        ):
-            # The fields of all forces at one node become adjacent. The map of the first force returns charges in the
-            # unit of this force, which is proportional to the squared amplitude.
+        for table, force in zip(map_tables, map_forces, strict=True):
+            # Create a map with a single force, in which the fields of all forces are further fields at each node.
             fields = np.moveaxis(table, 1, 3)
+            first_force = force[0]
             one_map = replace(
                 self,
-                probe=self.probe.under(force[0]),
+                probe=self.probe.under(first_force),
                 family=replace(family, force=force[:1]),
                 table=fields.reshape(-1, fields[0, 0].size).astype(precision),
             )
-            charge = one_map.field_charges(contacts_at(position, force[0]), np.tile(is_odd, force.size))
-            unit_ratio = amplitude_squared(self.sensor.film, force) / amplitude_squared(self.sensor.film, force[0])
-            by_force = charge.reshape(*charge.shape[:2], force.size, is_odd.size) * unit_ratio[:, None]
-            charges.append(np.moveaxis(by_force, 2, 0))
+            charge = one_map.field_charges(contacts_at(position, first_force), np.tile(is_odd, force.size))
+            charge_by_force = charge.reshape(*charge.shape[:2], force.size, is_odd.size)
+
+            # The map multiplies all fields by the squared amplitude of its single force. Correct the other fields.
+            squared_amplitude = amplitude_squared(self.sensor.film, force)
+            charge_by_force *= (squared_amplitude / squared_amplitude[0])[:, None]
+            charges.append(np.moveaxis(charge_by_force, 2, 0))
         return np.concatenate(charges)
 
     def _unchecked_charges(self, contact: Array, orientation: Array | float = 0.0) -> Array:
@@ -376,8 +381,9 @@ class ForwardMap:
             force = self.family.force
             weights = lagrange_values(np.log(force), np.log(contact[:, 2]))
             weights *= amplitude_squared(film, contact[:, 2])[:, None] / amplitude_squared(film, force)
+            family_charges = self.charges_by_force(contact[:, :2], is_odd)
             # Sum over the forces of the family (index k), for each press (n), electrode (e) and field (f).
-            return np.asarray(np.einsum("nk,knef->nef", weights, self.charges_by_force(contact[:, :2], is_odd)))
+            return np.asarray(np.einsum("nk,knef->nef", weights, family_charges))
 
         position = to_complex(contact[:, :2])
         orientation = np.broadcast_to(orientation, len(contact))
@@ -422,16 +428,18 @@ class ForwardMap:
         fields = weights.astype(self.table.dtype) @ self.table
         stress = fields.reshape(position.size, -1, is_odd.size, 3).swapaxes(1, 2)  # shape (n, n_field, n_node, 3)
 
-        # Convert the stress into charge per area, for each reflection of the mesh and each kind of piece.
+        # Compute the charge per area and stress in the frame of the stress, for each press (index n), field (f), stress
+        # component (c), reflection of the mesh (m) and kind of piece (k).
         signs = _reflection_signs(is_odd) if template.half else np.ones((1, is_odd.size, 3))
         frame_angle = direction + rotation + self.probe.angle
         charge_per_frame_stress = rotate_stress(np.eye(3), frame_angle[:, None]) @ charge_per_stress.T
-        # The indices are the press (n), field (f), stress component (c), reflection (m) and kind of piece (k).
         coefficients = np.einsum("mfc,nck->nfcmk", signs, charge_per_frame_stress).astype(fields.dtype)
+
+        # Convert the stress into charge per area, and order the axes as in `PressedFilm.density`.
         density = stress @ coefficients.reshape(*stress.shape[:2], 3, -1)  # shape (n, n_field, n_node, n_sign * n_kind)
         shape = (len(signs), len(charge_per_stress), position.size, template.n_element, -1, is_odd.size)
-        node_density = density.transpose(3, 0, 2, 1).reshape(shape)
-        return PressedFilm(position, self.probe, film.radius, template, placement, node_density)
+        ordered_density = density.transpose(3, 0, 2, 1).reshape(shape)
+        return PressedFilm(position, self.probe, film.radius, template, placement, ordered_density)
 
 
 def _reflection_signs(is_odd: Booleans) -> Array:

@@ -14,6 +14,7 @@ charge under load minus the charge without load. The charge of a uniform pretens
 import cmath
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -106,13 +107,10 @@ class ElectrodePieces:
             readout: "area" for a mean over the area of an electrode, "edge" for a mean over its edges.
             rotation: Angle by which the electrodes are turned later, rad. It decides which edges are the left ones.
         """
-        pieces = [
-            (index, *piece)
-            for index, electrode in enumerate(electrodes)
-            for piece in (_edge_lines(electrode, rotation) if readout == "edge" else _area_pieces(electrode))
-        ]
-        index_of_piece, corners, line_area, kind = (np.array(column) for column in zip(*pieces, strict=True))
-        return cls(to_complex(corners), line_area, index_of_piece, kind)
+        pieces_of = partial(_edge_lines, rotation=rotation) if readout == "edge" else _area_pieces
+        pieces = [(index, *piece) for index, electrode in enumerate(electrodes) for piece in pieces_of(electrode)]
+        electrode_of_piece, corners, line_area, kind = (np.array(column) for column in zip(*pieces, strict=True))
+        return cls(to_complex(corners), line_area, electrode_of_piece, kind)
 
     @classmethod
     def of(cls, sensor: Sensor) -> "ElectrodePieces":
@@ -140,7 +138,7 @@ class ElectrodePieces:
             The integration points of some of the pairs of a press and a piece.
         """
         near_count, distant_count = counts
-        press, piece = (grid.ravel() for grid in np.indices((position.size, len(self.corners))))
+        press, piece = np.indices((position.size, len(self.corners))).reshape(2, -1)  # all pairs
         corners = self.corners[piece]
         line_area = self.line_area[piece]
         while press.size:
@@ -150,13 +148,14 @@ class ElectrodePieces:
             sides = np.abs(np.roll(corners, -1, axis=1) - corners)
             is_halved = is_near & (sides.max(axis=1) > NEAR_SIDE * probe.half_width)
             for count, selected in ((near_count, is_near & ~is_halved), (distant_count, ~is_near)):
-                indices = np.flatnonzero(selected)
-                block = 50_000 // count**2  # with more points, the working arrays would exceed 100 MB
-                for start in range(0, indices.size, block):
-                    used = indices[start : start + block]
-                    points, area = gauss_quadrilaterals(corners[used], line_area[used], count)
-                    yield PieceRule(press[used], piece[used], points, area)
+                pairs = np.flatnonzero(selected)
+                chunk_size = 50_000 // count**2  # with more points, the working arrays would exceed 100 MB
+                for start in range(0, pairs.size, chunk_size):
+                    chunk = pairs[start : start + chunk_size]
+                    points, area = gauss_quadrilaterals(corners[chunk], line_area[chunk], count)
+                    yield PieceRule(press[chunk], piece[chunk], points, area)
 
+            # Continue with both halves of each halved piece.
             press = np.tile(press[is_halved], 2)
             piece = np.tile(piece[is_halved], 2)
             line_area = np.tile(0.5 * line_area[is_halved], 2)
@@ -281,9 +280,10 @@ def _area_pieces(electrode: Electrode) -> Iterator[tuple[Array, float, int]]:
     """
     for polygon in electrode.collecting_polygons:
         # The quadrilaterals share the first corner. If a corner is missing, the last one is repeated.
-        n_corner = len(polygon)
-        for second in range(1, n_corner - 1, 2):
-            yield polygon[[0, second, second + 1, min(second + 2, n_corner - 1)]], 0.0, 0
+        last = len(polygon) - 1
+        for second in range(1, last, 2):
+            fourth = min(second + 2, last)
+            yield polygon[[0, second, second + 1, fourth]], 0.0, 0
 
 
 def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[tuple[Array, float, int]]:
@@ -302,14 +302,14 @@ def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[tuple[Array, 
         end again, shape (4, 2), mm. The area that the line represents, mm^2. The kind of the piece, which is the row of
         its weights in `STRESS_WEIGHTS`.
     """
-    # Each mean is over two edges, so each half of an edge represents a quarter of the area of the electrode.
+    line_area = 0.25 * electrode.area  # each mean is over the halves of two edges
     corners = np.array(electrode.corners)
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         middle = 0.5 * (start + end)
         rotated_edge = complex(*(end - start)) * cmath.rect(1.0, rotation)
-        is_lower_or_upper = abs(rotated_edge.real) > abs(rotated_edge.imag)
+        kind = 1 if abs(rotated_edge.real) > abs(rotated_edge.imag) else 0  # 1 for the lower and upper edges
         for first, last in ((start, middle), (middle, end)):
-            yield np.array([first, last, last, first]), 0.25 * electrode.area, int(is_lower_or_upper)
+            yield np.array([first, last, last, first]), line_area, kind
 
 
 @dataclass(frozen=True)
@@ -351,14 +351,16 @@ class PressedFilm:
         # After the rotation, the press is on the x axis. The unit is the radius of the film.
         rotation_and_scale = np.exp(-1j * np.angle(self.position)) / self.film_radius
         for rule in pieces.rules(self.probe, self.position):
+            # For each point, select the charge per area at the nodes of its element.
             points = rule.points * rotation_and_scale[rule.press, None]
-            element, xi, eta, is_mirrored = locate_points(self.placement[rule.press], self.template, points)
-            basis_values = tensor_values(self.template.resolution.order, xi.ravel(), eta.ravel())
+            element, xi, eta, is_reflected = locate_points(self.placement[rule.press], self.template, points)
             kind = pieces.kind[rule.piece, None]
-            density = self.density[is_mirrored.astype(np.intp), kind, rule.press[:, None], element]
+            density = self.density[is_reflected.astype(np.intp), kind, rule.press[:, None], element]
 
-            # Sum over the points of each pair and over the nodes of their elements.
-            node_weights = (rule.area.reshape(-1, 1) * basis_values).reshape(len(kind), 1, -1)
-            pair_charge = node_weights.astype(density.dtype) @ density.reshape(len(kind), -1, n_field)
+            # For each pair of press and piece, sum over its points and over the nodes of their elements.
+            n_pair = len(rule.press)
+            basis_values = tensor_values(self.template.resolution.order, xi.ravel(), eta.ravel())
+            node_weights = (rule.area.reshape(-1, 1) * basis_values).reshape(n_pair, 1, -1)
+            pair_charge = node_weights.astype(density.dtype) @ density.reshape(n_pair, -1, n_field)
             np.add.at(charge, (rule.press, pieces.electrode[rule.piece]), pair_charge[:, 0])
         return charge
