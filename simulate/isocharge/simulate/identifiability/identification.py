@@ -88,14 +88,15 @@ class LimitMap:
         ring_area = np.append(2 * np.arange(1, n_ring), n_ring)
         area = np.repeat(ring_area, n_angle)
         statistics = {"force_N": self.force}
-        for name, errors in (
+        for key, errors in (
             ("position_{}_mm", self.position.ravel()),
             ("force_{}_percent", 100.0 * self.relative_force.ravel()),
         ):
             median = np.quantile(np.repeat(errors, area), 0.5, method="inverted_cdf")
-            statistics[name.format("median")] = float(median)
-            statistics[name.format("rms")] = float(np.sqrt(np.average(errors**2, weights=area)))
-            statistics[name.format("worst")] = float(errors.max())
+            root_mean_square = np.sqrt(np.average(errors**2, weights=area))
+            statistics[key.format("median")] = float(median)
+            statistics[key.format("rms")] = float(root_mean_square)
+            statistics[key.format("worst")] = float(errors.max())
         return statistics
 
 
@@ -150,12 +151,13 @@ class Identification:
         middle_force = min(max(min_force, 1.0), max_force)
         forces = sorted({min_force, middle_force, max_force})
 
-        # Compute the limits on the whole disk of the map, and within the working area.
+        def limit_maps(radius: float) -> tuple[LimitMap, ...]:
+            """Compute the limits on a disk for each force."""
+            return tuple(LimitMap.of(charges, noise, force, Rings.spread(radius)) for force in forces)
+
         area = working_area(charges, noise, error=error)
-        maps, inner_maps = (
-            tuple(LimitMap.of(charges, noise, force, Rings.spread(radius)) for force in forces if radius > 0.0)
-            for radius in (charges.domain.radius, area.radius)
-        )
+        maps = limit_maps(charges.domain.radius)
+        inner_maps = limit_maps(area.radius) if area.radius > 0.0 else ()
         return cls(forward_map.sensor, forward_map.probe, noise, charges, area, maps, inner_maps)
 
     def to_dict(self) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def minimise(
     """
     point = into_unit_domain(start)
     active = np.arange(len(start))  # indices of the problems whose iteration has not ended
-    residual, slopes = (np.array(values) for values in evaluate(active, point))  # r and dr/du
+    residual, slopes = evaluate(active, point)  # r and dr/du
     squared_norm = (residual**2).sum(axis=1)  # |r|^2, shape (n,)
     damping = np.full(len(point), 1e-4)  # relative to the mean of the diagonal of J'J
     for _ in range(60):
@@ -100,13 +100,16 @@ def bounded_step(point: Array, residual: Array, slopes: Array, damping: Array) -
     matrix = matrix + damping[:, None, None] * trace * np.eye(3) / 3.0
 
     # The equations change only for points on the circle or at an end of the interval, which are the edges of D.
-    is_on_edge = np.column_stack([np.hypot(point[:, 0], point[:, 1]), np.abs(point[:, 2])]) > 1.0 - ROUNDING
+    edge_coordinates = np.column_stack([np.hypot(point[:, 0], point[:, 1]), np.abs(point[:, 2])])  # 1 on an edge
+    is_on_edge = edge_coordinates > 1.0 - ROUNDING
     rows = np.flatnonzero(is_on_edge.any(axis=1))
     if rows.size:
-        # The normals are (x, y, 0) and (0, 0, z), because the coordinates of a point on an edge have these lengths.
-        normals = point[rows, None] * np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) * is_on_edge[rows, :, None]
+        # On the circle, (x, y, 0) is the unit normal. At an end of the interval, (0, 0, z) is the unit normal.
+        normals = point[rows, None] * np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        normals[~is_on_edge[rows]] = 0.0
         matrix[rows], gradient[rows] = _along_edges(normals, matrix[rows], gradient[rows], trace[rows])
-    return into_unit_domain(point - np.linalg.solve(matrix, gradient[..., None])[..., 0])
+    step = -np.linalg.solve(matrix, gradient[..., None])[..., 0]
+    return into_unit_domain(point + step)
 
 
 def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -> tuple[Array, Array]:
@@ -123,16 +126,16 @@ def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -
         Modified matrices, shape (n, 3, 3), and modified gradients, shape (n, 3).
     """
     # An edge is active if the negative gradient has an outward component.
-    outward = -np.einsum("nbi,ni->nb", normals, gradient)
-    normals = normals * (outward > 0.0)[..., None]
+    outward = -(normals @ gradient[..., None])  # shape (n, 2, 1)
+    active_normals = normals * (outward > 0.0)
 
     # A step along the tangent of the circle must also turn with the circle. The turn adds the outward component to the
     # second derivative along the tangent.
-    tangent = normals[:, 0, [1, 0, 2]] * np.array([-1.0, 1.0, 0.0])
-    matrix = matrix + outward[:, 0, None, None] * tangent[:, :, None] * tangent[:, None, :]
+    tangent = active_normals[:, 0, [1, 0, 2]] * np.array([-1.0, 1.0, 0.0])
+    matrix = matrix + outward[:, :1] * tangent[:, :, None] * tangent[:, None, :]
 
     # Remove the components across the active edges. The trace makes the matrix regular in these directions.
-    across = np.einsum("nbi,nbj->nij", normals, normals)
+    across = active_normals.swapaxes(1, 2) @ active_normals  # projection onto the active normals, shape (n, 3, 3)
     along = np.eye(3) - across
     return along @ matrix @ along + trace * across, (along @ gradient[..., None])[..., 0]
 

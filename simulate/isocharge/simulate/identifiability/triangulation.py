@@ -103,13 +103,13 @@ class Triangulation:
         # Choose the best contact of each press, unless another contact is as good and lies elsewhere.
         row = np.arange(len(charge))
         best = spreads.argmin(axis=1)
-        contact = contacts[row, best]
-        spread = spreads[row, best]
-        is_elsewhere = np.linalg.norm((contacts - contact[:, None])[..., :2], axis=2) > TOLERANCE
-        other_spread = spreads.min(axis=1, where=is_elsewhere, initial=np.inf)
-        is_ambiguous = other_spread <= np.maximum(AMBIGUOUS_RATIO * spread, AMBIGUOUS_SPREAD)
-        contact[(spread > TOLERANCE) | is_ambiguous] = np.nan
-        return Fix(contact, spread)
+        best_contact = contacts[row, best]
+        best_spread = spreads[row, best]
+        distance = np.linalg.norm((contacts - best_contact[:, None])[..., :2], axis=2)
+        other_spread = spreads.min(axis=1, where=distance > TOLERANCE, initial=np.inf)
+        is_ambiguous = other_spread <= np.maximum(AMBIGUOUS_RATIO * best_spread, AMBIGUOUS_SPREAD)
+        best_contact[(best_spread > TOLERANCE) | is_ambiguous] = np.nan
+        return Fix(best_contact, best_spread)
 
     def _descend(self, charge: Array, contact: Array) -> tuple[Array, Array]:
         """Find the contacts near starting points for which the mean square distance from the contours is smallest.

@@ -26,7 +26,7 @@ from typing import Literal
 import numpy as np
 import scipy  # loads each of its subpackages on first use
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Booleans
 from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_count
 from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.nearest_contact import local_minima
@@ -57,37 +57,52 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
     """
     radius = INNER_RADIUS * charge_map.domain.radius
 
-    def contacts(position: Array) -> Array:
-        """Return contacts at positions of shape (..., 2), moved onto the disk of the map, shape (n, 3)."""
-        return contacts_at(onto_disk(position, radius).reshape(-1, 2), force)
-
     def position_error(position: Array) -> Array:
         """Return the Cramer-Rao position error at positions of shape (..., 2), which is infinite at a fold."""
-        return limits_at(charge_map, contacts(position), noise).position.reshape(position.shape[:-1])
+        contact = contacts_at(position.reshape(-1, 2), force)
+        return limits_at(charge_map, contact, noise).position.reshape(position.shape[:-1])
 
     # Refine the maxima of the error. In each round, the step is halved, and each position moves to the best of 25
     # points: itself and the 24 points that are up to two steps away along x and y.
-    error_on_rings = position_error(rings.position)
+    error_on_rings = position_error(onto_disk(rings.position, radius))
     position, step = _starting_points(rings, 1.0 / error_on_rings)
     neighbours = np.stack(np.meshgrid(range(-2, 3), range(-2, 3)), axis=-1).reshape(-1, 2)
     while step.max() > 0.05 * FOLD_WIDTH:
         step *= 0.5
         trial = onto_disk(position[:, None] + step[:, None, None] * neighbours, radius)  # shape (n, 25, 2)
-        position = trial[np.arange(len(trial)), position_error(trial).argmax(axis=1)]
+        best_trial = position_error(trial).argmax(axis=1)
+        position = trial[np.arange(len(trial)), best_trial]
 
     # A position is on a fold if the charge map reverses its orientation between two opposite points of a small circle
-    # around the position. Four pairs of points are tried. With the derivatives J1 and J2 at the points of a pair, the
-    # orientation is reversed if det(J1' J2) is negative.
+    # around the position. Four pairs of points are tried.
     angle = np.pi * np.arange(4) / 4.0
     half_width = 0.5 * FOLD_WIDTH * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    sides = np.stack([position[:, None] + half_width, position[:, None] - half_width])  # shape (2, n, 4, 2)
-    charge, jacobian = charge_map.linearised(contacts(sides))
-    scaled_jacobian = jacobian / noise.sigma(charge)[..., None]
-    first, second = scaled_jacobian.reshape(*sides.shape[:3], -1, 3)  # each of shape (n, 4, n_electrode, 3)
-    products = np.einsum("...ei,...ej->...ij", first, second)
-    is_fold = (np.linalg.det(products) < 0.0).any(axis=1)
+    pairs = np.stack([position[:, None] + half_width, position[:, None] - half_width])  # shape (2, n, 4, 2)
+    is_fold = _reverses_orientation(charge_map, onto_disk(pairs, radius), force, noise).any(axis=1)
     folds = position[is_fold]
-    return folds[np.argsort(np.hypot(*folds.T), kind="stable")], error_on_rings
+    distance = np.hypot(*folds.T)
+    return folds[np.argsort(distance, kind="stable")], error_on_rings
+
+
+def _reverses_orientation(charge_map: ChargeMap, pairs: Array, force: float, noise: NoiseModel) -> Booleans:
+    """Return whether a charge map reverses its orientation between the two positions of each pair.
+
+    Let J1 and J2 be the derivatives of the charges at the two positions, divided by the noise of the charges. The
+    orientation is reversed if det(J1' J2) is negative.
+
+    Args:
+        charge_map: Map that computes the charges of contacts.
+        pairs: Positions (x, y), shape (2, ..., 2), mm. The first axis is the position of a pair.
+        force: Force of the contacts, N.
+        noise: Noise of the readings.
+
+    Returns:
+        Whether the orientation is reversed, shape (...).
+    """
+    charge, jacobian = charge_map.linearised(contacts_at(pairs.reshape(-1, 2), force))
+    scaled_jacobian = jacobian / noise.sigma(charge)[..., None]
+    first, second = scaled_jacobian.reshape(*pairs.shape[:-1], -1, 3)  # each of shape (..., n_electrode, 3)
+    return np.asarray(np.linalg.det(first.swapaxes(-1, -2) @ second) < 0.0)
 
 
 def _starting_points(rings: Rings, precision: Array) -> tuple[Array, Array]:
@@ -100,12 +115,15 @@ def _starting_points(rings: Rings, precision: Array) -> tuple[Array, Array]:
     Returns:
         Positions (x, y), shape (n, 2), and the distance to the farthest neighbour of each, shape (n,), mm.
     """
-    # A position is chosen if none of its eight neighbours has a smaller precision. A position is also chosen if a line
-    # of neighbours has a kink, as at a fold line: the precision then decreases to zero and increases again.
+    # A position is chosen if none of its eight neighbours has a smaller precision.
     is_chosen = precision == scipy.ndimage.minimum_filter(precision, 3, mode=("nearest", "wrap"))
-    along_ring = np.roll(precision, 1, axis=1) + np.roll(precision, -1, axis=1)
-    is_chosen |= 3.0 * precision <= along_ring
-    is_chosen[1:-1] |= 3.0 * precision[1:-1] <= precision[:-2] + precision[2:]
+
+    # A position is also chosen if the precision has a kink, as at a fold line: along the ring or from ring to ring, the
+    # precision decreases to zero and increases again.
+    sum_along_ring = np.roll(precision, 1, axis=1) + np.roll(precision, -1, axis=1)
+    is_chosen |= 3.0 * precision <= sum_along_ring
+    sum_across_rings = precision[:-2] + precision[2:]
+    is_chosen[1:-1] |= 3.0 * precision[1:-1] <= sum_across_rings
     ring, _ = np.nonzero(is_chosen)
     spacing_on_ring = rings.distance * 2.0 * np.pi / precision.shape[1]
     neighbour_distance = np.maximum(rings.distance[0], spacing_on_ring)  # shape (n_ring,)
@@ -213,11 +231,11 @@ def find_ambiguous_pairs(
     min_distance = np.maximum(smallest_distance, MIN_DISTANCE_SIGMAS * position_std)
     sigma = noise.sigma(charge)
 
-    # Search for the second contacts. A search that finds the first contact again is discarded below. Then select the
-    # pairs whose contacts are still distant, and whose charges agree within the noise. One digit of the difference of
-    # the charges is sufficient.
-    second, residual = local_minima(charge_map, charge, sigma, starts=STARTS, min_change=1e-4)  # shape (n, STARTS, 3)
-    first = np.broadcast_to(contact[:, None], second.shape)
+    # Search for the second contacts. Then select the pairs whose contacts are distant, and whose charges agree within
+    # the noise. A search that has found the first contact again is thus discarded. The tolerance is coarse, because one
+    # digit of the difference of the charges is sufficient.
+    second, residual = local_minima(charge_map, charge, sigma, starts=STARTS, min_change=1e-4)
+    first = np.broadcast_to(contact[:, None], second.shape)  # shape (n, STARTS, 3)
     charge_difference = np.linalg.norm(residual, axis=2)
     is_distant = np.linalg.norm((second - first)[..., :2], axis=2) > min_distance[:, None]
     is_ambiguous = is_distant & (charge_difference < INDISTINGUISHABLE_SIGMAS)
@@ -226,9 +244,9 @@ def find_ambiguous_pairs(
     separation = np.linalg.norm((second[:, :, None] - second[:, None])[..., :2], axis=3)  # shape (n, STARTS, STARTS)
     is_same = (separation < position_std[:, None, None]) & is_ambiguous[:, None]
     is_ambiguous &= ~np.tril(is_same, -1).any(axis=2)
-    columns = (first[is_ambiguous], second[is_ambiguous], charge_difference[is_ambiguous])
-    order = np.argsort(AmbiguousPairs(*columns).outer_radius, kind="stable")
-    return AmbiguousPairs(*(column[order] for column in columns))
+    pairs = AmbiguousPairs(first[is_ambiguous], second[is_ambiguous], charge_difference[is_ambiguous])
+    order = np.argsort(pairs.outer_radius, kind="stable")
+    return AmbiguousPairs(pairs.first[order], pairs.second[order], pairs.distance[order])
 
 
 DEFAULT_ERROR = 1.0
@@ -349,19 +367,23 @@ def working_area(
     n_rings = max(1, int(_round_down(search_radius, step) / step + 0.5))
     rings = Rings.spread(min(n_rings * step, search_radius), n_rings)
 
-    # Find the folds, and the last ring before the error first exceeds its limit. An error that is NaN exceeds it.
-    folds_of_forces, errors_of_forces = zip(
-        *(find_folds(charge_map, rings, force, noise) for force in forces), strict=True
-    )
+    # Find the folds, the largest error on each ring for each force, and the ambiguous pairs.
+    folds_of_forces = []
+    ring_errors = np.empty((n_force, n_rings))
+    for index, force in enumerate(forces):
+        folds_of_force, error_on_rings = find_folds(charge_map, rings, force, noise)
+        folds_of_forces.append(folds_of_force)
+        ring_errors[index] = error_on_rings.max(axis=1)
     folds = np.concatenate(folds_of_forces)
     fold_radius = float(np.hypot(*folds.T).min(initial=np.inf))
-    errors = np.max(errors_of_forces, axis=2)  # largest error on each ring for each force, shape (n_force, n_ring)
-    is_within_limit = (errors <= error).all(axis=0)
+    pairs = find_ambiguous_pairs(charge_map, noise, forces) if search_pairs else NO_PAIRS
+
+    # Find the last ring before the error first exceeds its limit. An error that is NaN exceeds it.
+    is_within_limit = (ring_errors <= error).all(axis=0)
     first_exceeding = is_within_limit.argmin()
     error_radius = search_radius
     if not is_within_limit.all():
         error_radius = float(np.append(0.0, rings.distance)[first_exceeding])
-    pairs = find_ambiguous_pairs(charge_map, noise, forces) if search_pairs else NO_PAIRS
 
     # The smallest of the following radii bounds the working area. The first of several equal radii is the bound: if the
     # error never exceeds its limit, `error_radius` is the radius of the search.
@@ -377,7 +399,7 @@ def working_area(
         bound=bound,
         fold_radius=fold_radius,
         error_radius=error_radius,
-        error_force=forces[errors[:, first_exceeding].argmax()],
+        error_force=forces[ring_errors[:, first_exceeding].argmax()],
         error=error,
         search_radius=search_radius,
         force_range=(min_force, max_force),
