@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from isocharge.common.arrays import Array, Integers
 from isocharge.simulate import NoiseModel, noise_model
 from isocharge.simulate.noise import GaussianNoise
-from isocharge.train.data.contact_errors import rounded
+from isocharge.train.data.contact_errors import rms, rounded
 
 NEIGHBOURS = 16
 """Number of contacts to which a quadratic function is fitted, which has ten coefficients."""
@@ -83,13 +83,12 @@ class ChannelNoise(GaussianNoise):
     def estimate(cls, charge: Array, unit_contact: Array) -> "ChannelNoise":
         """Estimate the noise of each channel from measured presses.
 
-        Rows that are copies of other rows are left out, because they contain no further noise. If every channel has
-        charges at `MIN_REPEATED_CONTACTS` or more repeated contacts, the residuals are the differences between the
-        repeated charges and their means. Differences of repeated charges contain only noise. Otherwise, the
-        residuals are the differences between the charges of a press and the values of a quadratic function, which is
-        fitted to the neighbours of the press. Differences from the function contain the noise and the error of the
-        quadratic approximation. The white noise and the noise of the gain are fitted to the residuals. Both kinds of
-        noise have lower limits.
+        Presses that are copies of other presses are left out, because they contain no further noise. If every channel
+        has charges at `MIN_REPEATED_CONTACTS` or more repeated contacts, the residuals are the differences between the
+        repeated charges and their means. Otherwise, the residuals are the differences between the charges of a press
+        and a quadratic function, which is fitted to the neighbours of the press. These differences also contain the
+        error of the quadratic approximation. The white noise and the noise of the gain are fitted to the residuals.
+        Both kinds of noise have lower limits.
 
         Args:
             charge: Measured charges, shape (n, n_electrode), pC.
@@ -98,21 +97,24 @@ class ChannelNoise(GaussianNoise):
         Returns:
             Noise model with the white noise and the noise of the gain of each channel.
         """
+        # Leave out copies, and compute charges without noise and the residuals, each of shape (m, n_electrode).
         different_rows = np.unique(np.column_stack([unit_contact, charge]), axis=0)
-        unit_contact, charge = np.split(different_rows, [3], axis=1)
-        size, residual = _repeated_residuals(unit_contact, charge)
+        contact = different_rows[:, :3]
+        noisy_charge = different_rows[:, 3:]
+        exact_charge, residual = _repeated_residuals(contact, noisy_charge)
         # A channel that is silent at repeated contacts does not show its noise there.
-        if np.count_nonzero(np.unique(size, axis=0), axis=0).min() < MIN_REPEATED_CONTACTS:
-            planes = LocalPlanes.fit(unit_contact, charge)
-            size = planes.value
+        if np.count_nonzero(np.unique(exact_charge, axis=0), axis=0).min() < MIN_REPEATED_CONTACTS:
+            planes = LocalPlanes.fit(contact, noisy_charge)
+            exact_charge = planes.value
             residual = planes.residual
-        white_std, gain_std = np.array(list(map(_fit_noise, size.T, residual.T))).T  # each of shape (n_electrode,)
+
+        # Fit the noise of each channel.
+        white_std, gain_std = np.transpose(list(map(_fit_noise, exact_charge.T, residual.T)))
         gain = np.maximum(gain_std, LEAST_GAIN)
         # The presses do not determine the white noise if all charges are large. The lower limit of the white noise is a
         # small fraction of the noise of the gain at the usual charge.
-        smallest_white = LEAST_SHARE * gain * usual_size(charge)
-        white = np.maximum(white_std, smallest_white)
-        return cls(white, gain)
+        smallest_white = LEAST_SHARE * gain * usual_size(noisy_charge)
+        return cls(np.maximum(white_std, smallest_white), gain)
 
     @classmethod
     def alike(cls, noise: NoiseModel) -> "ChannelNoise":
@@ -289,11 +291,12 @@ def _repeated_residuals(unit_contact: Array, charge: Array) -> tuple[Array, Arra
         contact is repeated. The residuals have the variance of the noise.
     """
     _, mean_charge, press_count, contact_of_press = _average_repeated(unit_contact, charge)
-    count = press_count[contact_of_press]
-    mean = mean_charge[contact_of_press]
-    is_repeated = count > 1
-    count = count[is_repeated, None]
-    return mean[is_repeated], (charge - mean)[is_repeated] * np.sqrt(count / (count - 1))
+    is_repeated = press_count[contact_of_press] > 1
+    repeated_contact = contact_of_press[is_repeated]
+    mean = mean_charge[repeated_contact]
+    count = press_count[repeated_contact, None]
+    # The variance of a difference from the mean of k charges is (k - 1) / k times that of the noise.
+    return mean, (charge[is_repeated] - mean) * np.sqrt(count / (count - 1))
 
 
 def usual_size(charge: Array) -> Array:
@@ -321,20 +324,23 @@ def _fit_noise(charge: Array, residual: Array) -> Array:
     Returns:
         The standard deviation of the white noise, pC, and the relative standard deviation of the gain.
     """
-    # Each unknown is divided by the value with which it alone explains the residuals, because charges may be very large
-    # or small.
+    # The unknowns are the logarithms of white and gain. Each of them is divided by the value with which it alone
+    # explains the residuals, because charges may be very large or small.
     is_silent = (charge == 0.0) & (residual == 0.0)
-    units = np.finfo(float).tiny + np.sqrt(np.mean(residual**2)) / [1.0, np.sqrt(np.mean(charge**2))]
+    smallest_number = np.finfo(float).tiny
+    units = smallest_number + rms(residual) / np.array([1.0, rms(charge)])
 
     def loss(log_std: Array) -> float:
         """Return the mean negative logarithm of the likelihood, without a constant."""
         white, gain = units * np.exp(log_std)
-        variance = np.maximum(white**2 + (gain * charge) ** 2, np.finfo(float).tiny)
+        variance = np.maximum(white**2 + (gain * charge) ** 2, smallest_number)
         square = residual**2 / variance  # in squared standard deviations
         tail = OUTLIER**2 * np.log(np.maximum(square / OUTLIER**2, 1.0))
-        return float(np.mean(np.where(is_silent, 0.0, np.log(variance) + np.minimum(square, OUTLIER**2) + tail)))
+        terms = np.log(variance) + np.minimum(square, OUTLIER**2) + tail
+        return float(np.mean(np.where(is_silent, 0.0, terms)))
 
-    return np.asarray(units * np.exp(minimize(loss, [-0.5, -0.5], method="Nelder-Mead").x))
+    solution = minimize(loss, [-0.5, -0.5], method="Nelder-Mead").x
+    return np.asarray(units * np.exp(solution))
 
 
 Noise = NoiseModel | ChannelNoise

@@ -147,8 +147,9 @@ def fit_film_series(
     names = electrodes * node_MPa.size
     is_validation = np.arange(len(contact)) % 10 == 0
     all_nodes = fit_charge_series(domain, names, presses[~is_validation], presses[is_validation])
-    coefficients = all_nodes.coefficients[0].reshape(*all_nodes.coefficients.shape[1:4], node_MPa.size, len(electrodes))
-    return replace(all_nodes, electrodes=electrodes, coefficients=np.moveaxis(coefficients, 3, 0), node_MPa=node_MPa)
+    joined = all_nodes.coefficients[0]
+    by_node = joined.reshape(*joined.shape[:3], node_MPa.size, len(electrodes))
+    return replace(all_nodes, electrodes=electrodes, coefficients=np.moveaxis(by_node, 3, 0), node_MPa=node_MPa)
 
 
 def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
@@ -182,10 +183,13 @@ def determined_degree(coordinate: Array, largest: int) -> int:
     # Smallest singular value of the matrix of the Chebyshev polynomials, divided by the root of n, with which a degree
     # counts as determined. For evenly distributed coordinates, it is above 0.3.
     smallest_singular_value = 0.1
-    terms = chebyshev.chebvander(coordinate, largest)
+    terms = chebyshev.chebvander(coordinate, largest)  # shape (n, largest + 1)
     moments = terms.T @ terms / len(coordinate)
-    smallest_eigenvalues = [np.linalg.eigvalsh(moments[:count, :count])[0] for count in range(1, largest + 2)]
-    return int(np.flatnonzero(np.array(smallest_eigenvalues) >= smallest_singular_value**2)[-1])
+    for degree in range(largest, 0, -1):
+        smallest_eigenvalue = np.linalg.eigvalsh(moments[: degree + 1, : degree + 1])[0]
+        if smallest_eigenvalue >= smallest_singular_value**2:
+            return degree
+    return 0
 
 
 def series_term_count(degree: int, force_degree: int) -> int:

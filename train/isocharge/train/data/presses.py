@@ -193,7 +193,8 @@ def merged_places(contact: Array, step_mm: float = PLACE_STEP_mm) -> Array:
     cells, cell_of_press = np.unique(np.round(position / grid_mm), axis=0, return_inverse=True)
     pairs = cKDTree(cells * grid_mm).query_pairs(step_mm, output_type="ndarray")
     steps = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(cells), len(cells)))
-    place_of_press = connected_components(steps, directed=False)[1][cell_of_press.ravel()]
+    _, place_of_cell = connected_components(steps, directed=False)
+    place_of_press = place_of_cell[cell_of_press.ravel()]
 
     def mean_of_place(values: Array) -> Array:
         """Return for each press the mean of the values, shape (n,), over all presses at its place."""
@@ -201,10 +202,11 @@ def merged_places(contact: Array, step_mm: float = PLACE_STEP_mm) -> Array:
         return np.asarray(mean[place_of_press])
 
     # Keep the original positions of places that are too large.
-    merged_position = np.column_stack([mean_of_place(coordinate) for coordinate in position.T])
-    mean_square = mean_of_place(((position - merged_position) ** 2).sum(axis=1))
-    is_place = mean_square <= step_mm**2
-    return np.column_stack([np.where(is_place[:, None], merged_position, position), contact[:, 2]])
+    mean_position = np.column_stack([mean_of_place(coordinate) for coordinate in position.T])
+    mean_squared_distance = mean_of_place(((position - mean_position) ** 2).sum(axis=1))
+    is_small = mean_squared_distance <= step_mm**2
+    merged_position = np.where(is_small[:, None], mean_position, position)
+    return np.column_stack([merged_position, contact[:, 2]])
 
 
 def position_ranks(contact: Array) -> Array:

@@ -143,8 +143,12 @@ def _measure_detection(
 
     def detected_fraction(*wrong_gains: float) -> float:
         """Return the share of alarms over all presses, electrodes and gains, with one wrong electrode at a time."""
-        is_faulty = np.eye(noisy_charge.shape[1], dtype=bool)  # one electrode in each row
-        faulty_charges = [noisy_charge * gains for gain in wrong_gains for gains in np.where(is_faulty, gain, 1.0)]
+        faulty_charges = []
+        for gain in wrong_gains:
+            for electrode in range(noisy_charge.shape[1]):
+                faulty_charge = noisy_charge.copy()
+                faulty_charge[:, electrode] *= gain
+                faulty_charges.append(faulty_charge)
         _, _, misfit = predict(np.concatenate(faulty_charges))
         return rounded(np.mean(misfit > threshold))
 

@@ -113,14 +113,17 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     # first. In a hidden layer, it is the first row of the next layer with a weight for the misfit perceptron.
     misfit_starts = [ANGLES.stop]
     for weight, _ in (last, *hidden[:0:-1]):
-        misfit_starts.insert(0, int(weight[:, misfit_starts[0] :].any(axis=1).argmax()))
+        has_misfit_weight = weight[:, misfit_starts[0] :].any(axis=1)
+        misfit_starts.insert(0, int(has_misfit_weight.argmax()))
 
     def perceptron(columns: list[slice]) -> Perceptron:
         """Return the perceptron to which the given columns of each layer belong, from the first layer to the last."""
-        rows = [slice(None), *columns]  # all inputs in the first layer, and then the columns of the previous layer
-        parts = zip((*hidden, last), rows, columns, strict=False)
-        *hidden_parts, last_part = (Layer(weight[row, column], bias[column]) for (weight, bias), row, column in parts)
-        return Perceptron(tuple(hidden_parts), last_part, skip[:, columns[-1]])
+        rows = [slice(None), *columns[:-1]]  # all inputs in the first layer, and then the columns of the previous layer
+        layers = [
+            Layer(weight[layer_rows, layer_columns], bias[layer_columns])
+            for (weight, bias), layer_rows, layer_columns in zip((*hidden, last), rows, columns, strict=True)
+        ]
+        return Perceptron(tuple(layers[:-1]), layers[-1], skip[:, columns[-1]])
 
     contact = perceptron([slice(start) for start in misfit_starts])
     misfit = perceptron([slice(start, None) for start in misfit_starts])

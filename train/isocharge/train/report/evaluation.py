@@ -86,9 +86,12 @@ class Method:
         Args:
             charge: Charges of the presses, shape (n, n_electrode), pC.
         """
-        call_for = self.single_call or (lambda press_charge: partial(self.estimate, press_charge[None]))
-        calls = cycle([call_for(press_charge) for press_charge in charge])
-        return lambda: next(calls)()
+        if self.single_call is not None:
+            calls = [self.single_call(press_charge) for press_charge in charge]
+        else:
+            calls = [partial(self.estimate, press_charge[None]) for press_charge in charge]
+        calls_in_turn = cycle(calls)
+        return lambda: next(calls_in_turn)()
 
 
 def triangulation(task: FittingTask) -> Method:

@@ -14,6 +14,7 @@ training step, random noise with half of the estimated size is added to the char
 
 import logging
 from dataclasses import replace
+from functools import partial
 from statistics import NormalDist
 
 import numpy as np
@@ -126,12 +127,10 @@ def fit_presses(
     level = noise.level(labelled.charge)  # charges on a scale on which the noise has the standard deviation 1
     with threads_and_seed(training.threads, training.seed):
         features = signed_features(labelled.charge, noise.transition_charge(labelled.charge))
-        # The first network is returned. This network learns from the other networks, which are those of the
-        # cross-validation.
-        network, *fold_networks = (
-            InverseNetwork(domain, features, labelled.charge, settings.network, force_std)
-            for _ in range(1 + HELD_PARTS)
-        )
+        # The first network is returned. It learns from the networks of the cross-validation.
+        create_network = partial(InverseNetwork, domain, features, labelled.charge, settings.network, force_std)
+        network = create_network()
+        fold_networks = [create_network() for _ in range(HELD_PARTS)]
         fold_of_press = (HELD_PARTS * position_ranks(uncertain_places(usable))).astype(int)
         _train_fold_networks(fold_networks, labelled, fold_of_press, noise, training)
         contact, std, misfit = _cross_validated_answers(

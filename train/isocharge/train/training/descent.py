@@ -66,12 +66,14 @@ class Soap:
         Args:
             rate: Learning rate, which is approximately the change of each entry.
         """
+        # Update the moving averages, and at times the eigenbases.
         gradient = self.parameter.grad
         assert gradient is not None
         new_weight = 1.0 - DECAY
         if self.moments:
-            for moment, product in zip(self.moments, (gradient @ gradient.T, gradient.T @ gradient), strict=True):
-                moment.lerp_(product, new_weight)
+            row_moment, column_moment = self.moments
+            row_moment.lerp_(gradient @ gradient.T, new_weight)
+            column_moment.lerp_(gradient.T @ gradient, new_weight)
             if self.step_count % BASIS_PERIOD == 0:
                 pairs = zip(self.moments, self.bases, strict=True)
                 self.bases = [torch.linalg.qr(moment @ basis).Q for moment, basis in pairs]
@@ -85,7 +87,8 @@ class Soap:
         root_mean_square = torch.sqrt(self.mean_square / total_weight) + torch.finfo(gradient.dtype).tiny  # never zero
         ratio = _rotate(self.mean_gradient, self.bases) / (total_weight * root_mean_square)
         ratio.clamp_(-1.0, 1.0)
-        self.parameter.add_(_rotate(ratio, [basis.T for basis in self.bases]), alpha=-rate)
+        direction = _rotate(ratio, [basis.T for basis in self.bases])
+        self.parameter.add_(direction, alpha=-rate)
 
 
 def _rotate(matrix: Tensor, bases: Sequence[Tensor]) -> Tensor:
@@ -149,7 +152,7 @@ class TrainingStage:
         largest_rate = self.rate
         losses: list[float] = []  # since the latest report
         smallest_mean_loss = math.inf
-        checkpoints: deque[list[Tensor]] = deque(maxlen=2)
+        checkpoints: deque[list[Tensor]] = deque(maxlen=2)  # weights at the latest two reports
         for step in range(self.steps):
             loss = self.loss(random)
             losses.append(loss.item())
@@ -160,20 +163,23 @@ class TrainingStage:
                 )
             self.network.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
+            rate = largest_rate * relative_rate(step / self.steps)
             for optimiser in optimisers:
-                optimiser.step(largest_rate * relative_rate(step / self.steps))
+                optimiser.step(rate)
+            if len(losses) < REPORT_EVERY and step + 1 < self.steps:
+                continue
 
-            if len(losses) == REPORT_EVERY or step + 1 == self.steps:
-                mean_loss = math.fsum(losses) / len(losses)
-                losses = []
-                report(f"training the {self.name} network", step + 1, self.steps, f"loss {mean_loss:.3f}")
-                if mean_loss > smallest_mean_loss + MAX_LOSS_INCREASE:
-                    largest_rate *= 0.5
-                    for parameter, earlier in zip(parameters, checkpoints[0], strict=True):
-                        parameter.data.copy_(earlier)
-                else:
-                    smallest_mean_loss = min(smallest_mean_loss, mean_loss)
-                    checkpoints.append([parameter.detach().clone() for parameter in parameters])
+            # Report the mean loss, and return to earlier weights if it has increased too much.
+            mean_loss = math.fsum(losses) / len(losses)
+            losses = []
+            report(f"training the {self.name} network", step + 1, self.steps, f"loss {mean_loss:.3f}")
+            if mean_loss > smallest_mean_loss + MAX_LOSS_INCREASE:
+                largest_rate *= 0.5
+                for parameter, earlier_weights in zip(parameters, checkpoints[0], strict=True):
+                    parameter.data.copy_(earlier_weights)
+            else:
+                smallest_mean_loss = min(smallest_mean_loss, mean_loss)
+                checkpoints.append([parameter.detach().clone() for parameter in parameters])
 
 
 def relative_rate(progress: float) -> float:

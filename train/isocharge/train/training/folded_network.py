@@ -293,15 +293,14 @@ def _add_features(builder: GraphBuilder, features: ChargeFeatures) -> str:
     Returns:
         Name of the tensor with the features.
     """
-    is_signed = features.mean is not None
-    low, high = builder.constant(features.low_pC), builder.constant(features.high_pC)
-    if is_signed:
-        clipped = builder.add("Min", builder.add("Max", INPUT, low), high)
-    else:
+    low = builder.constant(features.low_pC)
+    high = builder.constant(features.high_pC)
+    factor = 1.0 / features.typical_pC
+    if features.mean is None:  # all charges are positive
         clipped = builder.add("Clip", INPUT, low, high)
-    ratio = builder.add("Mul", clipped, builder.constant(1.0 / features.typical_pC))
-    if not is_signed:
-        return builder.add("Log", ratio)
+        return builder.add("Log", builder.add("Mul", clipped, builder.constant(factor)))
+    clipped = builder.add("Min", builder.add("Max", INPUT, low), high)
+    ratio = builder.add("Mul", clipped, builder.constant(factor))
     return builder.add("Sub", builder.add("Asinh", ratio), builder.constant(features.mean))
 
 
@@ -323,14 +322,16 @@ def _add_perceptrons(builder: GraphBuilder, inputs: str, perceptrons: Sequence[P
     hidden_outputs = inputs
     for layers in zip(*(perceptron.hidden for perceptron in perceptrons), strict=True):
         weights, biases = zip(*layers, strict=True)
-        joined_weights = np.hstack(weights) if hidden_outputs is inputs else block_diag(*weights)
-        constants = (builder.constant(joined_weights), builder.constant(np.concatenate(biases)))
-        linear = builder.add("Gemm", hidden_outputs, *constants)
-        hidden_outputs = builder.add("Tanh", linear)
+        is_first = hidden_outputs is inputs
+        joined_weight = builder.constant(np.hstack(weights) if is_first else block_diag(*weights))
+        joined_bias = builder.constant(np.concatenate(biases))
+        hidden_outputs = builder.add("Tanh", builder.add("Gemm", hidden_outputs, joined_weight, joined_bias))
+
+    # The last layer has the output of the skip layer as its bias, which contains the bias of the last layer.
     skip = builder.constant(np.hstack([perceptron.skip for perceptron in perceptrons]))
-    weights, biases = zip(*(perceptron.last for perceptron in perceptrons), strict=True)
-    skip_and_bias = builder.add("Gemm", inputs, skip, builder.constant(np.concatenate(biases)))
-    return builder.add("Gemm", hidden_outputs, builder.constant(block_diag(*weights)), skip_and_bias)
+    last_weights, last_biases = zip(*(perceptron.last for perceptron in perceptrons), strict=True)
+    skip_and_bias = builder.add("Gemm", inputs, skip, builder.constant(np.concatenate(last_biases)))
+    return builder.add("Gemm", hidden_outputs, builder.constant(block_diag(*last_weights)), skip_and_bias)
 
 
 def fold(perceptron: Perceptron, mean: Array, matrix: Array, answer_map: Layer) -> Perceptron:
@@ -349,17 +350,15 @@ def fold(perceptron: Perceptron, mean: Array, matrix: Array, answer_map: Layer) 
     Returns:
         Perceptron that computes the answers from the features.
     """
-    first, *later = perceptron.hidden
     # ((features - mean) @ matrix) @ weight + bias  =  features @ (matrix @ weight) + (bias - mean @ matrix @ weight)
+    first, *later = perceptron.hidden
     first_weight = matrix @ first.weight
+    first_bias = first.bias - mean @ first_weight
     skip = matrix @ perceptron.skip @ answer_map.weight
+    last_weight = perceptron.last.weight @ answer_map.weight
     # The skip layer has no bias. The term - mean @ skip is therefore added to the bias of the last layer.
     last_bias = perceptron.last.bias @ answer_map.weight + answer_map.bias - mean @ skip
-    return Perceptron(
-        hidden=(Layer(first_weight, first.bias - mean @ first_weight), *later),
-        last=Layer(perceptron.last.weight @ answer_map.weight, last_bias),
-        skip=skip,
-    )
+    return Perceptron((Layer(first_weight, first_bias), *later), Layer(last_weight, last_bias), skip)
 
 
 TURN = slice(6, 9)

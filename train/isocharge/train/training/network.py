@@ -230,10 +230,11 @@ class InverseNetwork(nn.Module):
         if force_std is not None:
             self.output_factor[FORCE_OUTPUTS] = 0.0
             self.output_offset[LOG_STD.stop - 1] = np.log(force_std / domain.scale[2])
-        values = feature_values(features, torch.tensor(charge, dtype=torch.float64))
-        mean = values.mean(dim=0)
+
         # The rows of `axes` are the principal axes. The standard deviation of the values along an axis is its singular
         # value divided by the square root of the number of values.
+        values = feature_values(features, torch.tensor(charge, dtype=torch.float64))
+        mean = values.mean(dim=0)
         _, singular_values, axes = torch.linalg.svd(values - mean, full_matrices=False)
         inverse_std = len(values) ** 0.5 / singular_values.clamp(min=torch.finfo(values.dtype).eps)
         self.features_mean = nn.Buffer(mean.float())
@@ -264,8 +265,9 @@ def feature_values(features: ChargeFeatures, charge: Tensor) -> Tensor:
         return torch.tensor(values, dtype=charge.dtype)
 
     ratio = charge.clamp(constant(features.low_pC), constant(features.high_pC)) / constant(features.typical_pC)
-    # Logarithmic features, which have no mean, are for presses whose charges are all positive.
-    return torch.log(ratio) if features.mean is None else torch.asinh(ratio) - constant(features.mean)
+    if features.mean is None:  # all charges are positive
+        return torch.log(ratio)
+    return torch.asinh(ratio) - constant(features.mean)
 
 
 def compress_length(residual: Tensor) -> Tensor:

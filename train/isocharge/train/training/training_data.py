@@ -194,17 +194,16 @@ class Split:
         """
         # Fit the field, and determine the domain without folds.
         presses = data.presses
-        whole_field = data.field or fit_charge_series(
-            data.domain, data.sensor.electrode_names, *split_by_position(presses, training.hold_out)
-        )
+        train, test = split_by_position(presses, training.hold_out)
+        whole_field = data.field or fit_charge_series(data.domain, data.sensor.electrode_names, train, test)
         domain, cautions = invertible_domain(whole_field, presses, misfit_noise(training.noise_model))
-        is_folded = domain != data.domain  # `invertible_domain` reduces the domain only if the map folds
-        used_presses = presses.within(domain.radius) if is_folded else presses
+        if domain == data.domain:
+            return cls(domain, train, test, whole_field, cautions, folded_charges=None)
 
-        train, test = split_by_position(used_presses, training.hold_out)
-        field = within(whole_field, domain.radius) if is_folded else whole_field
-        folded_charges = replace(whole_field, is_folded=True) if is_folded else None
-        return cls(domain, train, test, field, cautions, folded_charges)
+        # The map folds. Use only the presses within the smaller domain.
+        train, test = split_by_position(presses.within(domain.radius), training.hold_out)
+        field = within(whole_field, domain.radius)
+        return cls(domain, train, test, field, cautions, folded_charges=replace(whole_field, is_folded=True))
 
     def features(self, noise: NoiseModel) -> ChargeFeatures:
         """Choose the features of the charges for the training presses.
