@@ -69,12 +69,12 @@ def draw_layout(sensor: Sensor) -> Drawing:
         rightmost_corner = max(electrode.corners)  # tuples (x, y) are compared by x first
         space.add_text(name, dxfattribs={"layer": "NAMES"}).set_placement(rightmost_corner)
 
-    # Draw the metal of the back, unless it covers the whole film. Electrodes may share it, so equal polygons are drawn
-    # only once. An electrode for which no metal is described collects the charge of its whole area.
-    has_pads = any(electrode.back for electrode in sensor.electrodes)
-    back = [polygon for electrode in sensor.electrodes for polygon in electrode.back or electrode.front]
-    for polygon in dict.fromkeys(back if has_pads else ()):
-        space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "BACK"})
+    # Draw the metal of the back, unless it covers the whole film. If only some electrodes have their own metal on the
+    # back, the other electrodes need metal of their own shape. Electrodes may share a polygon, which is drawn once.
+    if any(electrode.back for electrode in sensor.electrodes):
+        back = [polygon for electrode in sensor.electrodes for polygon in electrode.back or electrode.front]
+        for polygon in dict.fromkeys(back):
+            space.add_lwpolyline(polygon, close=True, dxfattribs={"layer": "BACK"})
     return document
 
 

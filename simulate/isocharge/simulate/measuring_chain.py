@@ -149,7 +149,7 @@ class Measurement:
         self.gain = 1.0 + amplifier.gain_mismatch * rng.standard_normal(electrodes)
         self.bias = amplifier.bias * rng.choice([-1.0, 1.0], electrodes)
         self.offset = amplifier.offset * rng.standard_normal(electrodes)
-        self.hum_phase = rng.uniform(0.0, 2.0 * np.pi, electrodes)
+        self.hum_phase = rng.uniform(0.0, math.tau, electrodes)
 
         # Without a mismatch of the pyroelectric charges, no random numbers are drawn for them.
         self.pyro_charge_per_K = np.full(electrodes, amplifier.pyro)
@@ -198,7 +198,7 @@ class Measurement:
 
         # Output of the amplifiers, and disturbances of the output
         output = self._integrate(film_charge) + self.offset
-        hum_angle = 2.0 * np.pi * self.amplifier.hum_frequency * time[:, np.newaxis] + self.hum_phase
+        hum_angle = math.tau * self.amplifier.hum_frequency * time[:, np.newaxis] + self.hum_phase
         output_with_hum = output + self.amplifier.hum * np.sin(hum_angle)
         noisy_output = self.amplifier.noise.add(output_with_hum, self.rng)
         return self._convert(noisy_output)

@@ -179,7 +179,7 @@ class Sweep:
         # A Sobol sequence is balanced if the number of points is a power of two. Draw the next larger power of two, and
         # use the first `count` points. A probe may have no presses if there are more probes than presses.
         rng = np.random.default_rng([self.seed, *stream])
-        log2_count = int(np.ceil(np.log2(max(count, 2))))
+        log2_count = math.ceil(math.log2(max(count, 2)))
         points = scipy.stats.qmc.Sobol(4, rng=rng).random_base2(log2_count)[:count]
         distance_fraction, angle_fraction, force_fraction, turn_fraction = points.T
 

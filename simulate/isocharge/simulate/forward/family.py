@@ -161,8 +161,8 @@ class Family:
         is_oriented = orientation == "fixed" and not film.is_axisymmetric and not probe.is_axisymmetric
         if is_oriented:
             # The period of the film is half a turn, and the period of film and probe together is a multiple of both.
-            symmetry_order = round(2.0 * np.pi / period)
-            period = 2.0 * np.pi / math.gcd(symmetry_order, 2)
+            symmetry_order = round(math.tau / period)
+            period = math.tau / math.gcd(symmetry_order, 2)
         has_directions = not film.is_axisymmetric and not is_oriented
         turns = Turns.spread(count.largest_harmonics, period, has_directions=has_directions)
         return cls(domain, film.radius, distance, force, turns, is_oriented)
@@ -280,7 +280,7 @@ class Family:
         solved_period = solved.reshape(*solved.shape[:-1], mesh.n_element, -1, 3)
         stress_of_periods = []
         for period_index in range(symmetry_order):
-            angle = 2.0 * np.pi * period_index / symmetry_order
+            angle = math.tau * period_index / symmetry_order
             rotated_elements = mesh.rotated_elements(period_index, symmetry_order)
             reordered_stress = solved_period[..., rotated_elements, :, :]
             # The stress itself does not change, but its components refer to a frame that was rotated by `angle`.
@@ -391,7 +391,7 @@ def family_mesh(film: Film, probe: Probe, domain: Domain, settings: SolveSetting
         Fineness of the mesh, and total width of the thin rings at the rim, in film radii.
     """
     min_force, max_force = domain.force_range
-    middle_force = float(np.sqrt(min_force * max_force))
+    middle_force = math.sqrt(min_force * max_force)
     layer = layer_for(film, middle_force) if settings.layer == "auto" else settings.layer
     # The smallest force needs the finest mesh if the pretension is uneven, or if the footprint is smallest then.
     force = middle_force if film.is_axisymmetric and not probe.grows else min_force

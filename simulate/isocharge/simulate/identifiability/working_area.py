@@ -19,6 +19,7 @@ Even without folds, two distant contacts may have the same charges. The search f
 the map.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -359,7 +360,7 @@ def working_area(
     noise.check_white()
     search_radius = charge_map.domain.radius
     min_force, max_force = charge_map.domain.force_range
-    n_force = 1 + int(np.ceil(2.0 * np.log(max_force / min_force)))
+    n_force = 1 + math.ceil(2.0 * math.log(max_force / min_force))
     forces = np.geomspace(min_force, max_force, n_force).tolist()
 
     # The distances of the rings are multiples of the step to which the radius of the working area is rounded.

@@ -10,6 +10,7 @@ electrode, between these presses. The best layouts are therefore improved furthe
 of the worst of many presses, and the worst presses are then selected again.
 """
 
+import math
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -101,15 +102,15 @@ def _layouts_within(radius: float, case: DesignCase) -> list[Array]:
     Random points are added to each layout if they satisfy the distance rules. The list of the layouts is empty if one
     layout remains incomplete.
     """
-    grid = radius * sunflower(1000)
-    grid = grid[case.clearance(grid) >= 0.0]
+    points = radius * sunflower(1000)
+    allowed_points = points[case.clearance(points) >= 0.0]
     rng = np.random.default_rng(case.seed)
     layouts = []
     for _ in range(STARTS):
-        positions = grid[:0]
-        for candidate in grid[rng.permutation(len(grid))]:
-            if len(positions) < case.new_count and (case.pair_clearance(positions, candidate[None]) >= 0.0).all():
-                positions = np.vstack([positions, candidate])
+        positions = np.empty((0, 2))
+        for point in rng.permutation(allowed_points):
+            if len(positions) < case.new_count and (case.pair_clearance(positions, point[None]) >= 0.0).all():
+                positions = np.vstack([positions, point])
         if len(positions) < case.new_count:
             return []
         layouts.append(positions)
@@ -171,19 +172,19 @@ class Search:
         Args:
             layout: Layout for which the power mean of the errors of a few presses is small.
         """
-        positions = layout.positions
-        smallest_errors = self.errors(positions)
+        best_positions = layout.positions
+        best_errors = self.errors(best_positions)
         if self.case.goal != "worst":
-            return Layout(positions, float(np.sqrt(np.mean(smallest_errors**2))))
+            return Layout(best_positions, math.sqrt(np.mean(best_errors**2)))
         for round_number in range(1, ROUNDS + 1):
-            largest = np.argsort(-smallest_errors)[: len(self.case.search_presses)]
+            largest = np.argsort(-best_errors)[: len(self.case.search_presses)]
             presses = np.concatenate([self.case.search_presses, self.case.fine_presses[largest]])
-            changed = self.minimise(presses, positions, POWER * 2.0**round_number).positions
-            errors = self.errors(changed)
-            if errors.max() < smallest_errors.max():
-                positions = changed
-                smallest_errors = errors
-        return Layout(positions, float(smallest_errors.max()))
+            positions = self.minimise(presses, best_positions, POWER * 2.0**round_number).positions
+            errors = self.errors(positions)
+            if errors.max() < best_errors.max():
+                best_positions = positions
+                best_errors = errors
+        return Layout(best_positions, float(best_errors.max()))
 
     def minimise(self, presses: Array, start: Array, power: float) -> Layout:
         """Minimise a power mean of the position errors of presses.
@@ -214,15 +215,17 @@ class Search:
 
         def objective(coordinates: Array) -> tuple[float, Array]:
             """Return the logarithm of the power mean, and its derivatives with respect to x1, y1, x2, y2, ..."""
-            # If one square moves, only the rows of this square change.
             positions = coordinates.reshape(-1, 2)
-            moved_positions = (positions[:, None] + DIFFERENCE_STEP * np.eye(2)).reshape(-1, 2)
             rows = square_rows(positions)
             value = log_mean(rows)
+
+            # Move each square along x and along y. Only the rows of this square change.
+            moved_positions = (positions[:, None] + DIFFERENCE_STEP * np.eye(2)).reshape(-1, 2)
+            moved_rows = square_rows(moved_positions)
             gradient = np.empty(coordinates.size)
-            for index, moved_rows in enumerate(square_rows(moved_positions).swapaxes(0, 1)):  # one coordinate moves
+            for index in range(coordinates.size):
                 changed_rows = rows.copy()
-                changed_rows[:, index // 2] = moved_rows
+                changed_rows[:, index // 2] = moved_rows[:, index]
                 gradient[index] = (log_mean(changed_rows) - value) / DIFFERENCE_STEP
             return value, gradient
 
@@ -236,8 +239,8 @@ class Search:
         )
         positions = solution.x.reshape(-1, 2)
         if self.case.all_clearances(positions).min() < -CLEARANCE_TOLERANCE:
-            return Layout(start, float(np.exp(objective(start.ravel())[0])))
-        return Layout(positions, float(np.exp(solution.fun)))
+            return Layout(start, math.exp(objective(start.ravel())[0]))
+        return Layout(positions, math.exp(solution.fun))
 
 
 DECIMALS = 3
@@ -277,7 +280,7 @@ class ErrorMap:
         """
         return {
             "worst_mm": float(errors.max()),
-            "rms_mm": float(np.sqrt(np.mean(errors**2))),
+            "rms_mm": math.sqrt(np.mean(errors**2)),
             "worst_at_mm": self.presses[np.argmax(errors)].round(DECIMALS).tolist(),
         }
 

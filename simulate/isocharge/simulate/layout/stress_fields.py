@@ -116,7 +116,8 @@ def electrode_rows(pressed: PressedFilm, electrodes: Sequence[Electrode]) -> Arr
     # Rotate the derivatives along and across the direction of each press into derivatives with respect to x and y.
     x_column = COLUMNS.index("x")
     y_column = COLUMNS.index("y")
-    derivative = (rows[..., x_column] + 1j * rows[..., y_column]) * np.exp(1j * np.angle(pressed.position))[:, None]
+    rotation = np.exp(1j * np.angle(pressed.position))[:, None]
+    derivative = (rows[..., x_column] + 1j * rows[..., y_column]) * rotation
     rows[..., x_column] = derivative.real
     rows[..., y_column] = derivative.imag
     return rows
@@ -137,24 +138,26 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
         shape (n_element, n_local, 6, 3).
     """
     stress = _stress_in_film_axes(solved, surface)
+    distance, _ = solved.at
     radius = solved.probe.reach
     steps = np.multiply(STEPS, [radius, radius, 1.0, radius, 1.0])
     columns = [stress]
     for column, step, changes in zip(COLUMNS[1:], steps, np.diag(steps), strict=True):
-        later = _changed_press(solved, changes)
-        if column == "pretension":  # the pretension may be zero and must not become negative
-            columns.append((_stress_in_film_axes(later, surface) - stress) / step)
+        increased = _changed_press(solved, changes)
+        if column == "pretension":  # a one-sided difference, because the pretension may be zero
+            columns.append((_stress_in_film_axes(increased, surface) - stress) / step)
             continue
-        earlier = _changed_press(solved, -changes)
-        distance, _ = solved.at
-        # Near the centre, the direction of the press changes by a large angle, and the mesh turns with it.
-        turned_distance = {"x": 1.0, "y": 10.0}.get(column, 0.0) * step
-        if distance < turned_distance:
-            change = _change_at_fixed_points(solved, earlier, later, surface)
+
+        # Near the centre, the direction of the press changes by a large angle, and the mesh turns with it. Therefore
+        # both stresses are read at the nodes of the original mesh.
+        decreased = _changed_press(solved, -changes)
+        smallest_distance = {"x": 1.0, "y": 10.0}.get(column, 0.0) * step
+        if distance < smallest_distance:
+            change = _change_at_fixed_points(solved, decreased, increased, surface)
         else:
             # The nodes move with the press. Subtract the change of the stress that their movement causes.
-            node_shift = _nodes_in_film_axes(later) - _nodes_in_film_axes(earlier)
-            change_at_nodes = _stress_in_film_axes(later, surface) - _stress_in_film_axes(earlier, surface)
+            node_shift = _nodes_in_film_axes(increased) - _nodes_in_film_axes(decreased)
+            change_at_nodes = _stress_in_film_axes(increased, surface) - _stress_in_film_axes(decreased, surface)
             change = change_at_nodes - change_by_node_shift(solved.mesh, stress, node_shift)
         columns.append(change / (2.0 * step))
     return np.stack(columns, axis=2) / (solved.film.young * solved.groups.squared_amplitude)
@@ -191,13 +194,13 @@ def _nodes_in_film_axes(solved: Equilibrium) -> Complexes:
     return np.asarray(solved.mesh.points * np.exp(1j * solved.direction))
 
 
-def _change_at_fixed_points(solved: Equilibrium, earlier: Equilibrium, later: Equilibrium, surface: Surface) -> Array:
-    """Return the difference of the stresses of two presses at the nodes of a third press.
+def _change_at_fixed_points(solved: Equilibrium, first: Equilibrium, second: Equilibrium, surface: Surface) -> Array:
+    """Return the stress of the second press minus the stress of the first press at the nodes of a third press.
 
     Args:
         solved: Press whose nodes are the points at which both stresses are read.
-        earlier: Press whose stress is subtracted.
-        later: Press from whose stress it is subtracted.
+        first: Press whose stress is subtracted.
+        second: Press from whose stress it is subtracted.
         surface: Surface at which the stress is read.
 
     Returns:
@@ -205,5 +208,5 @@ def _change_at_fixed_points(solved: Equilibrium, earlier: Equilibrium, later: Eq
     """
     points = solved.film.radius * (1.0 - 1e-12) * solved.mesh.points  # on the film despite rounding errors
     corners = to_corners(points.ravel())
-    difference = touch_stress(later, corners, surface) - touch_stress(earlier, corners, surface)
+    difference = touch_stress(second, corners, surface) - touch_stress(first, corners, surface)
     return difference.reshape(*points.shape, 3)

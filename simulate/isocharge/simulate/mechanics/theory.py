@@ -23,6 +23,7 @@ bending (`error_estimate.modelling_error`), and the amplitude determines whether
 Saint-Venant-Kirchhoff elasticity (`load_case.check_press`).
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -267,7 +268,7 @@ class DimensionlessGroups:
         The load is the force of the probe plus the magnitude of the force of the static pressure.
         """
         load = self.load + np.pi * abs(self.static_pressure)
-        return float(np.cbrt(load)) ** 2
+        return math.cbrt(load) ** 2
 
     @property
     def height(self) -> float:
@@ -293,8 +294,8 @@ class DimensionlessGroups:
         air_stiffness = 0.5 * np.pi * self.ambient_pressure * self.compression
         linear_factor = 4.0 * max(self.tension, 0.0) + 64.0 * self.bending + air_stiffness
         cubic_factor = 1.0 / 0.662**3
-        height = float(_root(linear_factor / cubic_factor, abs(self.static_pressure) / cubic_factor))
-        return float(np.copysign(height, self.static_pressure))
+        height = _root(linear_factor / cubic_factor, abs(self.static_pressure) / cubic_factor)
+        return math.copysign(height, self.static_pressure)
 
 
 def side_force_unit(film: Film, squared_amplitude: Array | float) -> Any:
@@ -368,7 +369,7 @@ def bending_length(film: Film, force: float) -> float:
     """
     groups = DimensionlessGroups.of(film, force, bending=True)
     tension = max(groups.tension, 0.0) + INDUCED_STRAIN * groups.height**2
-    return float(np.sqrt(groups.bending / tension))
+    return math.sqrt(groups.bending / tension)
 
 
 def theory_by_name(name: str) -> Theory:

@@ -14,6 +14,7 @@ the map converts the circle |z| = r0 into the circle with the radius R and the c
 of the mesh.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -202,7 +203,7 @@ def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) ->
     """
     # Directions of the inner points, and evenly spaced directions with the same mean, each of shape (..., n_point)
     inner_angle = np.unwrap(np.angle(inner_points))
-    angle_from_first = np.linspace(0.0, 2.0 * np.pi / blocks.copies, inner_angle.shape[-1])
+    angle_from_first = np.linspace(0.0, math.tau / blocks.copies, inner_angle.shape[-1])
     first_even_angle = np.mean((inner_angle - angle_from_first)[..., :-1], axis=-1, keepdims=True)
     even_angle = first_even_angle + angle_from_first
 
@@ -275,7 +276,7 @@ def stretch_angles(angle: Array, factor: Array) -> Array:
     Returns:
         Changed angles, shape (..., n), rad. Each angle remains in the same full turn.
     """
-    full_turns = 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
+    full_turns = math.tau * np.round(angle / math.tau)
     half_angle = 0.5 * (angle - full_turns)
     return full_turns + 2.0 * np.arctan(factor[..., None] * np.tan(half_angle))
 

@@ -4,6 +4,7 @@ The mesh consists of a template and the position of the template on the film. Th
 computed when they are needed first.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import NamedTuple
@@ -88,7 +89,7 @@ class PlacedMesh:
         The shape is (n_element, n_local, n_local).
         """
         weights = np.repeat(self.weights, 2, axis=1)[..., None]  # for both derivatives at each quadrature point
-        return np.asarray(self.stacked_gradient.transpose(0, 2, 1) @ (weights * self.stacked_gradient))
+        return self.stacked_gradient.transpose(0, 2, 1) @ (weights * self.stacked_gradient)
 
     @cached_property
     def mass(self) -> Array:
@@ -153,7 +154,7 @@ class PlacedMesh:
             return np.inf
         film_area = np.pi * (1.0 + 0.5 * abs(self.placement.oval) ** 2)  # in squared film radii
         mesh_area = self.template.copies * self.weights.sum()
-        return float(np.sqrt(abs(mesh_area / film_area - 1.0)))
+        return math.sqrt(abs(mesh_area / film_area - 1.0))
 
     def gradient(self, element: Integers, xi: Array, eta: Array) -> Array:
         """Compute the derivatives of the basis functions with respect to (X1, X2) at given points of elements.
@@ -216,7 +217,7 @@ def place(
 
     # Rotate the press, the probe and the axis of an oval film such that the press lies on the positive x axis.
     x, y = at
-    direction = float(np.arctan2(y, x))
+    direction = math.atan2(y, x)
     distance = np.array(np.hypot(x, y))
     oval = film_oval(film, direction)
     placement = Placement.of(template, probe.rotated(-direction), distance, film.radius, layer, oval=oval)
@@ -253,7 +254,7 @@ class _ElementRule(NamedTuple):
             points: Film points x + iy of the nodes of every element, shape (n_element, n_local), in film radii.
         """
         z_xi, z_eta = _point_derivatives(self.derivatives, points)
-        return np.asarray(cross_product(z_xi, z_eta) * self.weights)
+        return cross_product(z_xi, z_eta) * self.weights
 
 
 @lru_cache(maxsize=16)

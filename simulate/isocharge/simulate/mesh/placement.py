@@ -100,7 +100,7 @@ class Placement:
 
         def on_film(footprint_points: Complexes) -> Complexes:
             """Convert points relative to the centroid, mm, into points of the circular film, in film radii."""
-            return np.asarray(centroid[..., None] + rotation_and_scale[..., None] * footprint_points)
+            return centroid[..., None] + rotation_and_scale[..., None] * footprint_points
 
         corners = np.concatenate([on_film(probe.core()), centroid[..., None]], axis=-1)
 

@@ -230,13 +230,7 @@ def _inner_corners(placement: Placement, blocks: Blocks) -> Complexes:
     return np.concatenate(sides, axis=1).reshape(n_placement, blocks.n_inner, 4)
 
 
-def _local_coordinates(
-    placement: Placement,
-    blocks: Blocks,
-    points: Complexes,
-    element: Integers,
-    difference_step: float = 1e-5,
-) -> Array:
+def _local_coordinates(placement: Placement, blocks: Blocks, points: Complexes, element: Integers) -> Array:
     """Compute the local coordinates of points in given elements inside the innermost circle by Newton's method.
 
     A point with the radial coordinate r lies on the straight line between two points with the same angular coordinate:
@@ -247,23 +241,22 @@ def _local_coordinates(
         blocks: The elements.
         points: Film points x + iy, shape (n,), in film radii.
         element: Index of the element that contains each point, shape (n,).
-        difference_step: Step of the angular coordinate for the derivative of the sides of an element by central
-            differences.
 
     Returns:
         Radial coordinate and angular coordinate, shape (2, n). They are between 0 and 1 for points inside the element.
     """
+    step_size = 1e-5  # of the angular coordinate, for the derivative of the sides by central differences
     coordinates = np.full((2, points.size), 0.5)
     for _ in range(20):  # three to six steps are typical
         # Evaluate the sides at the angular coordinate, and before and after it for the central differences.
         radial, angular = coordinates
-        shifted_angular = angular[:, None] + np.array([0.0, -difference_step, difference_step])
+        shifted_angular = angular[:, None] + np.array([0.0, -step_size, step_size])
         inner, outer = placement.sides(blocks, element, shifted_angular)
         shifted_points = inner + radial[:, None] * (outer - inner)
         current, before, after = shifted_points.T
         residual = current - points
         radial_derivative = outer[:, 0] - inner[:, 0]
-        angular_derivative = (after - before) / (2.0 * difference_step)
+        angular_derivative = (after - before) / (2.0 * step_size)
 
         # Newton step for two unknowns by Cramer's rule
         determinant = cross_product(radial_derivative, angular_derivative)

@@ -268,13 +268,13 @@ class Turns:
             largest_k = largest_harmonics[abs(m)] if period else 0
             pairs.extend((m, k) for k in range(-largest_k, largest_k + 1))
         harmonics = np.array(pairs)
-        symmetry_order = round(2.0 * np.pi / period) if period else 1
+        symmetry_order = round(math.tau / period) if period else 1
         n_turn, step = _lattice(harmonics, symmetry_order)
         turn = np.arange(n_turn)
         return cls(
             # Only even harmonics of d occur, so half a turn is the period of d.
             direction=np.pi * step * turn / n_turn if has_directions else np.zeros(n_turn),
-            rotation=2.0 * np.pi * turn / n_turn if period else np.zeros(n_turn),
+            rotation=math.tau * turn / n_turn if period else np.zeros(n_turn),
             harmonics=harmonics * np.array([2, 1]),  # (2 m, k)
             symmetry_order=symmetry_order,
         )

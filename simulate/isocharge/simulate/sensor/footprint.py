@@ -219,12 +219,12 @@ class CurvedProbe(Probe):
     @property
     def outline(self) -> Complexes:
         """Points x + iy of the boundary at evenly spaced parameters, shape (OUTLINE_POINTS,), mm."""
-        return self.boundary(2.0 * np.pi * np.arange(OUTLINE_POINTS) / OUTLINE_POINTS)
+        return self.boundary(math.tau * np.arange(OUTLINE_POINTS) / OUTLINE_POINTS)
 
     def core(self) -> Complexes:
         """Return the corners x + iy of the core polygon, shape (n_corner,), mm."""
         n_corner = self.topology.n_corner
-        parameter = 2.0 * np.pi * (np.arange(n_corner) + 0.5) / n_corner
+        parameter = math.tau * (np.arange(n_corner) + 0.5) / n_corner
         return CORE_SHARE * self.boundary(parameter)
 
 

@@ -168,7 +168,7 @@ class GrowingFinger(Finger):
         Raises:
             SceneError: If the force is so small that the radius is below `MIN_LENGTH`, or if it is not positive.
         """
-        radius = self.radius * float(np.cbrt(force))
+        radius = self.radius * math.cbrt(force)
         if not radius >= MIN_LENGTH:
             raise SceneError(
                 f"{self.notation} under {force:.4g} N: expected a radius of at least {MIN_LENGTH:g} mm, got "
@@ -301,7 +301,7 @@ class Polygon(Probe):
         """
         check_length("probe side", side)
         circumradius = side / np.sqrt(3.0)
-        corner_angles = 0.5 * np.pi + 2.0 * np.pi / 3.0 * np.arange(3)
+        corner_angles = 0.5 * math.pi + math.tau / 3.0 * np.arange(3)
         return cls.of(to_corners(np.exp(1j * corner_angles) * circumradius), angle, f"triangle:{tidy(side)}")
 
     @property

@@ -216,7 +216,7 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
             calibration=Calibration(
                 calibration.gain,
                 calibration.shift_mm,
-                float(np.deg2rad(calibration.rotation_deg)),
+                math.radians(calibration.rotation_deg),
                 calibration.crosstalk,
             ),
         )
@@ -248,7 +248,7 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
         "calibration": {
             "gain": dict(calibration.gain),
             "shift_mm": _tidy_all(calibration.shift),
-            "rotation_deg": tidy(float(np.rad2deg(calibration.rotation))),
+            "rotation_deg": tidy(math.degrees(calibration.rotation)),
             **({"crosstalk": tidy(calibration.crosstalk)} if calibration.crosstalk else {}),
         },
     }

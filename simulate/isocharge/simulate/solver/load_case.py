@@ -372,7 +372,7 @@ def _thin_ring_count(placement: Placement, total_width: float) -> int:
     # The widths of the strip in the template plane are divided by the range of ln(r) that all rings cover. The upper
     # limit of 1 / 8 keeps the thin rings near the rim.
     stretch = float(map_stretch(placement.map_parameter, 1.0))
-    log_range = -float(np.log(placement.template_radius))
+    log_range = -math.log(placement.template_radius)
     max_width = 1.0 / 8.0
     largest_width = min(total_width * stretch / log_range, max_width)
     smallest_width = min(min(total_width, 0.2) / stretch / log_range, max_width)

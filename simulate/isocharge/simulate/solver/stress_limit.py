@@ -8,10 +8,10 @@ centre. In a membrane, the stress is proportional to F^(2/3), where F is the for
 increases slightly more slowly with the force.
 """
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 
-import numpy as np
 import scipy  # scipy.optimize is imported when it is used
 
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
@@ -93,12 +93,12 @@ def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tup
         return max_force
 
     log_force = scipy.optimize.brentq(
-        lambda log_force: np.log(largest_stress(film, probe, float(np.exp(log_force))) / limit),
-        np.log(min_force),
-        np.log(max_force),
+        lambda log_force: math.log(largest_stress(film, probe, math.exp(log_force)) / limit),
+        math.log(min_force),
+        math.log(max_force),
         xtol=1e-3,
     )
-    return float(np.exp(log_force))
+    return math.exp(log_force)
 
 
 def yield_force(film: Film, probes: Sequence[Probe], force_range: tuple[float, float]) -> float | None:

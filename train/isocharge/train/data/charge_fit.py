@@ -167,7 +167,7 @@ def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
     """
     size = np.maximum(np.linalg.norm(charge, axis=1), LOWEST_CHARGE)
     degree = determined_degree(unit_log_force, SIZE_DEGREE)
-    return np.asarray(chebyshev.chebfit(unit_log_force, np.log(size), degree))
+    return chebyshev.chebfit(unit_log_force, np.log(size), degree)
 
 
 def determined_degree(coordinate: Array, largest: int) -> int:

@@ -60,7 +60,7 @@ def evaluate(fitted: Fitted) -> dict[str, float]:
     return {**errors, HELD_PRESSES: float(len(truth)), **_misfit_percentiles(misfit)}
 
 
-def simulated_errors(predict: Predict, presses: LabelledPresses, noise: Noise, seed: int = 1) -> dict[str, float]:
+def simulated_errors(predict: Predict, presses: LabelledPresses, noise: Noise) -> dict[str, float]:
     """Measure the errors of a network on simulated presses, with and without noise, and how it detects faults.
 
     A fault counts as detected if the misfit is larger than that of 99 % of good presses.
@@ -69,17 +69,16 @@ def simulated_errors(predict: Predict, presses: LabelledPresses, noise: Noise, s
         predict: Function that computes the answers of the network.
         presses: Presses without noise.
         noise: Noise to add.
-        seed: Seed of the noise.
 
     Returns:
         Errors by name, as `evaluate` returns them.
     """
-    contact, std, _ = predict(presses.noisy(noise, seed))
+    contact, std, _ = predict(presses.noisy(noise, seed=1))
     clean_contact, _, _ = predict(presses.charge)
     clean_median_mm, clean_p95_mm = np.percentile(position_error(clean_contact, presses.contact), [50, 95])
 
     unit_noise = misfit_noise(noise)
-    _, _, misfits = predict(presses.repeated(N_GOOD_PRESSES).noisy(unit_noise, seed))
+    _, _, misfits = predict(presses.repeated(N_GOOD_PRESSES).noisy(unit_noise, seed=1))
     min_force, max_force = FORCES_NEAR_1_N
     force = presses.contact[:, 2]
     presses_near_1_N = presses[(force >= min_force) & (force <= max_force)]
@@ -89,7 +88,7 @@ def simulated_errors(predict: Predict, presses: LabelledPresses, noise: Noise, s
         "clean_position_median_mm": rounded(clean_median_mm),
         "clean_position_p95_mm": rounded(clean_p95_mm),
         **_misfit_percentiles(misfits),
-        **_measure_detection(predict, presses_near_1_N, unit_noise, threshold, seed + 1),
+        **_measure_detection(predict, presses_near_1_N, unit_noise, threshold),
     }
 
 
@@ -123,7 +122,7 @@ def _misfit_percentiles(good_misfits: Array) -> dict[str, float]:
 
 
 def _measure_detection(
-    predict: Predict, presses: LabelledPresses, noise: Noise, threshold: float, seed: int
+    predict: Predict, presses: LabelledPresses, noise: Noise, threshold: float
 ) -> Mapping[str, float]:
     """Simulate one faulty electrode at a time, and compute the fraction of presses whose misfits exceed a threshold.
 
@@ -132,14 +131,13 @@ def _measure_detection(
         presses: Presses without noise.
         noise: Noise to add.
         threshold: Misfit above which there is an alarm.
-        seed: Seed of the noise.
 
     Returns:
         Fractions by name, for a gain that is wrong by 20 % and for a dead electrode; empty if there are no presses.
     """
     if not len(presses):  # for example, if no force is near 1 N
         return {}
-    noisy_charge = presses.noisy(noise, seed)
+    noisy_charge = presses.noisy(noise, seed=2)
 
     def detected_fraction(*wrong_gains: float) -> float:
         """Return the share of alarms over all presses, electrodes and gains, with one wrong electrode at a time."""
