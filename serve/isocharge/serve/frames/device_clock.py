@@ -80,11 +80,11 @@ class DeviceClock:
         The fit is a straight line that converts the clock of the device to the time of the host. The fit begins with
         the first reading.
         """
-        self._sent_us: int | None = None  # clock of the latest reading as the device sent it
         self._device_us = 0  # clock of the latest reading after the wraps were removed
         self._chunk_arrival_s: float | None = None  # arrival of the latest chunk
         self._is_new_arrival = False  # whether the present chunk arrived at another time than the latest chunk
 
+        self._has_fit = False
         # According to the fit, the host time was `_fitted_host_s` when the clock of the device was `_fitted_us`.
         self._fitted_us = 0
         self._fitted_host_s = 0.0
@@ -120,7 +120,7 @@ class DeviceClock:
                 self._stamp_with_device(frame, frame.t_us, modulus, chunk.timestamp)
         if len(chunk.data) < MAX_READ_BYTES:  # otherwise, the bytes may have waited to be read
             self._chunk_arrival_s = chunk.timestamp
-            if self._is_new_arrival and self._sent_us is not None:
+            if self._is_new_arrival and self._has_fit:
                 self._fit_arrival(chunk.timestamp)
 
     def _shift_host_times(self, jump_s: float) -> None:
@@ -167,19 +167,16 @@ class DeviceClock:
             arrival_s: Arrival of the chunk that contains the reading, unix seconds.
         """
         step_us = 0  # time since the previous reading
-        if self._sent_us is None:
-            self._begin_fit(t_us, arrival_s)
-        else:
+        if self._has_fit:
             # The modulo makes the step correct even if the clock has wrapped between the readings.
             half_range_us = modulus // 2
-            step_us = (t_us - self._sent_us + half_range_us) % modulus - half_range_us
-            if step_us >= -min(MAX_DELAY_s * 1e6, self._device_us):
-                self._device_us += step_us
-            else:
-                frame.is_clock_reset = step_us < -MAX_DELAY_s * 1e6
-                self._begin_fit(t_us, arrival_s)
-            step_us = max(0, step_us)
-        self._sent_us = t_us
+            step_us = (t_us - self._device_us + half_range_us) % modulus - half_range_us
+            frame.is_clock_reset = step_us < -MAX_DELAY_s * 1e6
+        if not self._has_fit or step_us < -min(MAX_DELAY_s * 1e6, self._device_us):
+            self._begin_fit(t_us, arrival_s)
+        else:
+            self._device_us += step_us
+        step_us = max(0, step_us)
         self._predicted_s = self._fitted_host_s + self.rate * (self._device_us - self._fitted_us) * 1e-6
 
         # A reading is taken before it arrives. If the predicted time is much later than the arrival, the fit is wrong.
@@ -216,6 +213,7 @@ class DeviceClock:
         self._fitted_us = device_us
         self._fitted_host_s = max(arrival_s, self._latest_host_s)
         self._predicted_s = self._fitted_host_s
+        self._has_fit = True
         self._is_fit_provisional = True
 
     def _fit_arrival(self, arrival_s: float) -> None:
