@@ -3,8 +3,8 @@
 Each format has a section class, which declares the keys of the format and creates the parser.
 """
 
-from collections.abc import Iterator, Mapping
-from functools import partial
+from collections.abc import Mapping
+from functools import cached_property
 
 from isocharge.serve.frames.binary import BinaryParser
 from isocharge.serve.frames.frame import SEQ, TIMES_US, Frame, Parser
@@ -25,19 +25,14 @@ class AutoParser(Parser):
     def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
         """Begin without a recognised format. The class describes the arguments."""
         super().__init__("nothing recognised yet")
+        self._columns = columns
+        self._meanings = meanings
         self._binary = BinaryParser()
-        self._text: TextParser | None = None  # created when bytes arrive that are no binary frame
-        self._create_text_parser = partial(TextParser, columns, meanings)
 
-    def _candidates(self) -> Iterator[Parser]:
-        """Yield the parser of the recognised format, or the parsers of all formats until one of them is recognised."""
-        if self.recognised is not None:
-            yield self.recognised
-            return
-        yield self._binary
-        if self._text is None:
-            self._text = self._create_text_parser()
-        yield self._text
+    @cached_property
+    def _text(self) -> TextParser:
+        """Parser of text, which is created when bytes arrive that are no binary frame."""
+        return TextParser(self._columns, self._meanings)
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames that end within `data`.
@@ -46,16 +41,19 @@ class AutoParser(Parser):
         frame receives all further data. The description of the format and the moduli of the counter and the clock are
         copied from the parser together with each frame, because the parser may determine them only after many frames.
         """
-        for parser in self._candidates():
+        parser = self.recognised or self._binary
+        frames = parser.feed(data)
+        if not (frames or self.recognised):
+            parser = self._text
             frames = parser.feed(data)
-            if frames:
-                self.recognised = parser
-                self.counts = parser.counts
-                self.format = parser.format
-                self.seq_modulus = parser.seq_modulus
-                self.t_us_modulus = parser.t_us_modulus
-                return frames
-            self.unread_line = parser.unread_line or self.unread_line
+        if frames:
+            self.recognised = parser
+            self.counts = parser.counts
+            self.format = parser.format
+            self.seq_modulus = parser.seq_modulus
+            self.t_us_modulus = parser.t_us_modulus
+            return frames
+        self.unread_line = parser.unread_line or self.unread_line
         if self.recognised is None:  # a recognised parser counts its bytes itself
             self.counts.bytes_dropped += len(data)
         return []
@@ -66,8 +64,8 @@ class AutoParser(Parser):
         A format that was recognised stays recognised.
         """
         super().reset()
-        for parser in self._candidates():
-            parser.reset()
+        self._binary.reset()
+        self._text.reset()
 
 
 class TextFrames(FrameSection, tag="text", frozen=True):
