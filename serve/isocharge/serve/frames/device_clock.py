@@ -173,6 +173,7 @@ class DeviceClock:
             step_us = (t_us - self._device_us + half_range_us) % modulus - half_range_us
             frame.is_clock_reset = step_us < -MAX_DELAY_s * 1e6
         if not self._has_fit or step_us < -min(MAX_DELAY_s * 1e6, self._device_us):
+            step_us = 0
             self._begin_fit(t_us, arrival_s)
         else:
             self._device_us += step_us
