@@ -92,11 +92,17 @@ def test_record_before_the_tare(predictor):
         assert record.charge_raw_pC == {"A": 12.0, "B": -7.0, "C": 3.0}
 
 
-def test_board_that_sends_other_lines_from_now_on_is_reported_once(predictor, caplog):
+@pytest.mark.parametrize(
+    ("first", "later", "message"),
+    [
+        (b"\n" + b"1,2,3\n" * 9, b"A=1 B=2 C=3\n" * 300, ", such as 'A=1 B=2 C=3'; expected text: 3 columns"),
+        (encode_frame(Frame(1, 2, (1.0, 2.0, 3.0))), b"\n" * 3600, "; expected binary frames"),
+    ],
+)
+def test_board_that_sends_other_bytes_from_now_on_is_reported_once(predictor, caplog, first, later, message):
     """For example, its program was replaced while the stream runs."""
-    pieces = [b"\n" + b"1,2,3\n" * 9, *[b"A=1 B=2 C=3\n" * 300] * 5]
-    list(stream([Chunk(piece, 1e9, 0) for piece in pieces], predictor))
-    assert caplog.text.count("the latest 10800 bytes, such as 'A=1 B=2 C=3'; expected text: 3 columns") == 1
+    list(stream([Chunk(piece, 1e9, 0) for piece in (b"boot\n\0", first, *[later] * 5)], predictor))
+    assert caplog.text.count(f" bytes{message}") == 1
 
 
 @pytest.mark.parametrize("data", [b"", b"hello, film\n"])

@@ -95,15 +95,6 @@ def test_port_opened_by_another_program_is_refused(board):
         pass
 
 
-def test_silent_port_is_lost_after_the_timeout(board):
-    with Port(board.url, silence_s=0.05) as port:
-        board.write_whole(b"x")
-        chunks = iter(port)
-        assert next(chunks).data == b"x"
-        with pytest.raises(PortLost, match=r"no data for 0.05 s; check that"):
-            next(chunks)
-
-
 @pytest.mark.parametrize(("wait", "start_up"), [(0.0, "0.06"), (0.1, "0.1")])
 def test_board_that_restarts_when_the_port_is_opened_may_be_silent_longer_at_first(board, monkeypatch, wait, start_up):
     """An Arduino restarts when DTR rises. The option `wait` also sets the time for the first byte."""
@@ -132,13 +123,13 @@ def test_silent_port_is_opened_again_after_growing_pauses(board, monkeypatch):
     assert pauses_s == [0.01, 0.02, 0.04, 0.05, 0.05, 0.05]
 
 
-def test_port_that_is_opened_again_waits_until_the_board_has_started_again(board, monkeypatch):
+def test_silent_port_is_lost_and_waits_until_the_board_has_started_again(board, monkeypatch):
     monkeypatch.setattr("isocharge.serve.port.source.START_UP_s", 0.05)
     port = Port(board.url, silence_s=0.01)
     with port:
         board.write_whole(b"started")
         next(iter(port))
-        with pytest.raises(PortLost, match=r"no data for 0\.01 s"):
+        with pytest.raises(PortLost, match=r"no data for 0\.01 s; check that"):
             next(iter(port))
     with port, pytest.raises(PortLost, match=r"no data for 0\.05 s"):
         next(iter(port))
