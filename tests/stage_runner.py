@@ -12,6 +12,7 @@ from isocharge.serve.live.device import create_stages
 from isocharge.serve.model.contact import disk_corners
 from isocharge.serve.record.record import flags_in_order
 from isocharge.serve.signal_chain.stage import Device, Setup
+from isocharge.serve.tracking.contact_mixture import ContactMixture
 from isocharge.serve.tracking.tracker import Tracker, TrackRule
 
 
@@ -66,12 +67,21 @@ def charges_and_contacts(frames):
     return np.array(charges), np.array([frame.is_contact for frame in frames])
 
 
-def new_tracker(mixture=None, **settings):
-    """Return a tracker with settings of the section `[track]`, and with a mixture for a film with a fold."""
+def contact_mixture(charges, noise):
+    """Return a mixture whose contacts are valid on the whole film of a charge map."""
+    return ContactMixture(charges, noise, Validity(disk_corners(charges.domain.radius), (0.0, np.inf)))
+
+
+def new_tracker(new_filter=None, **settings):
+    """Return a tracker with settings of the section `[track]`.
+
+    Args:
+        new_filter: Function that returns a new filter, for a film with a fold.
+        settings: Settings.
+    """
     tracker = Tracker(Setup((), Device(rules={TrackRule: TrackRule(**settings)})))
-    if mixture is not None:
-        tracker._mixture = mixture
-        tracker._mixture_validity = Validity(disk_corners(mixture.charges.domain.radius), (0.0, np.inf))
+    if new_filter is not None:
+        tracker._new_filter = new_filter
     return tracker
 
 

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,9 +15,9 @@ from isocharge.serve.live.device import device_from_table
 from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.model.metadata import ModelNoise
-from isocharge.serve.tracking.contact_mixture import GAIN_STD, ContactMixture
+from isocharge.serve.tracking.contact_mixture import GAIN_STD
 from model_files import put_charge_map
-from stage_runner import new_tracker, recorded_lines
+from stage_runner import contact_mixture, new_tracker, recorded_lines
 from stage_runner import track as track_frame
 
 RADIUS = 6.0
@@ -69,7 +70,7 @@ def noisy_charges(x, gains=(1.0, 1.0, 1.0), noise=NOISE):
 
 def folded_tracker():
     """Return a tracker of the folded film."""
-    return new_tracker(ContactMixture(folded_series(), NOISE))
+    return new_tracker(partial(contact_mixture, folded_series(), NOISE))
 
 
 def track(x, rate_Hz=1000.0, **options):
@@ -151,7 +152,7 @@ def test_charges_of_no_contact_are_not_tracked_and_saturated_frames_are_ignored(
 
 def test_rapidly_rising_force_is_followed():
     """The force triples from frame to frame, which the motion of a contact does not explain."""
-    mixture = ContactMixture(folded_series(), NOISE)
+    mixture = contact_mixture(folded_series(), NOISE)
     for number, force in enumerate([0.06, 0.2, 0.6]):
         contact, *_ = mixture.update(charges(-4.0, 1.0, force), 5e-3 * number)
         assert contact.mean[2] == pytest.approx(np.log(force), abs=0.05)
@@ -160,11 +161,11 @@ def test_rapidly_rising_force_is_followed():
 def test_frames_before_a_gap_do_not_change_the_contact_after_it():
     """At 1 kHz, a step has several frames. The charges before the gap are those of another contact."""
     before, after = noisy_charges(np.full(12, -5.0)), noisy_charges(np.full(10, -2.0))
-    mixture = ContactMixture(folded_series(), NOISE)
+    mixture = contact_mixture(folded_series(), NOISE)
     for number, charge_pC in enumerate(before):
         mixture.update(charge_pC, 1e-3 * number)
     first, *_ = mixture.update(after[0], 0.4)
-    contact = first.contact(0.0)
+    contact = first.contact_after(0.0, misfit=0.0)
     assert mixture.time_s == 0.4
     assert abs(contact.x_mm + 2.0) < 3.0 * contact.x_std_mm
 

@@ -95,7 +95,7 @@ def test_moving_mode_equals_the_kalman_filter_with_constant_velocity():
     mean = np.array([measured[0], 0.0])
     covariance = np.diag([std**2, INITIAL_RATE_STD[0] ** 2])
     for value in measured[1:]:
-        density = ACCELERATION_DENSITY + SPEED_CHANGE_RATE * mean[1] ** 2
+        density = ACCELERATION_DENSITY[0] + SPEED_CHANGE_RATE[0] * mean[1] ** 2
         mean = transition @ mean
         covariance = transition @ covariance @ transition.T + density * process_noise + drift
         gain = covariance[:, 0] / (covariance[0, 0] + std**2)
@@ -103,9 +103,7 @@ def test_moving_mode_equals_the_kalman_filter_with_constant_velocity():
         covariance = covariance - np.outer(gain, covariance[0])
 
         modes.probability = only_moving
-        modes.predict(dt)
-        modes.probability = only_moving
-        modes.update(np.array([value, 0.0, 0.0]), noise)
+        modes.step(dt, np.array([value, 0.0, 0.0]), noise)
         assert modes.mean[3, [0, 3]] == pytest.approx(mean, rel=1e-6, abs=1e-6)
         np.testing.assert_allclose(modes.covariance[3][np.ix_([0, 3], [0, 3])], covariance, rtol=1e-6)
 
@@ -249,7 +247,7 @@ def test_slow_press_of_a_released_model_is_tracked_from_its_first_frame(name):
 
 def test_filter_whose_covariance_has_a_negative_eigenvalue_takes_no_frame():
     motion = MotionFilter(np.zeros(3), -np.eye(3))
-    assert not motion.update(np.ones(3), 0.1 * np.eye(3))
+    assert not motion.step(0.0, np.ones(3), 0.1 * np.eye(3))
     np.testing.assert_array_equal(motion.mean, 0.0)
 
 

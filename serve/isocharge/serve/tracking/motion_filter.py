@@ -12,12 +12,14 @@ contact moves smoothly.
 """
 
 import math
+from collections import deque
 
 import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.serve.flags import BEYOND, MISFIT, SATURATED
-from isocharge.serve.model.contact import Contact, correlation_matrices
+from isocharge.serve.frames.frame import Frame
+from isocharge.serve.model.contact import correlation_matrices
 from isocharge.serve.record.record import TrackedContact
 
 VALUES = slice(0, 3)
@@ -32,8 +34,14 @@ RATES = slice(3, 6)
 VELOCITY = slice(3, 5)
 """Slice of the velocities along x and y in a state."""
 
-IS_MOVING = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0], [1.0, 1.0, 1.0]])
-"""Whether x, y and ln F change (1) or are held (0) in each of the four modes."""
+MOVING_POSITION = slice(2, 4)
+"""Slice of the two modes in which the position moves."""
+
+_IS_MOVING = np.tile([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0], [1.0, 1.0, 1.0]], 2)
+"""Whether x, y and ln F change (1) or are held (0) in each of the four modes, and the same for their rates, (4, 6)."""
+
+_MODE_DIFFERENCE = np.array([[0.0, 1.0, 1.0, 2.0], [1.0, 0.0, 2.0, 1.0], [1.0, 2.0, 0.0, 1.0], [2.0, 1.0, 1.0, 0.0]])
+"""Number of the two quantities (position and force) that one mode changes and another mode holds, shape (4, 4)."""
 
 MEAN_MODE_TIME_s = 0.7
 """Mean time after which a position or a force that is held starts to change, or the reverse, s."""
@@ -41,34 +49,43 @@ MEAN_MODE_TIME_s = 0.7
 INITIAL_RATE_STD = np.array([60.0, 60.0, 100.0])
 """Standard deviations of the rates at the beginning of a movement, mm/s, mm/s and 1/s."""
 
-_HELD_RATE_COVARIANCE = np.eye(6) * np.pad((1.0 - IS_MOVING) * INITIAL_RATE_STD**2, ((0, 0), (3, 0)))[:, None]
-"""Variances of the rates of held values, shape (4, 6, 6). A held value may begin to change at any time."""
-
-_HAS_EFFECT = np.concatenate([np.ones((4, 3)), IS_MOVING], axis=1)[:, None]
+_HAS_EFFECT = np.maximum(_IS_MOVING, [1.0, 1.0, 1.0, 0.0, 0.0, 0.0])[:, None]
 """Factor of each value and rate in the prediction of the next state: 0 for rates of held values, else 1; (4, 1, 6)."""
 
-_KEPT = np.eye(6) * _HAS_EFFECT
-"""Matrices that keep the values, and the rates of values that change, shape (4, 6, 6)."""
+_HELD_RATE_COVARIANCE = np.eye(6) * (1.0 - _HAS_EFFECT) * np.tile(INITIAL_RATE_STD, 2) ** 2
+"""Variances of the rates of held values, shape (4, 6, 6). A held value may begin to change at any time."""
 
-_INTEGRATION = np.eye(6, k=3) * _HAS_EFFECT
-"""Matrices that add the rates of values that change to the values, shape (4, 6, 6)."""
+_IDENTITY = np.eye(6)
+
+_INTEGRATION = np.eye(6, k=3)
+"""Matrix that selects the rate of each value of a state."""
 
 HELD_DRIFT = 5e-4
 """Increase of the variance of a held value per second, mm^2/s or 1/s. A held finger drifts by 0.02 mm in a second."""
 
-_HELD_DRIFT_DENSITY = np.diag([HELD_DRIFT] * 3 + [0.0] * 3)
+_HELD_DRIFT_DENSITY = HELD_DRIFT * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 """Increase of the covariance of a state per second because of this drift, shape (6, 6)."""
 
-_IDENTITY = np.eye(3)
+ACCELERATION_DENSITY = np.array([150.0, 150.0, 1e6] * 2)
+"""Spectral densities of the accelerations of slow x and y, mm^2/s^3, and of the second derivative of ln F, 1/s^3.
 
-ACCELERATION_DENSITY = 150.0
-"""Spectral density of the acceleration of a slow contact, mm^2/s^3."""
+The same densities apply to the rates, so the shape is (6,).
+"""
 
-SPEED_CHANGE_RATE = 0.5
-"""Increase of the spectral density of the acceleration with the squared speed, 1/s."""
+SPEED_CHANGE_RATE = np.array([0.5, 0.5, 0.0] * 2)
+"""Increase of these spectral densities with the squared speed, 1/s, shape (6,).
 
-FORCE_ACCELERATION_DENSITY = 1e6
-"""Spectral density of the second derivative of a changing ln F, 1/s^3."""
+A fast contact changes its velocity more than a slow contact.
+"""
+
+UNIT_NOISE = np.kron([[1.0 / 3.0, 1.0 / 2.0], [1.0 / 2.0, 1.0]], np.eye(3))
+"""Covariance that white accelerations of unit spectral density add to a moving state in 1 s, shape (6, 6).
+
+The covariance after the time t is the product of each entry and a power of t (Bar-Shalom et al. 2001, 6.2.2).
+"""
+
+TIME_EXPONENT = np.kron([[3.0, 2.0], [2.0, 1.0]], np.ones((3, 3)))
+"""Exponents of the time in the covariance that white accelerations add, shape (6, 6)."""
 
 SQUARED_GATE = 30.0
 """Squared Mahalanobis distance of a frame above which it does not belong to a contact."""
@@ -93,46 +110,6 @@ NOISE_INTERVAL_s = 0.0045
 """Time after which the noise of two frames is independent, s. Boards filter their charges over shorter times."""
 
 
-def process_noise(velocity_mm_per_s: Array, force_density: float, dt_s: float, is_moving: Array | float = 1.0) -> Array:
-    """Return the covariance that a white acceleration adds to moving states (Bar-Shalom et al. 2001, 6.2.2).
-
-    The spectral density of the acceleration of the position increases with the squared speed, because a fast contact
-    changes its velocity more than a slow contact.
-
-    Args:
-        velocity_mm_per_s: Velocities along x and y, shape (n, 2), mm/s.
-        force_density: Spectral density of the second derivative of ln F, 1/s^3.
-        dt_s: Time over which the acceleration acts, s.
-        is_moving: Whether x, y and ln F change (1) or are held (0) in each state, shape (n, 3). By default, all change.
-
-    Returns:
-        Covariances of x, y, ln F and their rates, shape (n, 6, 6).
-    """
-    density = np.full((len(velocity_mm_per_s), 3), force_density)
-    squared_speed = (velocity_mm_per_s**2).sum(axis=1)
-    density[:, POSITION] = (ACCELERATION_DENSITY + SPEED_CHANGE_RATE * squared_speed)[:, None]
-    # Covariance of a value and its rate for a unit density. Values that are held get no covariance. In the sum, a and b
-    # select the value or its rate, k and l select x, y or ln F, and n selects the state.
-    unit_covariance = np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
-    blocks: Array = np.einsum("ab,nk,kl->nakbl", unit_covariance, is_moving * density, _IDENTITY)
-    return blocks.reshape(-1, 6, 6)
-
-
-def mixture_moments(weight: Array, mean: Array, covariance: Array) -> tuple[Array, Array]:
-    """Return the means, shape (m, k), and the covariances, shape (m, k, k), of m mixtures of n Gaussian components.
-
-    Args:
-        weight: Weights of the components in each mixture, shape (m, n). Each row adds up to 1.
-        mean: Means of the components, shape (n, k).
-        covariance: Covariances of the components, shape (n, k, k).
-    """
-    mixed_mean = weight @ mean
-    deviation = mean - mixed_mean[:, None]  # shape (m, n, k)
-    spread = (weight[:, :, None] * deviation).swapaxes(1, 2) @ deviation  # covariance of the means of the components
-    mean_covariance = (weight @ covariance.reshape(len(mean), -1)).reshape(spread.shape)
-    return mixed_mean, mean_covariance + spread
-
-
 class NoiseEstimate:
     """Estimate of the noise of measured values, relative to the noise that the model states.
 
@@ -144,7 +121,7 @@ class NoiseEstimate:
         """Start with the noise that the model states."""
         self.relative_variance = 1.0
         self._frames = 1  # the noise that the model states has the weight of one frame
-        self._latest: list[Array] = []  # the latest values and their times, at most three arrays of shape (4,)
+        self._latest: deque[Array] = deque(maxlen=3)  # the latest values and their times, arrays of shape (4,)
         self._latest_s = -math.inf
 
     def update(self, measured: Array, covariance: Array, t_s: float) -> None:
@@ -163,14 +140,15 @@ class NoiseEstimate:
         if t_s - self._latest_s < NOISE_INTERVAL_s:
             return
         self._latest_s = t_s
-        self._latest = [*self._latest[-2:], np.append(measured, t_s)]
+        self._latest.append(np.append(measured, t_s))
         if len(self._latest) < 3:
             return
         # Compare the middle values with the line between the first and the last values. The last entry is the time.
         first, middle, last = self._latest
-        time_share = (middle[-1] - first[-1]) / (last[-1] - first[-1])
-        deviation = (middle - (1.0 - time_share) * first - time_share * last)[:-1]
-        variance_factor = (1.0 + (1.0 - time_share) ** 2 + time_share**2) * deviation.size
+        last_share = (middle - first)[3] / (last - first)[3]
+        first_share = 1.0 - last_share
+        deviation = (middle - first_share * first - last_share * last)[VALUES]
+        variance_factor = (1.0 + first_share**2 + last_share**2) * deviation.size
         relative_square = deviation @ np.linalg.solve(covariance, deviation) / variance_factor
 
         # Update the mean over all frames.
@@ -203,48 +181,40 @@ class MotionFilter:
         self.covariance[:, RATES, RATES] = np.diag(INITIAL_RATE_STD**2)
         self.probability = np.full(4, 0.25)
 
-    @property
-    def moving_probability(self) -> float:
-        """Probability that the position moves."""
-        return float(self.probability @ IS_MOVING[:, 0])
-
-    def predict(self, dt_s: float) -> None:
-        """Mix the modes, and predict the state of each mode at the next frame.
+    def step(self, dt_s: float, measured: Array, covariance: Array) -> bool:
+        """Predict the modes at the next frame, and update them and their probabilities with the frame.
 
         Args:
-            dt_s: Time until the next frame, s, not negative.
-        """
-        # Probability that a value is held or moves (row) after it was held or moved (column), shape (2, 2). Position
-        # and force change independently, so the probabilities of the modes are products, shape (4, 4).
-        change = min(dt_s / MEAN_MODE_TIME_s, 0.5)
-        value_transition = np.array([[1.0 - change, change], [change, 1.0 - change]])
-        mode_transition = (value_transition[:, None, :, None] * value_transition[:, None]).reshape(4, 4)
-
-        # Mix the states of the previous modes (columns) for each new mode (row).
-        joint_probability = mode_transition * self.probability
-        self.probability = joint_probability.sum(axis=1)
-        mixing_weights = joint_probability / self.probability[:, None]
-        mean, covariance = mixture_moments(mixing_weights, self.mean, self.covariance)
-
-        # The rate of a held value is that of a movement that would begin now: zero on average.
-        noise = process_noise(mean[:, VELOCITY], FORCE_ACCELERATION_DENSITY, dt_s, IS_MOVING)
-        noise += _HELD_RATE_COVARIANCE + dt_s * _HELD_DRIFT_DENSITY
-        transition = _KEPT + dt_s * _INTEGRATION
-        self.mean = (transition @ mean[:, :, None])[:, :, 0]
-        self.covariance = transition @ covariance @ transition.swapaxes(1, 2) + noise
-
-    def update(self, measured: Array, covariance: Array) -> bool:
-        """Update the predicted modes and their probabilities with the measured values of the frame.
-
-        Args:
+            dt_s: Time since the previous frame, s, not negative.
             measured: Measured x, y and ln F, shape (3,).
             covariance: Covariance of the noise, shape (3, 3).
 
         Returns:
-            Whether the frame belongs to the contact. Otherwise nothing is updated. The result is also False if rounding
-            errors have made a covariance useless.
+            Whether the frame belongs to the contact. Otherwise, the modes are only predicted. The result is also False
+            if rounding errors have made a covariance useless.
         """
-        # Mahalanobis distance of the measured values from the prediction of each mode
+        # Mix the states of the previous modes (columns) for each new mode (row). The position and the force start or
+        # stop to change independently, so the probability of a change of both is the product of the two probabilities.
+        change = min(dt_s / MEAN_MODE_TIME_s, 0.5)
+        mode_transition = change**_MODE_DIFFERENCE * (1.0 - change) ** (2.0 - _MODE_DIFFERENCE)
+        joint_probability = mode_transition * self.probability
+        self.probability = joint_probability.sum(axis=1)
+        weights = joint_probability / self.probability[:, None]
+        mean = weights @ self.mean
+        deviation = self.mean - mean[:, None]  # of each previous mode (axis 1) from the mean of each new mode (axis 0)
+        spread = (weights[:, :, None] * deviation).swapaxes(1, 2) @ deviation
+        mixed_covariance = np.einsum("nm,mij->nij", weights, self.covariance) + spread
+
+        # Predict the states. The rate of a held value is that of a movement that would begin now: zero on average.
+        squared_speed = (mean[:, VELOCITY] ** 2).sum(axis=1, keepdims=True)
+        density = _IS_MOVING * (ACCELERATION_DENSITY + squared_speed * SPEED_CHANGE_RATE)
+        noise = density[:, None] * UNIT_NOISE * dt_s**TIME_EXPONENT
+        noise += _HELD_RATE_COVARIANCE + dt_s * _HELD_DRIFT_DENSITY
+        transition = (_IDENTITY + dt_s * _INTEGRATION) * _HAS_EFFECT
+        self.mean = (transition @ mean[:, :, None])[:, :, 0]
+        self.covariance = transition @ mixed_covariance @ transition.swapaxes(1, 2) + noise
+
+        # Compute the Mahalanobis distance of the measured values from the prediction of each mode.
         innovation = (measured - self.mean[:, VALUES])[:, :, None]  # shape (4, 3, 1)
         precision = np.linalg.inv(self.covariance[:, VALUES, VALUES] + covariance)  # shape (4, 3, 3)
         squared_distance = (innovation * (precision @ innovation)).sum(axis=(1, 2))
@@ -258,15 +228,15 @@ class MotionFilter:
         posterior = self.probability * likelihood
         self.probability = np.maximum(posterior / posterior.sum(), np.finfo(float).tiny)
 
-        # Kalman update of each mode
+        # Apply the Kalman update to each mode.
         gain = self.covariance[:, :, VALUES] @ precision
-        self.mean = self.mean + (gain @ innovation)[:, :, 0]
-        self.covariance = self.covariance - gain @ self.covariance[:, VALUES]
+        self.mean += (gain @ innovation)[:, :, 0]
+        self.covariance -= gain @ self.covariance[:, VALUES]
         return True
 
 
 class ContactFilter:
-    """Filter that smooths the position and the force of one contact over successive frames.
+    """Filter that smooths the position and the force of one contact over the frames of a touch.
 
     The errors of a model have two parts. The first part of the errors changes from frame to frame, such as the noise of
     the charges. The second part is the same in every frame of a held contact, such as the approximation error of the
@@ -274,83 +244,77 @@ class ContactFilter:
     the variance of the first part alone, and adds the variance of the second part to that of the smoothed values.
 
     The noise is estimated from all frames of a touch, even if the touch consists of several successive contacts.
+
+    Attributes:
+        time_s: Time of the latest frame, s.
+        other: Always None, because the charges of a film without folds determine the contact.
     """
 
+    other = None
+
     def __init__(self, constant_variance_share: float) -> None:
-        """Start without a tracked contact.
+        """Start without a frame.
 
         Args:
             constant_variance_share: Variance of the errors that are the same in every frame of a held contact, divided
                 by the variance that the model states, 0 to 1.
         """
+        self.time_s = -math.inf
         self._constant_share = constant_variance_share
-        self.reset()
-
-    def reset(self) -> None:
-        """Discard the tracked contact."""
-        self._filter: MotionFilter | None = None
+        self._motion: MotionFilter | None = None
         self._noise = NoiseEstimate()
         self._is_outlier = False  # whether the latest frame was ignored
-        self._latest_time_s = 0.0
 
-    def step(self, contact: Contact, t_s: float, flags: tuple[str, ...]) -> TrackedContact:
+    def step(self, frame: Frame, t_s: float) -> TrackedContact:
         """Process the next frame, and return the smoothed contact.
 
         The standard deviations of the smoothed contact include the constant errors.
 
         A single frame that does not belong to the contact is ignored. A second such frame in succession begins a new
-        contact. A new contact also begins if the time since the latest frame is longer than `MAX_GAP_s`. Frames may
-        have the same time, for example because they were received together.
+        contact. Frames may have the same time, for example because they were received together.
 
         Args:
-            contact: Contact predicted by the model.
+            frame: Frame with a contact that the model predicted. Frames with a flag in `WEAK_FLAGS` have a small
+                weight.
             t_s: Time of the frame on a clock that is never set back, s.
-            flags: Flags of the frame. Frames with flags in `WEAK_FLAGS` have a small weight.
         """
-        # Compute the measured values, and the part of their covariance that changes from frame to frame.
-        dt_s = t_s - self._latest_time_s
-        if dt_s > MAX_GAP_s:
-            self.reset()
-        self._latest_time_s = t_s
-        measured, stated_covariance = _measured_values(contact)
+        # Compute the measured values. The standard deviations are limited, because a model may state 1e-6 mm or 1e14 mm
+        # for charges that differ much from those of its training.
+        contact = frame.contact
+        assert contact is not None
+        smallest_force_N = float(np.finfo(np.float32).tiny)  # ln F would be infinite if the force were zero
+        force_N = max(smallest_force_N, contact.force_N)
+        measured = np.array([contact.x_mm, contact.y_mm, math.log(force_N)])
+        stated_std = [contact.x_std_mm, contact.y_std_mm, contact.force_std_N / force_N]
+        std = np.clip(stated_std, 1e-5 * LARGEST_STD, LARGEST_STD)
+        stated_covariance = correlation_matrices(contact) * np.outer(std, std)
+
+        # Compute the part of the covariance that changes from frame to frame.
         model_covariance = (1.0 - self._constant_share) * stated_covariance
         covariance = self._noise.relative_variance * model_covariance
-        if WEAK_FLAGS.intersection(flags):
+        if not WEAK_FLAGS.isdisjoint([*frame.flags, *frame.contact_flags]):
             covariance *= WEAK_VARIANCE_FACTOR
 
         # Update the filter, or begin a new contact at the second frame that does not belong to the contact.
-        belongs = False
-        if self._filter is not None:
-            self._filter.predict(dt_s)
-            belongs = self._filter.update(measured, covariance)
-            self._is_outlier = not (belongs or self._is_outlier)
-        if self._filter is None or not (belongs or self._is_outlier):
-            self._filter = MotionFilter(measured, covariance)
+        motion = self._motion
+        belongs = motion is not None and motion.step(t_s - self.time_s, measured, covariance)
+        self._is_outlier = not (motion is None or belongs or self._is_outlier)
+        if motion is None or not (belongs or self._is_outlier):
+            motion = MotionFilter(measured, covariance)
+            self._motion = motion
         if not self._is_outlier:
             self._noise.update(measured, model_covariance, t_s)
+        self.time_s = t_s
 
         # Combine the modes, and add the constant errors.
-        modes = self._filter
-        (mean,), (smoothed_covariance,) = mixture_moments(modes.probability[None], modes.mean, modes.covariance)
-        variance = smoothed_covariance[VALUES, VALUES] + self._constant_share * stated_covariance
-        x_std_mm, y_std_mm, log_force_std = np.sqrt(variance.diagonal()).tolist()
+        mean = motion.probability @ motion.mean
+        spread = (motion.mean - mean) ** 2
+        variances = motion.probability @ (np.diagonal(motion.covariance, axis1=1, axis2=2) + spread)
+        smoothed_std = np.sqrt(variances[VALUES] + self._constant_share * stated_covariance.diagonal())
+        x_std_mm, y_std_mm, log_force_std = smoothed_std.tolist()
         x_mm, y_mm, log_force, vx_mm_s, vy_mm_s, _ = mean.tolist()
-        force_N = math.exp(log_force)
+        smoothed_N = math.exp(log_force)
+        moving = float(motion.probability[MOVING_POSITION].sum())
         return TrackedContact(
-            x_mm, y_mm, force_N, x_std_mm, y_std_mm, force_N * log_force_std, vx_mm_s, vy_mm_s, modes.moving_probability
+            x_mm, y_mm, smoothed_N, x_std_mm, y_std_mm, smoothed_N * log_force_std, vx_mm_s, vy_mm_s, moving
         )
-
-
-def _measured_values(contact: Contact) -> tuple[Array, Array]:
-    """Return x, y and ln F of a contact, shape (3,), and their covariance, shape (3, 3).
-
-    The standard deviations are limited, and the correlations are made slightly smaller, so that the covariance has only
-    positive eigenvalues in spite of rounding errors. For charges that differ much from those of its training, a model
-    may state 1e-6 mm or 1e14 mm.
-    """
-    smallest_force_N = float(np.finfo(np.float32).tiny)  # ln F would be infinite if the force were zero
-    force_N = max(smallest_force_N, contact.force_N)
-    stated_std = [contact.x_std_mm, contact.y_std_mm, contact.force_std_N / force_N]
-    std = np.clip(stated_std, 1e-5 * LARGEST_STD, LARGEST_STD)
-    covariance = correlation_matrices(contact) * np.outer(std, std)
-    return np.array([contact.x_mm, contact.y_mm, math.log(force_N)]), covariance

@@ -6,20 +6,18 @@ contact directly from the charges.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
-from isocharge.serve.flags import SATURATED
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.charge_file import read_charge_map
-from isocharge.serve.model.contact import Contact, disk_corners
+from isocharge.serve.model.contact import disk_corners
 from isocharge.serve.record.record import OtherContact, TrackedContact
 from isocharge.serve.signal_chain.stage import Rule, Setup, Share, Stage
 from isocharge.serve.tracking.contact_mixture import ContactMixture
 from isocharge.serve.tracking.film_follower import FollowRule
-from isocharge.serve.tracking.motion_filter import VELOCITY, ContactFilter
-
-CERTAIN_PROBABILITY = 0.97
-"""Probability of a contact above which no other contact is reported."""
+from isocharge.serve.tracking.motion_filter import ContactFilter, MAX_GAP_s
 
 SLIDE_PROBABILITY = 0.95
 """Probability that the contact moves, above which it may slide."""
@@ -122,15 +120,14 @@ class Tracker(Stage):
             ModelError: If the file `charges.npz` of the model is damaged.
         """
         rule = setup.device.rule(TrackRule) or TrackRule()
-        self._filter = ContactFilter(constant_variance_share=rule.lasting**2)
-        self._mixture: ContactMixture | None = None
+        self._new_filter: Callable[[], ContactFilter | ContactMixture] = partial(ContactFilter, rule.lasting**2)
         predictor = setup.predictor
         if predictor is not None and setup.device.rule(FollowRule) is None:
             charges = read_charge_map(predictor.folder, predictor.metadata.electrodes)  # None without the file
             if charges is not None and charges.is_folded:
-                self._mixture = ContactMixture(charges, predictor.noise)
                 # A contact of the mixture is valid in the whole area for which the file describes the charges.
-                self._mixture_validity = replace(predictor.validity, corners_mm=disk_corners(charges.domain.radius))
+                validity = replace(predictor.validity, corners_mm=disk_corners(charges.domain.radius))
+                self._new_filter = partial(ContactMixture, charges, predictor.noise, validity)
         self._time_s = 0.0  # time of the latest frame on a clock that is never set back
         self._latest_clock_s = math.inf
         self._events: TouchEvents | None = None  # None without a touch
@@ -141,11 +138,9 @@ class Tracker(Stage):
 
         A touch that has begun ends with the next valid frame without a contact.
         """
+        self._filter: ContactFilter | ContactMixture | None = None  # None without a contact
         self._tracked: TrackedContact | None = None
         self._other: OtherContact | None = None  # another contact that also explains the charges
-        self._filter.reset()
-        if self._mixture is not None:
-            self._mixture.reset()
 
     def continue_touch(self, previous: Stage) -> None:
         """Continue the touch of the tracker of another model, so that the end of the touch is reported as an event."""
@@ -157,51 +152,30 @@ class Tracker(Stage):
     def step(self, frame: Frame) -> None:
         """Update the tracked contact with a frame, and add the tracked contact and its event to the frame.
 
-        The previous tracked contact is used again if the frame is invalid, if its charges are saturated and there is a
-        mixture, or if no contact explains the charges.
+        The previous tracked contact is used again if the frame is invalid, or if the filter returns no contact. After a
+        time without a contact of more than `MAX_GAP_s`, a new filter begins.
 
         If the clock was set back, the touch continues. The time between the two frames is unknown and is not counted.
         """
         self._time_s += max(frame.clock_s - self._latest_clock_s, 0.0)
         self._latest_clock_s = frame.clock_s
         if frame.contact is not None:
-            frame.event = self._follow(frame, frame.contact)
+            if self._filter is None or self._time_s - self._filter.time_s > MAX_GAP_s:
+                self._filter = self._new_filter()
+            tracked = self._filter.step(frame, self._time_s)
+            if tracked is not None:
+                self._tracked = tracked
+                self._other = self._filter.other
+                if self._events is None:
+                    self._events = TouchEvents(tracked, self._time_s)
+                    frame.event = "press"
+                else:
+                    frame.event = self._events.step(tracked, self._time_s)
         elif frame.is_valid:  # an invalid frame does not show whether the touch has ended
             if self._events is not None:
                 frame.event = self._events.end(self._time_s)
                 self._events = None
-            self.reset()
+            if self._filter is not None:
+                self.reset()
         frame.tracked = self._tracked
         frame.other = self._other
-
-    def _follow(self, frame: Frame, contact: Contact) -> str | None:
-        """Update the tracked contact with a frame in contact, and return the event that begins, or None.
-
-        Args:
-            frame: The frame. If contacts are tracked by a mixture, its contact is replaced by the most probable one.
-            contact: Contact predicted by the model.
-        """
-        t_s = self._time_s
-        if self._mixture is None:
-            tracked = self._filter.step(contact, t_s, (*frame.flags, *frame.contact_flags))
-        else:
-            if SATURATED in frame.flags or frame.charge_pC is None:  # saturated charges are wrong
-                return None
-            hypotheses = self._mixture.update(frame.charge_pC, t_s)  # possible contacts, the most probable first
-            if not hypotheses:  # the frame contains no information, so the tracked contact remains
-                return None
-            best, *others = hypotheses
-            delay_s = t_s - self._mixture.time_s
-            contact = best.contact(delay_s)
-            frame.set_contact(contact, self._mixture_validity)
-            self._other = None
-            if best.probability < CERTAIN_PROBABILITY:
-                self._other = OtherContact(*others[0].contact(delay_s)[:3], others[0].probability)
-            vx_mm_s, vy_mm_s = best.mean[VELOCITY].tolist()
-            tracked = TrackedContact(*contact[:6], vx_mm_s, vy_mm_s, best.moving_probability)
-
-        self._tracked = tracked
-        if self._events is None:
-            self._events = TouchEvents(tracked, t_s)
-            return "press"
-        return self._events.step(tracked, t_s)
