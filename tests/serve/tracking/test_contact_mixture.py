@@ -15,7 +15,7 @@ from isocharge.serve.live.device import device_from_table
 from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.model.metadata import ModelNoise
-from isocharge.serve.tracking.contact_mixture import GAIN_STD
+from isocharge.serve.tracking.gaussian_components import GAIN_STD
 from model_files import put_charge_map
 from stage_runner import contact_mixture, new_tracker, recorded_lines
 from stage_runner import track as track_frame

@@ -13,8 +13,8 @@ from isocharge.serve import Contact, Frame
 from isocharge.serve.model.charge_file import FILE, charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.signal_chain.stage import Device, Setup
-from isocharge.serve.tracking.contact_mixture import contacts_of
 from isocharge.serve.tracking.film_follower import FilmFollower, TouchPeak
+from isocharge.serve.tracking.gaussian_components import contacts_of
 from isocharge.simulate import NoiseModel, noise_model
 
 NOISE = noise_model("reference")

@@ -30,216 +30,26 @@ from isocharge.serve.model.charge_series import ChargeSeries
 from isocharge.serve.model.contact import Contact, Validity
 from isocharge.serve.model.metadata import ModelNoise
 from isocharge.serve.record.record import OtherContact, TrackedContact
+from isocharge.serve.tracking.gaussian_components import (
+    GAIN_STD,
+    INITIAL_RATE_STD,
+    MOTION,
+    Components,
+    contacts_of,
+    predict_components,
+    prune_components,
+    split_first_component,
+    update_components,
+)
 from isocharge.serve.tracking.motion_filter import (
-    ACCELERATION_DENSITY,
     POSITION,
     RATES,
-    SPEED_CHANGE_RATE,
     SQUARED_GATE,
-    TIME_EXPONENT,
-    UNIT_NOISE,
     VALUES,
     VELOCITY,
     MAX_GAP_s,
-    MEAN_MODE_TIME_s,
     NOISE_INTERVAL_s,
 )
-
-MOTION = slice(0, 6)
-"""Slice of x, y, ln F and their rates in a state."""
-
-GAINS = slice(6, None)
-"""Slice of the logarithms of the electrode gains in a state."""
-
-GAIN_STD = 0.01
-"""Standard deviation of an electrode gain about its calibrated value, dimensionless."""
-
-MAX_ITERATION_STEP = np.array([0.5, 0.5, 0.2])
-"""Largest change of x and y (mm) and of ln F in one iteration. The linearisation is inaccurate for larger changes."""
-
-INITIAL_RATE_STD = np.array([60.0, 60.0, 10.0])
-"""Standard deviations of the rates at the beginning of a movement, mm/s, mm/s and 1/s.
-
-The rate of ln F is small, because a wrong contact together with a change of the force may explain the charges. If the
-force changes faster, the film is searched again.
-"""
-
-FORCE_ACCELERATION_DENSITY = 2.0
-"""Spectral density of the second derivative of ln F, 1/s^3. It is small for the same reason."""
-
-
-class Components(NamedTuple):
-    """The n Gaussian components of a mixture.
-
-    Attributes:
-        mean: Mean of the state of each component, shape (n, 6 + n_electrode).
-        covariance: Covariance of the state of each component, shape (n, 6 + n_electrode, 6 + n_electrode).
-        log_weight: Logarithm of the weight of each component, shape (n,). Only differences of the logarithms matter.
-    """
-
-    mean: Array
-    covariance: Array
-    log_weight: Array
-
-    def select(self, rows: list[int] | Booleans) -> "Components":
-        """Return copies of the components with the indices `rows`, or of those for which `rows` is true."""
-        return Components(self.mean[rows], self.covariance[rows], self.log_weight[rows])
-
-    def with_copies_of_first(self, count: int) -> "Components":
-        """Return copies of all components, followed by `count` further copies of the first component."""
-        return self.select([*range(len(self.mean)), *[0] * count])
-
-
-class UpdatedComponents(NamedTuple):
-    """Components after an update.
-
-    Attributes:
-        components: The components, in the order before the update.
-        squared_misfit: Squared misfit of the charges of each component relative to the noise, shape (n,).
-        squared_distance: Sum of the squared misfit and the squared change of the state relative to its covariance
-            before the update, shape (n,).
-    """
-
-    components: Components
-    squared_misfit: Array
-    squared_distance: Array
-
-
-def contacts_of(states: Array) -> Array:
-    """Return the contacts (x, y, F), shape (n, 3), of states whose first components are x, y and ln F."""
-    return np.column_stack([states[:, POSITION], np.exp(states[:, 2])])
-
-
-def predict_components(components: Components, dt_s: float) -> Components:
-    """Predict the components at a later time, and add one component whose rates have changed to unknown values.
-
-    The rates are constant except for a random white acceleration.
-
-    Args:
-        components: Components after the previous step. The added component has the contact of the first component,
-            which is the most probable.
-        dt_s: Time since the previous step, s.
-    """
-    present = components.with_copies_of_first(1)
-    present.mean[-1, RATES] = 0.0
-    present.covariance[-1, RATES] = 0.0
-    present.covariance[-1, :, RATES] = 0.0
-    present.covariance[-1, RATES, RATES] = np.diag(INITIAL_RATE_STD**2)
-    present.log_weight[-1] += math.log(dt_s / MEAN_MODE_TIME_s)
-
-    transition = np.eye(present.mean.shape[1])
-    transition[VALUES, RATES] = dt_s * np.eye(3)
-    covariance = transition @ present.covariance @ transition.T
-    squared_speed = (present.mean[:, VELOCITY] ** 2).sum(axis=1, keepdims=True)
-    density = ACCELERATION_DENSITY + squared_speed * SPEED_CHANGE_RATE
-    density[:, [2, 5]] = FORCE_ACCELERATION_DENSITY  # of ln F and its rate
-    covariance[:, MOTION, MOTION] += density[:, None] * UNIT_NOISE * dt_s**TIME_EXPONENT
-    return present._replace(mean=present.mean @ transition.T, covariance=covariance)
-
-
-def update_components(
-    charges: ChargeSeries, prior: Components, charge_pC: Array, variance_pC2: Array, iterations: int
-) -> UpdatedComponents:
-    """Update components with measured charges by an iterated extended Kalman filter (Bell and Cathey 1993).
-
-    Each iteration linearises the charges about the present state, computes the Kalman update of the prior mean with the
-    linearised charges, and moves the state towards the updated mean. The measured charge of an electrode is the charge
-    that the film produces, multiplied by the gain of the electrode.
-
-    Let J be the Jacobian of the charges, P the prior covariance, and R the covariance of the noise. The covariance of
-    the innovation v is S = J P J^T + R. The likelihood p of a component is given by -2 ln p = squared misfit + squared
-    change of the state + ln det S.
-
-    Args:
-        charges: Charges that the film produces for every contact.
-        prior: Predicted components.
-        charge_pC: Measured charges, shape (n_electrode,), pC.
-        variance_pC2: Variances of the noise of the charges, shape (n_electrode,), pC^2.
-        iterations: Number of iterations.
-    """
-    states = prior.mean
-    jacobian = np.zeros((len(states), charge_pC.size, states.shape[1]))  # J
-    for iteration in range(iterations + 1):
-        # Predict the measured charges and their derivatives with respect to the state. A measured charge is the charge
-        # of the film times the gain.
-        film_charge_pC, film_jacobian = charges.linearised(contacts_of(states))
-        gains = np.exp(states[:, GAINS])
-        predicted_pC = film_charge_pC * gains
-        jacobian[:, :, VALUES] = film_jacobian * gains[:, :, None]
-        jacobian[:, :, GAINS] = predicted_pC[:, :, None] * np.eye(charge_pC.size)
-
-        # Compute the innovation v and its covariance S, relative to the charges of the prior mean.
-        cross_covariance = jacobian @ prior.covariance  # J P
-        charge_covariance = cross_covariance @ jacobian.swapaxes(1, 2)  # J P J^T
-        innovation_covariance = charge_covariance + np.diag(variance_pC2)
-        residual_pC = charge_pC - predicted_pC
-        innovation = residual_pC[:, :, None] - jacobian @ (prior.mean - states)[:, :, None]
-        weighted_innovation = np.linalg.solve(innovation_covariance, innovation)  # S^-1 v
-        if iteration < iterations:  # move the state, unless this is the last evaluation
-            # From the present state to the Kalman update of the prior mean, shape (n_component, n_state)
-            step = prior.mean + (cross_covariance.swapaxes(1, 2) @ weighted_innovation)[:, :, 0] - states
-            relative_length = np.abs(step[:, VALUES]) / MAX_ITERATION_STEP
-            states = states + step / np.maximum(relative_length.max(axis=1, keepdims=True), 1.0)
-
-    squared_misfit = (residual_pC**2 / variance_pC2).sum(axis=1)
-    squared_change = (weighted_innovation * (charge_covariance @ weighted_innovation)).sum(axis=(1, 2))
-    squared_distance = squared_misfit + squared_change
-    log_weight = prior.log_weight - 0.5 * (squared_distance + np.linalg.slogdet(innovation_covariance).logabsdet)
-    gain = np.linalg.solve(innovation_covariance, cross_covariance).swapaxes(1, 2)  # Kalman gain P J^T S^-1
-    covariance = prior.covariance - gain @ cross_covariance
-    covariance = 0.5 * (covariance + covariance.swapaxes(1, 2))  # removes asymmetric rounding errors
-    return UpdatedComponents(Components(states, covariance, log_weight), squared_misfit, squared_distance)
-
-
-def prune_components(components: Components, max_count: int = 8, merge_distance: float = 0.7) -> Components:
-    """Remove components whose weight is too small for a number, and merge components with a similar motion.
-
-    If the motions of two components are similar, the less probable component is removed. The weight of the removed
-    component is added to the weight of the more probable component.
-
-    Args:
-        components: Components after an update.
-        max_count: Largest number of components that remain, which are the most probable ones.
-        merge_distance: Difference of each entry of `MOTION` below which two components are merged, in standard
-            deviations of the entry.
-
-    Returns:
-        The remaining components, the most probable first.
-    """
-    log_weight = components.log_weight - components.log_weight.max()
-    # Motion of each component and its standard deviations, shape (n_component, number of entries of MOTION)
-    motion = components.mean[:, MOTION]
-    std = np.sqrt(np.diagonal(components.covariance, axis1=1, axis2=2)[:, MOTION])
-    kept: list[int] = []
-    for row in np.argsort(-log_weight, kind="stable").tolist():  # the most probable component first
-        if np.exp(log_weight[row]) < np.finfo(float).tiny:
-            break
-        is_similar = (np.abs(motion[kept] - motion[row]) < merge_distance * std[row]).all(axis=1)
-        if is_similar.any():
-            first = kept[is_similar.argmax()]
-            log_weight[first] = np.logaddexp(log_weight[first], log_weight[row])  # add the weights
-        else:
-            kept.append(row)
-    return components._replace(log_weight=log_weight).select(kept[:max_count])
-
-
-def split_first_component(components: Components, axis: Array, distance: float) -> Components:
-    """Add two narrow components, one at each end of an axis through the first component.
-
-    The weight of an added component is the density of the first component at this end. Its variance along the axis is a
-    quarter of that of the first component.
-
-    Args:
-        components: The components.
-        axis: Expected change of the state for one standard deviation along the axis, shape (6 + n_electrode,).
-        distance: Distance of the ends from the first component, in standard deviations.
-    """
-    split = components.with_copies_of_first(2)
-    split.mean[-2:] += distance * np.array([axis, -axis])
-    split.covariance[-2:] -= 0.75 * np.outer(axis, axis)
-    split.log_weight[-2:] -= 0.5 * distance**2
-    return split
-
 
 SLOW_NOISE_STD = 0.003
 """Standard deviation of slow noise, relative to the charge. Slow noise lasts for several frames."""

@@ -47,7 +47,7 @@ from isocharge.serve.model.robust_estimate import ModelValues, RobustProblem
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.stage import Rule, Setting, Setup, Stage
 from isocharge.serve.signal_chain.thermal import warming_ratios
-from isocharge.serve.tracking.contact_mixture import GAIN_STD, contacts_of
+from isocharge.serve.tracking.gaussian_components import GAIN_STD, contacts_of
 
 UNUSED_FRAME_FLAGS = frozenset({OUTSIDE, BEYOND, STRESS, GAP, REPEAT})
 """Flags of frames that are not used, although the other frames of the same touch may be used.
