@@ -100,8 +100,8 @@ class PressWatch:
     """Time since the touch after which a press is refused if it is not steady yet, s. A longer press would have a
     larger error of the leak correction."""
 
-    CHECKS_PER_WINDOW = 10
-    """Number of examinations within the length of a window. An examination at every frame would take too long."""
+    CHECK_INTERVAL_S = 0.05
+    """Time between examinations of the window, s. An examination at every frame would take too long."""
 
     MIN_REST_FRAMES = 3
     """Smallest number of frames at rest that must precede a press."""
@@ -144,10 +144,10 @@ class PressWatch:
         self._begin_s = t_s
         self._end_s = t_s  # time of the latest frame of the press
         rest_charges_pC = [frame.charge_pC for frame in self._frames if frame.clock_s <= t_s - self.EDGE_S]
-        self._frames.clear()
         self._rest_pC: Array | None = None  # mean charges just before the touch; None without enough frames
         if len(rest_charges_pC) >= self.MIN_REST_FRAMES:
             self._rest_pC = np.array(rest_charges_pC).mean(axis=0)
+        self._frames.clear()
         self._last_check_s = t_s  # time at which the window was last examined
         self._reason = ""  # why the press is not steady yet; empty before the first examined window
         self._min_scatter_pC = math.inf  # smallest scatter of all windows
@@ -174,29 +174,25 @@ class PressWatch:
             The phase and, if a press is refused or not steady yet, the reason. The result contains an accepted press
             only for the reading with which the press was accepted.
         """
-        if not {RECONNECTED, RESTART}.isdisjoint(frame.flags):
+        if RECONNECTED in frame.flags or RESTART in frame.flags:
             # The charges and times before the interruption cannot be compared with later ones.
-            self._frames.clear()
-            self._end_s = -math.inf
+            self._begin(-math.inf)
             self._phase = Phase.taring
             return WatchResult(Phase.refused, PORT_LOST)
         if frame.charge_pC is None:  # there is no tare yet, or the frame is invalid
             if TARE in frame.flags:  # the tare is being measured
                 self._phase = Phase.taring
-            return WatchResult(self._phase)
-        if not frame.is_contact:
+        elif not frame.is_contact:
             return self._process_rest(frame)
-
-        # Something touches the film.
-        if self._phase in (Phase.waiting, Phase.taring):
-            self._begin(frame.clock_s)
-            self._phase = Phase.settling
-        if self._phase is Phase.lift:  # the press was accepted or refused before, and the finger is still on the film
-            return WatchResult(self._phase)
-        result = self._process_press(frame)
-        if result.phase is not Phase.settling:
-            self._phase = Phase.lift
-        return result
+        elif self._phase is not Phase.lift:
+            if self._phase is not Phase.settling:
+                self._begin(frame.clock_s)
+                self._phase = Phase.settling
+            result = self._process_press(frame)
+            if result.phase is not Phase.settling:
+                self._phase = Phase.lift
+            return result
+        return WatchResult(self._phase)
 
     def _process_press(self, frame: Frame) -> WatchResult:
         """Add the next frame to the window, and accept or refuse the press if this can be decided.
@@ -214,9 +210,8 @@ class PressWatch:
             return WatchResult(Phase.refused, NO_REST_BEFORE_PRESS)
         self._store(frame, self.WINDOW_S, self.MIN_FRAMES)
 
-        # The window is examined several times within its length, but not in each frame, which would take too long.
         is_window_full = held_s >= self.WINDOW_S and len(self._frames) >= self.MIN_FRAMES
-        if is_window_full and self._end_s - self._last_check_s >= self.WINDOW_S / self.CHECKS_PER_WINDOW:
+        if is_window_full and self._end_s - self._last_check_s >= self.CHECK_INTERVAL_S:
             self._last_check_s = self._end_s
             press = self._examine_window(self._rest_pC, frame.noise_pC)
             if press is not None:
@@ -231,7 +226,9 @@ class PressWatch:
 
         A straight line is fitted to each charge in the window. The scatter of a charge is the standard deviation of its
         residuals from the line. The drift of a charge is the change of its line from the beginning to the end of the
-        window. The reason is that of the window with the smallest scatter, because the reason of a window with a sudden
+        window. The charges scatter because of the noise at rest, and because a hand varies its force.
+
+        The reason is that of the window with the smallest scatter, because the reason of a window with a sudden
         movement, such as the release, would only describe the movement.
 
         Args:
@@ -247,50 +244,34 @@ class PressWatch:
         slope_pC_per_s = centred_s @ charge_pC / square_sum_s2
         mean_pC = charge_pC.mean(axis=0)
         scatter_pC = (charge_pC - mean_pC - np.outer(centred_s, slope_pC_per_s)).std(axis=0)
+        drift_pC = np.abs(slope_pC_per_s) * (times_s[-1] - times_s[0])
 
-        reason = self._unsteady(mean_pC, scatter_pC, slope_pC_per_s, times_s[-1] - times_s[0], noise_pC)
-        if not reason:
+        # A charge that is smaller than the mean magnitude may change as much as a charge of the mean magnitude. The
+        # change of a line through n values has the standard deviation sqrt(12 / n) times that of one value.
+        magnitude_pC = np.abs(mean_pC)
+        reference_pC = np.maximum(magnitude_pC, magnitude_pC.mean())
+        drift_std_pC = scatter_pC * math.sqrt(12.0 / len(times_s))
+        relative_drift = drift_pC / (self.MAX_RELATIVE_DRIFT * reference_pC + self.DRIFT_SIGMAS * drift_std_pC)
+        hand_noise_pC = self.RELATIVE_NOISE * magnitude_pC.mean()
+        relative_scatter = scatter_pC / (self.MAX_SCATTER_SIGMAS * np.hypot(noise_pC, hand_noise_pC))
+
+        shaking = relative_scatter.argmax()
+        drifting = relative_drift.argmax()
+        if relative_scatter[shaking] > 1.0:
+            reason = f"the charge of {self._electrodes[shaking]} shakes by {scatter_pC[shaking]:.2g} pC"
+        elif relative_drift[drifting] > 1.0:
+            reason = (
+                f"the charge of {self._electrodes[drifting]} changes by {slope_pC_per_s[drifting]:.2g} pC per second "
+                f"from {mean_pC[drifting]:.3g} pC: hold place and force still; if it also changes under a weight, "
+                "measure the leak of the amplifiers with isocharge serve doctor"
+            )
+        else:
             flags = flags_in_order(flag for frame in self._frames for flag in frame.flags)
             return SteadyPress(mean_pC, self._end_s - self._begin_s, flags)
         if scatter_pC.max() <= self._min_scatter_pC:
             self._min_scatter_pC = scatter_pC.max()
             self._reason = reason
         return None
-
-    def _unsteady(
-        self, charge_pC: Array, scatter_pC: Array, slope_pC_per_s: Array, window_s: float, noise_pC: Array
-    ) -> str:
-        """Return the reason if a charge scatters or drifts too much; empty if the press is steady.
-
-        The charges scatter because of the noise at rest, and because a hand varies its force.
-
-        Args:
-            charge_pC: Mean charges, shape (n_electrode,), pC.
-            scatter_pC: Scatter of the charges, shape (n_electrode,), pC.
-            slope_pC_per_s: Slopes of the lines, shape (n_electrode,), pC/s.
-            window_s: Length of the window, s.
-            noise_pC: Standard deviation of the charges at rest, shape (n_electrode,), pC.
-        """
-        mean_magnitude_pC = np.abs(charge_pC).mean()
-        max_scatter_pC = self.MAX_SCATTER_SIGMAS * np.hypot(noise_pC, self.RELATIVE_NOISE * mean_magnitude_pC)
-        worst = (scatter_pC / max_scatter_pC).argmax()
-        if scatter_pC[worst] > max_scatter_pC[worst]:
-            return f"the charge of {self._electrodes[worst]} shakes by {scatter_pC[worst]:.2g} pC"
-
-        # The change of a line through n values has the standard deviation sqrt(12 / n) times that of one value.
-        drift_std_pC = scatter_pC * math.sqrt(12.0 / len(self._frames))
-        # A charge that is smaller than the mean magnitude may change as much as a charge of the mean magnitude.
-        reference_pC = np.maximum(np.abs(charge_pC), mean_magnitude_pC)
-        max_drift_pC = self.MAX_RELATIVE_DRIFT * reference_pC + self.DRIFT_SIGMAS * drift_std_pC
-        drift_pC = np.abs(slope_pC_per_s) * window_s
-        worst = (drift_pC / max_drift_pC).argmax()
-        if drift_pC[worst] <= max_drift_pC[worst]:
-            return ""
-        return (
-            f"the charge of {self._electrodes[worst]} changes by {slope_pC_per_s[worst]:.2g} pC per second from "
-            f"{charge_pC[worst]:.3g} pC: hold place and force still; if it also changes under a weight, measure the "
-            "leak of the amplifiers with isocharge serve doctor"
-        )
 
     def _store(self, frame: Frame, duration_s: float, min_count: int = 1) -> None:
         """Store a frame, and discard the frames that are older than `duration_s`, except the latest `min_count`."""
