@@ -172,21 +172,17 @@ def wander(
             f", got {force_range_N} N, {radius_mm} mm, a rest of {rest_s} s and {seconds} s at {rate_Hz} Hz"
         )
     rng = np.random.default_rng(seed)
-    rows = [(0.0, 0.0, 0.0, 0.0)]
+    rows = [np.zeros((1, 4))]
     start_s = rest_s
     while start_s < seconds:
         end_s = start_s + rng.uniform(*PRESS_DURATION_S)
         distance_mm = radius_mm * np.sqrt(rng.uniform(size=2))  # distributes the points evenly over the disk
-        first, last = distance_mm * np.exp(2j * np.pi * rng.uniform(size=2))
+        position = np.repeat(distance_mm * np.exp(2j * np.pi * rng.uniform(size=2)), 2)  # x + iy of the four rows
         first_force_N, last_force_N = min_force_N * (max_force_N / min_force_N) ** rng.uniform(size=2)
-        rows += [
-            (start_s, first.real, first.imag, 0.0),
-            (start_s + RAMP_S, first.real, first.imag, first_force_N),
-            (end_s - RAMP_S, last.real, last.imag, last_force_N),
-            (end_s, last.real, last.imag, 0.0),
-        ]
+        time_s = [start_s, start_s + RAMP_S, end_s - RAMP_S, end_s]
+        rows.append(np.column_stack([time_s, position.real, position.imag, [0.0, first_force_N, last_force_N, 0.0]]))
         start_s = end_s + rng.uniform(*PAUSE_DURATION_S)
-    return _interpolate(np.array(rows), np.arange(round(seconds * rate_Hz)) / rate_Hz, rate_Hz, min_force_N)
+    return _interpolate(np.concatenate(rows), np.arange(round(seconds * rate_Hz)) / rate_Hz, rate_Hz, min_force_N)
 
 
 def corrupt(data: bytes, fraction: float, rng: np.random.Generator) -> bytes:

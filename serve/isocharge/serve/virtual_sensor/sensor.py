@@ -174,9 +174,7 @@ class VirtualSensor:
         self._offset_pC = random_pC if offset_pC is None else np.reshape(offset_pC, n_electrode)
 
         self._reset_counters()
-        self._stop = threading.Event()
-        self._writer: threading.Thread | None = None
-        self._port_stack = contextlib.ExitStack()  # closes the port and removes the link, if the context is active
+        self._port_stack = contextlib.ExitStack()  # stops the writer and closes the port, if the context is active
         self.port_path = ""
 
     def _reset_counters(self) -> None:
@@ -194,7 +192,7 @@ class VirtualSensor:
         Raises:
             PortError: If the context is not active.
         """
-        if self._writer is None:
+        if not self.port_path:
             raise PortError("the virtual sensor does not play; use `with VirtualSensor(...) as sensor`")
         return str(self._link or self.port_path)
 
@@ -210,7 +208,7 @@ class VirtualSensor:
             rows = range(first_frame, first_frame + block_size)
             clean_pC = self._clean_pC.take(rows, axis=0, mode="wrap")  # after its last row, the script begins again
             block_pC = self._noise(clean_pC, self._rng) + self._offset_pC  # shape (block_size, electrodes)
-            for frame_number, charge_pC in enumerate(block_pC.tolist(), start=first_frame):
+            for frame_number, charge_pC in zip(rows, block_pC.tolist(), strict=True):
                 yield self._frame_bytes(frame_number, tuple(charge_pC))
 
     def _frame_bytes(self, frame_number: int, charge_pC: tuple[float, ...]) -> bytes:
@@ -223,16 +221,16 @@ class VirtualSensor:
         Returns:
             The bytes that the sensor sends; empty if the frame is lost because of a fault.
         """
-        faults = self._faults
         # A random number is drawn only if random frames are to be lost. Otherwise, it would change the noise that
         # belongs to the seed.
-        if faults.lose_share > 0.0 and self._rng.random() < faults.lose_share:
+        lose_share = self._faults.lose_share
+        if lose_share > 0.0 and self._rng.random() < lose_share:
             return b""
         t_us = round(1e6 * frame_number / self.script.rate_Hz) % T_US_MODULUS
         data = self._encode(Frame(frame_number % SEQ_MODULUS, t_us, charge_pC))
-        if not faults.corrupt_share:
+        if not self._faults.corrupt_share:
             return data
-        damaged_data = corrupt(data, faults.corrupt_share, self._rng)
+        damaged_data = corrupt(data, self._faults.corrupt_share, self._rng)
         if damaged_data != data:
             self.corrupted += 1
         return damaged_data
@@ -244,38 +242,35 @@ class VirtualSensor:
             OutputError: If the link cannot be created.
         """
         self._reset_counters()
-        self._stop.clear()
-        port = PseudoPort()
+        stop = threading.Event()
         with contextlib.ExitStack() as stack:  # closes the port if the link cannot be created
-            stack.callback(port.close)
+            port = stack.enter_context(contextlib.closing(PseudoPort()))
             if self._link:
                 with as_output_errors(self._link):
                     self._link.symlink_to(port.url)
                 stack.callback(self._link.unlink, missing_ok=True)
+            writer = threading.Thread(target=self._play, args=(port, stop), name="virtual sensor", daemon=True)
+            writer.start()
+            stack.callback(writer.join)
+            stack.callback(stop.set)  # called before `writer.join`, because an exit stack calls the last callback first
             self._port_stack = stack.pop_all()
         self.port_path = port.url
-        self._writer = threading.Thread(target=self._play, args=(port,), name="virtual sensor", daemon=True)
-        self._writer.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         """Stop the thread that writes the frames, and close the port."""
-        self._stop.set()
-        if self._writer is not None:
-            self._writer.join()
         self._port_stack.close()
-        self._writer = None
+        self.port_path = ""
 
-    def _play(self, port: PseudoPort) -> None:
-        """Write each frame to the port when it is due, until the sensor is stopped.
+    def _play(self, port: PseudoPort, stop: threading.Event) -> None:
+        """Write each frame to the port when it is due, until the event `stop` is set.
 
         A frame that is late by more than `MAX_LATENESS_S` postpones all later frames.
         """
         start_s = time.perf_counter()
         for frame_number, data in enumerate(self.frames()):
             due_s = start_s + self.paused_s + frame_number / self.script.rate_Hz
-            is_stopped = self._stop.wait(max(0.0, due_s - time.perf_counter()))
-            if is_stopped:
+            if stop.wait(max(0.0, due_s - time.perf_counter())):
                 return
             lateness_s = time.perf_counter() - due_s
             if lateness_s > MAX_LATENESS_S:
