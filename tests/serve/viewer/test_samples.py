@@ -122,7 +122,7 @@ def test_recorded_tape_stores_all_samples_and_the_largest_force_of_each_piece(re
     assert len(recorded.samples(0, 36_000)) == recorded.total == 36_000
     assert recorded.span() == (1e9, 1e9 + 35.999)
     assert recorded.first_number_after(1e9 + 15.0005) == 15_001
-    overview = recorded.overview()
+    overview = recorded.extent()["overview"]
     assert len(overview) == MAX_DRAWN_SAMPLES
     assert overview.index(1.5) / MAX_DRAWN_SAMPLES == pytest.approx(0.5, abs=0.01)
     assert sum(force > 0 for force in overview) == 1

@@ -12,7 +12,6 @@ messages for a slow browser exists.
 
 import secrets
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -136,7 +135,6 @@ class LivePage(Application):
         self.act: Callable[[Action], None] | None = None
         self.traffic = Traffic()
         self._access = access
-        self._markers: deque[tuple[float, str]] = deque(maxlen=MAX_MARKERS)
         self._state: dict[str, Any] = {}
         self._state_lock = Lock()  # the thread of the stream and the thread of the server change the state
         self._version = 0  # number of times that the state has changed
@@ -161,9 +159,8 @@ class LivePage(Application):
 
     def add_marker(self, marker: tuple[float, str]) -> None:
         """Add a marker, which consists of a Unix time, s, and a text, to the markers that the page shows."""
-        time_s, text = marker  # the encoder of JSON accepts no named tuple
-        self._markers.append((time_s, text))
-        self.update(markers=list(self._markers))
+        earlier_markers = self._state.get("markers", [])
+        self.update(markers=[*earlier_markers, tuple(marker)][-MAX_MARKERS:])  # JSON accepts no named tuple
 
     def _check_and_answer(self, method: str, path: str, headers: Mapping[str, str], body: bytes) -> Response:
         """Check whether a request is allowed, and return the response. The files of the page need no token.
@@ -205,10 +202,7 @@ class LivePage(Application):
             "samples": samples.tolist(),
         }
         if version != request.version:
-            extent: dict[str, Any] = {}
-            if isinstance(tape, RecordedTape):
-                extent = {"span": tape.span(), "samples": tape.total, "overview": tape.overview()}
-            content |= {"version": version, "state": self._state | extent}
+            content |= {"version": version, "state": self._state | tape.extent()}
         return content
 
 

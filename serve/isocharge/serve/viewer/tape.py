@@ -38,9 +38,6 @@ RECORD_NUMBERS = (
 )
 """Names of the numbers of the record in a sample."""
 
-OTHER_NUMBERS = ("x_mm", "y_mm")
-"""Names of the numbers of the other contact in a sample, where they have the prefix `other_`."""
-
 
 def sample_type(electrodes: tuple[str, ...]) -> "np.dtype[Any]":
     """Return the NumPy type of a sample, with one field for each number.
@@ -48,9 +45,9 @@ def sample_type(electrodes: tuple[str, ...]) -> "np.dtype[Any]":
     Args:
         electrodes: Names of the electrodes. The charge of the electrode A is the field `charge_pC.A`.
     """
-    others = [f"other_{name}" for name in OTHER_NUMBERS]
     charges = [f"charge_pC.{electrode}" for electrode in electrodes]
-    return np.dtype([(name, float) for name in (*RECORD_NUMBERS, *others, "flags", "contact", "records", *charges)])
+    names = [*RECORD_NUMBERS, "other_x_mm", "other_y_mm", "flags", "contact", "records", *charges]
+    return np.dtype([(name, float) for name in names])
 
 
 def sample_values(record: PredictionRecord, electrodes: tuple[str, ...]) -> tuple[float | None, ...]:
@@ -62,12 +59,12 @@ def sample_values(record: PredictionRecord, electrodes: tuple[str, ...]) -> tupl
     """
     # The tracked contact, if there is one, has only some of the numbers.
     values = [getattr(record.tracked, name, getattr(record, name)) for name in RECORD_NUMBERS]
-    others = [getattr(record.other, name, None) for name in OTHER_NUMBERS]
+    other_position = (None, None) if record.other is None else (record.other.x_mm, record.other.y_mm)
     flags = sum(FLAG_BITS.get(flag, 0) for flag in record.flags)
     record_count = 1  # `coalesce` adds the counts of the samples that it replaces by a single sample
     charge_pC = record.charge_pC or {}
     charges = [charge_pC.get(electrode) for electrode in electrodes]
-    return *values, *others, flags, float(record.contact), record_count, *charges
+    return *values, *other_position, flags, float(record.contact), record_count, *charges
 
 
 def coalesce(samples: Samples, max_samples: int) -> Samples:
@@ -128,16 +125,17 @@ class Tape:
 
     One thread appends samples. Any other thread may read samples at the same time.
 
-    Args:
-        dtype: NumPy type of a sample.
-        capacity: Number of samples that are stored.
-
     Attributes:
         total: Number of samples that were appended since the tape was created.
     """
 
     def __init__(self, dtype: "np.dtype[Any]", capacity: int = LIVE_SAMPLES) -> None:
-        """Create a tape without samples. The docstring of the class describes the arguments."""
+        """Create a tape without samples.
+
+        Args:
+            dtype: NumPy type of a sample.
+            capacity: Number of samples that are stored.
+        """
         self.total = 0
         self._ring: Samples = np.zeros(capacity, dtype)
 
@@ -162,7 +160,7 @@ class Tape:
         return samples[numbers >= self.oldest]  # samples may have been appended while the others were copied
 
     def timestamp(self, number: int) -> float:
-        """Return the Unix time of the stored sample that has the given number, s."""
+        """Return the Unix time of the stored sample that has the given number, s. Without samples, return 0."""
         return float(self._ring[number % len(self._ring)]["timestamp"])
 
     def first_number_after(self, time_s: float) -> int:
@@ -174,9 +172,11 @@ class Tape:
 
     def span(self) -> tuple[float, float]:
         """Return the Unix times of the oldest and the latest stored sample, s. Without samples, return two zeros."""
-        if not self.total:
-            return 0.0, 0.0
         return self.timestamp(self.oldest), self.timestamp(self.total - 1)
+
+    def extent(self) -> dict[str, Any]:
+        """Return a description of a complete recording, which a live stream does not have."""
+        return {}
 
     def rate_Hz(self) -> float | None:
         """Compute the frame rate of the last `HISTORY_S` seconds, Hz. Return None if the rate is unknown."""
@@ -201,8 +201,7 @@ class RecordedTape(Tape):
         if self.total == len(self._ring):
             self._double()
         time_s, *others = values
-        _, latest_time_s = self.span()
-        super().append((max(latest_time_s, time_s or 0.0), *others))
+        super().append((max(self.timestamp(self.total - 1), time_s or 0.0), *others))
 
     def _double(self) -> None:
         """Replace the buffer by a file of twice its size that is mapped to memory.
@@ -217,12 +216,15 @@ class RecordedTape(Tape):
             file.flush()
             self._ring = np.memmap(file, self._ring.dtype, "r+")  # the mapping keeps the closed file
 
-    def overview(self) -> list[float]:
-        """Return the largest force in each of `MAX_DRAWN_SAMPLES` pieces of the recording, N."""
+    def extent(self) -> dict[str, Any]:
+        """Return the times of the first and the last sample, the number of samples, and an overview of the forces.
+
+        The overview contains the largest force in each of `MAX_DRAWN_SAMPLES` pieces of the recording, N.
+        """
         samples = self._ring[: self.total]
         start_s, end_s = self.span()
         elapsed = (samples["timestamp"] - start_s) / max(end_s - start_s, np.finfo(float).tiny)  # from 0 to 1
         piece_of_sample = np.minimum(elapsed * MAX_DRAWN_SAMPLES, MAX_DRAWN_SAMPLES - 1).astype(int)
         max_force_N = np.zeros(MAX_DRAWN_SAMPLES)
-        np.maximum.at(max_force_N, piece_of_sample, np.nan_to_num(samples["force_N"], nan=0.0))
-        return max_force_N.round(3).tolist()
+        np.fmax.at(max_force_N, piece_of_sample, samples["force_N"])  # ignores forces that are NaN
+        return {"span": (start_s, end_s), "samples": self.total, "overview": max_force_N.round(3).tolist()}
