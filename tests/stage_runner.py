@@ -5,14 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 from msgspec import structs
 
-from isocharge.serve import Chunk, Frame, TouchStream, Validity, device_from_table, encode_frame
+from isocharge.serve import Chunk, Frame, TouchStream, device_from_table, encode_frame
 from isocharge.serve.flags import INVALID
 from isocharge.serve.frames.frame import SATURATED_BIT
 from isocharge.serve.live.device import create_stages
-from isocharge.serve.model.contact import disk_corners
 from isocharge.serve.record.record import flags_in_order
 from isocharge.serve.signal_chain.stage import Device, Setup
-from isocharge.serve.tracking.contact_mixture import ContactMixture
 from isocharge.serve.tracking.tracker import Tracker, TrackRule
 
 
@@ -67,22 +65,9 @@ def charges_and_contacts(frames):
     return np.array(charges), np.array([frame.is_contact for frame in frames])
 
 
-def contact_mixture(charges, noise):
-    """Return a mixture whose contacts are valid on the whole film of a charge map."""
-    return ContactMixture(charges, noise, Validity(disk_corners(charges.domain.radius), (0.0, np.inf)))
-
-
-def new_tracker(new_filter=None, **settings):
-    """Return a tracker with settings of the section `[track]`.
-
-    Args:
-        new_filter: Function that returns a new filter, for a film with a fold.
-        settings: Settings.
-    """
-    tracker = Tracker(Setup((), Device(rules={TrackRule: TrackRule(**settings)})))
-    if new_filter is not None:
-        tracker._new_filter = new_filter
-    return tracker
+def new_tracker(**settings):
+    """Return a tracker with settings of the section `[track]`."""
+    return Tracker(Setup((), Device(rules={TrackRule: TrackRule(**settings)})))
 
 
 def track(tracker, contact, t_s, flags=(), charge_pC=None):

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from functools import partial
 
 import numpy as np
 import pytest
@@ -10,14 +9,16 @@ from numpy.polynomial import Polynomial, chebyshev
 
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError
-from isocharge.serve import Predictor, TouchStream
+from isocharge.serve import Predictor, TouchStream, Validity
 from isocharge.serve.live.device import device_from_table
 from isocharge.serve.model.charge_file import charge_map_bytes
 from isocharge.serve.model.charge_series import ChargeSeries
+from isocharge.serve.model.contact import disk_corners
 from isocharge.serve.model.metadata import ModelNoise
+from isocharge.serve.tracking.contact_mixture import ContactMixture
 from isocharge.serve.tracking.gaussian_components import GAIN_STD
 from model_files import put_charge_map
-from stage_runner import contact_mixture, new_tracker, recorded_lines
+from stage_runner import new_tracker, recorded_lines
 from stage_runner import track as track_frame
 
 RADIUS = 6.0
@@ -68,9 +69,16 @@ def noisy_charges(x, gains=(1.0, 1.0, 1.0), noise=NOISE):
     return clean + np.sqrt(noise.variance(clean)) * rng.standard_normal(clean.shape)
 
 
+def folded_mixture():
+    """Return a mixture of contacts on the folded film."""
+    return ContactMixture(folded_series(), NOISE, Validity(disk_corners(RADIUS), (0.0, np.inf)))
+
+
 def folded_tracker():
     """Return a tracker of the folded film."""
-    return new_tracker(partial(contact_mixture, folded_series(), NOISE))
+    tracker = new_tracker()
+    tracker._new_filter = folded_mixture
+    return tracker
 
 
 def track(x, rate_Hz=1000.0, **options):
@@ -152,7 +160,7 @@ def test_charges_of_no_contact_are_not_tracked_and_saturated_frames_are_ignored(
 
 def test_rapidly_rising_force_is_followed():
     """The force triples from frame to frame, which the motion of a contact does not explain."""
-    mixture = contact_mixture(folded_series(), NOISE)
+    mixture = folded_mixture()
     for number, force in enumerate([0.06, 0.2, 0.6]):
         contact, *_ = mixture.update(charges(-4.0, 1.0, force), 5e-3 * number)
         assert contact.mean[2] == pytest.approx(np.log(force), abs=0.05)
@@ -161,7 +169,7 @@ def test_rapidly_rising_force_is_followed():
 def test_frames_before_a_gap_do_not_change_the_contact_after_it():
     """At 1 kHz, a step has several frames. The charges before the gap are those of another contact."""
     before, after = noisy_charges(np.full(12, -5.0)), noisy_charges(np.full(10, -2.0))
-    mixture = contact_mixture(folded_series(), NOISE)
+    mixture = folded_mixture()
     for number, charge_pC in enumerate(before):
         mixture.update(charge_pC, 1e-3 * number)
     first, *_ = mixture.update(after[0], 0.4)
