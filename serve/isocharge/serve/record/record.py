@@ -171,21 +171,20 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
         Raises:
             ValueError: If a number is not finite.
         """
-        line: str | None = self.__dict__.get("line")
-        if line is None:
-            values: dict[str, Any] = {}
-            for field in record_fields(self.sections):
-                value = getattr(self, field.name)
-                if isinstance(value, float):
-                    value = round(value, DECIMALS)
-                elif value and field.json_type == "object":  # the charges by electrode, or a struct of numbers
-                    numbers = value if isinstance(value, dict) else structs.asdict(value)
-                    value = {
-                        name: None if number is None else round(number, DECIMALS) for name, number in numbers.items()
-                    }
-                values[field.name] = value
-            line = _ENCODE(values)
-            self.__dict__["line"] = line
+        stored_line: str | None = self.__dict__.get("line")
+        if stored_line is not None:
+            return stored_line
+        values: dict[str, Any] = {}
+        for field in record_fields(self.sections):
+            value = getattr(self, field.name)
+            if isinstance(value, float):
+                value = round(value, DECIMALS)
+            elif value and field.json_type == "object":  # the charges by electrode, or a struct of numbers
+                numbers = value if isinstance(value, dict) else structs.asdict(value)
+                value = {name: None if number is None else round(number, DECIMALS) for name, number in numbers.items()}
+            values[field.name] = value
+        line = _ENCODE(values)
+        self.__dict__["line"] = line
         return line
 
     @property

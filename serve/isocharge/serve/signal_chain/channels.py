@@ -293,10 +293,9 @@ class Gain(Stage):
     def __init__(self, setup: Setup) -> None:
         """Set the conversion. Without settings, the values are charges in pC."""
         self._channels = Channels(setup)
-        self._layout: tuple[tuple[str, ...], int] | None = None  # names and number of values of the previous frame
-        self._select: itemgetter[Any] = itemgetter(
-            0
-        )  # function that returns the values of the electrodes in frames of this layout
+        # Names and number of values of the previous frame, and the function that selects the values of the electrodes
+        self._layout: tuple[tuple[str, ...], int] | None = None  # None before the first frame
+        self._select: itemgetter[Any] = itemgetter(0)
         rule = setup.device.rule(GainRule) or GainRule(pC_per_unit=1.0)
         self.gain_pC = setup.for_each_electrode("gain.pC_per_unit", rule.pC_per_unit)
         self.zero = setup.for_each_electrode("gain.offset", rule.offset)
