@@ -28,7 +28,6 @@ from isocharge.serve.model.model_folder import find_model
 from isocharge.serve.presses.number_columns import CHARGE_RULE
 from isocharge.serve.presses.table_file import CsvTable
 from isocharge.serve.record.formats import csv_header
-from isocharge.serve.record.record import RECORD_FIELDS
 
 HARMFUL_CATEGORIES = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
 
@@ -151,7 +150,7 @@ def read_metadata(names):
     props = GOOD_PROPS | {key: json.dumps(content.get(key, names[0]))}
     metadata = ModelMetadata.from_props(props, names[2])
     show(metadata.label)
-    print(csv_header(metadata.electrodes, RECORD_FIELDS))
+    print(csv_header(metadata.electrodes))
     print(metadata.frame_id)
 
 

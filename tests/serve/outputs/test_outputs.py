@@ -14,14 +14,14 @@ from isocharge.common.errors import InputError
 from isocharge.serve.outputs.output import WriterQueue
 from isocharge.serve.outputs.udp import UdpOutput
 from isocharge.serve.record.formats import csv_header, csv_row
-from isocharge.serve.record.record import FollowedFilm, TrackedContact, record_fields
+from isocharge.serve.record.record import FollowedFilm, TrackedContact
 
 ELECTRODES = ("A", "B")
 
 
 def test_csv_has_the_fields_of_a_record(contract, record):
     columns = [field for field in contract for _ in (ELECTRODES if field.endswith("_pC") else "_")]
-    assert [name.partition(".")[0] for name in csv_header(ELECTRODES, record_fields()).split(",")] == columns
+    assert [name.partition(".")[0] for name in csv_header(ELECTRODES).split(",")] == columns
     written = record(tare_pC={"A": 1.0, "B": -2.5}, seq=7, flags=("gap", "outside"))
     assert csv_row(written, ELECTRODES) == (
         "1763600000.123457,,7,1.234568,,,,,,,,,,true,800.062500,,,,1.000000,-2.500000,gap outside,,linear/1,linear-film"
@@ -33,7 +33,7 @@ def test_csv_quotes_electrode_names(name, record):
     """Electrodes and films may have any names."""
     electrodes = ("A", name)
     row = csv_row(record(frame_id=name, charge_pC={"A": 1.0, name: 2.0}), electrodes)
-    text = io.StringIO(f"{csv_header(electrodes, record_fields())}\n{row}\n", newline="")
+    text = io.StringIO(f"{csv_header(electrodes)}\n{row}\n", newline="")
     (read,) = csv.DictReader(text, strict=True)
     assert (read["frame_id"], read[f"charge_pC.{name}"], read["model"]) == (name, "2.000000", "linear/1")
     assert None not in read
@@ -41,8 +41,8 @@ def test_csv_quotes_electrode_names(name, record):
 
 def test_tracked_contact_and_followed_film_are_the_last_columns(record):
     sections = ("track", "follow")
-    header = csv_header(ELECTRODES, record_fields(sections))
-    assert header.removeprefix(csv_header(ELECTRODES, record_fields())).startswith(",tracked.x_mm,tracked.y_mm,")
+    header = csv_header(ELECTRODES, sections)
+    assert header.removeprefix(csv_header(ELECTRODES)).startswith(",tracked.x_mm,tracked.y_mm,")
     options = {"sections": sections, "film": FollowedFilm(0.7, 0.05, 12)}
     touched = record(tracked=TrackedContact(*map(float, range(9))), event="tap", **options)
     lines = [csv_row(each, ELECTRODES) for each in (touched, record(**options))]

@@ -24,7 +24,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 from isocharge.common.errors import IsochargeError, OutputError
 from isocharge.common.files import AtomicWriter, new_file
 from isocharge.serve.record.formats import csv_header, csv_row
-from isocharge.serve.record.record import PredictionRecord, record_fields
+from isocharge.serve.record.record import PredictionRecord
 
 
 class Output(Protocol):
@@ -259,7 +259,7 @@ class CsvLines(JsonLines):
         """Write the header."""
         super().__init__(write_text, context)
         self._electrodes = context.electrodes
-        write_text(csv_header(context.electrodes, record_fields(context.sections)) + "\n")
+        write_text(csv_header(context.electrodes, context.sections) + "\n")
 
     def write(self, record: PredictionRecord) -> None:
         """Write the line of a record."""

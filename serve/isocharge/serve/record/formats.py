@@ -9,22 +9,23 @@ that may be null. Because of the two descriptions, viewers can list all fields, 
 
 import csv
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
+from functools import cache
 from typing import Any
 
 from isocharge.serve.record.record import DECIMALS, RECORD_FIELDS, Field, PredictionRecord, record_fields
 
 
-def csv_header(electrodes: Sequence[str], fields: Sequence[Field]) -> str:
+def csv_header(electrodes: Sequence[str], sections: tuple[str, ...] = ()) -> str:
     """Return the header of a CSV file of records, which contains the names of the columns, without the line end.
 
     A field with several numbers has one column for each number, such as `charge_pC.A` for the electrode A.
 
     Args:
         electrodes: Names of the electrodes.
-        fields: Fields of the records.
+        sections: Sections of the device file that may add fields to the records.
     """
-    return _line(name if part is None else f"{name}.{part}" for name, part in _columns(electrodes, fields))
+    return _line(name if part is None else f"{name}.{part}" for name, part in _columns(tuple(electrodes), sections))
 
 
 def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
@@ -37,7 +38,7 @@ def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
         electrodes: Names of the electrodes, in the order of the header.
     """
     cells: list[str] = []
-    for name, part in _columns(electrodes, record_fields(record.sections)):
+    for name, part in _columns(tuple(electrodes), record.sections):
         value = getattr(record, name)
         if part is not None and value is not None:
             value = value[part] if isinstance(value, dict) else getattr(value, part)
@@ -45,16 +46,18 @@ def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
     return _line(cells)
 
 
-def _columns(electrodes: Sequence[str], fields: Sequence[Field]) -> Iterator[tuple[str, str | None]]:
-    """Yield two names for each column: the name of its field, and the name of the part of the field in the column.
+@cache
+def _columns(electrodes: tuple[str, ...], sections: tuple[str, ...]) -> list[tuple[str, str | None]]:
+    """Return two names for each column: the name of its field, and the name of the part of the field in the column.
 
     The parts of charges are the electrodes, and the parts of an object are its fields. The part is None for a field
     with one column.
     """
-    for field in fields:
+    columns: list[tuple[str, str | None]] = []
+    for field in record_fields(sections):
         parts: Sequence[str | None] = _part_names(field, electrodes)
-        for part in parts or [None]:
-            yield field.name, part
+        columns += [(field.name, part) for part in parts or [None]]
+    return columns
 
 
 def _part_names(field: Field, electrodes: Sequence[str]) -> Sequence[str]:
@@ -77,14 +80,14 @@ def cell_text(value: Any) -> str:
     The value None becomes an empty text. The words of a tuple are joined with blanks. A floating-point number gets six
     decimals.
     """
+    if isinstance(value, float):
+        return f"{value:.{DECIMALS}f}"
     if value is None:
         return ""
     if isinstance(value, tuple):
         return " ".join(value)
     if isinstance(value, bool):
         return str(value).lower()
-    if isinstance(value, float):
-        return f"{value:.{DECIMALS}f}"
     return str(value)
 
 
