@@ -12,6 +12,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import partial
+from itertools import islice
 
 from msgspec import structs
 
@@ -261,7 +262,16 @@ def replay(
     """
     previous_chunk: Chunk | None = None
     due_s = 0.0  # monotonic time at which the replay of the next chunk begins
+    records: Iterator[PredictionRecord] = iter(())  # records of the previous chunk that were not yielded yet
     for event in recording.events():
+        if event.latency_us is not None:
+            for record in islice(records, 1):
+                yield structs.replace(record, latency_us=event.latency_us)
+            continue
+
+        # If the recording program ended within the chunk, its last records were not recorded. The stream processes the
+        # whole chunk all the same.
+        deque(records, maxlen=0)
         chunk = event.chunk
         if event.marker is not None:
             on_marker(event.marker)
@@ -277,8 +287,4 @@ def replay(
                 wait_s = max(0.0, due_s - time.monotonic())
                 time.sleep(min(wait_s, threading.TIMEOUT_MAX))
             records = stream.feed(chunk)
-            for latency_us, record in zip(event.latencies_us, records, strict=False):
-                yield structs.replace(record, latency_us=latency_us)
-            # If the recording program ended within the chunk, its last records were not recorded. The stream processes
-            # the whole chunk all the same.
-            deque(records, maxlen=0)
+    deque(records, maxlen=0)

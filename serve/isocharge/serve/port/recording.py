@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self, TypeVar
 
-from msgspec import Meta, Struct, field
+from msgspec import Meta, Struct
 from msgspec.json import encode
 
 from isocharge.common.errors import RecordingError, cut, is_printable
@@ -167,7 +167,6 @@ class Event(Struct):
         use: Label of a new model, `name/version`. The model computed all records after this line.
         marker: A moment that the user has marked.
         chunk: A chunk.
-        latencies_us: Latency of each record that was computed from the chunk, us.
     """
 
     timestamp: float | None = None
@@ -176,7 +175,6 @@ class Event(Struct):
     use: ModelLabel | None = None
     marker: Marker | None = None
     chunk: Chunk | None = None
-    latencies_us: list[Latency] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         """Check that the line contains a complete record or an event.
@@ -234,24 +232,14 @@ class Recording:
         self.name = header.name
 
     def events(self) -> Iterator[Event]:
-        """Yield all events of the recording in their order.
+        """Yield all lines of the recording after the first line in their order.
 
-        The records are not yielded. The event of a chunk contains the latencies of the records that were computed from
-        the chunk, which follow the chunk in the file.
+        The records of a chunk follow the chunk.
 
         Raises:
             RecordingError: If a line other than the last line is damaged.
         """
-        event: Event | None = None
-        for line in self._parsed_lines(Event):
-            if line.latency_us is None:
-                if event is not None:
-                    yield event
-                event = line
-            elif event is not None:
-                event.latencies_us.append(line.latency_us)
-        if event is not None:
-            yield event
+        return self._parsed_lines(Event)
 
     def records(self, record_type: type[Line]) -> Iterator[Line]:
         """Yield the prediction records of the recording in their order.
