@@ -31,7 +31,7 @@ def signed_charges(contact):
     return contact[:, 2:] * (contact[:, :2] @ [[10.0, 0.0, 4.0], [0.0, 10.0, -4.0]] + [0.0, 0.0, 50.0])
 
 
-@pytest.mark.parametrize(("forces", "scatter"), [((0.5,), 0.0), ((0.2, 1.0), 0.0), ((0.2, 0.5, 1.0, 1.8), 0.01)])
+@pytest.mark.parametrize(("forces", "scatter"), [((0.5,), 0.0), ((0.2, 0.5, 1.0, 1.8), 0.01)])
 @pytest.mark.parametrize("is_signed", [False, True])
 def test_presses_with_few_forces_determine_no_higher_powers_of_the_force(film, forces, scatter, is_signed):
     """A series of a higher degree would agree at these forces, but be wrong by the size of the charge between them."""
@@ -107,6 +107,12 @@ def test_field_of_a_taut_film_follows_the_change_of_the_exponent_of_the_force():
     assert fit_field(charges)[0].charge_std < 1e-3
 
 
+def test_error_of_small_charges_of_both_signs_is_below_their_white_noise():
+    presses = draw_presses(lambda contact: 0.02 * signed_charges(contact))
+    series = fit_charge_series(DOMAIN, ("A", "B", "C"), presses[500:], presses[:500], white_pC=0.1)
+    assert rms(series.charges(presses.contact) - presses.charge) < 0.01
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_contacts_of_a_calibration_suffice_for_a_degree_with_an_error_below_the_noise(film, sign):
     """Negative charges, which have no logarithm, need a high degree in the position."""
@@ -180,8 +186,6 @@ def test_charge_series_of_the_whole_domain_and_a_caution_are_released_if_the_dom
 
 FAULTS = {
     "noisy": lambda charge, rng: REFERENCE.add(charge, rng),
-    "wrong gain": lambda charge, _: charge * [1.0, 1.3, 1.0],
-    "far too hard": lambda charge, _: 4.0 * charge,
     "dead electrode": lambda charge, _: np.maximum(charge * [1.0, 0.0, 1.0], 1.0),
     "anything": lambda charge, rng: 10.0 ** rng.uniform(0.0, 4.0, charge.shape),
 }

@@ -49,7 +49,6 @@ def test_domain_is_that_of_the_manifest(dataset):
             lambda d: replace(d, samples=d.samples[np.arange(100)]),
             "expected at least 500 presses at 50 positions, got 100 at 100",
         ),
-        (lambda d: with_samples(d, x_mm=0.0 * d.samples.x_mm, y_mm=0.0 * d.samples.y_mm), "got 6000 at 1"),
         (lambda d: with_samples(d, charge_pC=d.samples.charge_pC[:, :2]), "at least three electrodes"),
         (
             lambda d: with_samples(d, force_N=-d.samples.force_N),

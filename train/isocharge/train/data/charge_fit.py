@@ -58,7 +58,7 @@ SIZE_DEGREE = 4
 """Degree of the polynomial that approximates the logarithm of the size S of the charges as a function of l."""
 
 REFERENCE = noise_model("reference")
-"""Noise that decides which charges of both signs count as small."""
+"""Noise for which the error of a series is chosen."""
 
 FEWEST_PER_TERM = 8
 """Smallest number of presses per coefficient. Fewer presses would not determine the slopes near the edge."""
@@ -75,7 +75,11 @@ GOOD_ENOUGH = 1.5e-4
 
 
 def fit_charge_series(
-    domain: Domain, electrodes: tuple[str, ...], presses: LabelledPresses, validation: LabelledPresses
+    domain: Domain,
+    electrodes: tuple[str, ...],
+    presses: LabelledPresses,
+    validation: LabelledPresses,
+    white_pC: float = REFERENCE.white,
 ) -> ChargeSeries:
     """Fit a charge series to presses by least squares, and choose its degrees by the error on other presses.
 
@@ -84,6 +88,7 @@ def fit_charge_series(
         electrodes: Names of the electrodes, in the order of the charges.
         presses: Presses to which the series is fitted.
         validation: Other presses, on which the error is measured.
+        white_pC: White noise of the charges, pC, which decides which charges of both signs count as small.
 
     Returns:
         The series with the smallest error among the degrees that were tried. Its `charge_std` is the root mean square
@@ -99,7 +104,7 @@ def fit_charge_series(
         candidate_degrees = SIGNED_CANDIDATE_DEGREES
         log_size = _fit_log_size(unit_contact[:, 2], presses.charge)
         target = presses.charge / series_size(log_size, unit_contact[:, 2])[0]
-        error_unit = REFERENCE.sigma(validation.charge) / REFERENCE.gain
+        error_unit = np.hypot(validation.charge, white_pC / REFERENCE.gain)
     else:
         candidate_degrees = CANDIDATE_DEGREES
         log_size = None

@@ -243,7 +243,7 @@ def evaluate_dataset(dataset: Dataset, model_folder: Path, settings: Settings) -
     failure_reasons = []
     try:
         train, validation = split_by_position(presses, TrainingConfig().hold_out)
-        charge_map = fit_charge_series(domain, dataset.sensor.electrode_names, train, validation)
+        charge_map = fit_charge_series(domain, dataset.sensor.electrode_names, train, validation, noise.white)
         task = FittingTask(presses, charge_map, noise)
         methods += [build_method(task) for build_method in METHOD_BUILDERS]
         # The limit follows from the derivatives of the series, and the noise of measured presses is unknown.

@@ -195,8 +195,11 @@ class Split:
         # Fit the field, and determine the domain without folds.
         presses = data.presses
         train, test = split_by_position(presses, training.hold_out)
-        whole_field = data.field or fit_charge_series(data.domain, data.sensor.electrode_names, train, test)
-        domain, cautions = invertible_domain(whole_field, presses, misfit_noise(training.noise_model))
+        noise = misfit_noise(training.noise_model)
+        whole_field = data.field or fit_charge_series(
+            data.domain, data.sensor.electrode_names, train, test, noise.white
+        )
+        domain, cautions = invertible_domain(whole_field, presses, noise)
         if domain == data.domain:
             return cls(domain, train, test, whole_field, cautions, folded_charges=None)
 
