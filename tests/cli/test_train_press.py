@@ -123,7 +123,6 @@ FIRST = (0.0, 0.0, 1.0)
         ([STEADY, "", "q"], [FIRST], "so much is known"),
         ([STEADY, "q"], [], ""),
         ([STEADY, SessionEnd()], [], ""),
-        ([SessionEnd()], [], ""),
         ([STEADY, "u", STEADY, "", "u", "q"], [], "press 1 is removed"),
         (["what?", STEADY, "1 2", "1 2 3", "q"], [(1.0, 2.0, 3.0)], "got '1 2'"),
         (["", STEADY, "q"], [], "press first"),
@@ -242,7 +241,7 @@ def test_presses_of_a_machine_become_a_file_that_calibrates_a_film(command, desk
     assert "presses in presses.csv: 1; the same command continues the session" in err
     assert len(read_presses(desk / "presses.csv")) == 1
 
-    problem = ("--probe", "circle:1.1", "--radius", "7.9")
+    problem = ("--probe", "circle:1.1", "--radius", "7.9", "--force", "0.04", "1.9")
     code, _, err = command(*PRESS, *problem, "--port", "rest.bin", "--press-list", "list.csv")
     assert code == 0, err
     assert "presses.csv has 1 presses; the session continues with them" in err

@@ -137,7 +137,6 @@ NAN = float("nan")
     [
         ("  \r", "take", None),
         ("3.1 -2.5 1.7", "take", (3.1, -2.5, 1.7)),
-        ("3.1, -2.5, 1.7", "take", (3.1, -2.5, 1.7)),
         ("? ? .5e0", "take", (NAN, NAN, 0.5)),
         (",,1", "take", (NAN, NAN, 1.0)),
         ("?", "take", (NAN, NAN, NAN)),
@@ -151,7 +150,7 @@ def test_typed_answer_is_read(text, reply, contact):
     np.testing.assert_array_equal(answer.contact, contact)
 
 
-@pytest.mark.parametrize("text", ["3,1 2,5 1,7", "3 2,", "1 2", "1 2 3 4", "1 2 nan", "1 2 1e999", "yes", "u 3"])
+@pytest.mark.parametrize("text", ["3,1 2,5 1,7", "1 2", "1 2 3 4", "1 2 nan", "1 2 1e999", "u 3"])
 def test_invalid_answer_is_refused(text):
     with pytest.raises(PressError, match="expected"):
         read_answer(text)

@@ -9,6 +9,7 @@ import typer
 from isocharge.cli.shared.forward_maps import ProbeOption, executor_for
 from isocharge.cli.shared.options import (
     EarlierOption,
+    ForceRangeOption,
     ForceStdOption,
     JsonOption,
     MapRadiusOption,
@@ -17,7 +18,7 @@ from isocharge.cli.shared.options import (
     StressLimitOption,
 )
 from isocharge.cli.shared.terminal import say, show, show_json, show_result, shown_progress, this_command
-from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import InputError
 from isocharge.serve.model.model_folder import load_model
 from isocharge.serve.presses.measured_presses import read_presses
@@ -56,6 +57,7 @@ def calibrate_command(
     ] = None,
     probe: ProbeOption = "circle:1.0",
     radius: MapRadiusOption = DEFAULT_RADIUS,
+    force: ForceRangeOption = DEFAULT_FORCE_RANGE,
     position_std_mm: PositionStdOption = 0.1,
     force_std: ForceStdOption = 0.01,
     next_count: Annotated[
@@ -96,7 +98,7 @@ def calibrate_command(
         )
     if file is None and output is not None:
         raise InputError("--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out")
-    problem = CalibrationProblem(load_sensor(sensor), parse_probe(probe), radius=radius, stress_limit=stress_limit)
+    problem = CalibrationProblem(load_sensor(sensor), parse_probe(probe), radius, force, stress_limit=stress_limit)
     if output is not None:
         check_calibration_folder(output, problem.electrodes)
     fields: dict[str, Any] = {}  # of the JSON object

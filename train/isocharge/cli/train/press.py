@@ -15,6 +15,7 @@ from isocharge.cli.shared.options import (
     BaudOption,
     DeviceOption,
     EarlierOption,
+    ForceRangeOption,
     ForceStdOption,
     MapRadiusOption,
     PortOption,
@@ -25,7 +26,7 @@ from isocharge.cli.shared.options import (
 from isocharge.cli.shared.port_hints import no_frames_advice_added
 from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents
-from isocharge.common.defaults import DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
+from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import OutputError, PressError, error_prefix
 from isocharge.common.files import as_output_errors, check_new_output
 from isocharge.serve import ReadingStream, load_device, open_source
@@ -51,6 +52,7 @@ def press_command(
     ],
     probe: ProbeOption = "circle:1.0",
     radius: MapRadiusOption = DEFAULT_RADIUS,
+    force: ForceRangeOption = DEFAULT_FORCE_RANGE,
     position_std_mm: PositionStdOption = 0.1,
     force_std: ForceStdOption = 0.01,
     device: DeviceOption = None,
@@ -88,7 +90,7 @@ def press_command(
 
     Example: isocharge train press --port /dev/ttyACM0 --sensor four-25um-biaxial -o presses.csv
     """
-    problem = CalibrationProblem(load_sensor(sensor), parse_probe(probe), radius=radius, stress_limit=stress_limit)
+    problem = CalibrationProblem(load_sensor(sensor), parse_probe(probe), radius, force, stress_limit=stress_limit)
 
     # A machine makes the presses of a list. Without a list, a person makes the presses, and is asked about each press.
     contacts = None if press_list is None else read_press_list(press_list)
@@ -150,6 +152,8 @@ def press_command(
     if session.refusal:  # the reason why the presses cannot be used for a calibration
         raise PressError(f"{output}: {session.refusal}")
     options = ["--sensor", sensor, "--probe", probe, "--radius", f"{radius:g}"]
+    if force != DEFAULT_FORCE_RANGE:
+        options += ["--force", *map(str, force)]
     if earlier:
         options += ["--from", str(earlier)]
     if stress_limit != DEFAULT_STRESS_LIMIT:

@@ -94,7 +94,7 @@ def calibrate(
     cautions = []
     outside_words = (
         f"{ordered_presses[is_outside].line_words}: a calibration takes presses {domain_words(problem.solved_domain)} "
-        "(--radius)"
+        "(--radius, --force)"
     )
     if is_outside.any():
         if len(ordered_presses) == 1 or _is_uninformative(used_presses):

@@ -43,7 +43,7 @@ GRID_MM = 0.5
 """Grid to which proposed positions are rounded, mm, so that a person can set them."""
 
 GRID_N = 0.05
-"""Grid to which proposed forces are rounded, N."""
+"""Largest grid to which proposed forces are rounded, N. The grid is at most the smallest force of the domain."""
 
 
 @dataclass(frozen=True)
@@ -201,13 +201,14 @@ def _candidates(problem: CalibrationProblem) -> Array:
     """Return the presses that are compared, (x, y, F), shape (n, 3)."""
     domain = problem.domain
     grid_position = np.unique(np.round(sunflower(N_CONTACTS) * domain.radius / GRID_MM), axis=0)
-    position = GRID_MM * grid_position
+    position = GRID_MM * grid_position + 0.0  # not -0.0
     position = position[np.hypot(*position.T) <= domain.radius]
     low, high = domain.force_range
     strongest = force_within_stress(problem.sensor.film, problem.probe, problem.stress_limit, domain.force_range)
     high = min(high, strongest)
     forces = log_spaced_forces(np.array(CANDIDATE_FORCES), (low, high))
-    forces = np.clip(np.round(forces / GRID_N) * GRID_N, max(low, GRID_N), high)
+    grid = min(GRID_N, low)
+    forces = np.clip(np.round(forces / grid) * grid, low, high)
     return np.array([(x, y, force) for x, y in position for force in forces])
 
 

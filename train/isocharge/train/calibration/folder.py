@@ -166,8 +166,8 @@ def _check_same_problem(path: Path, content: _CalibrationFile, problem: Calibrat
     ):
         if got != expected:
             raise PressError(
-                f"{path}: {key}: expected {cut(str(expected))}, as in this calibration, got {cut(str(got))}; calibrate "
-                "without the earlier calibration"
+                f"{path}: {key}: expected {cut(str(expected))}, as in this calibration, got {cut(str(got))}; state "
+                "the earlier value, or calibrate without the earlier calibration"
             )
 
 
