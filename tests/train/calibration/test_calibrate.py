@@ -212,7 +212,10 @@ def test_errors_that_are_announced_after_noisy_presses_contain_the_noise(fit, pr
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda p: replace(p, contact=p.contact + np.array([20.0, 0.0, 0.0])), r"and of .* N \(--radius, --force\); is it"),
+        (
+            lambda p: replace(p, contact=p.contact + np.array([20.0, 0.0, 0.0])),
+            r"and of .* N \(--radius, --force\); is it",
+        ),
         (lambda p: replace(p, contact=p.contact[::-1].copy()), "no film of 'four-25um-biaxial' explains these 12"),
     ],
 )
