@@ -76,9 +76,8 @@ MAX_VALUE_CHARACTERS = 200
 
 def cut(text: str) -> str:
     """Shorten a text for an error message to `MAX_VALUE_CHARACTERS` characters, and make the text printable."""
-    if len(text) <= MAX_VALUE_CHARACTERS:
-        return printable(text)
-    return printable(text[:MAX_VALUE_CHARACTERS]) + "..."
+    ending = "..." if len(text) > MAX_VALUE_CHARACTERS else ""
+    return printable(text[:MAX_VALUE_CHARACTERS]) + ending
 
 
 def shown(value: object) -> str:

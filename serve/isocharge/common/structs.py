@@ -283,14 +283,13 @@ def _union_members(expected_type: Any) -> Iterator[Any]:
     Args:
         expected_type: The type.
     """
-    if get_origin(expected_type) is Annotated:
-        type_without_annotations = get_args(expected_type)[0]
-        yield from _union_members(type_without_annotations)
-    elif get_origin(expected_type) in (Union, UnionType):
-        for member in get_args(expected_type):
-            yield from _union_members(member)
-    else:
+    origin = get_origin(expected_type)
+    if origin not in (Annotated, Union, UnionType):
         yield expected_type
+        return
+    arguments = get_args(expected_type)
+    for member in arguments[:1] if origin is Annotated else arguments:  # the annotations follow the type
+        yield from _union_members(member)
 
 
 def _join(path: str, key: str) -> str:

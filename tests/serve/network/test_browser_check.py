@@ -10,8 +10,8 @@ from isocharge.serve.network.protocol.handler import Handler
 
 
 def headers_of(**headers):
-    """Return headers by their names, in which an underscore stands for a hyphen."""
-    return {name.replace("_", "-"): value for name, value in headers.items()}
+    """Return headers as bytes. An underscore in a name stands for a hyphen."""
+    return {name.replace("_", "-").encode(): value.encode() for name, value in headers.items()}
 
 
 SERVED = [
@@ -68,7 +68,7 @@ def test_link_on_another_site_is_accepted():
         host="127.0.0.1:8000", sec_fetch_site="cross-site", sec_fetch_mode="navigate", sec_fetch_dest="document"
     )
     AccessCheck().check("GET", link)
-    for method, changes in (("POST", {}), ("GET", {"sec-fetch-dest": "iframe"})):
+    for method, changes in (("POST", {}), ("GET", {b"sec-fetch-dest": b"iframe"})):
         with pytest.raises(RequestError, match="Sec-Fetch-Site"):
             AccessCheck().check(method, link | changes)
 

@@ -70,7 +70,7 @@ class AccessCheck:
         self._token = None if token is None else token.encode()
         self._any_host = any_host or token is not None
 
-    def check(self, method: str, headers: Mapping[str, str], *, needs_token: bool = True) -> None:
+    def check(self, method: str, headers: Mapping[bytes, bytes], *, needs_token: bool = True) -> None:
         """Check the headers of a request, and raise an error if the request is refused.
 
         Args:
@@ -82,7 +82,7 @@ class AccessCheck:
             RequestError: If a page of another site has sent the request, if `Host` is not a name of this server, or if
                 the token is missing or wrong.
         """
-        host = headers.get("host", "").lower()
+        host = headers.get(b"host", b"").decode("latin-1").lower()
         name = _name_in(host)
         is_served = self._any_host or name in self._host_names or ip_address(name) is not None
         if host and not is_served:  # HTTP/1.0 does not require the header, but browsers always send it
@@ -92,7 +92,7 @@ class AccessCheck:
                 403,
             )
 
-        origin = headers.get("origin", "").lower()
+        origin = headers.get(b"origin", b"").decode("latin-1").lower()
         if origin and not self._is_own_page(origin, host):
             raise RequestError(
                 f"Origin: expected a page of this server, got a page of {shown(origin)}; open {shown(host)} "
@@ -104,8 +104,8 @@ class AccessCheck:
         # Without `Origin`, `Sec-Fetch-Site` decides. Browsers send `same-origin` if a page of this server sends the
         # request, and `none` if the user has typed the address. Other programs do not send the header. A link on
         # another site may open a page of this server, because the other site cannot read the response.
-        fetch_site = headers.get("sec-fetch-site", "none").lower()
-        is_link = headers.get("sec-fetch-dest") == "document" and method in ("GET", "HEAD")
+        fetch_site = headers.get(b"sec-fetch-site", b"none").decode("latin-1").lower()
+        is_link = headers.get(b"sec-fetch-dest") == b"document" and method in ("GET", "HEAD")
         if not (origin or is_link or fetch_site in ("same-origin", "none")):
             raise RequestError(
                 f"Sec-Fetch-Site: expected a request by a page of this server, got {shown(fetch_site)}; open the page "
@@ -114,13 +114,13 @@ class AccessCheck:
             )
 
         if needs_token:
-            self.check_token(headers.get("authorization", ""))
+            self.check_token(headers.get(b"authorization", b""))
 
-    def check_token(self, authorization: str) -> None:
+    def check_token(self, authorization: bytes) -> None:
         """Check the token that a client has sent. If the server has no token, every client is accepted.
 
         Args:
-            authorization: Value of the header or of the gRPC metadata `authorization`, such as "Bearer TOKEN"; empty if
+            authorization: Value of the header or the gRPC metadata `authorization`, such as b"Bearer TOKEN"; empty if
                 the client has sent none. The word `Bearer` may be in upper case or lower case (RFC 9110, 11.1).
 
         Raises:
@@ -128,11 +128,11 @@ class AccessCheck:
         """
         if self._token is None:
             return
-        scheme, _, token = authorization.partition(" ")
+        scheme, _, token = authorization.partition(b" ")
         # The duration of this comparison does not depend on the number of correct characters. A client therefore cannot
         # use it to guess the token character by character.
-        is_correct = hmac.compare_digest(token.lstrip(" ").encode(), self._token)
-        if scheme.lower() != "bearer" or not is_correct:
+        is_correct = hmac.compare_digest(token.lstrip(b" "), self._token)
+        if scheme.lower() != b"bearer" or not is_correct:
             received = "a wrong one" if authorization else "none"
             raise RequestError(
                 "expected `Authorization: Bearer TOKEN` with this server's token, in a header or in the metadata of "
@@ -165,7 +165,7 @@ class AccessCheck:
         return page_name in self._allowed_names and (page_name != _name_in(host) or is_port_removed)
 
 
-def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[str, str]:
+def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
     """Return the value of each header by its name. If a header is repeated, its last value is returned.
 
     Args:
@@ -174,11 +174,12 @@ def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[str, str]:
     Raises:
         RequestError: If `Host` (RFC 9112, 3.2) or `Origin` is repeated. A proxy could have checked the other value.
     """
-    for name in (b"host", b"origin"):
-        values = [value.decode("latin-1") for other_name, value in headers if other_name == name]
-        if len(values) > 1:
-            raise RequestError(f"{name.decode()}: expected one header, got {' and '.join(map(shown, values))}")
-    return {name.decode("latin-1"): value.decode("latin-1") for name, value in headers}
+    values: dict[bytes, bytes] = {}
+    for name, value in headers:
+        if name in values and name in (b"host", b"origin"):
+            raise RequestError(f"{name.decode()}: expected one header, got {shown(values[name])} and {shown(value)}")
+        values[name] = value
+    return values
 
 
 _HOST_NAME_PATTERN = re.compile(r"[a-z0-9_-][a-z0-9_.-]*")

@@ -162,7 +162,7 @@ class LivePage(Application):
         earlier_markers = self._state.get("markers", [])
         self.update(markers=[*earlier_markers, tuple(marker)][-MAX_MARKERS:])  # JSON accepts no named tuple
 
-    def _check_and_answer(self, method: str, path: str, headers: Mapping[str, str], body: bytes) -> Response:
+    def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
         """Check whether a request is allowed, and return the response. The files of the page need no token.
 
         Raises:

@@ -134,7 +134,7 @@ def test_decompression_stops_at_the_limit():
     assert len(bomb) < 100_000
     tracemalloc.start()
     with pytest.raises(InputError, match="unpacks to more than 1000 bytes"):
-        decompress(bomb, "gzip", 1000)
+        decompress(bomb, b"gzip", 1000)
     (_, peak), _ = tracemalloc.get_traced_memory(), tracemalloc.stop()
     assert peak < 1_000_000
 

@@ -124,7 +124,7 @@ class Application(ABC):
         return "page", None
 
     @abstractmethod
-    def _check_and_answer(self, method: str, path: str, headers: Mapping[str, str], body: bytes) -> Response:
+    def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
         """Check whether a request is allowed, answer the request, and return the response.
 
         Args:
@@ -203,7 +203,7 @@ class Handler(Application):
         route, model = match_path(path)
         return route.paths[0], self.store.label(**model) if self.traffic.log else None
 
-    def _check_and_answer(self, method: str, path: str, headers: Mapping[str, str], body: bytes) -> Response:
+    def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
         """Check a request, and answer it with the function of its route."""
         route, model = match_path(path)
         # The token is checked before unknown paths are refused. A client without the token therefore cannot find out
@@ -214,7 +214,7 @@ class Handler(Application):
         # A HEAD request is answered like a GET request. The server then sends the response without its body.
         if (method, route.method) != ("HEAD", "GET"):
             check_method(path, method, route.method)
-        body = decompress(body, headers.get("content-encoding", "").lower(), self.limits.body_bytes)
+        body = decompress(body, headers.get(b"content-encoding", b"").lower(), self.limits.body_bytes)
         answer = route.respond(Request(self.store, self.traffic, headers, body, **model))
         return answer if isinstance(answer, Response) else json_response(answer)
 

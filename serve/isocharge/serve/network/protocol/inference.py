@@ -72,7 +72,7 @@ This output is only computed if the client requests it.
 """
 
 
-def read_infer(body: bytes, header_length: str | None) -> tuple[InferBody, bytes]:
+def read_infer(body: bytes, header_length: bytes | None) -> tuple[InferBody, bytes]:
     """Read a request for an inference from the body of an HTTP request.
 
     Args:
@@ -90,10 +90,10 @@ def read_infer(body: bytes, header_length: str | None) -> tuple[InferBody, bytes
     if header_length is not None:
         # The characters are checked before the conversion, because int() also accepts signs, blanks and underscores,
         # and is slow for long texts.
-        if not header_length.isdecimal() or len(header_length) > len(str(len(body))):
+        if not header_length.isdigit() or len(header_length) > len(str(len(body))):
             raise RequestError(
                 f"Inference-Header-Content-Length: expected a whole number up to {len(body)}, the bytes of the body, "
-                f"got {header_length!r:.50}"
+                f"got {header_length.decode('latin-1')!r:.50}"
             )
         json_length = int(header_length)
     return parse_json(body[:json_length], "", RequestError, InferBody), body[json_length:]

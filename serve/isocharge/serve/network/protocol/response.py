@@ -64,7 +64,7 @@ def error_response(error: Exception) -> Response:
     return json_response({"error": message}, status, *getattr(error, "headers", ()))
 
 
-def decompress(body: bytes, encoding: str, limit: int) -> bytes:
+def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
     """Decompress the body of a request.
 
     Args:
@@ -76,10 +76,11 @@ def decompress(body: bytes, encoding: str, limit: int) -> bytes:
         RequestError: If the encoding is not gzip, deflate or identity, if the decompressed body is larger than the
             limit, if the compressed data are damaged or incomplete, or if other data follow them.
     """
-    if encoding in ("", "identity"):
+    if encoding in (b"", b"identity"):
         return body
-    if encoding not in ("gzip", "x-gzip", "deflate"):  # the encoding `deflate` of HTTP is the zlib format
-        raise RequestError(f"Content-Encoding: expected gzip, deflate or identity, got {shown(encoding)}", 415)
+    if encoding not in (b"gzip", b"x-gzip", b"deflate"):  # the encoding `deflate` of HTTP is the zlib format
+        name = shown(encoding.decode("latin-1"))
+        raise RequestError(f"Content-Encoding: expected gzip, deflate or identity, got {name}", 415)
     decompressor = zlib.decompressobj(zlib.MAX_WBITS | 32)  # recognises gzip and deflate
     try:
         plain_body = decompressor.decompress(body, limit + 1)  # the additional byte shows that the limit is exceeded

@@ -54,7 +54,7 @@ class Request(NamedTuple):
 
     store: ModelStore
     traffic: Traffic
-    headers: Mapping[str, str]
+    headers: Mapping[bytes, bytes]
     body: bytes
     name: str = ""
     version: str = ""
@@ -181,9 +181,9 @@ def _infer(request: Request) -> Response:
     The body of the response is a JSON text, which may be followed by binary tensors.
     """
     loaded = request.loaded
-    if not request.body and "upgrade" in request.headers:  # uvicorn discards the body of a request for an upgrade
+    if not request.body and b"upgrade" in request.headers:  # uvicorn discards the body of a request for an upgrade
         raise RequestError("Upgrade: this server reads no body after this header; set the client to HTTP/1.1")
-    header_length = request.headers.get("inference-header-content-length")
+    header_length = request.headers.get(b"inference-header-content-length")
     with loaded.statistics.refused.count_exceptions(), loaded.statistics.latency.time():
         body, binary = read_infer(request.body, header_length)
         content = infer(loaded, body, binary)
