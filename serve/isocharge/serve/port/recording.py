@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self, TypeVar
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, structs
 from msgspec.json import encode
 
 from isocharge.common.errors import RecordingError, cut, is_printable
@@ -157,11 +157,10 @@ class Recorder:
 class Event(Struct):
     """A line of a recording after the first line.
 
-    A record contains `timestamp`, `latency_us` and other keys, which are ignored. A chunk, a request for a new tare, a
-    change of the model and a marker each contain one of the other keys.
+    A record contains `latency_us` and keys that are ignored. A chunk, a request for a new tare, a change of the model
+    and a marker each contain one of the other keys.
 
     Attributes:
-        timestamp: Time of a record, unix seconds.
         latency_us: Latency of a record, us.
         tare: Whether a new tare was requested.
         use: Label of a new model, `name/version`. The model computed all records after this line.
@@ -169,7 +168,6 @@ class Event(Struct):
         chunk: A chunk.
     """
 
-    timestamp: float | None = None
     latency_us: Latency | None = None
     tare: bool | None = None
     use: ModelLabel | None = None
@@ -177,16 +175,13 @@ class Event(Struct):
     chunk: Chunk | None = None
 
     def __post_init__(self) -> None:
-        """Check that the line contains a complete record or an event.
+        """Check that the line contains a record or an event.
 
         Raises:
-            WrongKey: If a record lacks its time or its latency, or if the line has no known key.
+            WrongKey: If the line has no known key.
         """
-        if (self.timestamp is None) != (self.latency_us is None):  # a record has both keys, and an event has neither
+        if all(value is None for value in structs.astuple(self)):
             raise WrongKey("latency_us")
-        known_keys = (self.timestamp, self.tare, self.use, self.marker, self.chunk)
-        if all(key is None for key in known_keys):
-            raise WrongKey("chunk")
 
 
 class Recording:
