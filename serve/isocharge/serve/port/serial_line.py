@@ -69,10 +69,6 @@ SOCKET_SCHEMES = ("tcp://", "socket://", "rfc2217://")
 """First characters of the URLs that need a port number."""
 
 
-class OtherReader(OSError):
-    """Bytes arrived at a line, but another program has read them."""
-
-
 class SerialLine:
     """An open connection to a board through a serial port or another port that pyserial supports.
 
@@ -130,6 +126,7 @@ class SerialLine:
             The bytes; empty if no byte arrives in time.
 
         Raises:
+            BlockingIOError: If bytes arrived, but another program has read them.
             READ_ERRORS: If the line disappears. If bytes have arrived before, the next call raises the error.
         """
         if self._descriptor is None:
@@ -143,16 +140,13 @@ class SerialLine:
                 # `os.read` needs one system call. pyserial would need five, or one for each byte of a socket.
                 received = os.read(self._descriptor, MAX_READ_BYTES)
                 if not received:  # `select` also reports the end of a stream as readable
-                    raise BlockingIOError(
-                        "it is readable and has no data: it was unplugged, or the other end has closed"
-                    )
+                    if os.isatty(self._descriptor):  # false if the terminal was unplugged
+                        raise BlockingIOError
+                    raise OSError("it is readable and has no data: it was unplugged, or the other end has closed")
                 data += received
-        except READ_ERRORS as error:
-            if data:
-                return data
-            if isinstance(error, BlockingIOError) and os.isatty(self._descriptor):  # false if it was unplugged
-                raise OtherReader from error
-            raise
+        except READ_ERRORS:
+            if not data:
+                raise
         return data
 
     def _receive_by_pyserial(self, timeout_s: float) -> bytes:

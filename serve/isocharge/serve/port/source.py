@@ -36,7 +36,6 @@ from isocharge.serve.port.serial_line import (
     OPEN_ERRORS,
     READ_ERRORS,
     UDP_SCHEME,
-    OtherReader,
     Request,
     Requester,
     SerialLine,
@@ -231,7 +230,7 @@ class Port:
             raise PortError(f"{self.url}: the port is not open; use `with Port(...) as port`")
         try:
             data = self._line.receive(timeout_s)
-        except OtherReader as error:
+        except BlockingIOError as error:
             raise PortLost(
                 f"{self.url}: another program reads this port, too, and takes some of its bytes; end that program (on "
                 f"Linux, `fuser {self.url}` shows its number)"
