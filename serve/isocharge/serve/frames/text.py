@@ -81,19 +81,20 @@ class Layout:
         columns: Meanings of the values as frame counter, clock or channels.
     """
 
-    def __init__(self, lines: Sequence[Line], new_names: Sequence[str] = ()) -> None:
+    def __init__(self, lines: Sequence[Line], new_names: Sequence[str], meanings: Mapping[str, str]) -> None:
         """Determine the layout from the lines of one frame.
 
         Args:
             lines: The lines.
             new_names: Names for the values that have no names in the lines; empty if they are not known.
+            meanings: Meanings of the names of counters and clocks; see `TextParser`.
         """
         self.lines = lines
         self.patterns = [line.pattern for line in lines]
         self.names = [name for line in lines for name in line.names]
         self.unnamed = [index for index, name in enumerate(self.names) if not name]
         for index, name in zip(self.unnamed, new_names, strict=False):
-            self.names[index] = name
+            self.names[index] = meanings.get(name, name)
         words = tuple(word for line in lines for word in line.words)
         self.columns = Columns(self.names, (1.0,) * len(self.names), words=words)  # values in text have no scale
 
@@ -208,7 +209,7 @@ class TextParser(DelimitedParser):
         names = header_names(text, layout.lines[0])
         if line.names or not names or all(layout.names):
             return self._reject(size)
-        self._set_layout(self._named_layout(layout.lines, names))
+        self._set_layout(Layout(layout.lines, names, self._meanings))
         return []
 
     def _add_values(self, layout: Layout, position: int, values: tuple[float, ...], size: int) -> list[Frame]:
@@ -301,13 +302,9 @@ class TextParser(DelimitedParser):
         unnamed_count = frame_lines[0].names.count("")  # in a cycle of several lines, all values have names
         headers = [header_names(header, frame_lines[0]) for header in reversed(self._headers)]
         new_names = next((names for names in (self._columns, *headers) if len(names) == unnamed_count), ())
-        layout = self._named_layout(frame_lines, new_names)
+        layout = Layout(frame_lines, new_names, self._meanings)
         has_other_columns = self._columns and "" in layout.names
         return None if has_other_columns or _has_channel_number(layout, lines) else layout
-
-    def _named_layout(self, frame_lines: Sequence[Line], new_names: Sequence[str]) -> Layout:
-        """Return the layout of the lines of a frame, whose values without names get the meanings of the new names."""
-        return Layout(frame_lines, [self._meanings.get(name, name) for name in new_names])
 
     def _set_layout(self, layout: Layout) -> None:
         """Set the layout, the attribute `format`, which describes the layout, and the modulus of the clock."""
@@ -316,8 +313,9 @@ class TextParser(DelimitedParser):
         is_time_of_day = unit_us == TIMES_US["t_s"]  # a day has 86400 s; other clocks count ms or us
         self.t_us_modulus = (86_400 if is_time_of_day else T_US_MODULUS) * unit_us
         names = [name for name in layout.names if name]
-        if len(names) < len(layout.names):
-            names.append(f"{len(layout.names) - len(names)} columns without names")
+        unnamed_count = layout.names.count("")
+        if unnamed_count > 0:
+            names.append(f"{unnamed_count} columns without names")
         self.format = f"text: {printable(', '.join(names))}"
 
 
