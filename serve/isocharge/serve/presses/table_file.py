@@ -17,11 +17,11 @@ import math
 import re
 from array import array
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 from pty import STDIN_FILENO
-from typing import NoReturn
 
 import numpy as np
 
@@ -88,17 +88,12 @@ class CsvTable:
         self._expected = expected
         checked_lines = self._checked_lines(lines)
         first_lines = list(islice(checked_lines, _MAX_LINES_TO_HEADER))
-        lines_above, self._separator, is_found = _find_header(first_lines, names)
-        if not is_found:  # `numpy.savetxt` writes the header as a comment
-            uncommented = [line.removeprefix("# ") for line in first_lines]
-            lines_above, self._separator, is_found = _find_header(uncommented, names)
-            if is_found:
-                first_lines[lines_above] = uncommented[lines_above]
-        self._rows = self._numbered_rows(chain(first_lines[lines_above:], checked_lines), lines_above)
-        header_row = next(self._rows, None)
-        if header_row is None:
+        lines_above, self._separator, header_line = _find_header(first_lines or [""], names)
+        table_lines = chain([header_line], first_lines[lines_above + 1 :], checked_lines)
+        self._rows = self._numbered_rows(table_lines, lines_above)
+        _, header = next(self._rows, (0, []))
+        if not header:
             raise self.error(f": empty; expected {expected}")
-        _, header = header_row
         if len(header) > MAX_COLUMNS:
             raise self.error(f": expected at most {MAX_COLUMNS:,} columns, got {len(header):,}")
         self.header = tuple(name if name in names else name.strip() for name in header)
@@ -133,14 +128,14 @@ class CsvTable:
         self.refuse_similar_names((name for name in self.header if name not in known_rules), known_rules)
         missing_names = [name for name in required if name not in self.header]
         if missing_names:
-            self._refuse_header("missing", missing_names)
-        chosen_rules = {name: rule for name, rule in known_rules.items() if name in self.header}
-        repeated_names = [name for name in chosen_rules if self.header.count(name) > 1]
+            raise self._header_error("missing", missing_names)
+        repeated_names = [name for name in known_rules if self.header.count(name) > 1]
         if repeated_names:
-            self._refuse_header("repeated", repeated_names)
-        ignored_names = [name for name in self.header if name not in chosen_rules]
+            raise self._header_error("repeated", repeated_names)
+        ignored_names = [name for name in self.header if name not in known_rules]
         if ignored_names:
             log.warning("%s: ignored columns: %s", self._where, shown(ignored_names))
+        chosen_rules = {name: rule for name, rule in known_rules.items() if name in self.header}
         columns = self._read_columns(chosen_rules, max_rows)
         columns.check(chosen_rules, f"{self._where}, ", self._error_class)
         return columns
@@ -165,7 +160,7 @@ class CsvTable:
             for spelling in _spellings(column) & absent_names.keys():
                 name = absent_names[spelling]
                 advice = f"rename {shown(column)} to {shown(name)} and check its unit, or remove the column"
-                self._refuse_header(f"{advice}; missing", [name])
+                raise self._header_error(f"{advice}; missing", [name])
 
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
         """Convert the cells of the requested columns to numbers, row by row, without checking the numbers.
@@ -189,13 +184,9 @@ class CsvTable:
                 cell = cells[column_index].strip()
                 number = self._number(cell)
                 if number is None:
-                    has_other_mark = self._mark != "" and any(mark in cell for mark in ",." if mark != self._mark)
-                    advice = f"; the decimal mark is {self._mark!r}" if has_other_mark else ""
-                    if "pC" in cell:  # this cell is right, but another one is wrong
-                        advice = "; a row of units may only contain mm, N and pC"
                     raise self.error(
                         f", line {line_number}, column {shown(name)}: expected {rules[name].description}, got "
-                        f"{shown(cell)}{advice}"
+                        f"{shown(cell)}{self._cell_advice(cell)}"
                     )
                 numbers.append(number)
             self._is_mark_certain = self._is_mark_certain or self._has_fraction(cells)
@@ -207,6 +198,13 @@ class CsvTable:
         rows = np.asarray(numbers, dtype=np.float64).reshape(len(line_numbers), len(column_indices))
         values = dict(zip(column_indices, rows.T, strict=True))
         return NumberColumns(values, line_numbers)
+
+    def _cell_advice(self, cell: str) -> str:
+        """Return advice for a cell that is not a number, for the end of an error message; empty if there is none."""
+        if "pC" in cell:  # this cell is right, but another one is wrong
+            return "; a row of units may only contain mm, N and pC"
+        has_other_mark = ({",", "."} - {self._mark}) & {*cell}
+        return f"; the decimal mark is {self._mark!r}" if self._mark and has_other_mark else ""
 
     def _has_fraction(self, cells: list[str]) -> bool:
         """Return whether a cell of any column has a fraction such as 0.5, whose mark does not separate thousands."""
@@ -249,23 +247,20 @@ class CsvTable:
             InputError: If the row has too few cells, or additional cells that are not blank.
         """
         additional_cells = cells[len(self.header) :]
-        if len(cells) < len(self.header) or any(cell.strip() for cell in additional_cells):
+        if len(cells) < len(self.header) or "".join(additional_cells).strip():
             raise self.error(
                 f", line {line_number}: expected {len(self.header)} cells as in the header, got "
                 f"{len(cells)}: {shown(cells)}"
             )
 
-    def _refuse_header(self, reason: str, names: Sequence[str]) -> NoReturn:
-        """Raise the error for a wrong header.
+    def _header_error(self, reason: str, names: Sequence[str]) -> InputError:
+        """Return the error for a wrong header.
 
         Args:
             reason: What is wrong with some names, for the error message.
             names: These names.
-
-        Raises:
-            InputError: Always.
         """
-        raise self.error(
+        return self.error(
             f": expected {self._expected}, got the header {shown(list(self.header))}; {reason}: {shown(names)}"
         )
 
@@ -286,8 +281,7 @@ class CsvTable:
                         ": expected a CSV file, got a Parquet file; convert it to CSV, for example in Python with "
                         "pandas.read_parquet(FILE).to_csv(NEW, index=False)"
                     )
-                is_plain = line.isascii() and "\0" not in line  # is fast to check, and true for most lines
-                wrong_byte = None if is_plain else _WRONG_BYTE.search(line)
+                wrong_byte = _WRONG_BYTE.search(line)
                 if wrong_byte:  # the file is binary, or text in another encoding
                     raise self.error(
                         f", line {line_number}: the byte 0x{ord(wrong_byte[0]) & 0xFF:02x} is not text in UTF-8: "
@@ -316,9 +310,9 @@ class CsvTable:
         reader = csv.reader(lines, delimiter=self._separator, strict=True)
         try:
             for cells in reader:
-                first_cell = cells[0].strip() if cells else ""
+                first_cell = "".join(cells[:1]).strip()
                 is_comment = first_cell.startswith("#") and first_cell not in self._names
-                if any(cell.strip() for cell in cells) and not is_comment:
+                if "".join(cells).strip() and not is_comment:
                     yield lines_above + reader.line_num, cells
         except csv.Error as cause:
             raise self.error(f", line {lines_above + reader.line_num}: not CSV text ({cause})") from cause
@@ -333,9 +327,8 @@ def csv_text(columns: Mapping[str, Array]) -> str:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(columns)  # the keys of `columns`, which are the names
-    rows = np.column_stack(list(columns.values()))  # shape (n, n_column)
-    for row in rows.tolist():
-        writer.writerow("" if math.isnan(value) else value for value in row)
+    rows = np.column_stack(list(columns.values())).tolist()
+    writer.writerows(["" if math.isnan(value) else value for value in row] for row in rows)
     return buffer.getvalue()
 
 
@@ -345,38 +338,44 @@ def _is_row_of_units(cells: list[str]) -> bool:
     return "pC" in units and units <= _UNITS
 
 
-def _find_header(lines: list[str], names: Collection[str]) -> tuple[int, str, bool]:
+def _find_header(lines: Sequence[str], names: Collection[str]) -> tuple[int, str, str]:
     """Find the header at the beginning of a text, and the separator of the columns.
 
     The header is the first line that contains a name and no number, and is no comment. If there is no such line, the
-    result is the first line. The function chooses the separator with which the header has the most names. Among
-    separators with equally many names, the function chooses the separator with the most cells.
+    header is the first comment that contains a name and no number, because `numpy.savetxt` writes such headers. If
+    there is no such comment, the header is the first line.
 
     Args:
-        lines: First lines of the text.
+        lines: First lines of the text, at least one.
         names: Names of columns that have a meaning.
 
     Returns:
-        The number of lines above the header, the separator, and whether the header contains a name.
+        The number of lines above the header, the separator, and the header without the mark of a comment.
     """
-    best_score = (0, 0)
-    best = (0, _SEPARATORS[0])
-    for line_index, line in enumerate(lines):
-        for separator in _SEPARATORS:
-            with suppress(csv.Error):  # the error is raised again when the table is read
-                texts = {cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])}
-                has_number = any(map(_NUMBER.fullmatch, texts.difference(names)))
-                # Number of names, and number of cells. Without a name, only the first line may be the header.
-                score = (
-                    0 if has_number or line.startswith("# ") else len(texts.intersection(names)),
-                    len(texts) if line_index == 0 else 0,
-                )
-                if score > best_score:
-                    best_score = score
-                    best = (line_index, separator)
-        if best_score[0] > 0:
-            break
-    return *best, best_score[0] > 0
+    lines_without_comments = ["" if line.startswith("# ") else line for line in lines]
+    uncommented_lines = [line.removeprefix("# ") for line in lines]
+    for lines_above, line in chain(enumerate(lines_without_comments), enumerate(uncommented_lines)):
+        separator = max(_SEPARATORS, key=partial(_header_score, line, names))
+        name_count, _ = _header_score(line, names, separator)
+        if name_count > 0:
+            return lines_above, separator, line
+    return 0, max(_SEPARATORS, key=partial(_header_score, lines[0], names)), lines[0]
+
+
+def _header_score(line: str, names: Collection[str], separator: str) -> tuple[int, int]:
+    """Return the number of names in a line, which is 0 if the line contains a number, and the number of cells.
+
+    Args:
+        line: The line.
+        names: Names of columns that have a meaning.
+        separator: Separator of the cells.
+    """
+    try:
+        cells = {cell.strip() for cell in next(csv.reader([line], delimiter=separator))}
+    except csv.Error:  # is raised again when the table is read
+        return 0, 0
+    has_number = any(map(_NUMBER.fullmatch, cells.difference(names)))
+    return 0 if has_number else len(cells.intersection(names)), len(cells)
 
 
 def _spellings(name: str) -> set[str]:
