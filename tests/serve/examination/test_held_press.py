@@ -7,8 +7,8 @@ import pytest
 
 from boards import encoded_frames, received
 from isocharge.serve import device_from_table
+from isocharge.serve.examination.held_press import HeldPress, find_held_press
 from isocharge.serve.examination.port_check import examine_received
-from isocharge.serve.examination.press_detector import HeldPress, find_held_press
 from isocharge.serve.signal_chain.leak import LeakRule
 
 T_S = np.arange(0.0, 20.0, 0.005)

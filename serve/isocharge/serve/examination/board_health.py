@@ -9,8 +9,8 @@ from msgspec import structs
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ChargeError, printable, shown
+from isocharge.serve.examination.held_press import HeldPress
 from isocharge.serve.examination.listening import Capture, elapsed_times
-from isocharge.serve.examination.press_detector import HeldPress
 from isocharge.serve.port.source import has_speed
 from isocharge.serve.signal_chain.channels import Channels
 from isocharge.serve.signal_chain.leak import LeakRule

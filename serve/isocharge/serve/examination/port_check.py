@@ -21,8 +21,9 @@ from isocharge.serve.examination.board_health import (
     transmission_sentences,
     unit_sentences,
 )
+from isocharge.serve.examination.held_press import find_held_press
 from isocharge.serve.examination.listening import BAUDS, Capture, ReceivedData, listen, read_frames
-from isocharge.serve.examination.press_detector import find_held_press, find_touch
+from isocharge.serve.examination.press_detector import find_touch
 from isocharge.serve.examination.proposal import propose, recognised_frames, unit_of
 from isocharge.serve.live.device import ANY_BOARD, device_from_table
 from isocharge.serve.port.serial_line import Request
