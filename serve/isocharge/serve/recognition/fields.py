@@ -13,8 +13,9 @@ from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Array
 from isocharge.serve.frames.frame import SEQ
 from isocharge.serve.frames.frame_layout import PADDING, STRUCT_FORMATS, ByteOrder, FieldType
 from isocharge.serve.recognition.framing import INTACT_SHARE, Bytes, usual_bytes
@@ -32,13 +33,13 @@ CHANNEL = "channel"
 """Name of all channels during the recognition."""
 
 
-def identify(steps: Array, frame_rate_Hz: float, tolerance: float = 0.04) -> tuple[bool, tuple[str, float] | None, int]:
-    """Determine whether the values of consecutive frames are those of a frame counter or of a clock.
+def possible_meanings(steps: Array, frame_rate_Hz: float, tolerance: float = 0.04) -> Iterator[tuple[str, float]]:
+    """Yield the fields that the values of consecutive frames may belong to: the frame counter, then a clock.
 
     A counter increases by 1. A clock has one of the usual tick rates of boards. At about 1000 frames per second, a
     clock in ms also increases by 1, but it repeats some of its values. A step is only used if it is close to the median
     step. If a number increases by a power of 256, its high bytes are a counter, and its low bytes belong to the channel
-    behind the counter.
+    behind the counter. Such a number has no meaning.
 
     Args:
         steps: Differences of the values of consecutive frames, shape (n,).
@@ -46,24 +47,35 @@ def identify(steps: Array, frame_rate_Hz: float, tolerance: float = 0.04) -> tup
         tolerance: Largest relative deviation of a tick rate from a usual tick rate. It is large, because frames
             arrive in bursts.
 
-    Returns:
-        Whether the values are those of a counter. For values that may be those of a clock, also the name of the field,
-        which is `t_s`, `t_ms` or `t_us`, and the duration of one tick in the unit of this name; otherwise None.
-        Finally, how often the values wrap. A damaged value also causes a step back, but causes a step forwards, too.
+    Yields:
+        The name of the field, which is `seq`, `t_s`, `t_ms` or `t_us`, and the value of one tick in the unit of this
+        name.
     """
     median_step = np.median(steps)
-    large_step = 20.0 * (median_step or 1.0)
-    wrap_count = int((steps < -large_step).sum() - (steps > large_step).sum())
     regular_steps = steps[np.abs(steps - median_step) <= max(1.0, 0.7 * median_step)]
     is_regular = len(regular_steps) >= INTACT_SHARE * len(steps) and regular_steps.min() >= 0.0
     if not is_regular or np.mean(steps == 0.0) >= INTACT_SHARE:
-        return False, None, wrap_count
+        return
     tick_rate_Hz = float(regular_steps.mean()) * frame_rate_Hz
     usual_rates_Hz = [*CLOCKS, *(frame_rate_Hz * 256.0**size for size in (1, 2, 3))]  # size of the channel's bytes
     deviation, nearest_rate_Hz = min((abs(tick_rate_Hz / usual_Hz - 1.0), usual_Hz) for usual_Hz in usual_rates_Hz)
     clock = CLOCKS.get(nearest_rate_Hz) if deviation < tolerance else None
-    is_counter = np.mean(steps == 1.0) >= INTACT_SHARE and (clock is None or bool(steps.all()))
-    return is_counter, clock, wrap_count
+    if np.mean(steps == 1.0) >= INTACT_SHARE and (clock is None or steps.all()):
+        yield SEQ, 1.0
+    if clock is not None:
+        yield clock
+
+
+def count_wraps(steps: Array) -> int:
+    """Return how often a number wraps, which causes a large step back.
+
+    A damaged value also causes a large step back, but causes a large step forwards, too.
+
+    Args:
+        steps: Differences of the values of consecutive frames, shape (n,).
+    """
+    large_step = 20.0 * (np.median(steps) or 1.0)
+    return int((steps < -large_step).sum() - (steps > large_step).sum())
 
 
 class Weights:
@@ -130,7 +142,7 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[
         For each of the `length` bytes, a list of parts, of which the first is padding.
     """
     usual, is_constant = usual_bytes(rows)
-    is_zero = is_constant & (usual == 0)
+    constant_bytes = np.where(is_constant, usual.astype(int), -1)
     byte_step = 1 if order == "little" else -1
     parts_at_each_byte: list[list[Part]] = []
     for position in range(rows.shape[1] - LARGEST_SIZE):
@@ -142,15 +154,14 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[
                 parts.append(Part(CHANNEL, type_name, end - position, Weights.constant, is_constant=True))
                 continue
             lowest_first = range(position, end)[::byte_step]
-            parts += _number_parts(
-                rows[:, lowest_first], is_constant[lowest_first], is_zero[lowest_first], type_name, frame_rate_Hz
-            )
+            number_bytes = np.ascontiguousarray(rows[:, lowest_first])
+            parts += _number_parts(number_bytes, constant_bytes[lowest_first], type_name, frame_rate_Hz)
         parts_at_each_byte.append(parts)
     return parts_at_each_byte
 
 
 def _number_parts(
-    number_bytes: Bytes, is_constant: Booleans, is_zero: Booleans, type_name: FieldType, frame_rate_Hz: float
+    number_bytes: Bytes, constant_bytes: NDArray[np.int64], type_name: FieldType, frame_rate_Hz: float
 ) -> Iterator[Part]:
     """Yield the possible parts of a frame for bytes that contain a number of a given type.
 
@@ -160,15 +171,13 @@ def _number_parts(
 
     Args:
         number_bytes: Bytes of the number, the lowest first, shape (n, size).
-        is_constant: Whether each byte is constant, shape (size,).
-        is_zero: Whether each byte is always 0, shape (size,).
+        constant_bytes: Value of each byte that is constant, and -1 for the other bytes, shape (size,).
         type_name: Type of the number, such as "u16", "i16" or "f32".
         frame_rate_Hz: Number of frames per second, Hz.
     """
-    size = len(is_constant)  # bytes
+    size = len(constant_bytes)
     values = _values(number_bytes, type_name)
     steps = np.diff(values)
-    counter_steps = steps  # steps if the number is a counter or a clock, which may overflow
     magnitude = np.median(np.abs(values))
     unit = 1.0  # smallest step that the number can represent
     if type_name[0] == "f":
@@ -176,24 +185,25 @@ def _number_parts(
             return
         # Only the share `Weights.fraction` of the bytes contains the digits of the number. Low bytes that are always 0
         # contain no digits.
-        low_zero_byte_count = np.argmin(is_zero)  # index of the lowest byte that is not always 0
-        digit_byte_count = Weights.fraction * size - low_zero_byte_count
-        unit = magnitude * 256.0**-digit_byte_count
+        low_zero_byte_count = np.argmax(constant_bytes != 0)
+        unit = magnitude * 256.0 ** (low_zero_byte_count - Weights.fraction * size)
+
+    # A counter that overflows restarts at 0. If upper bytes do not change while it wraps, they do not belong to it.
+    counter_steps = steps
     if type_name[0] == "u":
         half_range = 1 << (8 * size - 1)
-        counter_steps = (steps + half_range) % (2 * half_range) - half_range  # a counter that overflows restarts at 0
-
-    is_counter, clock, wrap_count = identify(counter_steps, frame_rate_Hz)
-    if wrap_count <= 0:  # otherwise, upper bytes that do not change while the number wraps do not belong to it
-        score = Weights.constant_high * (is_constant & ~is_zero).sum() if size == 3 else 0.0
-        if is_counter:
-            yield Part(SEQ, type_name, size, score)  # the values of a counter need no bits
-        elif clock is not None and (size < 8 or clock[1] in (1.0, 1e-3)):  # 8 bytes count s, ms, us or ns
-            name, tick_duration = clock
+        counter_steps = (steps + half_range) % (2 * half_range) - half_range
+    name, tick = next(possible_meanings(counter_steps, frame_rate_Hz), ("", 1.0))
+    has_usual_size = size < 8 or tick in (1.0, 1e-3)  # 8 bytes count s, ms, us or ns
+    if name and has_usual_size and count_wraps(counter_steps) <= 0:
+        score = 0.0
+        if size == 3:
+            score += Weights.constant_high * np.count_nonzero(constant_bytes > 0)
+        if name != SEQ:  # the values of a counter need no bits
             # A bonus for clocks of eight bytes: without it, an `f64` with few digits could score better that consists
             # of the high bytes of the clock and of the first bytes behind them.
             score += _bits(counter_steps - np.median(counter_steps), unit, size) - size // 8 * Weights.noise
-            yield Part(name, type_name, size, score, scale=tick_duration)
+        yield Part(name, type_name, size, score, scale=tick)
 
     if type_name == "i64":  # times only
         return
@@ -266,7 +276,6 @@ def _values(number_bytes: Bytes, type_name: str) -> Array:
         type_name: Type of the number: "f" for floating-point, "u" for unsigned or "i" for signed, and the size in bits.
     """
     size = number_bytes.shape[1]
-    number_bytes = np.ascontiguousarray(number_bytes)
     if type_name[0] == "f":
         return number_bytes.view(f"<f{size}")[:, 0].astype(float)
     # The bytes become the high bytes of a signed number of 64 bits.

@@ -12,7 +12,7 @@ All checksums with a name are tried for every possible position of the first byt
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from itertools import product
+from itertools import islice
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -61,6 +61,11 @@ class FrameDivision(NamedTuple):
     stream: Bytes
     starts: NDArray[np.int64]
     length: int
+
+    @property
+    def covered_share(self) -> float:
+        """Share of the bytes of the stream that belong to frames, dimensionless."""
+        return min(1.0, len(self.starts) * self.length / len(self.stream))
 
     def rows(self, distance: int = 0, next_bytes: int = 0) -> Bytes:
         """Return the bytes of each frame, shape (frames, length + next_bytes).
@@ -187,25 +192,24 @@ def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDiv
     single_bytes = stream.astype(int)
     pairs = 256 * single_bytes[:-1] + single_bytes[1:]
 
-    # A code is the number of a byte or of a pair. The dictionary contains, for each length of a frame, the positions at
-    # which frames of this length begin. The byte or pair with the most positions is chosen, and a pair if a byte has
-    # equally many.
-    best_starts: dict[int, NDArray[np.int64]] = {}
+    # A code is the number of a byte or of a pair. For each length of a frame, frames begin at the positions at which
+    # the same code follows at this distance. The code with the most positions is chosen. If a pair and a byte have
+    # equally many, the pair is chosen.
+    best_division: dict[int, FrameDivision] = {}
     for codes in (pairs, single_bytes):
         positions = np.argsort(codes, kind="stable")  # first all positions of the smallest code
         distances = np.diff(positions) * (np.diff(codes[positions]) == 0)  # 0 between two codes
         for length in range(MIN_FRAME_BYTES, MAX_FRAME_BYTES + 1):
             starts = positions[:-1][distances == length]
             best_code = np.bincount(codes[starts], minlength=1).argmax()
-            starts = starts[codes[starts] == best_code]
-            is_frequent = len(starts) * length > COVERED_SHARE * len(data)
-            if is_frequent and len(starts) > len(best_starts.get(length, ())):
-                best_starts[length] = starts
+            division = FrameDivision(SYNC, stream, starts[codes[starts] == best_code], length)
+            best_division[length] = max(
+                best_division.get(length, division), division, key=lambda division: division.covered_share
+            )
 
     # The shares are rounded to 0.1, so that of two lengths with about equal shares the shorter length comes first.
-    shares = {length: round(len(starts) * length / len(data), 1) for length, starts in best_starts.items()}
-    for length in sorted(shares, key=lambda length: (-shares[length], length))[:max_lengths]:
-        yield FrameDivision(SYNC, stream, best_starts[length], length)
+    frequent = [division for division in best_division.values() if division.covered_share > COVERED_SHARE]
+    yield from sorted(frequent, key=lambda division: (-round(division.covered_share, 1), division.length))[:max_lengths]
 
 
 ORDERS: tuple[ByteOrder, ...] = ("little", "big")
@@ -213,27 +217,35 @@ ORDERS: tuple[ByteOrder, ...] = ("little", "big")
 
 
 class Check(NamedTuple):
-    """A checksum that fits the frames.
+    """A checksum at the end of each frame.
 
     Attributes:
-        size: Number of bytes of the checksum; 0 if the frames have no checksum.
+        name: Name of the checksum; "none" if the frames have no checksum.
         order: Byte order of the checksum.
-        name: Name of the checksum.
         start: First byte that the checksum covers.
     """
 
-    size: int
-    order: ByteOrder
     name: str = "none"
+    order: ByteOrder = "little"
     start: int = 0
+
+    @property
+    def size(self) -> int:
+        """Number of bytes of the checksum."""
+        return CHECKSUMS[self.name].size
+
+    def is_correct(self, frame: bytes) -> bool:
+        """Return whether a frame ends with this checksum of its other bytes."""
+        computed = CHECKSUMS[self.name].compute(frame[self.start : -self.size])
+        return computed == int.from_bytes(frame[-self.size :], self.order)
 
 
 def find_checks(rows: Bytes) -> Iterator[Check]:
     """Yield the checksums that fit the frames, from the widest to the narrowest checksum.
 
-    The checksum is at the end of each frame. The checksum covers the other bytes of the frame. Constant bytes at the
-    beginning, such as a sync pattern, need not be covered. For each size and byte order, at most one checksum is
-    yielded. If there are fewer than `MIN_FRAMES` different frames, no checksum is yielded.
+    The checksum covers the other bytes of the frame. Constant bytes at the beginning, such as a sync pattern, need not
+    be covered. For each size and byte order, at most one checksum is yielded. If there are fewer than `MIN_FRAMES`
+    different frames, no checksum is yielded.
 
     Args:
         rows: Bytes of the frames, shape (n, length).
@@ -245,18 +257,15 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
         return
     frames = [row.tobytes() for row in checked_rows]
     _usual, is_constant = usual_bytes(checked_rows)  # `is_constant` has the shape (length,)
-    length = len(is_constant)
     for size in (4, 3, 2, 1):  # in bytes
         if is_constant[-size:].all():  # a checksum would differ from frame to frame
             continue
 
-        # Try each position for the first covered byte, up to the first byte that is not constant.
-        last_possible_start = min(count_leading(is_constant), length - size - 2)  # it covers at least two bytes
+        # Try each position for the first covered byte, up to the first byte that is not constant. A checksum covers at
+        # least two bytes. Some frames may be damaged.
+        last_possible_start = min(count_leading(is_constant), len(is_constant) - size - 2)
         names = [name for name, checksum in CHECKSUMS.items() if checksum.size == size]
         for order in ORDERS[:size]:  # a single byte has no byte order
-            for start, name in product(range(last_possible_start + 1), names):
-                compute = CHECKSUMS[name].compute
-                wrong = [compute(frame[start:-size]) != int.from_bytes(frame[-size:], order) for frame in frames]
-                if sum(wrong) <= (1.0 - INTACT_SHARE) * len(frames):  # some frames may be damaged
-                    yield Check(size, order, name, start)
-                    break
+            checks = (Check(name, order, start) for start in range(last_possible_start + 1) for name in names)
+            fitting = (check for check in checks if sum(map(check.is_correct, frames)) >= INTACT_SHARE * len(frames))
+            yield from islice(fitting, 1)

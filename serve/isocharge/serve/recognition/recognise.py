@@ -22,7 +22,8 @@ from isocharge.serve.recognition.fields import (
     LARGEST_SIZE,
     Part,
     Weights,
-    identify,
+    count_wraps,
+    possible_meanings,
     possible_parts,
     split_frame,
 )
@@ -90,22 +91,21 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
     distances = np.flatnonzero(_may_be_sync(division.rows()))[:MAX_CONSTANT_BYTES].tolist() if has_sync else [0]
     rows_at = {distance: division.rows(distance) for distance in distances}
     checks = [(distance, check) for distance, rows in rows_at.items() for check in find_checks(rows)]
-    unchecked = [(distance, Check(0, "little")) for distance in distances]
+    if not checks:
+        checks = [(distance, Check()) for distance in distances]
 
-    # For each byte order and each checksum, find the division of the frame into parts with the lowest score.
-    stream_bytes = len(division.stream)
-    covered_share = min(1.0, len(division.starts) * length / stream_bytes)  # share of the bytes inside frames
-    frame_rate_Hz = stream_bytes / length / seconds  # as if all bytes of the stream belonged to frames
-    # The parts are listed once for frames that begin at `starts`. A frame that begins at a distance from there has the
-    # same parts, from this distance to the end and then from the beginning.
+    # For each byte order and each checksum, find the division of the frame into parts with the lowest score. The parts
+    # are listed once for frames that begin at `starts`. A frame that begins at a distance from there has the same
+    # parts, from this distance to the end and then from the beginning.
+    frame_rate_Hz = len(division.stream) / length / seconds  # as if all bytes of the stream belonged to frames
     wide_rows = division.rows(next_bytes=LARGEST_SIZE)
     parts_of_order = {order: possible_parts(wide_rows, order, frame_rate_Hz) for order in ORDERS}
-    for order, (distance, check) in product(ORDERS, checks or unchecked):
-        rows = rows_at[distance]
+    for order, (distance, check) in product(ORDERS, checks):
         parts = parts_of_order[order]
         parts_at_each_byte = (parts[distance:] + parts[:distance])[: length - check.size]
         # The first byte always belongs to the pattern, even if a damaged frame among these rows hides that it is
         # constant.
+        rows = rows_at[distance]
         sync_lengths = range(1, max(1, count_leading(_may_be_sync(rows))) + 1) if has_sync else [0]
         score, best_parts, sync_length = split_frame(parts_at_each_byte, sync_lengths, check.start)
         if all(part.name != CHANNEL for part in best_parts):
@@ -122,6 +122,7 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
             fields_and_padding=_fields(best_parts),
         )
         # Each byte outside of all frames contributes `Weights.noise` bits.
+        covered_share = division.covered_share
         yield covered_share * score / length + (1.0 - covered_share) * Weights.noise, layout
 
 
@@ -225,18 +226,17 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
     steps = np.diff([frame.values for frame in frames], axis=0)  # shape (n - 1, channels)
     for (column, _), channel_steps in zip(layout.columns.channels, steps.T, strict=True):
         name = names[column]
-        meaning = ""
-        is_counter, clock, wrap_count = identify(channel_steps, frame_rate_Hz)
-        has_time_name = clock is not None and any(word in name.lower() for word in ("ms", "milli", "time"))
-        if is_counter and SEQ not in names and not has_time_name:
-            meaning = SEQ
-        # A device file for lines of text cannot state another duration of a tick. A usual clock wraps at most once.
-        elif clock is not None and clock[1] == 1.0 and wrap_count < 2 and TIMES_US.keys().isdisjoint(names):
-            meaning = clock[0]
-        if meaning:
-            names[column] = meaning
-            if column not in layout.unnamed:
-                keys[meaning] = name
+        meanings = [*possible_meanings(channel_steps, frame_rate_Hz)]
+        if any(word in name.lower() for word in ("ms", "milli", "time")):
+            meanings = meanings[-1:]  # the clock, if the values may be those of a clock
+        for meaning, tick in meanings:
+            is_new = SEQ not in names if meaning == SEQ else TIMES_US.keys().isdisjoint(names)
+            # A device file for lines of text cannot state another duration of a tick. A usual clock wraps at most once.
+            if is_new and tick == 1.0 and (meaning == SEQ or count_wraps(channel_steps) < 2):
+                names[column] = meaning
+                if column not in layout.unnamed:
+                    keys[meaning] = name
+                break
 
     # Number the channels without names. Without names from a header, a counter or a clock, the columns need no names.
     if any(names[column] for column in layout.unnamed):
