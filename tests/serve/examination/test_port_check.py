@@ -133,7 +133,7 @@ def test_proposed_device_file_ignores_unused_inputs_and_reads_the_same_charges(m
     """
     report = examined(row, "loop://", electrodes=FOUR)
     monkeypatch.setattr(doctor, "check_electrodes", print)
-    doctor._check_wiring(report, ())
+    doctor._check_wiring(report)
     assert report.device["channels"] == {"A": "1", "B": "3", "C": "4", "D": "6"}
     assert (report.unused, report.unit) == (("2", "5"), "counts")
     assert "dead" not in missing(report)
@@ -243,7 +243,7 @@ def test_offset_drift_hum_and_noise_of_a_channel(rate_Hz, hum_pC):
     charge = np.random.default_rng(0).normal(12.0 + 3.0 * t, 0.3)
     for frequency_Hz, amplitude_pC in zip((50, 60), hum_pC, strict=True):
         charge += (amplitude_pC or 0.0) * np.sin(2 * np.pi * frequency_Hz * t + 1)
-    health = measure_channel_health("A", charge, t, rate_Hz)
+    health = measure_channel_health("A", "A", charge, t, rate_Hz)
     assert health.offset_pC == pytest.approx(12.0 + 6.0, abs=0.1)
     assert health.drift_pC_per_s == pytest.approx(3.0, abs=0.05)
     assert health.hum_pC == (pytest.approx(hum_pC, abs=0.05) if hum_pC[0] else hum_pC)

@@ -128,7 +128,7 @@ def doctor_command(
         obstacle = "the charge of one unit is missing: add the option that is named above"
     found_channels = None
     if check_wiring and examination.good and not obstacle:
-        wiring = _check_wiring(examination, electrodes)
+        wiring = _check_wiring(examination)
         found_channels = wiring.found
         examination = replace(examination, device=corrected_table(examination.device, wiring))
         if not json:
@@ -143,12 +143,11 @@ def doctor_command(
         _write_device_file(write, examination, model or "MODEL")
 
 
-def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> ElectrodeCheck:
+def _check_wiring(examination: Examination) -> ElectrodeCheck:
     """Ask the user for a press near each electrode, and return which channel changes most under each press.
 
     Args:
         examination: Result of the port check, with the device file and the channels of the board.
-        electrodes: Electrodes of the model; empty if no model is chosen.
 
     Raises:
         PressCheckError: If a press does not come, or the presses do not distinguish the channels.
@@ -157,14 +156,7 @@ def _check_wiring(examination: Examination, electrodes: tuple[str, ...]) -> Elec
     if examination.unit != "pC":
         table.pop("gain", None)  # without the charge of one unit, it is incomplete
     device = device_from_table(table, "board")
-    channel_names = [channel.name for channel in examination.channels]
-
-    # Determine the channel that each electrode is assumed to have before the check. If the device file does not assign
-    # the channels, they are assigned by their order, or each channel is an electrode with the name of the channel.
-    is_by_order = len(electrodes) == len(channel_names) and set(electrodes) != set(channel_names)
-    assumed_electrodes = electrodes if is_by_order else channel_names
-    channels = device.channels or dict(zip(assumed_electrodes, channel_names, strict=True))
-
+    channels = device.channels or {channel.electrode: channel.name for channel in examination.channels}
     with Port(examination.url, baud=examination.baud, request=device.request) as port:
         rest_span = max(channel.span_pC or 0.0 for channel in examination.channels)
         return check_electrodes(port, device, channels, say, examination.unit, rest_span)

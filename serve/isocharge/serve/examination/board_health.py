@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from msgspec import structs
@@ -30,6 +30,7 @@ class ChannelHealth:
 
     Attributes:
         name: Name that the device uses, or the number of the channel, counted from 1.
+        electrode: Electrode to which the channel is assumed to belong; the name of the channel if this is not clear.
         offset_pC: Mean charge.
         noise_pC: Standard deviation of the charge without drift and hum.
         drift_pC_per_s: Slope of the charge.
@@ -41,6 +42,7 @@ class ChannelHealth:
     """
 
     name: str
+    electrode: str
     offset_pC: float | None = None
     noise_pC: float | None = None
     drift_pC_per_s: float | None = None
@@ -51,22 +53,54 @@ class ChannelHealth:
 
 
 def measure_channel_health(
-    name: str,
+    name: str, electrode: str, charge_pC: Array, times_s: Array, rate_Hz: float
+) -> ChannelHealth:
+    """Measure the offset, the noise, the drift and the hum of a channel while the film is at rest.
+
+    The function ignores NaN and values whose magnitude is larger than `LARGEST`.
+
+    Args:
+        name: Name of the channel.
+        electrode: Electrode to which the channel is assumed to belong.
+        charge_pC: Values, shape (n,), pC, or in the unit of the board if the gain is not known.
+        times_s: Times since the first frame, shape (n,), s.
+        rate_Hz: Frames per second, Hz.
+
+    Returns:
+        The number of unusable values, and the other results, which are None if the channel has no usable value.
+    """
+    is_usable = np.abs(charge_pC) <= LARGEST  # false for NaN
+    unusable_pC = charge_pC[~is_usable]
+    unusable_value = f"{unusable_pC[0]:g}" if len(unusable_pC) else ""
+    health = ChannelHealth(name, electrode, unusable=len(unusable_pC), unusable_value=unusable_value)
+    if not is_usable.any():
+        return health
+    usable_pC = charge_pC[is_usable]
+    drift_pC_per_s, hum_pC, noise_pC = _fit_drift_and_hum(usable_pC, times_s[is_usable], rate_Hz)
+    return replace(
+        health,
+        offset_pC=float(usable_pC.mean()),
+        noise_pC=noise_pC,
+        drift_pC_per_s=drift_pC_per_s,
+        hum_pC=hum_pC,
+        span_pC=float(np.ptp(usable_pC)),  # largest minus smallest value
+    )
+
+
+def _fit_drift_and_hum(
     charge_pC: Array,
     times_s: Array,
     rate_Hz: float,
     min_samples_per_period: float = 2.2,
     min_hum_time_s: float = 0.5,
-) -> ChannelHealth:
-    """Measure the offset, the noise, the drift and the hum of a channel while the film is at rest.
+) -> tuple[float, tuple[float | None, float | None], float]:
+    """Fit a constant, a slope (the drift) and the hum at each mains frequency to a charge by least squares.
 
-    A constant, a slope (the drift) and the hum at each mains frequency are fitted to the values by least squares. The
-    hum is left out if the time is too short or the frame rate too low. The noise is the standard deviation of the
-    residuals. The function ignores NaN and values whose magnitude is larger than `LARGEST`.
+    In a short time, a hum cannot be distinguished from a drift. At a low frame rate, it cannot be sampled. The hum is
+    then left out.
 
     Args:
-        name: Name of the channel.
-        charge_pC: Values, shape (n,), pC, or in the unit of the board if the gain is not known.
+        charge_pC: Charge, shape (n,), pC.
         times_s: Times since the first frame, shape (n,), s.
         rate_Hz: Frames per second, Hz.
         min_samples_per_period: Smallest frame rate at which a hum is estimated. The default is 10 % above the Nyquist
@@ -75,37 +109,19 @@ def measure_channel_health(
             separates 50 from 60 Hz.
 
     Returns:
-        The number of unusable values, and the other results, which are None if the channel has no usable value.
+        The slope, pC/s; the amplitudes of the hum at 50 and at 60 Hz, pC, each None if it is left out; and the standard
+        deviation of the residuals, which is the noise, pC.
     """
-    is_usable = np.abs(charge_pC) <= LARGEST  # false for NaN
-    unusable_count = int(np.count_nonzero(~is_usable))
-    unusable_value = f"{charge_pC[~is_usable][0]:g}" if unusable_count else ""
-    if unusable_count == is_usable.size:
-        return ChannelHealth(name, unusable=unusable_count, unusable_value=unusable_value)
-    usable_pC = charge_pC[is_usable]
-    usable_times_s = times_s[is_usable]
-
-    # The columns of the design matrix are a constant, the time, and the cosine and the sine of each hum. In a short
-    # time, a hum cannot be distinguished from a drift. At a low frame rate, it cannot be sampled.
-    columns = [np.ones_like(usable_times_s), usable_times_s]
-    is_long = usable_times_s[-1] > min_hum_time_s
+    is_long = times_s[-1] > min_hum_time_s
     fitted_Hz = [hum_Hz for hum_Hz in MAINS_HZ if is_long and rate_Hz > min_samples_per_period * hum_Hz]
-    for hum_Hz in fitted_Hz:
-        phase = 2.0 * np.pi * hum_Hz * usable_times_s
-        columns += [np.cos(phase), np.sin(phase)]
-    design_matrix = np.column_stack(columns)
-    coefficients = np.linalg.lstsq(design_matrix, usable_pC, rcond=None)[0]
-    hum_pC = dict(zip(fitted_Hz, np.hypot(coefficients[2::2], coefficients[3::2]).tolist(), strict=True))
-    return ChannelHealth(
-        name,
-        offset_pC=float(usable_pC.mean()),
-        noise_pC=float((usable_pC - design_matrix @ coefficients).std()),
-        drift_pC_per_s=float(coefficients[1]),
-        hum_pC=(hum_pC.get(50.0), hum_pC.get(60.0)),  # None if the hum was not fitted
-        span_pC=float(np.ptp(usable_pC)),  # largest minus smallest value
-        unusable=unusable_count,
-        unusable_value=unusable_value,
-    )
+    phases = 2.0 * np.pi * np.outer(times_s, fitted_Hz)
+    design_matrix = np.column_stack([np.ones_like(times_s), times_s, np.cos(phases), np.sin(phases)])
+    coefficients = np.linalg.lstsq(design_matrix, charge_pC, rcond=None)[0]
+    _constant, drift_pC_per_s, *amplitudes = coefficients.tolist()
+    cosines, sines = np.reshape(amplitudes, (2, -1))
+    hum_pC = dict(zip(fitted_Hz, np.hypot(cosines, sines).tolist(), strict=True))
+    noise_pC = float((charge_pC - design_matrix @ coefficients).std())
+    return drift_pC_per_s, (hum_pC.get(50.0), hum_pC.get(60.0)), noise_pC
 
 
 LIVE_TIME_s = 0.5

@@ -85,17 +85,15 @@ def check_electrodes(
         PortLost: If the connection to the board is lost.
     """
     electrodes = list(channels)
-    channel_names = list(channels.values())
+    names = list(channels.values())
     ask("wait, and do not touch the film, until the rest level is known")
     frames = _charge_frames(port, device, channels, unit, rest_span)
     changes = np.array([_charges_of_press(frames, electrode, ask, timeout_s) for electrode in electrodes])
     columns = assign_channels(changes, electrodes)
-
+    found = {electrode: names[column] for electrode, column in zip(electrodes, columns, strict=True)}
     # A channel is inverted if its value falls under the press near its own electrode.
-    found_channels = [channel_names[column] for column in columns]
-    own_changes = changes[np.arange(len(columns)), columns]
-    inverted_channels = tuple(name for name, change in zip(found_channels, own_changes, strict=True) if change < 0.0)
-    return ElectrodeCheck(dict(channels), dict(zip(electrodes, found_channels, strict=True)), inverted_channels)
+    inverted = tuple(names[column] for row, column in enumerate(columns) if changes[row, column] < 0.0)
+    return ElectrodeCheck(dict(channels), found, inverted)
 
 
 def assign_channels(changes: Array, electrodes: Sequence[str], min_advantage: float = 1.1) -> list[int]:
@@ -130,10 +128,11 @@ def assign_channels(changes: Array, electrodes: Sequence[str], min_advantage: fl
                 f"the press near electrode {electrodes[row]} changes two channels by almost the same amount; press "
                 "closer to the electrode, with a thinner probe, and try again"
             )
-        if column in columns[:row]:
+        first_row = columns.index(column)
+        if first_row < row:
             raise PressCheckError(
-                f"the presses near electrodes {electrodes[columns.index(column)]} and {electrodes[row]} change the "
-                "same channel most; press closer to each electrode, and try again"
+                f"the presses near electrodes {electrodes[first_row]} and {electrodes[row]} change the same channel "
+                "most; press closer to each electrode, and try again"
             )
     return columns
 
@@ -153,17 +152,14 @@ def corrected_table(table: Mapping[str, Any], check: ElectrodeCheck) -> dict[str
     source_electrode = {electrode: expected_electrode[channel] for electrode, channel in check.found.items()}
 
     def moved(setting: Any) -> Any:
-        """Return a setting of a section, with the values of single electrodes moved to other electrodes."""
-        if not isinstance(setting, Mapping) or set(setting) != set(source_electrode):
+        """Return a setting, section or table, with the values of single electrodes moved to other electrodes."""
+        if not isinstance(setting, Mapping):
             return setting
-        return {electrode: setting[source] for electrode, source in source_electrode.items()}
+        if set(setting) == set(source_electrode):
+            return {electrode: setting[source] for electrode, source in source_electrode.items()}
+        return {name: moved(value) for name, value in setting.items()}
 
-    moved_sections = {
-        name: {key: moved(setting) for key, setting in section.items()}
-        for name, section in table.items()
-        if isinstance(section, Mapping)
-    }
-    return {**table, **moved_sections, "channels": dict(check.found)}
+    return {**moved(table), "channels": dict(check.found)}
 
 
 def _charge_frames(
@@ -211,7 +207,6 @@ def _charges_of_press(frames: Iterator[Frame], electrode: str, ask: Callable[[st
         PressCheckError: If the begin or the end of the press does not come in time.
     """
     deadline_s = time.monotonic() + timeout_s
-    begin_s = 0.0
     charges: list[Array] = []
     is_asked = False
     for frame in frames:
@@ -223,7 +218,8 @@ def _charges_of_press(frames: Iterator[Frame], electrode: str, ask: Callable[[st
             ask(f"press near electrode {electrode}, as close to it as you can, and let go")
             is_asked = True
         if frame.is_contact:
-            begin_s = begin_s if charges else frame.clock_s
+            if not charges:
+                begin_s = frame.clock_s
             charges.append(frame.charge_pC)
         elif charges and frame.clock_s - begin_s >= PressWatch.MIN_HELD_S:  # damaged frames are shorter
             return np.asarray(np.mean(charges, axis=0))

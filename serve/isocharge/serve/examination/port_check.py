@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.common.errors import ChargeError, IsochargeError, printable
+from isocharge.common.errors import ChargeError, IsochargeError
 from isocharge.serve.examination.board_health import (
     ChannelHealth,
     channel_count_sentences,
@@ -23,7 +23,7 @@ from isocharge.serve.examination.board_health import (
 )
 from isocharge.serve.examination.held_press import find_held_press
 from isocharge.serve.examination.listening import BAUDS, Capture, ReceivedData, listen, read_frames
-from isocharge.serve.examination.press_detector import find_touch
+from isocharge.serve.examination.press_detector import touch_sentence
 from isocharge.serve.examination.proposal import propose, recognised_frames, unit_of
 from isocharge.serve.live.device import ANY_BOARD, device_from_table
 from isocharge.serve.port.serial_line import Request
@@ -176,49 +176,41 @@ def examine_received(
     values, times_s = capture.values()
     held_press = find_held_press(values, times_s)
     is_rest = times_s < held_press.rest_end_s
+    rest_values = values[is_rest]
+    rest_times_s = times_s[is_rest]
 
     # Find the channel of each electrode. Without a device file, the settings of the board are proposed first.
     table = dict(device.table)
     if is_proposed:
-        table = propose(capture, values[is_rest], device.table["frames"], electrodes, gain or {})
+        table = propose(capture, rest_values, device.table["frames"], electrodes, gain or {})
         electrodes = electrodes or tuple(table.get("channels", {}))
         device = device_from_table({key: value for key, value in table.items() if gain or key != "gain"}, "board")
         Gain(Setup(electrodes, device))  # raises an error for the numbers of other electrodes
     electrode_at_position = electrodes_by_position(capture, device, electrodes)
-    unit = unit_of(capture, electrode_at_position)
 
-    # Measure the channels at rest. If no gain is stated, the values remain as the board sends them. With a gain, the
-    # values are converted to pC.
-    charges = values[is_rest][:, list(electrode_at_position)]  # shape (n, n_electrode)
+    # Measure the channels at rest. If no gain is stated, the values remain as the board sends them.
     gain_rule = device.rule(GainRule)
-    if gain_rule is not None:
-        unit = "pC"
-        for charge, electrode in zip(charges.T, electrode_at_position.values(), strict=True):
+    unit = "pC" if gain_rule is not None else unit_of(capture, electrode_at_position)
+    charges = rest_values[:, list(electrode_at_position)]  # shape (n, n_electrode)
+    channels = []
+    for (position, electrode), charge in zip(electrode_at_position.items(), charges.T, strict=True):
+        if gain_rule is not None:
             with np.errstate(over="ignore"):  # an unusable value may become infinite, and is ignored later
                 charge[:] = gain_rule.charge_pC(electrode, charge)
-    channels = tuple(
-        measure_channel_health(capture.names[position], charge, times_s[is_rest], capture.rate_Hz)
-        for position, charge in zip(electrode_at_position, charges.T, strict=True)
-    )
+        name = capture.names[position]
+        channels.append(measure_channel_health(name, electrode, charge, rest_times_s, capture.rate_Hz))
 
-    # A touch of the film would falsify the measurement at rest.
-    touch = ""
-    found = find_touch(charges, times_s[is_rest], unit_is_pC=unit == "pC") if channels else None
-    if found is not None:
-        touch = (
-            f"an untouched film: channel {printable(channels[found.column].name)} changes by {found.total_change:.4g} "
-            f"{unit} about {found.time_s:.1f} s after the first frame, as under a touch; take the finger away, and try "
-            "again"
-        )
+    # A touch of the film would falsify the measurement at rest. The offset, the noise and the drift of a pressed film
+    # say nothing about the board.
+    touch = touch_sentence([channel.name for channel in channels], charges, rest_times_s, unit)
+    if touch:
         missing.insert(0, touch)
-    if held_press.tau_s is not None:
-        table = {"leak": {"tau_s": held_press.tau_s}} | table  # keeps a section that the device file already has
-
-    # State what the board still needs before it can provide contacts.
     missing += channel_count_sentences(capture, device, len(channels), electrodes)
     missing += unit_sentences(unit)
-    if not touch:  # the offset, the noise and the drift of a pressed film say nothing about the board
+    if not touch:
         missing += channel_sentences(channels, unit, device)
+    if held_press.tau_s is not None:
+        table = {"leak": {"tau_s": held_press.tau_s}} | table  # keeps a section that the device file already has
     first_frame = capture.frames[0]
     is_numbered = first_frame.seq is not None
     return replace(
@@ -227,7 +219,7 @@ def examine_received(
         repeated=counts.repeated if is_numbered else None,
         device_clock=first_frame.t_us is not None,
         unit=unit,
-        channels=channels,
+        channels=tuple(channels),
         unused=tuple(name for position, name in enumerate(capture.names) if position not in electrode_at_position),
         held=held_press.description,
         touch=touch,

@@ -11,11 +11,12 @@ and an end cannot be distinguished from an amplifier with another rest level.
 
 import math
 import warnings
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Reals
+from isocharge.common.errors import printable
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.signal_chain.stage import Device, Setup
 from isocharge.serve.signal_chain.touch import Touch, TouchRule
@@ -79,50 +80,44 @@ def _detect_touches(levels: Array, times_s: Array, noise: Array) -> Booleans:
     return is_touched
 
 
-class TouchFound(NamedTuple):
-    """A channel that was touched while the film should be at rest.
+def touch_sentence(
+    names: Sequence[str],
+    values: Array,
+    times_s: Array,
+    unit: str,
+    min_noise_pC: float = 1.0,
+    max_slow_change_pC: float = 100.0,
+) -> str:
+    """Return a sentence about a touch of a film that should be at rest; empty if the film is not touched.
 
-    Attributes:
-        column: Column of the channel in the array of values.
-        total_change: Largest minus smallest value of the channel, in the unit of the values.
-        time_s: Time of the beginning of the touch, s from the first frame.
-    """
-
-    column: int
-    total_change: float
-    time_s: float
-
-
-def find_touch(
-    values: Array, times_s: Array, unit_is_pC: bool, min_noise_pC: float = 1.0, max_slow_change_pC: float = 100.0
-) -> TouchFound | None:
-    """Search for a touch in the values of a film that should be at rest.
-
-    If the values are in pC, a large slow change is a touch, too.
+    If the values are in pC, a large slow change is a touch, too. Otherwise the smallest change of a touch is derived
+    from the noise only. If the time is too short, no touch is found.
 
     Args:
+        names: Names of the channels.
         values: Values of the channels, shape (n, channels).
         times_s: Times since the first frame, shape (n,), s.
-        unit_is_pC: Whether the values are charges in pC. Otherwise the smallest change of a touch is derived from the
-            noise only.
+        unit: Unit of the values.
         min_noise_pC: Smallest noise of a channel in pC. With the default, the smallest touch is 20 pC. A press of 0.01
             N on a film of 25 um causes 40 pC.
         max_slow_change_pC: Largest change during the whole time without a touch, pC. The default is the largest offset
             that a tare accepts.
-
-    Returns:
-        The channel with the largest total change. None if the film is not touched, or if the time is too short.
     """
-    block_times_s, levels, is_touched = touched_blocks(values, times_s, min_noise_pC if unit_is_pC else 0.0)
-    if len(levels) == 0:
-        return None
+    is_in_pC = unit == "pC"
+    block_times_s, levels, is_touched = touched_blocks(values, times_s, min_noise_pC if is_in_pC else 0.0)
+    if levels.size == 0:
+        return ""
     total_changes = np.ptp(levels, axis=0)
-    is_slow_touch = unit_is_pC and (total_changes > max_slow_change_pC).any()
+    largest_change = total_changes.max()
+    is_slow_touch = is_in_pC and largest_change > max_slow_change_pC
     if not (is_touched.any() or is_slow_touch):
-        return None
-    column = int(np.argmax(total_changes))
-    begin_block = np.argmax(is_touched)
-    return TouchFound(column, float(total_changes[column]), float(block_times_s[begin_block]))
+        return ""
+    name = printable(names[int(np.argmax(total_changes))])
+    begin_s = block_times_s[np.argmax(is_touched)]
+    return (
+        f"an untouched film: channel {name} changes by {largest_change:.4g} {unit} about {begin_s:.1f} s after the "
+        "first frame, as under a touch; take the finger away, and try again"
+    )
 
 
 def block_medians(values: Array, times_s: Array) -> Array:

@@ -61,10 +61,7 @@ def propose(
     is_in_pC = unit_of(capture, positions.values()) == "pC"
     if gain or has_large_offset or not is_in_pC:
         table["gain"] = {"offset": offset} if any(offset.values()) else {}
-        if gain:
-            table["gain"] |= gain
-        elif is_in_pC:
-            table["gain"]["pC_per_unit"] = 1.0
+        table["gain"] |= gain or ({"pC_per_unit": 1.0} if is_in_pC else {})
     return table
 
 
