@@ -135,7 +135,7 @@ class Family:
     def spread(
         cls, domain: Domain, film: Film, probe: Probe, count: NodeCount, orientation: Orientation = "fixed"
     ) -> "Family":
-        """Distribute the solved presses over a domain.
+        """Distribute the solved presses, between which the stress is interpolated, over a domain.
 
         Args:
             domain: Presses for which the stress will be interpolated.
@@ -170,8 +170,9 @@ class Family:
     def weights(self, position: Complexes, force: Array, rotation: Array) -> Array:
         """Compute the weights that interpolate the stress between the solved presses (nodes).
 
-        Lagrange polynomials interpolate in the distance coordinate and in the logarithm of the force, and a Fourier
-        series in the direction of the press and in the rotation of the probe.
+        Lagrange polynomials interpolate in a coordinate that depends on the distance from the centre, and in the
+        logarithm of the force. A Fourier series interpolates in the direction of the press and in the rotation of the
+        probe. A pair of these two angles is called a turn.
 
         Args:
             position: Positions x + iy of the interpolated presses, shape (n,), mm.
@@ -205,7 +206,8 @@ class Family:
     ) -> Array:
         """Solve the presses of the family, and compute values such as the stress from each of them.
 
-        Only the rotations within one period of the probe are solved.
+        A turn is a pair of two angles: the direction of the press, and the rotation of the probe. Only the rotations
+        within one period of the probe are solved.
 
         Args:
             sensor: Sensor with the film, and with the surface at which the stress is read.

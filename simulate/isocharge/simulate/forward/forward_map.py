@@ -299,12 +299,12 @@ class ForwardMap:
         return self.charges(contact), self.derivatives(contact)
 
     def charges_by_force(self, position: Array, is_odd: Booleans = EVEN_FIELD) -> Array:
-        """Compute the charges of each stress field in the table at given positions, for all forces of the family.
+        """Compute the charges of each stress field at given positions, for all forces at which presses were solved.
 
-        If the footprint of the probe grows, each force has a map of its own with its own mesh. Otherwise, one map
-        contains the fields of all forces, so that the integration points are located only once. Its table has single
-        precision. The result includes neither the crosstalk nor the charges that the contact pressure causes. The probe
-        keeps its own orientation.
+        If the footprint of the probe grows with the force, each force has a map of its own with its own mesh.
+        Otherwise, one map contains the fields of all forces, so that the integration points are located only once. Its
+        table has single precision. The result includes neither the crosstalk nor the charges that the contact pressure
+        causes. The probe keeps its own orientation.
 
         Args:
             position: Positions (x, y) in the domain, shape (n, 2), mm.
@@ -404,6 +404,9 @@ class ForwardMap:
         self, position: Complexes, force: Array, orientation: Array, is_odd: Booleans, charge_per_stress: Array
     ) -> PressedFilm:
         """Interpolate the stress fields under several presses, and convert them into charge per area.
+
+        If only half of the film is meshed, the charge per area is also computed for the reflection of the mesh. The
+        electrodes are divided into pieces, which may be of different kinds with different weights of the stress.
 
         Args:
             position: Positions x + iy, shape (n,), mm.

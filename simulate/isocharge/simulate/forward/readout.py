@@ -100,7 +100,7 @@ class ElectrodePieces:
     def covering(
         cls, electrodes: Sequence[Electrode], readout: Readout = "area", rotation: float = 0.0
     ) -> "ElectrodePieces":
-        """Return the pieces of electrodes at their nominal positions.
+        """Divide electrodes at their nominal positions into pieces: quadrilaterals, or the lines of the edge readout.
 
         Args:
             electrodes: Electrodes of a layout, at least one.
@@ -123,11 +123,12 @@ class ElectrodePieces:
         return replace(nominal, corners=to_complex(sensor.calibration.place(to_corners(nominal.corners))))
 
     def rules(self, probe: Probe, position: Complexes, counts: tuple[int, int] = MAP_COUNTS) -> Iterator[PieceRule]:
-        """Compute the integration points of all pieces under several presses.
+        """Compute the integration points of all pieces of the electrodes under several presses.
 
-        A press and a piece are near if the distance of their centres is less than `NEAR_DISTANCE` times the sum of the
-        radii of the circles around the footprint and the piece. A near piece is halved across its longest side until
-        each part is distant, or has sides of at most `NEAR_SIDE` half widths of the footprint.
+        Near a press, the stress changes strongly, so a near piece gets more integration points. A press and a piece are
+        near if the distance of their centres is less than `NEAR_DISTANCE` times the sum of the radii of the circles
+        around the footprint and the piece. A near piece is halved across its longest side until each part is distant,
+        or has sides of at most `NEAR_SIDE` half widths of the footprint.
 
         Args:
             probe: Probe of the presses.
@@ -336,7 +337,7 @@ class PressedFilm:
     density: np.ndarray
 
     def charges(self, pieces: ElectrodePieces) -> Array:
-        """Integrate the charge per area over electrodes.
+        """Integrate the charge per area, which is known at the nodes of the mesh, over electrodes.
 
         If only half of the film is meshed, points in the other half are reflected into the meshed half.
 

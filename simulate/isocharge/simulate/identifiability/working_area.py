@@ -45,8 +45,11 @@ circle of four electrodes, the orientation is reversed within about 0.01 mm.
 def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseModel) -> tuple[Array, Array]:
     """Find the folds of a charge map for contacts that all have the same force.
 
+    At a fold, the map from contacts to charges turns back, so that contacts on both sides of the fold have the same
+    charges. There, the position error of an estimate from noisy charges is infinite (Cramer-Rao limit).
+
     Args:
-        charge_map: Map that computes the charges of contacts.
+        charge_map: Map that computes the charges of contacts (x, y, F).
         rings: Positions at which the search starts.
         force: Force of the contacts, N.
         noise: Noise of the readings.
@@ -109,12 +112,14 @@ def _reverses_orientation(charge_map: ChargeMap, pairs: Array, force: float, noi
 def _starting_points(rings: Rings, precision: Array) -> tuple[Array, Array]:
     """Choose the positions on rings near which a fold may lie.
 
+    At a fold, contacts on both sides have the same charges, and the position error is infinite.
+
     Args:
-        rings: Positions, of which the angles are periodic.
-        precision: Inverse of the position error at each position, shape (n_ring, n_angle).
+        rings: Positions on concentric rings. Each ring is closed.
+        precision: Inverse of the position error at each position, shape (n_ring, n_angle). It is zero at a fold.
 
     Returns:
-        Positions (x, y), shape (n, 2), and the distance to the farthest neighbour of each, shape (n,), mm.
+        Positions (x, y), shape (n, 2), mm, and the distance of each from its farthest neighbour, shape (n,), mm.
     """
     # A position is chosen if none of its eight neighbours has a smaller precision.
     is_chosen = precision == scipy.ndimage.minimum_filter(precision, 3, mode=("nearest", "wrap"))
@@ -126,8 +131,9 @@ def _starting_points(rings: Rings, precision: Array) -> tuple[Array, Array]:
     sum_across_rings = precision[:-2] + precision[2:]
     is_chosen[1:-1] |= 3.0 * precision[1:-1] <= sum_across_rings
     ring, _ = np.nonzero(is_chosen)
-    spacing_on_ring = rings.distance * 2.0 * np.pi / precision.shape[1]
-    neighbour_distance = np.maximum(rings.distance[0], spacing_on_ring)  # shape (n_ring,)
+    spacing_between_rings = rings.distance[0]
+    spacing_on_ring = rings.distance * math.tau / precision.shape[1]
+    neighbour_distance = np.maximum(spacing_between_rings, spacing_on_ring)  # shape (n_ring,)
     return rings.position[is_chosen], neighbour_distance[ring]
 
 
@@ -212,7 +218,7 @@ def find_ambiguous_pairs(
     """Find pairs of distant contacts whose charges cannot be distinguished because of the noise.
 
     The first contact of a pair is a press with one of the given forces at one of several positions. For each first
-    contact, the search for the nearest contact starts at distant contacts with similar charges.
+    contact, a search that starts at distant contacts with similar charges finds other contacts with its charges.
 
     Args:
         charge_map: Map that computes the charges of contacts.
@@ -334,11 +340,12 @@ class WorkingArea:
 def working_area(
     charge_map: ChargeMap, noise: NoiseModel, *, error: float = DEFAULT_ERROR, search_pairs: bool = True
 ) -> WorkingArea:
-    """Find the working area within the domain of a charge map.
+    """Find the working area of a sensor: the largest disk in which the charges determine the contact.
 
     The radius of the working area is the smallest of four radii: the distance from the centre at which the position
     error first exceeds its limit, the distance of the nearest fold, the radius of the nearest ambiguous pair, and the
-    radius of the domain.
+    radius of the domain. At a fold, the map from contacts to charges turns back. An ambiguous pair consists of two
+    distant contacts with the same charges.
 
     The errors, folds and pairs are computed at several forces, each at most 1.7 times the previous one. On a taut film,
     the charges change their sign with increasing force, and a fold or an ambiguous pair may exist at one of these

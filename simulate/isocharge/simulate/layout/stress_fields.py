@@ -148,11 +148,11 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
             columns.append((_stress_in_film_axes(increased, surface) - stress) / step)
             continue
 
-        # Near the centre, the direction of the press changes by a large angle, and the mesh turns with it. Therefore
-        # both stresses are read at the nodes of the original mesh.
         decreased = _changed_press(solved, -changes)
         smallest_distance = {"x": 1.0, "y": 10.0}.get(column, 0.0) * step
         if distance < smallest_distance:
+            # Near the centre, the direction of the press changes by a large angle, and the mesh turns with it.
+            # Therefore both stresses are read at the nodes of the original mesh.
             change = _change_at_fixed_points(solved, decreased, increased, surface)
         else:
             # The nodes move with the press. Subtract the change of the stress that their movement causes.

@@ -211,8 +211,9 @@ class Blocks:
     def rotated_elements(self, steps: int, steps_per_turn: int) -> Integers:
         """Return how the elements are renumbered by a rotation of the probe that maps the mesh onto itself.
 
-        In the core polygon, all elements at one corner are numbered before those at the next corner. The sectors are
-        numbered layer by layer and ring by ring, and anticlockwise within each layer or ring.
+        The mesh consists of the core polygon under the probe, and of layers and rings around it, which are divided into
+        sectors. In the core polygon, all elements at one corner are numbered before those at the next corner. The
+        sectors are numbered layer by layer and ring by ring, and anticlockwise within each layer or ring.
 
         Args:
             steps: Number of steps by which the probe is rotated.

@@ -133,10 +133,10 @@ def sector_angles(
     radius: Array,
     stretch: Array,
 ) -> Array:
-    """Compute the angles at which the sides of the sectors meet the innermost circle.
+    """Compute the angles at which the sides of the sectors meet the innermost circle of the mesh.
 
-    The sectors divide the rings between the innermost circle and the rim. The sides of the sectors begin where rays
-    from the centroid of the footprint meet the circle. The function `_ray_angles` chooses the directions of the rays.
+    The innermost circle encloses the footprint of the probe. The sectors divide the rings between this circle and the
+    rim of the film. The sides of the sectors begin where rays from the centroid of the footprint meet the circle.
 
     Args:
         blocks: The elements.
@@ -149,7 +149,8 @@ def sector_angles(
             shape (...); see `map_stretch`.
 
     Returns:
-        Angles in the template plane in increasing order, shape (..., n_sector + 1), rad.
+        Angles in the template plane, which the conformal map converts into the film. They increase, and have the shape
+        (..., n_sector + 1), rad.
     """
     # Add an axis for the points or the rays.
     ray_origin = centroid[..., None]
@@ -185,11 +186,11 @@ def _intersections_with_circle(origin: Array, ray: Complexes, radius: Array) -> 
 
 
 def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) -> Array:
-    """Compute the directions of the rays that extend from the centroid of the footprint to the sides of the sectors.
+    """Compute the directions of rays that extend from the centroid of the footprint to the innermost circle.
 
-    The last layer of elements inside the innermost circle connects the circle to an inner boundary. Each of the given
-    points on the inner boundary has a ray. The ray points to the point, and is then rotated a little so that the rays
-    become more evenly spaced. All other rays divide the angle between two such rays into equal parts.
+    Outside the circle, each ray continues as the side of a sector. Each of the given points on an inner boundary has a
+    ray. The ray points to the point, and is then rotated a little so that the rays become more evenly spaced. All other
+    rays divide the angle between two such rays into equal parts.
 
     Args:
         blocks: The elements.
@@ -226,10 +227,11 @@ def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) ->
 
 
 def rim_angles(angle: Array, map_parameter: Array, template_radius: Array) -> Array:
-    """Compute the angles at which the sides of the sectors meet the rim.
+    """Compute the angles at which the sides of the sectors of the mesh meet the rim of the film.
 
-    The conformal map compresses the far side of the film, which lies at the angle pi. Therefore the sides of the
-    sectors are shifted towards the angle pi. The angles on the innermost circle already contain a part of the shift.
+    A conformal map converts the template plane into the film. The map compresses the far side of the film, which lies
+    at the angle pi. Therefore the sides of the sectors are shifted towards the angle pi. The angles on the innermost
+    circle of the mesh already contain a part of the shift.
 
     Args:
         angle: Angles on the innermost circle in the template plane, shape (..., n_sector + 1), rad.
@@ -282,11 +284,11 @@ def stretch_angles(angle: Array, factor: Array) -> Array:
 
 
 def ring_edges(resolution: Resolution, template_radius: Array, thin_ring_width: Array) -> Array:
-    """Compute the depths of the edges of the rings, from 0 on the innermost circle to 1 on the rim.
+    """Compute the depths of the edges of the rings of a mesh, from 0 on the innermost circle to 1 on the rim.
 
-    The depth of a point is ln(r / r0) / ln(1 / r0), where r is the distance of the point from the origin of the
-    template plane, and r0 is the radius of the innermost circle. All rings except the thin rings at the rim cover equal
-    ranges of depth. Each thin ring is a third as wide as the previous thin ring.
+    The mesh is created in a unit disk, the template plane. The depth of a point is ln(r / r0) / ln(1 / r0), where r is
+    the distance of the point from the origin, and r0 is the radius of the innermost circle. All rings except the thin
+    rings at the rim cover equal ranges of depth. Each thin ring is a third as wide as the previous thin ring.
 
     Args:
         resolution: Fineness of the mesh.

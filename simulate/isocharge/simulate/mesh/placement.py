@@ -77,10 +77,11 @@ class Placement:
         rotation: Array | float = 0.0,
         oval: complex | Complexes = 0.0,
     ) -> Self:
-        """Place a template under a press on the positive x axis.
+        """Place a mesh template under a press on the positive x axis.
 
-        The method determines the innermost circle of the mesh and the conformal map for this circle. The method also
-        determines the angles and depths of the elements between the circle and the rim.
+        The innermost circle of the mesh encloses the footprint of the probe. The method determines this circle, the
+        conformal map that converts the template plane into the film, and the angles and depths of the elements between
+        the circle and the rim.
 
         Args:
             blocks: The elements. Their topology must be the topology of the probe.
@@ -185,7 +186,7 @@ class Placement:
         return np.clip(1.0 - log_ratio, 0.0, 1.0)
 
     def displacement(self, points: Complexes, depth: Array) -> Complexes:
-        """Compute the displacements of points from the circular film to the real film.
+        """Compute the displacements of points from a circular film to the real film, whose clamp may be oval.
 
         Args:
             points: Points x + iy of the circular film, shape (..., n), in film radii.
@@ -200,7 +201,9 @@ class Placement:
         return displacement
 
     def to_circular_film(self, points: Complexes) -> Complexes:
-        """Convert points of the real film into points of the circular film by a fixed-point iteration.
+        """Convert points of the real film, whose clamp may be oval, into points of a circular film.
+
+        The displacement depends on the point of the circular film, so the point is found by a fixed-point iteration.
 
         Args:
             points: Points x + iy of the real film, shape (..., n), in film radii.
@@ -301,7 +304,7 @@ class Placement:
         return inner, outer
 
     def _ring_element_points(self, blocks: Blocks) -> Complexes:
-        """Compute the film points of the nodes of the elements between the innermost circle and the rim.
+        """Compute the film points of the nodes of the elements between the innermost circle of the mesh and the rim.
 
         Args:
             blocks: The elements.

@@ -99,8 +99,8 @@ def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tu
     """Find the elements that contain film points, and the local coordinates of the points in their elements.
 
     Args:
-        placement: k placements, one for each row of points.
-        blocks: The elements.
+        placement: Positions of the mesh under k presses, one for each row of points.
+        blocks: The elements of the mesh.
         points: Film points x + iy, shape (k, n), in film radii. If only the upper half of the film is meshed, points in
             the lower half are reflected.
 
@@ -129,12 +129,15 @@ def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tu
 
 
 def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Complexes) -> tuple[Integers, Array]:
-    """Find the elements that contain points between the innermost circle and the rim.
+    """Find the elements that contain points between the innermost circle of the mesh and the rim of the film.
+
+    There, the mesh consists of rings, which are divided into sectors.
 
     Args:
-        placement: k placements, one for each row of points.
-        blocks: The elements.
-        template_points: Points x + iy of the template plane, shape (k, n).
+        placement: Positions of the mesh under k presses, one for each row of points.
+        blocks: The elements of the mesh.
+        template_points: Points x + iy of the template plane, which is a unit disk that represents the film, shape
+            (k, n).
 
     Returns:
         Index of the element, shape (k, n). Radial and angular coordinate in the element from 0 to 1, shape (2, k, n).
@@ -175,7 +178,7 @@ def _locate_in_intervals(edges: Array, values: Array) -> tuple[Integers, Array]:
 def _locate_inside(
     placement: Placement, blocks: Blocks, points: Complexes, corners: Complexes
 ) -> tuple[Integers, Array]:
-    """Find the elements that contain points inside the innermost circle.
+    """Find the elements that contain points inside the innermost circle of the mesh.
 
     A straight line is drawn through each side of an element. The signed distance of a point from the line is positive
     if the point and the element lie on the same side of the line. Therefore the smallest of the four distances is
@@ -195,7 +198,8 @@ def _locate_inside(
     inner_first, inner_last, outer_first, outer_last = np.moveaxis(corners, -1, 0)
     sides = ((inner_first, outer_first), (outer_last, inner_last), (inner_last, inner_first), (outer_first, outer_last))
     distances = [_distance_to_left(start, end, points[:, None]) for start, end in sides]
-    candidates = np.argsort(-np.min(distances, axis=0), axis=1)  # shape (n, n_inner)
+    smallest_distance = np.min(distances, axis=0)  # shape (n, n_inner)
+    candidates = np.argsort(-smallest_distance, axis=1)
 
     element = candidates[:, 0]
     coordinates = np.full((2, points.size), np.inf)

@@ -220,9 +220,10 @@ class FilmPrior:
 
     @cached_property
     def properties(self) -> tuple[FilmProperty, ...]:
-        """Declarations of all properties, in the order of the vector of their values."""
-        # The shift may use half of the gap between the electrodes and the rim, and an oval clamp the other half. Each
-        # of them has two components of up to this size, whose vector sum is larger by a factor of sqrt(2).
+        """Declarations of all unknown properties of a real film, in the order of the vector of their values."""
+        # No electrode may reach the rim. A shift of the electrodes may use half of the gap between the electrodes and
+        # the rim, and an oval clamp the other half. Each of them has two components of up to this size, whose vector
+        # sum is larger by a factor of sqrt(2).
         largest_shift = 0.5 * self._rim_gap / math.sqrt(2.0)
         largest_oval = largest_shift / self.sensor.film.radius
         largest_of = {

@@ -204,7 +204,8 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
 def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
     """Solve the film before the contact, and add the solution to an equilibrium as the attribute `rest`.
 
-    Before the contact, only the static pressure acts on the film.
+    Before the contact, only the static pressure acts on the film. The touch stress is the difference of the stresses of
+    both equilibria.
 
     Args:
         equilibrium: Equilibrium of the press.

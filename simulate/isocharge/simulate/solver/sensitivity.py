@@ -178,16 +178,17 @@ def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
     """Compute how the scaled stress at the nodes changes if a property of the film or the radius of the probe changes.
 
     The properties are those of `FILM_FIELDS`. The film is rotated such that the press lies on the positive x axis. The
-    stress is compared at fixed points of the rotated film. A change of the tension is in units of E A^2 + T, where E is
-    Young's modulus, A is the amplitude of the press, and T is the mean pretension.
+    stress is compared at fixed points of the rotated film. An even change of the film is symmetric about the x axis,
+    and an odd change is antisymmetric. A change of the tension is in units of E A^2 + T, where E is Young's modulus, A
+    is the amplitude of the press, and T is the mean pretension.
 
     Args:
         solved: Press with a circular probe.
         surface: Surface of the film at which the stress is computed; see `touch_stress`.
 
     Returns:
-        Change of the stress per unit of each property, shape (n_element, n_local, n_field, 3), in the order of the
-        table of a `ForwardMap` with several fields. The last axis is the stress component (S11, S22, S12).
+        Change of the stress per unit of each property, shape (n_element, n_local, n_field, 3). The last axis is the
+        stress component (S11, S22, S12).
     """
     if solved.rest is not None:  # the touch stress is the difference from the stress before the contact
         before_contact = stress_changes(solved.rest, surface)
@@ -276,8 +277,9 @@ MAX_FRICTION = 1.0
 def holding_force(solved: Equilibrium) -> tuple[float, float]:
     """Compute, to first order, the side force that cancels the mean in-plane displacement of the footprint.
 
-    The compliance of the film is the mean displacement of the footprint under a unit side load. The holding force
-    causes a mean displacement that is equal and opposite to the mean displacement caused by the press.
+    The side force acts in the plane of the film. The compliance of the film is the mean displacement of the footprint
+    under a unit side load. The holding force causes a mean displacement that is equal and opposite to the mean
+    displacement caused by the press.
 
     Args:
         solved: Press without a side force.

@@ -188,9 +188,10 @@ class LocalPlanes:
     def fit(cls, unit_contact: Array, values: Array) -> "LocalPlanes":
         """For each contact, fit a quadratic function to the values of its neighbours by least squares.
 
-        The function maps the unit coordinates of a contact to the k values. The plane is the tangent of the function at
-        the contact. The values at the contact itself are not used in the fit, so that its residual is independent of
-        the plane. The residuals are scaled so that their variance is equal to that of the noise of the values.
+        The function maps the unit coordinates of a contact to the k values. Unit coordinates are x, y and ln F, scaled
+        such that each of them ranges from -1 to 1. The plane is the tangent of the function at the contact. The values
+        at the contact itself are not used in the fit, so that its residual is independent of the plane. The residuals
+        are scaled so that their variance is equal to that of the noise of the values.
 
         Args:
             unit_contact: Contacts in unit coordinates, shape (n, 3).
@@ -199,18 +200,21 @@ class LocalPlanes:
         Returns:
             The planes, one for each different contact.
         """
+        # Find the neighbours of each contact. The nearest contact is the contact itself.
         contact, mean_value, press_count, _ = _average_repeated(unit_contact, values)
         distance, nearest = cKDTree(contact).query(contact, min(NEIGHBOURS + 1, len(contact)))
-        neighbours = nearest[:, 1:]  # the nearest contact is the contact itself
-        offsets = contact[neighbours] - contact[:, None]
-        # The constant, the offsets of the neighbours, and their products, shape (n, number of neighbours, 10)
+        neighbours = nearest[:, 1:]
+
+        # The terms of the function are a constant, the offsets of the neighbours, and the products of two offsets.
+        offsets = contact[neighbours] - contact[:, None]  # shape (n, number of neighbours, 3)
         first, second = np.triu_indices(3)
         products = offsets[:, :, first] * offsets[:, :, second]
-        columns = np.concatenate([np.ones_like(offsets[:, :, :1]), offsets, products], axis=2)
-        # The pseudoinverse contains the weights of the neighbours in the least-squares solution.
-        weights = np.linalg.pinv(columns)
-        # The first coefficient is the value at the contact, and the next three are the slopes; shape (n, 10, k).
-        coefficients = weights @ mean_value[neighbours]
+        terms = np.concatenate([np.ones_like(offsets[:, :, :1]), offsets, products], axis=2)
+
+        # The pseudoinverse contains the weights of the neighbours in the least-squares solution. The first coefficient
+        # is the value at the contact, and the next three are the slopes.
+        weights = np.linalg.pinv(terms)
+        coefficients = weights @ mean_value[neighbours]  # shape (n, 10, k)
         value = coefficients[:, 0]
         slope = coefficients[:, 1:4].swapaxes(1, 2)  # shape (n, k, 3)
 
@@ -260,12 +264,12 @@ def _average_repeated(unit_contact: Array, values: Array) -> tuple[Array, Array,
     """Average the values of presses with the same contact.
 
     Args:
-        unit_contact: Contacts in unit coordinates, shape (n, 3).
+        unit_contact: Contacts of n presses in unit coordinates, shape (n, 3).
         values: Values of the presses, shape (n, k).
 
     Returns:
-        Different contacts, shape (m, 3). Their mean values, shape (m, k). Their numbers of presses, shape (m,). Index
-        of the contact of each press, shape (n,).
+        The m different contacts, shape (m, 3). Mean values of the presses at each contact, shape (m, k). Number of
+        presses at each contact, shape (m,). Index of the contact of each press, shape (n,).
     """
     # Number the different contacts, and count their presses.
     rounded_contact = np.round(unit_contact, SAME_CONTACT_DECIMALS)
@@ -280,7 +284,7 @@ def _average_repeated(unit_contact: Array, values: Array) -> tuple[Array, Array,
 
 
 def _repeated_residuals(unit_contact: Array, charge: Array) -> tuple[Array, Array]:
-    """Compute the residuals of presses whose contact is repeated: their differences from the mean of the contact.
+    """Compute the residuals of presses whose contact is repeated: the differences from the mean charges of the contact.
 
     Args:
         unit_contact: Contacts in unit coordinates, shape (n, 3).

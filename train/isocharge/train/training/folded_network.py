@@ -335,7 +335,7 @@ def _add_perceptrons(builder: GraphBuilder, inputs: str, perceptrons: Sequence[P
 
 
 def fold(perceptron: Perceptron, mean: Array, matrix: Array, answer_map: Layer) -> Perceptron:
-    """Fold the whitening of the features and a linear map of the outputs into a perceptron.
+    """Make the whitening of the features and a linear map of the outputs a part of a perceptron.
 
     The whitening of the features becomes part of the first layer and of the skip layer. The linear map from the outputs
     to the answers becomes part of the last layer and of the skip layer.
@@ -384,11 +384,13 @@ The arguments are a, b, a - b, a + b, a - b - c, a - b + c, a + b - c and a + b 
 def linear_answer_map(domain: Domain) -> Layer:
     """Return the linear map from the outputs of the contact perceptron to its answers.
 
-    The contact perceptron estimates unit coordinates, which the map converts to (x, y, ln F). The perceptron also
-    computes the logarithm of the relative standard deviation of the force. The corresponding answer is the logarithm of
-    the absolute standard deviation of the force in N. The map therefore adds ln F to the logarithm. The correlations
-    follow from three angles that the perceptron computes. The map converts these angles to eight sums of angles.
-    The graph computes the correlations as weighted sums of the cosines of these eight angles.
+    The outputs are three means, three logarithms of standard deviations, and three angles:
+
+    - The means are unit coordinates, which range from -1 to 1. The map converts them to x, y and ln F.
+    - The perceptron computes the logarithm of the relative standard deviation of the force. The answer is that of the
+      absolute standard deviation in N. The map therefore adds ln F.
+    - The correlations are weighted sums of the cosines of eight sums of the three angles. The map computes these sums
+      of angles.
 
     Args:
         domain: Domain that defines the centre and the scale of the unit coordinates.

@@ -71,7 +71,7 @@ def misfit_examples(
     charges are drawn at random (`draw_charges`). All other charges are those of presses outside the working area.
 
     Args:
-        split: Presses for training, and the charge field in which the search finds the nearest contacts.
+        split: Presses for training, and the map from contacts to charges with which the nearest contacts are found.
         features: Input features of the network, whose limits are also the limits of the charges.
         outside: Presses outside the working area, from which a share of the examples is drawn; None if there are none.
         config: Noise, number of examples and seed.

@@ -291,7 +291,7 @@ def as_tensor(values: Reals) -> Tensor:
 
 
 def fold_network(network: InverseNetwork) -> FoldedNetwork:
-    """Fold the whitening and the units of the answers into the perceptrons of a trained network.
+    """Make the whitening of the inputs and the units of the answers a part of the perceptrons of a trained network.
 
     If all presses have the same force, the last layer of the contact perceptron always gives this force.
     """

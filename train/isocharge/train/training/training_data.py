@@ -182,11 +182,11 @@ class Split:
 
     @classmethod
     def by_position(cls, data: TrainingData, training: TrainingConfig) -> "Split":
-        """Split presses into a part for training and a part for the test, and fit a charge field to all of them.
+        """Split presses into a part for training and a part for the test, and fit a charge field to them.
 
         A charge field is a smooth map from contacts to charges. The map folds where different contacts have the same
-        charges. The field is fitted to all presses and determines the largest disk in which the map certainly does not
-        fold. Only the presses within this disk are distributed among the two parts.
+        charges. The field determines the largest disk in which the map certainly does not fold. Only the presses within
+        this disk are used.
 
         Args:
             data: Presses of the sensor.
