@@ -85,9 +85,9 @@ def _invert(information: Array) -> Array:
     """Invert information matrices, and regularise singular matrices.
 
     Each matrix is first scaled such that its diagonal elements are 1, because the units of the parameters differ. Then
-    the eigenvalues of the matrix are increased by eight times the precision of a floating-point number, which is more
-    than their rounding errors. The limits of parameters that the charges do not determine are therefore very large
-    instead of infinite, and all other limits hardly change.
+    a tiny multiple of the identity matrix is added, which is larger than the rounding errors of the eigenvalues. The
+    variances of parameters that the measurement does not determine are therefore very large instead of infinite, and
+    all other variances hardly change.
 
     Args:
         information: Symmetric matrices, shape (n, p, p).
@@ -95,11 +95,13 @@ def _invert(information: Array) -> Array:
     Returns:
         Inverse matrices, shape (n, p, p).
     """
-    diagonal = np.diagonal(information, axis1=1, axis2=2)
     # The lower bound avoids a division by zero if there is no information about a parameter. The bound is the root of
     # the smallest number, because the products of two bounds must not underflow.
+    diagonal = np.diagonal(information, axis1=1, axis2=2)
     smallest_information = np.sqrt(np.finfo(float).tiny)
     parameter_scale = np.sqrt(np.maximum(diagonal, smallest_information))  # shape (n, p)
     matrix_scale = parameter_scale[:, :, None] * parameter_scale[:, None, :]
+
     addition = 8.0 * np.finfo(float).eps * np.eye(information.shape[1])
-    return np.asarray(np.linalg.inv(information / matrix_scale + addition) / matrix_scale)
+    scaled_inverse = np.linalg.inv(information / matrix_scale + addition)
+    return np.asarray(scaled_inverse / matrix_scale)

@@ -82,7 +82,7 @@ def minimise(
 
 
 def bounded_step(point: Array, residual: Array, slopes: Array, damping: Array) -> Array:
-    """Take one damped Gauss-Newton step that does not leave the domain D.
+    """Take one damped Gauss-Newton step that does not leave the domain D, the unit disk times the interval [-1, 1].
 
     Args:
         point: Points of D, shape (n, 3).
@@ -114,6 +114,9 @@ def bounded_step(point: Array, residual: Array, slopes: Array, damping: Array) -
 
 def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -> tuple[Array, Array]:
     """Modify the normal equations of points on an edge of the domain D such that each step does not leave D.
+
+    The domain D is the unit disk times the interval [-1, 1]. The normal equations J'J step = -J'r belong to a
+    least-squares problem with the residuals r and their Jacobian J.
 
     Args:
         normals: Outward normals of both edges of D at each point, shape (n, 2, 3): of the circle that bounds x and y,

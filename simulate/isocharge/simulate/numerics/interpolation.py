@@ -254,6 +254,9 @@ class Turns:
     def spread(cls, largest_harmonics: tuple[int, ...], period: float, *, has_directions: bool) -> "Turns":
         """Choose the smallest number of turns whose presses determine the coefficients of a Fourier series.
 
+        A turn is a pair of two angles: the direction d of a press, and the rotation r of the probe. A term of the
+        series is proportional to exp(i (2 m d + k r)).
+
         Args:
             largest_harmonics: Largest |k| of the terms of the series for |m| = 0, 1, 2, and so on; see the docstring of
                 the class. Without directions, only m = 0 is used. For an axisymmetric probe, only k = 0 is used.
@@ -295,11 +298,15 @@ class Turns:
         Returns:
             Weights, shape (n, n_turn). The weights of each press sum to 1.
         """
-        angles = np.stack(np.broadcast_arrays(direction, rotation), axis=1)
-        phase = angles @ self.harmonics.T  # shape (n, n_term)
-        turn_phase = np.stack([self.direction, self.rotation], axis=1) @ self.harmonics.T  # shape (n_turn, n_term)
-        terms = np.exp(1j * phase) @ np.exp(-1j * turn_phase).T
-        return np.asarray(terms.real / self.rotation.size)
+        # Phase of each term of the Fourier series at the presses and at the turns
+        press_angles = np.stack(np.broadcast_arrays(direction, rotation), axis=1)
+        press_phase = press_angles @ self.harmonics.T  # shape (n, n_term)
+        turn_angles = np.stack([self.direction, self.rotation], axis=1)
+        turn_phase = turn_angles @ self.harmonics.T  # shape (n_turn, n_term)
+
+        # A weight is the sum of exp(i (phase at the press - phase at the turn)) over the terms, divided by `n_turn`.
+        sum_over_terms = np.exp(1j * press_phase) @ np.exp(-1j * turn_phase).T
+        return np.asarray(sum_over_terms.real / self.rotation.size)
 
 
 def _lattice(harmonics: Integers, symmetry_order: int) -> tuple[int, int]:

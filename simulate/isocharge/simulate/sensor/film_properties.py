@@ -132,30 +132,29 @@ def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> t
     """
     # A missing value is 0, which changes nothing.
     value = defaultdict(float, {PRETENSION.name: sensor.film.pretension, **values})
-    piezo = sensor.piezo
-    calibration = sensor.calibration
-    shift_x, shift_y = calibration.shift
-    gains = {
-        name: calibration.gain.get(name, 1.0) * math.exp(value[f"gain {name}"])
-        for name in sensor.electrode_names
-        if value[f"gain {name}"]
-    }
-    changed_sensor = replace(
-        sensor,
-        film=_changed_mechanics(sensor.film, value),
-        piezo=replace(
-            piezo,
-            d31=piezo.d31 * math.exp(value["d31"]),
-            d32=piezo.d32 * math.exp(value["d32"]),
-            d12=piezo.d12 + value["d12"],
-        ),
-        calibration=Calibration(
-            gain=calibration.gain | gains,
-            shift=(shift_x + value["shift_x"], shift_y + value["shift_y"]),
-            rotation=calibration.rotation + value["rotation"],
-            crosstalk=calibration.crosstalk + value["crosstalk"],
-        ),
+    film = _changed_mechanics(sensor.film, value)
+    piezo = replace(
+        sensor.piezo,
+        d31=sensor.piezo.d31 * math.exp(value["d31"]),
+        d32=sensor.piezo.d32 * math.exp(value["d32"]),
+        d12=sensor.piezo.d12 + value["d12"],
     )
+
+    # Change the gains and the positions of the electrodes.
+    described = sensor.calibration
+    gain = dict(described.gain)
+    for name in sensor.electrode_names:
+        log_factor = value[f"gain {name}"]
+        if log_factor:
+            gain[name] = gain.get(name, 1.0) * math.exp(log_factor)
+    shift_x, shift_y = described.shift
+    calibration = Calibration(
+        gain=gain,
+        shift=(shift_x + value["shift_x"], shift_y + value["shift_y"]),
+        rotation=described.rotation + value["rotation"],
+        crosstalk=described.crosstalk + value["crosstalk"],
+    )
+    changed_sensor = replace(sensor, film=film, piezo=piezo, calibration=calibration)
     if isinstance(probe, Circle):
         probe = replace(probe, radius=probe.radius + value["probe_radius"])
     return changed_sensor, probe

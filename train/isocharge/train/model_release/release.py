@@ -72,9 +72,10 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
     """
     electrodes = metadata.electrodes
     sensor_name = metadata.sensor["name"]
-    is_measured = "measured" in metadata.made_with
-    noise = zip(*metadata.noise.for_each_electrode(len(electrodes)), strict=True)
-    noise_texts = [f"{white:g} pC and {100 * gain:.3g} %" for white, gain in noise]
+
+    truth_text = MEASURED_TRUTH if "measured" in metadata.made_with else SIMULATED_TRUTH
+    whites, gains = metadata.noise.for_each_electrode(len(electrodes))
+    noise_texts = [f"{white:g} pC and {100 * gain:.3g} %" for white, gain in zip(whites, gains, strict=True)]
     noise_text = noise_texts[0]
     if len(set(noise_texts)) > 1:
         noise_text = "; ".join(f"{name} {text}" for name, text in zip(electrodes, noise_texts, strict=True))
@@ -113,7 +114,7 @@ The misfit is the distance of the charges from those of the nearest single conta
 
 {unnoticed_text}## Limits
 
-- {MEASURED_TRUTH if is_measured else SIMULATED_TRUTH}
+- {truth_text}
 {cautions_text}{LIMITS}
 ## Make it again
 

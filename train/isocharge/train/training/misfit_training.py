@@ -41,11 +41,13 @@ def draw_charges(rng: np.random.Generator, charge: Array, noise: ChannelNoise, c
     Returns:
         Charges, shape (count, n_electrode), pC.
     """
-    level = noise.level(charge[rng.integers(len(charge), size=count)])
+    rows = rng.integers(len(charge), size=count)
+    level = noise.level(charge[rows])
     is_moved = rng.random(level.shape) < rng.random((count, 1))  # each press has its own share of such electrodes
     distance = 10.0 ** rng.uniform(*LOG_DISTANCES, (count, 1))
     std = np.where(is_moved, distance, 1.0)
-    return noise.charge(level + std * rng.standard_normal(level.shape))
+    error = std * rng.standard_normal(level.shape)
+    return noise.charge(level + error)
 
 
 OUTSIDE_SHARE = 0.25
