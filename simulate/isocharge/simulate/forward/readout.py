@@ -192,6 +192,8 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
 def stress_charge(sensor: Sensor, equilibrium: Equilibrium, counts: tuple[int, int] = DIRECT_COUNTS) -> Array:
     """Compute the charge that the stress under a solved press causes, without crosstalk.
 
+    The stress is integrated over pieces of the electrodes. Pieces near the probe get more integration points.
+
     Args:
         sensor: Sensor whose film was solved.
         equilibrium: Equilibrium of the film under the press.

@@ -114,17 +114,22 @@ class Triangulation:
     def _descend(self, charge: Array, contact: Array) -> tuple[Array, Array]:
         """Find the contacts near starting points for which the mean square distance from the contours is smallest.
 
+        The contour of an electrode consists of the positions at which a press causes the given charge. To first order,
+        the distance from the contour is the difference of the charges divided by the length of the gradient.
+
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
             contact: Starting points (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Contacts (x, y, F), shape (n, 3), mm and N, and their spreads, shape (n,), mm.
+            Contacts (x, y, F), shape (n, 3), mm and N, and root mean square distances of their positions from the
+            contours, shape (n,), mm.
         """
         for _ in range(ROUNDS):
             _, derivatives = self.charge_map.linearised(contact)
-            gradient_length = np.linalg.norm(derivatives[..., :2], axis=2)
+            gradient_length = np.linalg.norm(derivatives[..., :2], axis=2)  # shape (n, n_electrode), pC/mm
             # The lower bound keeps the distance finite where a charge has an extremum.
-            slope = np.maximum(gradient_length, MIN_RELATIVE_SLOPE * gradient_length.max(axis=1, keepdims=True))
+            smallest_length = MIN_RELATIVE_SLOPE * gradient_length.max(axis=1, keepdims=True)
+            slope = np.maximum(gradient_length, smallest_length)
             contact, distance = explain(self.charge_map, charge, slope, contact)
         return contact, np.sqrt(np.mean(distance**2, axis=1))

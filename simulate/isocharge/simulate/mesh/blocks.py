@@ -87,6 +87,10 @@ class Blocks:
     def __init__(self, resolution: Resolution, topology: FootprintTopology, whole: bool = False) -> None:
         """Count the elements, and compute the local coordinates of their nodes.
 
+        The mesh consists of the core polygon inside the footprint of the probe, of one or two layers up to a circle
+        around the footprint, and of rings from this circle to the rim of the film. The layers and rings are divided
+        into sectors.
+
         Args:
             resolution: Fineness of the mesh.
             topology: Number and kind of the blocks in and around the footprint.
@@ -96,9 +100,9 @@ class Blocks:
         self.topology = topology
         self.half = topology.fills_circle and not whole
 
-        # In the meshed part of the film, the core polygon is divided into one quadrilateral for each corner. A
-        # quadrilateral consists of n_half_edge * n_half_edge elements. At each corner, two half edges meet. Each
-        # element along the edges begins a sector outside the core polygon.
+        # The core polygon is divided into one quadrilateral for each corner. A quadrilateral consists of n_half_edge *
+        # n_half_edge elements. At each corner, two half edges meet. Each element along the edges begins a sector
+        # outside the core polygon.
         self.n_corner = topology.n_corner
         self.n_half_edge = max(1, round(resolution.around / (2 * self.n_corner)))
         self.n_meshed_corner = self.n_corner // self.copies

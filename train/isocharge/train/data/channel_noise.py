@@ -134,23 +134,23 @@ class ChannelNoise(GaussianNoise):
         return np.sinh(exponent) * self.white / self.gain
 
     def transition_charge(self, charge: Array) -> Array:
-        """Return the transition charge of each channel, shape (n_electrode,), pC.
+        """Return the charge of each channel above which the inputs of a network become logarithmic.
 
         The inputs of the network are asinh(Q / transition charge). The inputs are nearly linear in charges Q below the
         transition charge, and nearly logarithmic above it. The transition charge is the charge above which the noise is
-        mostly proportional to the charge. For a channel with charges of both signs, the transition charge also has a
-        lower limit.
+        mostly proportional to the charge. If a channel has charges of both signs, the transition charge also has a
+        lower limit, because asinh would otherwise have a kink at the charge 0 for a channel with little noise.
 
         Args:
             charge: Charges of presses, shape (n, n_electrode), pC.
+
+        Returns:
+            Transition charges, shape (n_electrode,), pC.
         """
         low_charge, high_charge = np.quantile(charge, (LEAST_SHARE, 1.0 - LEAST_SHARE), axis=0)
         has_both_signs = (low_charge < 0.0) & (high_charge > 0.0)  # shape (n_electrode,)
-        # Without this lower limit, asinh would have a kink at the charge 0 for a channel with little noise.
-        smallest_transition = np.where(has_both_signs, MIN_TRANSITION_RATIO * usual_size(charge), 0.0)
-        # Below this charge, the noise is mostly white, and above it mostly proportional to the charge.
-        noise_corner = self.white / self.gain
-        return np.maximum(noise_corner, smallest_transition)
+        lower_limit = np.where(has_both_signs, MIN_TRANSITION_RATIO * usual_size(charge), 0.0)
+        return np.maximum(self.white / self.gain, lower_limit)
 
     def scaled(self, factor: float) -> "ChannelNoise":
         """Multiply all standard deviations by a factor, and return the new noise model."""
@@ -226,9 +226,9 @@ class LocalPlanes:
     def residuals(self, values: Array) -> Array:
         """Compute the difference between each set of k values and the nearest point of all planes.
 
-        A plane is a linear function from contacts to values. The points of a plane are the values of the contacts
-        around its press, up to the distance of the farthest neighbour of the press. Only the `CANDIDATES` planes whose
-        values at their own press are nearest to the set are searched.
+        A plane is a linear function from contacts to values. It describes the values of the contacts near one press, up
+        to the distance of the farthest neighbour of the press. Each set of values is compared with `CANDIDATES` planes:
+        those whose values at their own press are nearest to the set.
 
         Args:
             values: m sets of values, shape (m, k).
@@ -240,19 +240,17 @@ class LocalPlanes:
         inverse_slope = np.linalg.pinv(self.slope)  # shape (n, 3, k)
         smallest_residual = np.full(values.shape, np.inf)
         for plane_index in candidate_planes.T:  # index of one plane for each set of values, shape (m,)
-            # Find the point of the plane that is nearest to each set of values. The vector `step`, shape (m, 3), leads
-            # from the press of the plane to the contact of this point, in unit coordinates. The matrices are
-            # multiplied by column vectors, which have an additional last axis.
+            # Find the step from the press of the plane to the contact whose values are nearest to the set.
             difference = values - self.value[plane_index]  # from the values at the press, shape (m, k)
-            step = (inverse_slope[plane_index] @ difference[..., None])[..., 0]
+            step = np.einsum("mik,mk->mi", inverse_slope[plane_index], difference)  # in unit coordinates, shape (m, 3)
 
             # Shorten steps that end beyond the farthest neighbour.
             reach = self.reach[plane_index]
             length_ratio = reach / np.maximum(np.linalg.norm(step, axis=1), reach)
             limited_step = step * length_ratio[:, None]
 
-            # Difference from the point at the end of the step, shape (m, k)
-            residual = difference - (self.slope[plane_index] @ limited_step[..., None])[..., 0]
+            # Difference from the values at the end of the step, shape (m, k)
+            residual = difference - np.einsum("mki,mi->mk", self.slope[plane_index], limited_step)
 
             # Keep the residual if this plane is nearer than all earlier planes.
             is_nearer = (residual**2).sum(axis=1) < (smallest_residual**2).sum(axis=1)

@@ -128,9 +128,9 @@ def refit_covariance(network: InverseNetwork, train: LabelledPresses, noise: Noi
     by the method L-BFGS. The loss does not change the mean.
 
     The hidden units are correlated, and a fit of their weights would take hundreds of iterations. The change of the
-    weights is therefore a product of two matrices. The first matrix is fitted. The second matrix is the inverse of the
-    Cholesky factor of the Gram matrix of the hidden units. The entries of the first matrix are then the weights of
-    values that are nearly orthonormal over the presses.
+    weights is therefore the product of a fitted matrix and the inverse of the Cholesky factor of the Gram matrix of the
+    hidden units. The entries of the fitted matrix are then the weights of combinations of hidden units that are nearly
+    orthonormal over the presses.
 
     Args:
         network: Network that learns the force, with a trained contact perceptron.
@@ -148,13 +148,15 @@ def refit_covariance(network: InverseNetwork, train: LabelledPresses, noise: Noi
         gram_matrix.diagonal().add_(RIDGE)
         inverse_factor = torch.linalg.inv(torch.linalg.cholesky(gram_matrix))
 
-    def loss_and_gradient(change: Array) -> tuple[float, Array]:
-        """Return the loss and its gradient with respect to the first matrix; the matrix and the gradient are flat."""
-        matrix = as_tensor(change).view_as(weight).requires_grad_()
-        posterior = Posterior(*(outputs + hidden @ (matrix @ inverse_factor).T).split(3, dim=1))
+    def loss_and_gradient(entries: Array) -> tuple[float, Array]:
+        """Return the loss and its gradient with respect to the entries of the fitted matrix."""
+        fitted_matrix = as_tensor(entries).view_as(weight).requires_grad_()
+        new_outputs = outputs + hidden @ (fitted_matrix @ inverse_factor).T
+        posterior = Posterior(*new_outputs.split(3, dim=1))
         loss = covariance_loss(posterior, target - posterior.mean).sum()
-        (gradient,) = torch.autograd.grad(loss, matrix)
+        (gradient,) = torch.autograd.grad(loss, fitted_matrix)
         return loss.item(), gradient.numpy().ravel()
 
-    result = minimize(loss_and_gradient, np.zeros(weight.numel()), jac=True, method="L-BFGS-B", tol=LOSS_TOLERANCE)
+    start = np.zeros(weight.numel())
+    result = minimize(loss_and_gradient, start, jac=True, method="L-BFGS-B", tol=LOSS_TOLERANCE)
     weight += as_tensor(result.x).view_as(weight) @ inverse_factor

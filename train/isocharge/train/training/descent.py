@@ -56,12 +56,12 @@ class Soap:
         """Change the parameter by one step of SOAP (Vyas et al., 2024, algorithm 3).
 
         The averaged gradient is rotated into the eigenbasis. As in Adam, each entry of the rotated gradient is divided
-        by the root mean square of this entry over the past steps. The result is rotated back and gives the direction of
-        the step.
+        by the root mean square of this entry over the past steps. These ratios are rotated back, and give the direction
+        of the step.
 
-        With equal decay rates, the ratio is at most 1, except where an update of the eigenvectors has moved a part of
-        the averaged gradient to an entry whose mean square is nearly zero. The ratio of such an entry is limited to 1,
-        because the step would be arbitrarily long without a limit.
+        The ratios are limited to the range from -1 to 1. Only an update of the eigenvectors can cause larger ratios: if
+        it moves a part of the averaged gradient to an entry whose mean square is nearly zero, the step would be
+        arbitrarily long without the limit.
 
         Args:
             rate: Learning rate, which is approximately the change of each entry.

@@ -140,8 +140,8 @@ def invertible_domain(
             f"same charges there, and the model, which is trained for {requested_radius:g} mm, confuses them; a fit "
             f"with an error of {100.0 * field.charge_std:.2g} % does not show where: take more presses, of one probe"
         )
-        is_probable = fold_radius < PROBABLE_FOLD_RATIO * requested_radius
-        return field.domain, (caution,) if is_probable else ()
+        cautions = (caution,) if fold_radius < PROBABLE_FOLD_RATIO * requested_radius else ()
+        return field.domain, cautions
 
     if fold_radius < SMALLEST_SHARE * requested_radius:
         raise DatasetError(
