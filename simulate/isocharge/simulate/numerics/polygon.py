@@ -80,9 +80,9 @@ def area_in_disk(corners: Complexes, centre: complex, radius: Array | float) -> 
     """Compute the area that a polygon has in common with each of several concentric disks.
 
     Each edge of the polygon forms a triangle with the centre of the disk. The signed areas that the triangles and the
-    disk have in common add up to the common area of the polygon and the disk. The part of an edge inside the circle
-    contributes the area of a triangle. Each part of an edge outside the circle contributes the area of a circular
-    sector.
+    disk have in common add up to the common area of the polygon and the disk. Between the centre and the part of an
+    edge inside the circle, the common area is a triangle. Between the centre and each part of an edge outside the
+    circle, it is a circular sector.
 
     Args:
         corners: Corners x + iy, anticlockwise, shape (n,).
@@ -119,14 +119,15 @@ def area_in_disk(corners: Complexes, centre: complex, radius: Array | float) -> 
 
 
 def gauss_quadrilaterals(corners: Complexes, line_area: Array, count: int) -> tuple[Complexes, Array]:
-    """Compute the points and weights of a Gauss rule for quadrilaterals.
+    """Compute the points and weights of a Gauss rule for quadrilaterals, triangles and lines.
 
-    A bilinear function maps the rule of the unit square into each quadrilateral.
+    A bilinear function maps the rule of the unit square into each quadrilateral. An integral over a line is a mean
+    along the line, multiplied by an area that the line represents.
 
     Args:
         corners: Corners x + iy, anticlockwise, shape (n, 4). The last two corners of a triangle are equal. A line is a
             quadrilateral whose first and last corners are equal, and whose second and third corners are equal.
-        line_area: Area for which the integral over a line stands, shape (n,); zero for a quadrilateral that is no line.
+        line_area: Area that a line represents, shape (n,); zero for a quadrilateral or a triangle.
         count: Number of points along a side.
 
     Returns:

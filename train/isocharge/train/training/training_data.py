@@ -135,12 +135,12 @@ def invertible_domain(
     if not np.isfinite(area.fold_radius) or fold_radius >= requested_radius:
         return field.domain, ()
     if field.charge_std > MAX_ERROR_OF_CERTAIN_FOLD:
-        caution = (
+        probable_fold = (
             f"the map from contacts to charges probably folds beyond about {fold_radius:.2g} mm: two contacts give the "
             f"same charges there, and the model, which is trained for {requested_radius:g} mm, confuses them; a fit "
             f"with an error of {100.0 * field.charge_std:.2g} % does not show where: take more presses, of one probe"
         )
-        cautions = (caution,) if fold_radius < PROBABLE_FOLD_RATIO * requested_radius else ()
+        cautions = (probable_fold,) if fold_radius < PROBABLE_FOLD_RATIO * requested_radius else ()
         return field.domain, cautions
 
     if fold_radius < SMALLEST_SHARE * requested_radius:
@@ -148,13 +148,13 @@ def invertible_domain(
             f"the map from contacts to charges folds {fold_radius:g} mm from the centre, of {requested_radius:g} mm "
             "asked for: beyond, two contacts give the same charges; add an electrode, or take a biaxial film"
         )
-    caution = (
+    certain_fold = (
         f"the map from contacts to charges folds beyond {fold_radius:g} mm: two contacts give the same charges there; "
         f"the model is trained for {fold_radius:g} mm, not {requested_radius:g} mm, on "
         f"{len(presses.within(fold_radius))} of {len(presses)} presses; 'serve stream --track' follows contacts to "
         f"{requested_radius:g} mm"
     )
-    return field.domain.within(fold_radius), (caution,)
+    return field.domain.within(fold_radius), (certain_fold,)
 
 
 @dataclass(frozen=True)
