@@ -212,7 +212,7 @@ def _scaled_charges(forward_map: ForwardMap, force: Array, position: Array) -> A
     # Add the charge of the contact pressure.
     for index, one_force in enumerate(force.tolist()):
         contact = contacts_at(position, one_force)
-        pressure_charge = contact_charges(sensor, forward_map.probe, contact, np.zeros(len(position)))
+        pressure_charge = contact_charges(sensor, forward_map.probe, contact)
         scaled_charge[:, index] += pressure_charge / amplitude_squared(sensor.film, one_force)
     return sensor.calibration.read(scaled_charge)
 

@@ -33,6 +33,7 @@ from isocharge.simulate.identifiability.cramer_rao import limits_at
 from isocharge.simulate.identifiability.nearest_contact import local_minima
 from isocharge.simulate.noise import NoiseModel
 from isocharge.simulate.numerics.disk import INNER_RADIUS, Rings, contacts_at, onto_disk, sunflower
+from isocharge.simulate.numerics.polygon import to_corners
 
 FOLD_WIDTH = 0.02
 """Distance between two contacts on both sides of a fold, mm.
@@ -80,7 +81,7 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
     # A position is on a fold if the charge map reverses its orientation between two opposite points of a small circle
     # around the position. Four pairs of points are tried.
     angle = np.pi * np.arange(4) / 4.0
-    half_width = 0.5 * FOLD_WIDTH * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    half_width = 0.5 * FOLD_WIDTH * to_corners(np.exp(1j * angle))  # shape (4, 2)
     pairs = np.stack([position[:, None] + half_width, position[:, None] - half_width])  # shape (2, n, 4, 2)
     is_fold = _reverses_orientation(charge_map, onto_disk(pairs, radius), force, noise).any(axis=1)
     folds = position[is_fold]

@@ -98,8 +98,8 @@ def enclosing_circle(outline: Complexes, centroid: Array) -> tuple[Array, Array]
         return centroid, radius_at_centroid
 
     # Bisection for the centre with the largest x coordinate at which the circle fits
-    lower_bound = np.zeros(centroid.shape)
-    upper_bound = centroid.copy()
+    lower_bound = np.zeros_like(centroid)
+    upper_bound = centroid
     for _ in range(40):  # the error is then below 1e-12
         middle = 0.5 * (lower_bound + upper_bound)
         middle_fits = middle + _enclosing_radius(outline, middle, rim_gap) <= max_extent

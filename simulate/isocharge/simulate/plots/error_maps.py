@@ -166,7 +166,7 @@ def mirror_picture(sensor: Sensor, mirror: MirrorRegion) -> Figure:
 
     # Compute the corners of the cells, shape (n_ring + 1, n_sector + 1). A cell is the part of a ring in one sector.
     n_sector = mirror.share.shape[1]
-    edge_angle = 2.0 * np.pi * np.arange(n_sector + 1) / n_sector
+    edge_angle = np.linspace(0.0, 2.0 * np.pi, n_sector + 1)
     corners = np.outer(mirror.edges, np.exp(1j * edge_angle))
     shades = axes.pcolormesh(corners.real, corners.imag, mirror.share, vmin=0.0, vmax=1.0, cmap="Reds")
     figure.colorbar(shades, ax=axes, label="share of the forces that cannot be noticed", shrink=0.85)

@@ -126,9 +126,12 @@ def solve_newton(
         if iterate.size_of(step) <= ROUND_OFF:
             return iterate.result(iteration, "converged", f"converged to round-off in {iteration} steps")
 
-        # Close to the equilibrium, take the full step if it halves the residual. Otherwise search for the step length.
-        next_iterate = _take_full_step(iterate, step) if relative_residual <= full_steps_below else None
-        if next_iterate is None:
+        # Close to the equilibrium, take the full step if it halves the residual, even if it increases the energy. The
+        # flat equilibrium of a compressed film can have a slightly higher energy than the wrinkled equilibrium.
+        # Otherwise search for the length of a step that lowers the energy.
+        is_close = relative_residual <= full_steps_below
+        next_iterate: _Iterate | None = iterate.after(step)
+        if not (is_close and next_iterate.relative_residual < 0.5 * relative_residual):
             next_iterate = _line_search(iterate, _descent_step(iterate, step))
         if next_iterate is None:
             return iterate.result(iteration, "failed", "no step lowers the energy any more")
@@ -211,21 +214,6 @@ def _stabilising_tension(elastic: ElasticFilm, relative_residual: float) -> floa
     if relative_residual <= UNSTABILISED_BELOW:
         return 0.0
     return STABILISING_TENSION * elastic.groups.induced_tension * min(1.0, relative_residual)
-
-
-def _take_full_step(iterate: _Iterate, step: Array) -> _Iterate | None:
-    """Return the iterate after the full Newton step, or None if the step does not at least halve the residual.
-
-    The step may increase the energy. An increase of the energy is allowed, because the flat equilibrium of a compressed
-    film can have a slightly higher energy than the wrinkled equilibrium.
-
-    Args:
-        iterate: Present iterate.
-        step: Newton step, shape (n_node, 3).
-    """
-    next_iterate = iterate.after(step)
-    halves_residual = next_iterate.relative_residual < 0.5 * iterate.relative_residual
-    return next_iterate if halves_residual else None
 
 
 def _chord_steps(iterate: _Iterate, solve: SolveTangent, previous_residual: float, tolerance: float) -> _Iterate:
