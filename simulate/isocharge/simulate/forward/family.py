@@ -157,10 +157,12 @@ class Family:
         n_force = count.forces if max_log_force > min_log_force else 1
         force = np.exp(chebyshev_nodes(n_force, min_log_force, max_log_force))
 
+        # Choose the directions of the presses and the rotations of the probe. The period is the smallest rotation after
+        # which the stress repeats. If the probe keeps its orientation on the film, film and probe rotate together. The
+        # period of the film is half a turn, and the common period is a multiple of both.
         period = probe.period
         is_oriented = orientation == "fixed" and not film.is_axisymmetric and not probe.is_axisymmetric
         if is_oriented:
-            # The period of the film is half a turn, and the period of film and probe together is a multiple of both.
             symmetry_order = round(math.tau / period)
             period = math.tau / math.gcd(symmetry_order, 2)
         has_directions = not film.is_axisymmetric and not is_oriented

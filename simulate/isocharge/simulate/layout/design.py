@@ -97,10 +97,10 @@ def random_layouts(case: DesignCase) -> list[Array]:
 
 
 def _layouts_within(radius: float, case: DesignCase) -> list[Array]:
-    """Choose random layouts whose centres all lie within a radius, mm.
+    """Choose random layouts of new squares, whose centres all lie within a radius, mm.
 
-    Random points are added to each layout if they satisfy the distance rules. The list of the layouts is empty if one
-    layout remains incomplete.
+    Candidates are points that are distributed evenly over the disk. For each layout, they are tried in random order,
+    and added if the squares keep the smallest allowed distances. The result is empty if a layout remains incomplete.
     """
     points = radius * sunflower(1000)
     allowed_points = points[case.clearance(points) >= 0.0]

@@ -129,9 +129,11 @@ def solve_newton(
         # Close to the equilibrium, take the full step if it halves the residual, even if it increases the energy. The
         # flat equilibrium of a compressed film can have a slightly higher energy than the wrinkled equilibrium.
         # Otherwise search for the length of a step that lowers the energy.
-        is_close = relative_residual <= full_steps_below
-        next_iterate: _Iterate | None = iterate.after(step)
-        if not (is_close and next_iterate.relative_residual < 0.5 * relative_residual):
+        after_full_step = iterate.after(step)
+        next_iterate: _Iterate | None
+        if relative_residual <= full_steps_below and after_full_step.relative_residual < 0.5 * relative_residual:
+            next_iterate = after_full_step
+        else:
             next_iterate = _line_search(iterate, _descent_step(iterate, step))
         if next_iterate is None:
             return iterate.result(iteration, "failed", "no step lowers the energy any more")

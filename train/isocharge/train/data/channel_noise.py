@@ -313,8 +313,9 @@ def usual_size(charge: Array) -> Array:
 def _fit_noise(charge: Array, residual: Array) -> Array:
     """Estimate the white noise and the noise of the gain of one channel from residuals.
 
-    The likelihood of the residuals is maximised. Their variance is white^2 + gain^2 Q^2. The likelihood is that of a
-    normal distribution with longer tails beyond `OUTLIER` standard deviations (Huber 1964, proposal 2).
+    The variance of a residual is white^2 + gain^2 Q^2, where Q is the charge. The likelihood of the residuals is
+    maximised. It is that of a normal distribution with longer tails beyond `OUTLIER` standard deviations (Huber 1964,
+    proposal 2).
 
     A channel that is silent below a threshold does not show its noise there. Charges that are zero and have no residual
     are therefore left out. Otherwise, the likelihood would be infinite without white noise.
