@@ -138,7 +138,14 @@ class Measurement:
     """
 
     def __init__(self, amplifier: Amplifier, electrodes: int, rate: float, rng: np.random.Generator) -> None:
-        """Draw the properties and the initial temperatures, and set all charges to their stationary values."""
+        """Draw the properties of the channels and the initial temperatures, and set all charges to stationary values.
+
+        Args:
+            amplifier: Parameters of the measuring chain.
+            electrodes: Number of electrodes, each of which has one channel.
+            rate: Readings per second, Hz.
+            rng: Generator of the properties and of the noise.
+        """
         self.amplifier = amplifier
         self.rate = rate
         self.rng = rng

@@ -118,7 +118,7 @@ class ChargeSpline:
         return np.asarray(np.einsum("nk,nke->ne", weights, self.table(contact[:, :2])))
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """Compute charges and derivatives together.
+        """Compute the charges of presses, and their derivatives with respect to x, y and ln F.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.

@@ -229,7 +229,7 @@ class ForwardMap:
         return family.distance.size * family.force.size * len(family.turns.solved)
 
     def charges(self, contact: Array, orientation: Array | float = 0.0) -> Array:
-        """Compute the touch charges of presses.
+        """Compute the touch charges of presses: the charges under load minus the charges without load.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N. If F is zero, the charges are zero.
@@ -359,10 +359,11 @@ class ForwardMap:
         return self.sensor.calibration.read(charge)
 
     def field_charges(self, contact: Array, is_odd: Booleans, orientation: Array | float = 0.0) -> Array:
-        """Compute the charges of each stress field in the table.
+        """Compute the charges of each stress field in the table of the map.
 
-        The result includes neither the crosstalk nor the charges that the contact pressure causes. The presses are
-        evaluated in chunks, which limits the required memory.
+        The table contains stress fields at the nodes of the mesh under the solved presses: the stress itself, or its
+        changes with several properties of the film. The result includes neither the crosstalk nor the charges that the
+        contact pressure causes. The presses are evaluated in chunks, which limits the required memory.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.

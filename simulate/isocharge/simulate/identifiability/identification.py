@@ -77,7 +77,7 @@ class LimitMap:
         return cls(force, rings, rings.per_ring(limits.position), rings.per_ring(limits.force))
 
     def statistics(self) -> dict[str, float]:
-        """Return a dictionary for JSON with the median, the root mean square and the maximum of the errors.
+        """Return a dictionary for JSON with the median, the root mean square and the maximum of the error limits.
 
         The weight of a position is the area that it represents. Errors of the force are in percent of the force.
         """

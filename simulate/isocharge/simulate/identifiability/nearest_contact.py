@@ -132,8 +132,8 @@ def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -
     outward = -(normals @ gradient[..., None])  # shape (n, 2, 1)
     active_normals = normals * (outward > 0.0)
 
-    # A step along the tangent of the circle must also turn with the circle. The turn adds the outward component to the
-    # second derivative along the tangent.
+    # A step along the tangent (-y, x, 0) of the circle must also turn with the circle. The turn adds the outward
+    # component to the second derivative along the tangent.
     tangent = active_normals[:, 0, [1, 0, 2]] * np.array([-1.0, 1.0, 0.0])
     matrix = matrix + outward[:, :1] * tangent[:, :, None] * tangent[:, None, :]
 

@@ -73,7 +73,10 @@ class Triangulation:
         check_electrode_count(len(self.charge_map.electrodes))
 
     def locate(self, charge: Array) -> Fix:
-        """Estimate the contacts of presses.
+        """Estimate the contact (x, y, F) of each press from its charges.
+
+        The contour of an electrode consists of the positions at which a press causes its charge. The estimate is the
+        position that is nearest to the contours of all electrodes.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.

@@ -109,7 +109,15 @@ def pressed_film(fields: ForwardMap, presses: Array) -> PressedFilm:
 
 
 def electrode_rows(pressed: PressedFilm, electrodes: Sequence[Electrode]) -> Array:
-    """Compute the charges of electrodes and their derivatives for several presses; see `rows_of`."""
+    """Compute the charges of electrodes, and their derivatives with respect to the parameters of the presses.
+
+    Args:
+        pressed: Charge per area under the presses, with one field for each of the `COLUMNS`.
+        electrodes: Electrodes of any shape at their nominal positions.
+
+    Returns:
+        One row with the columns `COLUMNS` for each press and electrode, shape (n_press, n_electrode, 6).
+    """
     if not electrodes:
         return np.empty((pressed.position.size, 0, len(COLUMNS)))
     rows = pressed.charges(ElectrodePieces.covering(electrodes))  # shape (n_press, n_electrode, 6)

@@ -47,6 +47,12 @@ class ElasticFilm:
     """
 
     def __init__(self, mesh: PlacedMesh, groups: DimensionlessGroups) -> None:
+        """Create the parts of the potential energy that the film has: stretching, bending and the back pressure.
+
+        Args:
+            mesh: Mesh of the press.
+            groups: Dimensionless groups of the press, such as its load and the bending stiffness of the film.
+        """
         self.mesh = mesh
         self.groups = groups
         self.membrane = Membrane(mesh, groups)
@@ -97,7 +103,15 @@ class ElasticFilm:
         return element_forces
 
     def out_of_balance(self, field: Array, element_forces: Array) -> Array:
-        """Compute the residual from the internal forces of the elements; see `residual`."""
+        """Compute the internal force minus the external force at each node, from the internal forces of the elements.
+
+        Args:
+            field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
+            element_forces: Internal forces of the elements, shape (n_element, n_local, 3).
+
+        Returns:
+            Forces along (U1, U2, W), shape (n_node, 3).
+        """
         residual = np.stack([self.mesh.gather(element_forces[..., i]) for i in range(3)], axis=1)
         residual -= self.probe_force
 

@@ -312,11 +312,13 @@ class Turns:
 def _lattice(harmonics: Integers, symmetry_order: int) -> tuple[int, int]:
     """Find the smallest lattice of turns at which no two harmonics have the same values.
 
-    The lattice has n turns and the step s. At the turn j, the angle `direction` of `Turns` is pi s j / n, and the angle
-    `rotation` is 2 pi j / n. The harmonic (m, k) has the phase 2 pi (m s + k) j / n. Two harmonics therefore have the
-    same values at all turns if and only if the remainders of m s + k after the division by n are equal. While the
-    rotation increases by one period of the probe, the direction must increase by the same angle plus a multiple of half
-    a turn. The difference s - 2 is therefore a multiple of the symmetry order.
+    The lattice has n turns and the step s. At the turn j, the direction of the press is pi s j / n, and the rotation of
+    the probe is 2 pi j / n. The harmonic (m, k) of these angles has the phase 2 pi (m s + k) j / n. Two harmonics
+    therefore have the same values at all turns if and only if the remainders of m s + k after the division by n are
+    equal.
+
+    While the rotation increases by one period of the probe, the direction must increase by the same angle plus a
+    multiple of half a turn. The difference s - 2 is therefore a multiple of the symmetry order.
 
     Args:
         harmonics: Pairs (m, k), shape (n_term, 2).

@@ -64,7 +64,7 @@ LIMITS = """\
 
 
 def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
-    """Return the text of `card.md`.
+    """Return the text of `card.md`, which describes a model and its errors for users.
 
     Args:
         metadata: Metadata of the model.
