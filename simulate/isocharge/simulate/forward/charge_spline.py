@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # scipy.interpolate is imported when it is used
 from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
-from scipy.sparse.linalg import splu
 
 from isocharge.common.arrays import Array
 from isocharge.common.contact_domain import Domain
@@ -26,6 +25,7 @@ from isocharge.simulate.numerics.disk import contacts_at, sunflower
 from isocharge.simulate.numerics.interpolation import chebyshev_nodes, lagrange_values
 from isocharge.simulate.numerics.polygon import to_corners
 from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.solver.assembly import factorise
 
 MAX_KNOT_SPACING = 0.3
 """Largest distance between the knots, mm."""
@@ -236,7 +236,7 @@ def _fit_disk(forward_map: ForwardMap, force: Array, spacing: float) -> "scipy.i
     cells = int(np.clip(np.ceil(2.0 * radius / spacing), 8, MAX_CELLS))
     line_knots = np.concatenate([[-radius] * 3, np.linspace(-radius, radius, cells + 1), [radius] * 3])
     knots = (line_knots, line_knots)
-    count = line_knots.size - 4
+    axis_count = line_knots.size - 4  # number of coefficients along an axis
     position = radius * _fit_positions(cells)
     values = _scaled_charges(forward_map, force, position)  # shape (n, n_force, n_electrode)
 
@@ -244,16 +244,17 @@ def _fit_disk(forward_map: ForwardMap, force: Array, spacing: float) -> "scipy.i
     # the last coefficients if they do not affect any position, so it is created again with its full shape.
     cubic_degree = 3
     entries = scipy.interpolate.NdBSpline.design_matrix(position, knots, cubic_degree)
-    design = csr_array((entries.data, entries.indices, entries.indptr), shape=(len(position), count**2))
-    differences = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count))
-    identity = eye_array(count)
+    design = csr_array((entries.data, entries.indices, entries.indptr), shape=(len(position), axis_count**2))
+    differences = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(axis_count - 3, axis_count))
+    identity = eye_array(axis_count)
     penalty = SMOOTHING * vstack([kron(differences, identity), kron(identity, differences)])
 
     # Solve the normal equations. Their matrix is positive definite, so the factorisation needs no pivoting.
     normal_matrix = (design.T @ design + penalty.T @ penalty).tocsc()
     right_side = np.ascontiguousarray(design.T @ values.reshape(len(position), -1))
-    factors = splu(normal_matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    coefficients = factors.solve(right_side).reshape(count, count, *values.shape[1:])
+    coefficients = (
+        factorise(normal_matrix, "MMD_AT_PLUS_A").solve(right_side).reshape(axis_count, axis_count, *values.shape[1:])
+    )
     return scipy.interpolate.NdBSpline(knots, coefficients, cubic_degree)
 
 

@@ -93,7 +93,7 @@ class Assembly:
         # skeleton matrix and a dominant diagonal, because such a matrix needs no pivoting.
         pattern = self._skeleton_matrix(np.ones(self._indices.size))
         dominant_matrix = csc_matrix(pattern + pattern.sum() * eye_array(pattern.shape[0]))
-        new_number = _factorise(dominant_matrix, "MMD_AT_PLUS_A").perm_c
+        new_number = factorise(dominant_matrix, "MMD_AT_PLUS_A").perm_c
         self.skeleton = self.skeleton[np.argsort(new_number)]
         self._set_pattern()
 
@@ -164,7 +164,7 @@ class Assembly:
         # result, which is not used.
         entry_count = self._indices.size + 1
         skeleton_entries = np.bincount(self._entry_positions, schur_complement.ravel(), entry_count)[:-1]
-        skeleton_factor = _factorise(self._skeleton_matrix(skeleton_entries), "NATURAL")
+        skeleton_factor = factorise(self._skeleton_matrix(skeleton_entries), "NATURAL")
         return partial(self._solve, interior_inverse, coupling, reduced_coupling, skeleton_factor)
 
     def _solve(
@@ -218,7 +218,7 @@ class Assembly:
         return csc_matrix((entries, self._indices, self._indptr), shape=(self.skeleton.size, self.skeleton.size))
 
 
-def _factorise(matrix: csc_matrix, column_order: str) -> SuperLU:
+def factorise(matrix: csc_matrix, column_order: str) -> SuperLU:
     """Factorise a symmetric matrix without pivoting.
 
     Args:

@@ -116,18 +116,26 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
         has_misfit_weight = weight[:, misfit_starts[0] :].any(axis=1)
         misfit_starts.insert(0, int(has_misfit_weight.argmax()))
 
-    def perceptron(columns: list[slice]) -> Perceptron:
-        """Return the perceptron to which the given columns of each layer belong, from the first layer to the last."""
-        rows = [slice(None), *columns[:-1]]  # all inputs in the first layer, and then the columns of the previous layer
-        layers = [
-            Layer(weight[layer_rows, layer_columns], bias[layer_columns])
-            for (weight, bias), layer_rows, layer_columns in zip((*hidden, last), rows, columns, strict=True)
-        ]
-        return Perceptron(tuple(layers[:-1]), layers[-1], skip[:, columns[-1]])
-
-    contact = perceptron([slice(start) for start in misfit_starts])
-    misfit = perceptron([slice(start, None) for start in misfit_starts])
+    joined = Perceptron(tuple(hidden), last, skip)
+    contact = _select_units(joined, [slice(start) for start in misfit_starts])
+    misfit = _select_units(joined, [slice(start, None) for start in misfit_starts])
     return FoldedNetwork(features, contact, misfit)
+
+
+def _select_units(joined: Perceptron, units: list[slice]) -> Perceptron:
+    """Return the perceptron that consists of some units of several joined perceptrons.
+
+    Args:
+        joined: The joined perceptrons, which have the same inputs.
+        units: Units of each layer that belong to the perceptron, from the first layer to the last. They are columns of
+            the weights of the layer, and rows of the weights of the next layer.
+    """
+    rows = [slice(None), *units[:-1]]  # all inputs in the first layer
+    layers = [
+        Layer(weight[layer_rows, columns], bias[columns])
+        for (weight, bias), layer_rows, columns in zip((*joined.hidden, joined.last), rows, units, strict=True)
+    ]
+    return Perceptron(tuple(layers[:-1]), layers[-1], joined.skip[:, units[-1]])
 
 
 OutputFunction = Callable[[Array], tuple[Array, ...]]
