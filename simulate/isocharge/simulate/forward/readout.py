@@ -310,7 +310,7 @@ def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[tuple[Array, 
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         middle = 0.5 * (start + end)
         rotated_edge = complex(*(end - start)) * cmath.rect(1.0, rotation)
-        kind = 1 if abs(rotated_edge.real) > abs(rotated_edge.imag) else 0  # 1 for the lower and upper edges
+        kind = int(abs(rotated_edge.real) > abs(rotated_edge.imag))  # 1 for the lower and upper edges
         for first, last in ((start, middle), (middle, end)):
             yield np.array([first, last, last, first]), line_area, kind
 

@@ -15,6 +15,7 @@ On the edge of the disk, the curvature of the circle is added to the matrix J'J.
 converges within a few steps, even if the unconstrained minimum lies far outside D.
 """
 
+import math
 from collections.abc import Callable
 from functools import cache
 
@@ -327,7 +328,7 @@ def _unit_candidates(count: int) -> tuple[Array, Booleans]:
     radius = np.sqrt(radius_sample)  # uniform over the area of the disk
     # The first quarter of the sequence is evenly distributed. In contrast, every fourth point has a small radius.
     radius[: count // 4] = 1.0  # on the edge
-    angle = 2.0 * np.pi * angle_sample
+    angle = math.tau * angle_sample
     position = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
     distance = scipy.spatial.distance.cdist(position, position)
     return np.column_stack([position, 2.0 * force_sample - 1.0]), distance < START_SEPARATION

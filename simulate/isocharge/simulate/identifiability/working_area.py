@@ -107,7 +107,8 @@ def _reverses_orientation(charge_map: ChargeMap, pairs: Array, force: float, noi
     charge, jacobian = charge_map.linearised(contacts_at(pairs.reshape(-1, 2), force))
     scaled_jacobian = jacobian / noise.sigma(charge)[..., None]
     first, second = scaled_jacobian.reshape(*pairs.shape[:-1], -1, 3)  # each of shape (..., n_electrode, 3)
-    return np.asarray(np.linalg.det(first.swapaxes(-1, -2) @ second) < 0.0)
+    determinant: Array = np.linalg.det(first.swapaxes(-1, -2) @ second)
+    return determinant < 0.0
 
 
 def _starting_points(rings: Rings, precision: Array) -> tuple[Array, Array]:

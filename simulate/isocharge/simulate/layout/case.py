@@ -1,5 +1,6 @@
 """Design case: the requirements of an electrode layout, and the rules for the electrode positions."""
 
+import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -280,7 +281,7 @@ class DesignCase:
         Args:
             positions: Centres (x, y) of the new squares, shape (n, 2), mm.
         """
-        angle = np.arctan2(positions[:, 1], positions[:, 0]) % (2.0 * np.pi)
+        angle = np.arctan2(positions[:, 1], positions[:, 0]) % math.tau
         anticlockwise = positions[np.argsort(angle)]
         unused_names = [name for name in NAMES if name not in self.keep]
         squares = [

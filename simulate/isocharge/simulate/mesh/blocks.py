@@ -18,6 +18,7 @@ symmetric about the same line, only the upper half of the film is meshed. The cl
 of the elements, and the class `Template` numbers their nodes.
 """
 
+import math
 from dataclasses import asdict, dataclass
 from functools import cached_property
 
@@ -137,7 +138,7 @@ class Blocks:
     @cached_property
     def boundary_parameter(self) -> Array:
         """Boundary parameters of a curved footprint at the sides of the sectors, shape (n_sector + 1,)."""
-        return np.linspace(0.0, 2.0 * np.pi / self.copies, self.n_sector + 1)
+        return np.linspace(0.0, math.tau / self.copies, self.n_sector + 1)
 
     @cached_property
     def core_outline(self) -> Array:

@@ -8,6 +8,7 @@ coordinate increases from the inner side to the outer side of the element. The a
 anticlockwise.
 """
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -153,7 +154,7 @@ def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Comp
     # If the whole film is meshed, add full turns such that each angle lies within one turn after the first side.
     angle = np.angle(template_points)
     if not blocks.half:
-        angle = side_angles[0] + np.mod(angle - side_angles[0], 2.0 * np.pi)
+        angle = side_angles[0] + np.mod(angle - side_angles[0], math.tau)
     sector, angular = _locate_in_intervals(side_angles, angle)
     return blocks.n_inner + ring * blocks.n_sector + sector, np.stack([radial, angular])
 
