@@ -159,8 +159,8 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
         decreased = _changed_press(solved, -changes)
         smallest_distance = {"x": 1.0, "y": 10.0}.get(column, 0.0) * step
         if distance < smallest_distance:
-            # Near the centre, the direction of the press changes by a large angle, and the mesh turns with it.
-            # Therefore both stresses are read at the nodes of the original mesh.
+            # A step in x or y near the centre changes the direction of the press by a large angle, and the mesh turns
+            # with it. Therefore both stresses are read at the nodes of the original mesh.
             change = _change_at_fixed_points(solved, decreased, increased, surface)
         else:
             # The nodes move with the press. Subtract the change of the stress that their movement causes.

@@ -175,7 +175,8 @@ def nodal_stress(equilibrium: Equilibrium, surface: Surface = "middle") -> Array
 def _induced_stress(equilibrium: Equilibrium, surface: Surface, derivatives_of: Callable[[Array], Array]) -> Array:
     """Compute the scaled induced stress at some points of the elements.
 
-    The induced stress is the stress that the probe and the static pressure add to the pretension.
+    The induced stress is the stress that the probe and the static pressure add to the pretension. At an outer surface,
+    it includes the bending stress.
 
     Args:
         equilibrium: The solved press.
@@ -209,12 +210,12 @@ def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
     # Compute the scaled principal stresses without the mean pretension. The uneven part of the pretension is added
     # before, because it changes the directions of the principal stresses.
     uneven_tension = equilibrium.groups.uneven_tension
-    with_rest_stress = replace(equilibrium, rest=None)  # includes the stress before the contact
-    smallest, largest = principal_stresses(nodal_stress(with_rest_stress) + uneven_tension)
+    without_rest = replace(equilibrium, rest=None)  # so that the stress before the contact is not subtracted
+    smallest, largest = principal_stresses(nodal_stress(without_rest) + uneven_tension)
     if equilibrium.theory.bending:
         outer_surfaces: tuple[Surface, ...] = ("top", "bottom")
         for surface in outer_surfaces:
-            _, largest_at_surface = principal_stresses(nodal_stress(with_rest_stress, surface) + uneven_tension)
+            _, largest_at_surface = principal_stresses(nodal_stress(without_rest, surface) + uneven_tension)
             largest = max(largest, largest_at_surface)
 
     # Convert the stresses to MPa, and add the mean pretension, which is the same in all directions.

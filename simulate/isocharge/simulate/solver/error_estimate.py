@@ -55,8 +55,8 @@ MAX_MEMBRANE_BENDING_LENGTH = 0.3
 def highest_mode_share(mesh: PlacedMesh, slope: Array) -> float:
     """Compute the share of the highest polynomial modes in the slopes of the deflection.
 
-    The slopes in each element are expanded in products of Legendre polynomials. A small share of the polynomials of the
-    highest degree indicates that the mesh is fine enough.
+    The slopes in each element are expanded in products of Legendre polynomials, the modes. A small share of the modes
+    of the highest degree indicates that the mesh is fine enough.
 
     Args:
         mesh: Mesh of the press.
@@ -66,8 +66,8 @@ def highest_mode_share(mesh: PlacedMesh, slope: Array) -> float:
         Mean of the shares in all elements, weighted with the areas of the elements and the squares of the slopes.
     """
     # Convert the values on the square grid of nodes into coefficients of products of Legendre polynomials in xi and
-    # eta, shape (n_element, 2, n_node, n_node). The number `n_node` is that of nodes along a side of an element.
-    n_node = mesh.resolution.order + 1
+    # eta, shape (n_element, 2, n_node, n_node).
+    n_node = mesh.resolution.order + 1  # along a side of an element
     nodes_to_modes = modal_matrix(mesh.resolution.order)
     nodal_slope = slope.transpose(0, 2, 1).reshape(len(slope), 2, n_node, n_node)
     coefficients = nodes_to_modes @ nodal_slope @ nodes_to_modes.T

@@ -68,7 +68,8 @@ class PressEvents:
     def next(self) -> WatchResult | str:
         """Wait for the next reading or typed line.
 
-        Readings that were made before the last call of `arm` are passed to the watch, but are not returned.
+        After a call of the method `arm`, only presses that begin later count. Readings that were made before the last
+        call of `arm` are passed to the detector of steady presses, but are not returned.
 
         Returns:
             Result of the watch for a reading, or the typed line.
