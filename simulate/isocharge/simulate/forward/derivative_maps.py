@@ -84,7 +84,7 @@ class FilmSlopes:
             sensor: Sensor with the film.
             probe: Axisymmetric probe.
             domain: Presses for which the derivatives are needed.
-            settings: Accuracy, theory and mesh; see `ForwardMap.build`.
+            settings: Accuracy, theory and mesh. A setting that is "auto" is chosen once for all presses.
             executor: Executor that runs the solves; None for this process.
 
         Raises:

@@ -237,7 +237,7 @@ class Family:
         read: Reading,
         place: tuple[float, tuple[float, float]],
     ) -> Array:
-        """Solve one press for each force, all at one position and rotation, one after the other; see `solve`.
+        """Solve one press for each force, all at one position and rotation, one after the other.
 
         Args:
             sensor: Sensor with the film, and with the surface at which the stress is read.
@@ -245,7 +245,7 @@ class Family:
             settings: Theory, mesh and width of the thin rings at the rim.
             read: Function that computes the returned values from each solved press.
             place: Distance from the centre of the film, mm, and the angles of a turn, rad: the direction of the press,
-                and the rotation of the probe. The direction contains the rotation; see `Turns`.
+                and the rotation of the probe. The direction contains the rotation.
 
         Returns:
             Values that `read` computes, shape (n_force, n_value).
@@ -389,7 +389,7 @@ def family_mesh(film: Film, probe: Probe, domain: Domain, settings: SolveSetting
         film: Film of the forward map.
         probe: Probe that presses the film.
         domain: Presses of the forward map.
-        settings: Required accuracy, theory, and parts of the mesh that are not chosen here; see `ForwardMap.build`.
+        settings: Required accuracy, theory, and parts of the mesh. A part that is "auto" is chosen here.
 
     Returns:
         Fineness of the mesh, and total width of the thin rings at the rim, in film radii.

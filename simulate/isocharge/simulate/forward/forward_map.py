@@ -186,8 +186,8 @@ class ForwardMap:
             probe: Probe that presses the film.
             domain: Presses for which the map will be used.
             count: Numbers of distances and forces at which presses are solved, and of harmonics of the angles.
-            settings: Accuracy, theory and mesh; see `build`.
-            orientation: Whether the probe keeps its own orientation; see `build`.
+            settings: Accuracy, theory and mesh. A setting that is "auto" is chosen once for all presses.
+            orientation: Whether the probe keeps its own orientation ("fixed") or may be rotated ("random").
             read: Function that computes the stress fields of the table from each solved press, shape (n_element,
                 n_local, ..., 3), in the frame of the probe.
             executor: Executor that runs the solves; None for this process.
@@ -292,9 +292,9 @@ class ForwardMap:
         return differences(self._unchecked_charges, contact, steps, variables)
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
-        """Compute the charges of presses, and their derivatives with respect to x, y and ln F; see `derivatives`.
+        """Compute the charges of presses, and their derivatives with respect to x, y and ln F.
 
-        A `ChargeSpline` computes both much faster.
+        The methods `charges` and `derivatives` describe the arrays. A `ChargeSpline` computes both much faster.
         """
         return self.charges(contact), self.derivatives(contact)
 
@@ -308,7 +308,8 @@ class ForwardMap:
 
         Args:
             position: Positions (x, y) in the domain, shape (n, 2), mm.
-            is_odd: See `field_charges`.
+            is_odd: Whether each field is odd with respect to a reflection in the direction of the press, shape
+                (n_field,).
 
         Returns:
             Charges, shape (n_force, n, n_electrode, n_field), pC.

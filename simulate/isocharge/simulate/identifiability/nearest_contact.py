@@ -220,7 +220,7 @@ def search(
 ) -> tuple[Array, Array]:
     """Find the contacts whose charges are nearest to given charges, without given starting points.
 
-    For each row of charges, the result is the best of several descents; see `local_minima`.
+    For each row of charges, several least-squares descents start at different contacts. The result is the best of them.
 
     Args:
         charge_map: Map that computes the charges of contacts.
@@ -230,7 +230,8 @@ def search(
         candidates: Number of candidates for the starting points.
 
     Returns:
-        Contacts (x, y, F), shape (n, 3), mm and N, and residuals, shape (n, n_electrode); see `explain`.
+        Contacts (x, y, F), shape (n, 3), mm and N. Residuals, which are the given charges minus the charges of the
+        contacts, divided by `sigma`, shape (n, n_electrode), dimensionless.
     """
     contact, residual = local_minima(charge_map, charge, sigma, starts=starts, candidates=candidates)
     best_start = (residual**2).sum(axis=2).argmin(axis=1)  # shape (n,)
@@ -257,11 +258,12 @@ def local_minima(
         sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
         starts: Number of descents for each row of charges.
         candidates: Number of candidates for the starting points.
-        min_change: See `explain`.
+        min_change: A descent ends if the squared distance of the charges changes by less than `min_change` times 1 +
+            its value.
 
     Returns:
-        Contacts (x, y, F), shape (n, starts, 3), mm and N, and residuals, shape (n, starts, n_electrode), of each
-        descent; see `explain`.
+        Contact (x, y, F) that each descent finds, shape (n, starts, 3), mm and N. Residuals, which are given charges
+        minus the charges of the contacts, divided by `sigma`, shape (n, starts, n_electrode), dimensionless.
     """
     start = starting_contacts(charge_map, charge, sigma, starts=starts, candidates=candidates)
     contact, residual = explain(

@@ -82,7 +82,7 @@ class Triangulation:
             charge: Touch charges, shape (n, n_electrode), pC.
 
         Returns:
-            The contacts. A contact is NaN if no position, or more than one, agrees with the charges; see `Fix`.
+            The contacts. A contact is NaN if no position, or more than one, agrees with the charges.
 
         Raises:
             ChargeError: If there is not one finite charge for each electrode.

@@ -146,7 +146,7 @@ def sector_angles(
         centre: Position of the centre of the circle on the x axis, shape (...), in film radii.
         radius: Radius of the circle, shape (...), in film radii.
         stretch: Factor with which `stretch_angles` converts angles on the circle into angles in the template plane,
-            shape (...); see `map_stretch`.
+            shape (...).
 
     Returns:
         Angles in the template plane, which the conformal map converts into the film. They increase, and have the shape

@@ -191,7 +191,8 @@ def _locate_inside(
         placement: n placements, one for each point.
         blocks: The elements.
         points: Film points x + iy, shape (n,), in film radii.
-        corners: Corners of all elements for each point, shape (n, n_inner, 4); see `_inner_corners`.
+        corners: Corners x + iy of all elements for each point, shape (n, n_inner, 4): the first and the last corner of
+            the inner side, and the first and the last corner of the outer side.
 
     Returns:
         Index of the element, shape (n,). Radial and angular coordinate in the element from 0 to 1, shape (2, n).

@@ -258,12 +258,11 @@ class Turns:
         series is proportional to exp(i (2 m d + k r)).
 
         Args:
-            largest_harmonics: Largest |k| of the terms of the series for |m| = 0, 1, 2, and so on; see the docstring of
-                the class. Without directions, only m = 0 is used. For an axisymmetric probe, only k = 0 is used.
+            largest_harmonics: Largest |k| of the terms of the series for |m| = 0, 1, 2, and so on. Without directions,
+                only m = 0 is used. For an axisymmetric probe, only k = 0 is used.
             period: Smallest rotation that maps the probe onto itself, rad; 0 if the probe is axisymmetric.
-            has_directions: Whether the angle d varies; see the docstring of the class. It does not vary if the film is
-                axisymmetric, so that d has no effect, or if the probe keeps its orientation on the film, so that d is
-                zero.
+            has_directions: Whether the angle d varies. It does not vary if the film is axisymmetric, so that d has no
+                effect, or if the probe keeps its orientation on the film, so that d is zero.
         """
         largest_m = len(largest_harmonics) - 1 if has_directions else 0
         pairs: list[tuple[int, int]] = []  # (m, k) of each term

@@ -161,7 +161,13 @@ def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> t
 
 
 def _changed_mechanics(film: Film, value: Mapping[str, float]) -> Film:
-    """Change the mechanical properties of a film; see `changed_film`."""
+    """Return a film with changed mechanical properties.
+
+    Args:
+        film: Film that is changed.
+        value: Value of each property by its name. The value of the pretension is the new pretension. Any other value is
+            a change: a number that is added, or the logarithm of a factor.
+    """
     pretension = value[PRETENSION.name]
     difference, shear = film.deviator
     stiffness_change = complex(value["stiffness_x"], value["stiffness_xy"])

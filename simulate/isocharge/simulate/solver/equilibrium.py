@@ -161,7 +161,7 @@ def nodal_stress(equilibrium: Equilibrium, surface: Surface = "middle") -> Array
 
     Args:
         equilibrium: The solved press.
-        surface: Surface of the film at which the stress is computed; see `touch_stress`.
+        surface: Surface of the film at which the stress is computed. The probe touches the surface "top".
 
     Returns:
         Stress (S11, S22, S12) in units of E_young A^2, shape (n_element, n_local, 3).
@@ -180,7 +180,7 @@ def _induced_stress(equilibrium: Equilibrium, surface: Surface, derivatives_of: 
 
     Args:
         equilibrium: The solved press.
-        surface: Surface of the film at which the stress is computed; see `touch_stress`.
+        surface: Surface of the film at which the stress is computed. The probe touches the surface "top".
         derivatives_of: Function that computes the derivatives of fields with respect to (X1, X2) at the points, shape
             (..., 2, k), from the values of the fields at the nodes of every element, shape (n_element, n_local, k).
 

@@ -118,7 +118,7 @@ def _add_oval(solved: Equilibrium, value: float, direction: complex) -> Equilibr
 
     Args:
         solved: The press.
-        value: Parameter e of the oval clamp; see `mesh.oval`.
+        value: Parameter e of the oval clamp, whose semi-axes are 1 + e and 1 - e film radii.
         direction: exp(2 i alpha), where alpha is the angle from the direction of the press to the longer axis.
     """
     placement = solved.mesh.placement
@@ -184,7 +184,7 @@ def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
 
     Args:
         solved: Press with a circular probe.
-        surface: Surface of the film at which the stress is computed; see `touch_stress`.
+        surface: Surface of the film at which the stress is computed. The probe touches the surface "top".
 
     Returns:
         Change of the stress per unit of each property, shape (n_element, n_local, n_field, 3). The last axis is the
