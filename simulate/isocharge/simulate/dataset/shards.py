@@ -150,8 +150,8 @@ def write_files(folder: Path, name: str, sensor: Sensor, shards: Iterable[Sample
         folder: The empty folder.
         name: Name of the dataset, which may differ from the name of the folder.
         sensor: Sensor to which the charges belong.
-        shards: Samples of each shard, as for `write_dataset`.
-        about: Entries of the manifest about the origin of the samples, as for `write_dataset`.
+        shards: Samples of each shard, which is one file of the dataset.
+        about: Entries of the manifest about the origin of the samples, such as probes, ranges, seed and solver.
 
     Raises:
         DatasetError: If a column of a shard has a wrong shape or type or contains a number that is not finite, or if a
