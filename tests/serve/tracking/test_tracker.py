@@ -13,7 +13,7 @@ from isocharge.serve.model.model_folder import find_model, load_model
 from isocharge.serve.record.record import TrackedContact
 from isocharge.serve.tracking.motion_filter import (
     ACCELERATION_DENSITY,
-    HELD_DRIFT,
+    HELD_DRIFT_DENSITY,
     INITIAL_RATE_STD,
     SPEED_CHANGE_RATE,
     MotionFilter,
@@ -91,7 +91,7 @@ def test_moving_mode_equals_the_kalman_filter_with_constant_velocity():
 
     transition = np.array([[1.0, dt], [0.0, 1.0]])
     process_noise = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-    drift = np.diag([HELD_DRIFT * dt, 0.0])
+    drift = np.diag([HELD_DRIFT_DENSITY[0, 0] * dt, 0.0])
     mean = np.array([measured[0], 0.0])
     covariance = np.diag([std**2, INITIAL_RATE_STD[0] ** 2])
     for value in measured[1:]:

@@ -235,14 +235,13 @@ class FilmFollower(Stage):
         self._film = slice(0, film_size)
         self._gains = slice(film_size, film_size + len(electrodes))
         self._offset = self._gains.stop
-        std = np.ones(self._offset + 1)
-        std[0] = series.tension_std_MPa
-        std[self._gains] = GAIN_STD
-        std[self._offset] = self._offset_std_pC
+        direction_std = np.ones(series.direction_count)
+        gain_std = np.full(len(electrodes), GAIN_STD)
+        std = np.hstack([series.tension_std_MPa, direction_std, gain_std, self._offset_std_pC])
         self._initial_std = np.maximum(std, SMALLEST_STD)
-        self._fading_touches = np.full(std.size, math.inf)  # for each unknown
+        self._fading_touches = np.full(std.size, SLOW_FADING_TOUCHES, float)  # for each unknown
+        self._fading_touches[self._film] = math.inf
         self._fading_touches[0] = FADING_TOUCHES
-        self._fading_touches[self._gains.start :] = SLOW_FADING_TOUCHES
         highest = MAX_DEVIATION * self._initial_std
         lowest = -highest
         lowest[0], highest[0] = series.node_MPa[[0, -1]]
@@ -412,7 +411,7 @@ class FilmFollower(Stage):
 
     def _log_contact(self, contact: Contact) -> Array:
         """Return (x, y, ln F) of a contact, moved into the bounds of the charge map, shape (1, 3)."""
-        smallest_N, _largest_N = self._series.domain.force_range
+        smallest_N = self._series.domain.force_range[0]
         log_force = math.log(max(contact.force_N, smallest_N))
         return np.clip([[contact.x_mm, contact.y_mm, log_force]], *self._contact_bounds)
 

@@ -60,11 +60,11 @@ _IDENTITY = np.eye(6)
 _INTEGRATION = np.eye(6, k=3)
 """Matrix that selects the rate of each value of a state."""
 
-HELD_DRIFT = 5e-4
-"""Increase of the variance of a held value per second, mm^2/s or 1/s. A held finger drifts by 0.02 mm in a second."""
+HELD_DRIFT_DENSITY = np.diag([5e-4, 5e-4, 5e-4, 0.0, 0.0, 0.0])
+"""Increase of the covariance of a state per second, because held values drift, mm^2/s or 1/s, shape (6, 6).
 
-_HELD_DRIFT_DENSITY = HELD_DRIFT * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
-"""Increase of the covariance of a state per second because of this drift, shape (6, 6)."""
+A held finger drifts by 0.02 mm in a second.
+"""
 
 ACCELERATION_DENSITY = np.array([150.0, 150.0, 1e6] * 2)
 """Spectral densities of the accelerations of slow x and y, mm^2/s^3, and of the second derivative of ln F, 1/s^3.
@@ -122,7 +122,6 @@ class NoiseEstimate:
         self.relative_variance = 1.0
         self._frames = 1  # the noise that the model states has the weight of one frame
         self._latest: deque[Array] = deque(maxlen=3)  # the latest values and their times, arrays of shape (4,)
-        self._latest_s = -math.inf
 
     def update(self, measured: Array, covariance: Array, t_s: float) -> None:
         """Update the estimate with the values of a frame.
@@ -137,9 +136,8 @@ class NoiseEstimate:
             covariance: Covariance of the measured values as stated by the model, shape (3, 3).
             t_s: Time of the frame, s. Frames within `NOISE_INTERVAL_s` after the previous one are not used.
         """
-        if t_s - self._latest_s < NOISE_INTERVAL_s:
+        if self._latest and t_s - self._latest[-1][3] < NOISE_INTERVAL_s:
             return
-        self._latest_s = t_s
         self._latest.append(np.append(measured, t_s))
         if len(self._latest) < 3:
             return
@@ -209,7 +207,7 @@ class MotionFilter:
         squared_speed = (mean[:, VELOCITY] ** 2).sum(axis=1, keepdims=True)
         density = _IS_MOVING * (ACCELERATION_DENSITY + squared_speed * SPEED_CHANGE_RATE)
         noise = density[:, None] * UNIT_NOISE * dt_s**TIME_EXPONENT
-        noise += _HELD_RATE_COVARIANCE + dt_s * _HELD_DRIFT_DENSITY
+        noise += _HELD_RATE_COVARIANCE + dt_s * HELD_DRIFT_DENSITY
         transition = (_IDENTITY + dt_s * _INTEGRATION) * _HAS_EFFECT
         self.mean = (transition @ mean[:, :, None])[:, :, 0]
         self.covariance = transition @ mixed_covariance @ transition.swapaxes(1, 2) + noise
