@@ -4,7 +4,6 @@ A script file contains presses and faults of the transmission. A `Script` contai
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
@@ -95,8 +94,7 @@ class VirtualScript(Settings, frozen=True):
             WrongKey: If there is only one row, or the times do not increase.
         """
         times_s = [row[0] for row in self.presses]
-        is_rising = all(time_s < next_time_s for time_s, next_time_s in pairwise(times_s))
-        if len(times_s) == 1 or not is_rising:
+        if len(times_s) == 1 or not (np.diff(times_s) > 0.0).all():
             raise WrongKey("presses", "two rows or more with growing seconds", self.presses)
 
     def script(self, rate_Hz: float) -> Script | None:
