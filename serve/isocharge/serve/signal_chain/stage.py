@@ -240,5 +240,4 @@ class Stage(ABC):
             DeviceError: If the stage does not exist in C with these settings.
         """
         rule = setup.device.rule(cls.rule_class)
-        settings = {} if rule is None else structs.asdict(rule)
-        return {name: value for name, value in settings.items() if name != "on"}
+        return {} if rule is None else structs.asdict(rule)
