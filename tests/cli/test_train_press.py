@@ -45,7 +45,7 @@ class FakeSession:
         self._place()
 
     def _place(self):
-        self.proposed = SimpleNamespace(contact=np.array([len(self.taken), 0.0, 1.0]))
+        self.proposed = SimpleNamespace(contact=np.array([len(self.taken), 0.0, 0.024]))
         self.presses = SimpleNamespace(contact=np.array(self.taken), electrodes=NAMES)
 
     def __len__(self):
@@ -104,17 +104,17 @@ def dialogue(*events, contacts=None):
 
 def test_enter_takes_a_press_as_proposed(capsys):
     session, _ = dialogue(TARED, HELD, HELD, HELD, STEADY, "", STEADY, "1.5 2 0.9", STEADY, "? ? 0.5")
-    assert session.taken[:2] == [(0.0, 0.0, 1.0), (1.5, 2.0, 0.9)]
+    assert session.taken[:2] == [(0.0, 0.0, 0.024), (1.5, 2.0, 0.9)]
     assert np.isnan(session.taken[2][:2]).all()
     message = capsys.readouterr().err
-    assert "\n1. Press 1.00 N at (0.0, 0.0) mm and hold." in message
+    assert "\n1. Press 0.024 N at (0.0, 0.0) mm and hold." in message
     assert message.count("   hold it\n") == 1
     assert re.findall(r": A (\S+),", message) == ["500.0"] * 3
     assert message.count("so much is known") == 3
     assert message.endswith("With --until 0 the same command takes more presses.\n")
 
 
-FIRST = (0.0, 0.0, 1.0)
+FIRST = (0.0, 0.0, 0.024)
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_presses_of_a_machine_are_those_of_its_list(capsys):
     np.testing.assert_array_equal(session.taken, LIST[[0, 2]])
     message = capsys.readouterr().err
     assert script.armed == 0
-    assert message.index("Let the machine begin") < message.index("1. 0.50 N")
+    assert message.index("Let the machine begin") < message.index("1. 0.5 N")
     assert "row 2 is left out: it moves" in message
 
 

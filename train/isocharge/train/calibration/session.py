@@ -277,6 +277,6 @@ def describe_press(contact: Array) -> str:
         contact: Contact (x, y, F), shape (3,), mm and N, NaN where unknown.
     """
     x, y, force = contact.tolist()
-    force_text = "an unknown force" if math.isnan(force) else f"{force:.2f} N"
+    force_text = "an unknown force" if math.isnan(force) else f"{force:.3g} N"
     place_text = "an unknown place" if math.isnan(x) else f"({x:.1f}, {y:.1f}) mm"
     return f"{force_text} at {place_text}"
