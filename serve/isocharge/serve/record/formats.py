@@ -53,17 +53,16 @@ def _columns(electrodes: tuple[str, ...], sections: tuple[str, ...]) -> list[tup
     The parts of charges are the electrodes, and the parts of an object are its fields. The part is None for a field
     with one column.
     """
-    columns: list[tuple[str, str | None]] = []
-    for field in record_fields(sections):
-        parts: Sequence[str | None] = _part_names(field, electrodes)
-        columns += [(field.name, part) for part in parts or [None]]
-    return columns
+    return [(field.name, part) for field in record_fields(sections) for part in _part_names(field, electrodes)]
 
 
-def _part_names(field: Field, electrodes: Sequence[str]) -> Sequence[str]:
-    """Return the names of the numbers in an object, the fields of a struct or the electrodes; empty for other types."""
+def _part_names(field: Field, electrodes: Sequence[str]) -> Sequence[str | None]:
+    """Return the names of the numbers in an object: the fields of a struct, or the electrodes.
+
+    A field of another type is a single part without a name, which is None.
+    """
     if field.json_type != "object":
-        return ()
+        return [None]
     return [part.name for part in field.parts] or electrodes
 
 

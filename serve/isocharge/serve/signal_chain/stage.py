@@ -211,8 +211,8 @@ class Stage(ABC):
         """Return whether a stream has this stage."""
         is_on = cls.is_required or cls.rule_class in setup.device.rules
         fits_board = cls.front_end in (None, setup.device.front_end)
-        has_model = setup.predictor is not None
-        return is_on and fits_board and (has_model or not cls.needs_model)
+        lacks_model = cls.needs_model and setup.predictor is None
+        return is_on and fits_board and not lacks_model
 
     @abstractmethod
     def step(self, frame: Frame) -> None:
