@@ -98,8 +98,14 @@ def test_presses_outside_the_radius_reach_up_to_the_clamp(small_dataset):
 
 @pytest.mark.parametrize("changes", [{"outside": 0}, {"radius": 42.0}])
 def test_a_sweep_without_presses_outside(changes):
-    """No presses are requested, or the ring between the radius and the clamp is narrower than a millimetre."""
+    """No presses are requested, or the ring between the radius and the clamp is narrow."""
     assert outside_map(SENSOR, (PROBE,), small(**changes)) is None
+
+
+def test_smallest_width_of_the_ring_outside_is_relative_to_the_film(monkeypatch):
+    monkeypatch.setattr(sweep_module, "whole_film_map", lambda *_, **__: "map")
+    sensor = replace(SENSOR, film=replace(SENSOR.film, radius=16.0))
+    assert outside_map(sensor, (Circle(0.1),), small(radius=14.5)) == "map"
 
 
 def test_run_sweep_writes_the_same_bytes_as_write_sweep_and_reports_progress(tmp_path):

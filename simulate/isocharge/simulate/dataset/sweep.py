@@ -195,8 +195,11 @@ _log = logging.getLogger(__name__)
 SHARD_SIZE = 16384
 """Default number of samples in a shard, whose charges are computed in about two seconds."""
 
-MIN_RING_WIDTH = 1.0
-"""Smallest width of the ring between the radius of a sweep and the clamp, mm. A narrower ring contains no presses."""
+MIN_RING_WIDTH = 0.02
+"""Smallest width of the ring between the radius of a sweep and the clamp, in film radii, dimensionless.
+
+A narrower ring contains no presses.
+"""
 
 
 def run_sweep(
@@ -305,7 +308,8 @@ def outside_map(
         film cannot be solved up to the clamp. The last case is logged as a warning.
     """
     probe = Circle(max(probe.under(sweep.force_range[1]).reach for probe in probes))
-    if sweep.outside == 0 or outermost_distance(sensor.film, probe) < sweep.radius + MIN_RING_WIDTH:
+    ring_width = outermost_distance(sensor.film, probe) - sweep.radius
+    if sweep.outside == 0 or ring_width < MIN_RING_WIDTH * sensor.film.radius:
         return None
     try:
         return whole_film_map(sensor, probe, sweep.force_range, executor=executor)
