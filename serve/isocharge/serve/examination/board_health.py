@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from msgspec import structs
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import ChargeError, printable, shown
@@ -250,8 +249,8 @@ def channel_sentences(
         max_hum_pC: Largest harmless amplitude of hum, pC. The default is below the noise of the film.
     """
     rule = device.rule(TareRule) or TareRule()  # the defaults if the device file has no tare
-    if device.has_currents:  # a current of any size at rest is an offset
-        rule = structs.replace(rule, offset_limit_pC=math.inf)
+    # A current of any size at rest is an offset.
+    offset_limit_pC = math.inf if device.has_currents else rule.offset_limit_pC
     for channel in channels:
         name = f"channel {printable(channel.name)}"
         if channel.unusable:
@@ -272,10 +271,10 @@ def channel_sentences(
                 f"{name} has a noise of {channel.noise_pC:.3g} pC rms, but a tare needs less than "
                 f"{rule.noise_limit_pC:g} pC"
             )
-        if abs(channel.offset_pC) > rule.offset_limit_pC:
+        if abs(channel.offset_pC) > offset_limit_pC:
             yield (
                 f"{name} has {channel.offset_pC:.4g} pC at rest, but a tare accepts at most "
-                f"{rule.offset_limit_pC:g} pC: remove what lies on the film; if the amplifier rests at this value, "
+                f"{offset_limit_pC:g} pC: remove what lies on the film; if the amplifier rests at this value, "
                 "subtract it with [gain] offset, which --write puts into the device file"
             )
         if abs(channel.drift_pC_per_s) > max_drift_pC_per_s:

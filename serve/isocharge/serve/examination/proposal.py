@@ -80,7 +80,7 @@ def unit_of(capture: Capture, positions: Iterable[int], max_noise_V: float = 0.0
     - The unit of all other values is assumed to be pC.
 
     Args:
-        capture: The frames that were received. Without frames, the result is "pC".
+        capture: The frames that were received, at least one.
         positions: Positions of the electrodes' channels in the frame; empty for all channels.
         max_noise_V: Largest noise of a board that sends volts, V. Charges of a film in pC have more noise.
     """
@@ -89,15 +89,16 @@ def unit_of(capture: Capture, positions: Iterable[int], max_noise_V: float = 0.0
     units = {stated_unit(name) for name in names} - {""}
     if len(units) == 1:
         return units.pop()
-    if units or not capture.frames or capture.parser.format == BINARY:
+    if units or capture.parser.format == BINARY:
         return "pC"
     values = capture.values()[0][:, channels]  # shape (frames, channels)
     finite_values = values[np.isfinite(values)]
-    if finite_values.size and bool((finite_values == np.round(finite_values)).all()):
+    if finite_values.size and (finite_values == np.round(finite_values)).all():
         return "counts"
-    largest_noise = estimate_noise(values).max()
     names_state_volts = all(name.endswith("V") for name in names)
-    return "V" if names_state_volts or 0.0 < largest_noise <= max_noise_V else "pC"
+    if names_state_volts or 0.0 < estimate_noise(values).max() <= max_noise_V:
+        return "V"
+    return "pC"
 
 
 def _choose_channels(

@@ -49,10 +49,10 @@ def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: 
         if prefix in chain_source:
             settings = {"on": is_on, **stage.c_settings(setup)}
             macros |= {prefix + name.upper(): _c_literal(value) for name, value in settings.items()}
-        elif stage.section and is_on and stage.needs_contact:
-            host_sections.append(stage.section)
         elif stage.section and is_on:
-            raise DeviceError(f"{device.where}: {stage.section}: {NOT_IN_C}")
+            if not stage.needs_contact:
+                raise DeviceError(f"{device.where}: {stage.section}: {NOT_IN_C}")
+            host_sections.append(stage.section)
     if host_sections:
         log.warning(
             "%s: %s: not exported, because only `isocharge serve stream` does this",
