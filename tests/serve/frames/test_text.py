@@ -160,6 +160,7 @@ UNNAMED_NOTATIONS = [
 
 NAMED_NOTATIONS = [
     "A: {a} pC, B: {b} pC, C: {c} pC",
+    "A: {a} pC|B: {b} pC|C: {c} pC",
     "A {a} pC B {b} pC C {c} pC",
     "A={a} B={b} C={c}",
     "A{a:+}B{b:+}C{c:+}",

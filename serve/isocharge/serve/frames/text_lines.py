@@ -27,7 +27,7 @@ from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, SEQ, TIMES_US
 
 _QUOTED = r'"(?:[^"\\]|\\.)*"' + r"|(?<!\w)'[^']*'(?!\w)"
 
-_KEY = r"""(?:[0-9]+(?=[^\W\d_]))?(?![0-9()\[\]+.*$|&/-]|#[0-9])(?>(?:[^\s:=,;{}"'<>()]|\([^\s()]*\))+)"""
+_KEY = r"""(?:[0-9]+(?=[^\W\d_]))?(?![0-9()\[\]+.*$|&/-]|#[0-9])(?>(?:[^\s:=,;|&{}"'<>()]|\([^\s()]*\))+)"""
 
 _INDEX = r"\[\w*\](?!\s*[,;]?\s*(?:$|[^\W\d]))"  # not the value in `C[7] A[3]`, which stands before a name or the end
 
