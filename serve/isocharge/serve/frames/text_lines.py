@@ -15,6 +15,9 @@ A word directly before a number is the name of the number. If different words an
 `7 C, 3 A`, the words are names, too. Digits in a word, as in `ch3`, are not a number, and an index such as that in
 `ch 3: 801` is a name. Words that are neither names nor followed by a colon or an equals sign may change from line to
 line, except units of charge and voltage. Quotes around a number have no meaning.
+
+Names and units are found with regular expressions in the shape of a line, which has one symbol for each part of the
+line. For example, the shape of `A: 801.2 pC, B: -799.5 pC` is `k:0u,k:0u`.
 """
 
 import math
@@ -26,8 +29,10 @@ from typing import NamedTuple
 from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, SEQ, TIMES_US
 
 _QUOTED = r'"(?:[^"\\]|\\.)*"' + r"|(?<!\w)'[^']*'(?!\w)"
+"""Regular expression of a text in quotes."""
 
 _KEY = r"""(?:[0-9]+(?=[^\W\d_]))?(?![0-9()\[\]+.*$|&/-]|#[0-9])(?>(?:[^\s:=,;|&{}"'<>()]|\([^\s()]*\))+)"""
+"""Regular expression of a key without quotes, which is a name before a colon or an equals sign."""
 
 _INDEX = r"\[\w*\](?!\s*[,;]?\s*(?:$|[^\W\d]))"  # not the value in `C[7] A[3]`, which stands before a name or the end
 
@@ -35,11 +40,13 @@ _TIME = (
     r"(?<![\w.:])(?:[0-9]{1,4}[-/.][0-9]{1,2}[-/.][0-9]{1,4}[T ,;]+)?"  # a date
     r"[0-9]{1,2}:[0-9]{2}:[0-9]{2}"
 )
+"""Regular expression of a time in whole seconds, with or without a date."""
 
 _FRACTION = r"(?:\.[0-9]+(?:[.,][0-9]{3}(?=\]))?|,[0-9]{3}(?=\s)|,[0-9]+(?=;))"
 """Regular expression of the fraction of a second, as in 56.789, 56.789,012], 56,789 before a blank, or 56,7;."""
 
 _ZONE = r"(?:Z|[-+][0-9]{2}:?[0-9]{2}(?![\w.]))?(?![\w:])"
+"""Regular expression of the time zone after a time, which may be missing."""
 
 _NUMBER = r"(?>[-+]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|(?<!<)(?i:nan|inf(?:inity)?|ovf)(?!\w)))"
 """Regular expression of a decimal number, which also matches `nan`, `inf` and the `ovf` of Arduino."""
@@ -88,9 +95,16 @@ _SAME_COLUMN = r"(?:q|[^\w,;|\[(])*"
 """Regular expression, for the shape of a line, of parts that neither separate columns nor begin a list."""
 
 _NEAREST_NAME = rf"(?P<word>[kuw]){_SAME_COLUMN}(?P<number>[0t])"
+"""Regular expression, for the shape of a line, of the last word before a number in the same column."""
+
 _SECOND_NAME = rf"(?P<word>[kuw]){_SAME_COLUMN}[kuw]{_SAME_COLUMN}(?P<number>[0t])"
+"""Regular expression, for the shape of a line, of the last word but one before a number in the same column."""
+
 _UNIT_BEHIND = r"(?P<number>[0t])[:=]*(?P<word>[kuw])"
+"""Regular expression, for the shape of a line, of a word directly behind a number, which may be its unit."""
+
 _UNIT_BEFORE = r"[kquw]\W*(?P<word>[kquw])\W*(?P<number>[0t])"
+"""Regular expression, for the shape of a line, of a word between the name and the number, which may be its unit."""
 
 _IGNORED_AT_END = ",; \t"
 """Marks without a meaning at the end of a line."""
@@ -108,7 +122,8 @@ _SEPARATING_COMMA = (
 _DECIMAL_COMMA = r"(?<!:[0-9]{2}:[0-9]{2})(?<=[0-9]),(?=[0-9])"
 """Regular expression of a comma between digits that is not part of a time."""
 
-_CHARGE_UNITS = {*OTHER_CHARGE_UNITS, "pC"} - {"C"}  # C may be the name of an electrode
+_CHARGE_UNITS = {*OTHER_CHARGE_UNITS, "pC"} - {"C"}
+"""Units of charge and voltage, except C, which may be the name of an electrode."""
 
 
 class _Part(NamedTuple):
