@@ -10,6 +10,7 @@ interpolates its stress fields between forces in the same way. The interpolation
 further error.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -273,6 +274,6 @@ def _fit_positions(cells: int) -> Array:
     # In units of the side of a cell, the diameter of the disk is `cells`. The constants 16 and 8 ensure that there are
     # enough positions if there are only a few cells.
     inner_count = int(1.6 * np.pi * (0.5 * cells) ** 2) + 16
-    edge_count = int(2.0 * np.pi * cells) + 8
+    edge_count = int(math.tau * cells) + 8
     edge_positions = to_corners(np.exp(2j * np.pi * np.arange(edge_count) / edge_count))
     return np.concatenate([sunflower(inner_count), edge_positions])

@@ -122,9 +122,8 @@ class FilmSlopes:
         """
         contact = self.film.domain.check(contact, "properties of a film")
         film = self.film.sensor.film
-        field_charge = self.film.sensor.calibration.read(
-            self.fields.field_charges(contact, FILM_IS_ODD).swapaxes(1, 2)  # shape (n, n_field, n_electrode)
-        )
+        charge_without_crosstalk = self.fields.field_charges(contact, FILM_IS_ODD).swapaxes(1, 2)
+        field_charge = self.film.sensor.calibration.read(charge_without_crosstalk)  # shape (n, n_field, n_electrode)
         tension_unit = film.young * amplitude_squared(film, contact[:, 2]) + film.pretension
         field_charge[:, TENSION_FIELDS] /= tension_unit[:, None, None]
 
@@ -136,8 +135,7 @@ class FilmSlopes:
         components = even_and_odd * np.exp(2j * direction)
         directed[:, ::2] = components.real
         directed[:, 1::2] = components.imag
-        names = [field.name for field in FILM_FIELDS]
-        return dict(zip(names, np.moveaxis(field_charge, 1, 0), strict=True))
+        return {field.name: field_charge[:, index] for index, field in enumerate(FILM_FIELDS)}
 
 
 def _stress_and_changes(solved: Equilibrium, surface: Surface) -> Array:
