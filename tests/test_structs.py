@@ -76,9 +76,7 @@ def test_a_value_that_fits_is_taken():
 @pytest.mark.parametrize(
     ("board", "message"),
     [
-        ({"radius": -45}, "board.radius: expected a positive number, got -45"),
         ({"radius": math.nan}, "board.radius: expected a positive number, got nan"),
-        ({"share": "x"}, "board.share: expected a number from 0, got 'x'"),
         ({"offset": math.inf}, "board.offset: expected a finite number, got inf"),
         (
             {"offset": 10**400},
@@ -89,14 +87,11 @@ def test_a_value_that_fits_is_taken():
         ({"on": 1}, "board.on: expected true or false, got 1"),
         ({"order": "odd"}, "board.order: expected one of big, little, got 'odd'"),
         ({"gain": {"A": 1, "B": 0}}, "board.gain.B: expected a positive number, got 0"),
-        ({"frames": {"format": "binary", "length": 0}}, "board.frames.length: expected a whole number from 1 to 100"),
         ({"frames": {"format": "morse"}}, "board.frames.format: expected one of auto, binary, got 'morse'"),
         ({"parts": [{"name": "a"}, {"name": ""}]}, "board.parts[1].name: expected a text of 1 to 1000 characters"),
         ({"parts": [{"name": "a", "at": [1]}]}, "board.parts[0].at: expected [x, y] in mm, got [1]"),
         ({"pair": [1, 2, 3]}, "board.pair: expected a list of 2 numbers, got [1, 2, 3]"),
-        ({"parts": [3]}, "board.parts[0]: expected a table, got 3"),
         ({"radus": 1}, "unknown key 'board.radus'; did you mean 'radius'? Known are radius, share"),
-        ({"zzz": 1}, "unknown key 'board.zzz'; known are radius"),
         (3, "board: expected a table, got 3"),
     ],
 )

@@ -15,6 +15,7 @@ from isocharge.serve.tracking.motion_filter import (
     ACCELERATION_DENSITY,
     HELD_DRIFT_DENSITY,
     INITIAL_RATE_STD,
+    LARGEST_STD,
     SPEED_CHANGE_RATE,
     MotionFilter,
 )
@@ -283,6 +284,22 @@ def test_records_with_track_only_add_fields(film, predictor):
 def test_contact_with_very_small_and_very_large_standard_deviations_is_tracked():
     contacts = noisy_contacts(np.zeros(100), correlation=0.99999)
     assert np.isfinite(track_contacts(contact._replace(x_std_mm=1e-9, y_std_mm=1e9) for contact in contacts)).all()
+
+
+def test_rounding_errors_make_no_variance_negative():
+    """The errors are correlated and of very different sizes. The short form of the Kalman update fails for them."""
+    rng = np.random.default_rng(0)
+
+    def covariance():
+        root = rng.normal(size=(3, 3)) * 10.0 ** rng.uniform(-2.5, 0.0, (3, 1))
+        scaled_root = root * LARGEST_STD * 10.0 ** rng.uniform(-5.0, 0.0, 3)
+        return scaled_root.T @ scaled_root
+
+    for _ in range(50):
+        motion = MotionFilter(np.zeros(3), covariance())
+        for dt_s in rng.choice([0.0, 0.5], 8):
+            motion.step(dt_s, np.zeros(3), covariance())
+        assert np.diagonal(motion.covariance, axis1=1, axis2=2).min() > 0.0
 
 
 def test_rapidly_rising_force_is_followed():

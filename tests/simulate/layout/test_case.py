@@ -44,7 +44,6 @@ def test_new_squares_are_named_anticlockwise_with_unused_letters(sensor):
         ({"radius": 44.5}, "leave the film of radius 45 mm"),
         ({"force": 1e4}, "beyond small strains"),
         ({"keep": ("A", "A")}, "expected different names"),
-        ({"keep": ("A", "B", "C", "D")}, "nothing to place"),
         ({"keep": ("Q",)}, "no electrode 'Q'"),
         ({"side": 3000.0}, "side: expected 0.02 to 62.2254 mm, got 3000 mm"),
         ({"probe": Finger(3.0)}, "expected circle:RADIUS, .* got finger:3.0"),

@@ -106,6 +106,9 @@ The first frames of a slow press may have much larger standard deviations. Witho
 eigenvalues of the covariance of the state negative.
 """
 
+LARGEST_LOG_FORCE = 88.0
+"""Largest ln F of a smoothed contact, so that F is a finite number if the extrapolation of an outlier is absurd."""
+
 NOISE_INTERVAL_s = 0.0045
 """Time after which the noise of two frames is independent, s. Boards filter their charges over shorter times."""
 
@@ -226,10 +229,12 @@ class MotionFilter:
         posterior = self.probability * likelihood
         self.probability = np.maximum(posterior / posterior.sum(), np.finfo(float).tiny)
 
-        # Apply the Kalman update to each mode.
+        # Apply the Kalman update to each mode. The last statement is zero except for rounding errors: it completes the
+        # short form of the covariance to the form of Joseph, whose variances do not become negative.
         gain = self.covariance[:, :, VALUES] @ precision
         self.mean += (gain @ innovation)[:, :, 0]
         self.covariance -= gain @ self.covariance[:, VALUES]
+        self.covariance += (gain @ covariance - self.covariance[:, :, VALUES]) @ gain.swapaxes(1, 2)
         return True
 
 
@@ -311,7 +316,7 @@ class ContactFilter:
         smoothed_std = np.sqrt(variances[VALUES] + self._constant_share * stated_covariance.diagonal())
         x_std_mm, y_std_mm, log_force_std = smoothed_std.tolist()
         x_mm, y_mm, log_force, vx_mm_s, vy_mm_s, _ = mean.tolist()
-        smoothed_N = math.exp(log_force)
+        smoothed_N = math.exp(min(log_force, LARGEST_LOG_FORCE))
         moving = float(motion.probability[MOVING_POSITION].sum())
         return TrackedContact(
             x_mm, y_mm, smoothed_N, x_std_mm, y_std_mm, smoothed_N * log_force_std, vx_mm_s, vy_mm_s, moving
