@@ -84,7 +84,6 @@ def test_a_value_that_fits_is_taken():
         ),
         ({"poisson": 0.6}, "board.poisson: expected a number above -1 to 0.5, got 0.6"),
         ({"low": 3, "high": 2}, "board.low: expected at most high (2), got 3"),
-        ({"on": 1}, "board.on: expected true or false, got 1"),
         ({"order": "odd"}, "board.order: expected one of big, little, got 'odd'"),
         ({"gain": {"A": 1, "B": 0}}, "board.gain.B: expected a positive number, got 0"),
         ({"frames": {"format": "morse"}}, "board.frames.format: expected one of auto, binary, got 'morse'"),
