@@ -14,7 +14,7 @@ from isocharge.common.errors import lazy_names
 if TYPE_CHECKING:  # each `as` marks a public name (PEP 484); isort would split the statements
     # isort: off
     from isocharge.serve.examination.port_check import Examination as Examination, examine as examine
-    from isocharge.serve.frames.binary import BinaryParser as BinaryParser, encode_frame as encode_frame
+    from isocharge.serve.frames.formats import BinaryParser as BinaryParser, encode_frame as encode_frame
     from isocharge.serve.frames.formats import AutoParser as AutoParser
     from isocharge.serve.frames.frame import Frame as Frame
     from isocharge.serve.frames.text import encode_text as encode_text

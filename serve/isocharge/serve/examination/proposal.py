@@ -12,7 +12,7 @@ from isocharge.common.arrays import Array
 from isocharge.common.errors import ChargeError
 from isocharge.serve.examination.listening import Capture, ReceivedData
 from isocharge.serve.examination.press_detector import estimate_noise
-from isocharge.serve.frames.binary import FORMAT as BINARY
+from isocharge.serve.frames.formats import BINARY_FORMAT
 from isocharge.serve.recognition.recognise import recognise
 from isocharge.serve.signal_chain.channels import Channels, stated_unit
 from isocharge.serve.signal_chain.stage import Setup
@@ -89,7 +89,7 @@ def unit_of(capture: Capture, positions: Iterable[int], max_noise_V: float = 0.0
     units = {stated_unit(name) for name in names} - {""}
     if len(units) == 1:
         return units.pop()
-    if units or capture.parser.format == BINARY:
+    if units or capture.parser.format == BINARY_FORMAT:
         return "pC"
     values = capture.values()[0][:, channels]  # shape (frames, channels)
     finite_values = values[np.isfinite(values)]

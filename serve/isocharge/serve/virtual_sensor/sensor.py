@@ -28,7 +28,7 @@ import numpy as np
 from isocharge.common.arrays import Array
 from isocharge.common.errors import PortError, SceneError
 from isocharge.common.files import as_output_errors
-from isocharge.serve.frames.binary import encode_frame
+from isocharge.serve.frames.formats import encode_frame
 from isocharge.serve.frames.frame import SEQ_MODULUS, T_US_MODULUS, Frame
 from isocharge.serve.virtual_sensor.script import Faults, Script, corrupt
 
