@@ -353,7 +353,7 @@ def replay_command(
         else:
             feed = PageFeed(page, touch)
             write_records(play(on_marker=page.add_marker), [outputs.write, feed.write])
-            outputs.close()  # now, because Ctrl-C, until which the page stays open, would discard files that are open
+            outputs.close()  # before the page waits for Ctrl-C, because Ctrl-C discards files that are still open
             feed.update_state()  # with the counters of the whole recording
             page.update(is_complete=True)
             threading.Event().wait()  # sleeps until Ctrl-C, because nothing sets the event

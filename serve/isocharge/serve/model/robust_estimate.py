@@ -215,8 +215,8 @@ class RobustProblem:
         step ds of the state, the contact moves by du_i = a_i - B_i ds, with a_i = M_i^-1 (C_i' r_i + W m_i) and
         B_i = M_i^-1 C_i' S_i. The residuals of the charges are r_i, and those of the measured coordinates are m_i, in
         standard deviations. W is the diagonal matrix of the inverse standard deviations of the coordinates, and M_i is
-        C_i' C_i + W^2 with a damped diagonal. In the normal equations of the state, the part of a press is multiplied
-        by the weight of the press, which is small if its residuals are large.
+        C_i' C_i + W^2 with a damped diagonal. The normal matrix and the right side of the state are sums over the
+        presses. Each term is multiplied by the weight of its press, which is small if the residuals are large.
 
         Args:
             point: State and contacts.

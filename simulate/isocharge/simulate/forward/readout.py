@@ -127,8 +127,9 @@ class ElectrodePieces:
 
         Near a press, the stress changes strongly, so a near piece gets more integration points. A press and a piece are
         near if the distance of their centres is less than `NEAR_DISTANCE` times the sum of the radii of the circles
-        around the footprint and the piece. A near piece is halved across its longest side until each part is distant,
-        or has sides of at most `NEAR_SIDE` half widths of the footprint.
+        around the footprint and the piece. A near piece is divided into two halves along its longest side, again and
+        again, until each part is distant or small. A part is small if its sides are at most `NEAR_SIDE` times half of
+        the width of the footprint.
 
         Args:
             probe: Probe of the presses.

@@ -83,7 +83,7 @@ class PiezoTable(Settings, frozen=True):
 
 
 class PolygonTable(Settings, frozen=True):
-    """Description of an electrode that is not a square, in the form of a sensor file.
+    """Section of a sensor file that describes an electrode that is not a square.
 
     The electrode has a pad on the front of the film. The electrode may have further polygons and a trace on the front,
     and polygons on the back.

@@ -68,11 +68,12 @@ def _drawn_charges(series: ChargeSeries, rng: np.random.Generator, contact: Arra
 
 
 def _outside_presses(charges: FilmCharges, domain: Domain, executor: Executor | None) -> LabelledPresses | None:
-    """Solve presses between the working area and the clamp, on the axisymmetric film under the circular probe.
+    """Solve presses between the working area and the clamp.
 
-    They only teach the network which charges belong to no contact, so that the imperfections do not matter.
+    From these presses, the network only learns which charges belong to no contact. The imperfections of the film hardly
+    matter for that, so the presses are solved on the axisymmetric film without them, under a circular probe.
     """
-    round_map = charges.slopes.film
+    round_map = charges.slopes.film  # of the axisymmetric film
     outermost = outermost_distance(round_map.sensor.film, round_map.probe.under(domain.force_range[1]))
     if outermost <= domain.radius:
         return None

@@ -79,7 +79,7 @@ class Method:
     single_call: Callable[[Array], Callable[[], object]] | None = None
 
     def call_in_turn(self, charge: Array) -> Callable[[], object]:
-        """Return a function without arguments whose calls estimate the contacts of presses, one after the other.
+        """Return a function without arguments that estimates the contact of the next press in each call.
 
         The duration of the calls is measured. After the last press, the function begins again with the first press.
 
@@ -335,9 +335,10 @@ def split_presses(
 
 
 def noise_of(model: ModelMetadata) -> NoiseModel:
-    """Return the noise for which a model was trained; `reference` for a training without noise or with measured noise.
+    """Return the noise for which a model was trained.
 
-    Measured noise has different parameters for each electrode.
+    The noise `reference` is returned for a model that was trained without noise, or with measured noise, which has
+    different parameters for each electrode.
     """
     name, white_pC, gain = structs.astuple(model.noise)
     if isinstance(white_pC, tuple) or isinstance(gain, tuple):

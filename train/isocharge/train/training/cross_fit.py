@@ -327,10 +327,11 @@ def _train_fold_networks(
 
 
 def _misfit_examples(charge: Array, unit_contact: Array, noise: ChannelNoise, config: TrainingConfig) -> Array:
-    """Draw charges, and compute the differences between their levels and those of the most similar contacts.
+    """Draw charges, and compute how much they differ from the charges of the most similar contacts.
 
-    The charges of contacts are known only at the presses. Therefore, the levels of the contacts near each press are
-    approximated by a linear function of the contact (a plane).
+    A level is a charge on a scale on which the noise has the standard deviation 1. The charges of contacts are known
+    only at the presses. Near each press, the levels are therefore approximated by a linear function of the contact, a
+    plane. The most similar contact is searched on these planes.
 
     Args:
         charge: Charges of the presses, shape (n, n_electrode), pC.
@@ -339,7 +340,7 @@ def _misfit_examples(charge: Array, unit_contact: Array, noise: ChannelNoise, co
         config: Number of examples and seed.
 
     Returns:
-        Charges and differences, shape (2, n_example, n_electrode).
+        Charges, pC, and differences of the levels, shape (2, n_example, n_electrode).
     """
     planes = LocalPlanes.fit(unit_contact, noise.level(charge))
     _, n_electrode = charge.shape

@@ -242,7 +242,7 @@ class FoldedNetwork:
 
         # Split the answers: x and y, the logarithms of the force and of the three standard deviations, the angles that
         # determine the correlations, and the misfit vector. The exponentials of the limited logarithms are the force
-        # and the standard deviations. A result of a split has the name of an output, so it needs no further node.
+        # and the standard deviations. The names after `to` are those of the results, such as the output `contact_std`.
         widths = builder.constant((2, 4, len(COSINES_TO_CORRELATIONS), n_electrode), np.int64)
         builder.add("Split <axis = 1>", answers, widths, to="plane, logs, angles, misfit_vector")
         limits = (builder.constant(-LARGEST_LOGARITHM), builder.constant(LARGEST_LOGARITHM))

@@ -202,7 +202,7 @@ class Connection(HttpToolsProtocol):
             exchange.status = status
         self.transport.write(STATUS_LINE[status] + head + body)
         self.transport.close()
-        self._allow(self._limits.header_seconds)
+        self._allow(self._limits.header_seconds)  # the time in which the client must have received the refusal
 
 
 def _within_open_files(limits: ServerLimits) -> ServerLimits:
