@@ -41,10 +41,11 @@ def names_and_values(text):
         *((text, ("ch[0]", "ch[1]"), (7.0, 3.0)) for text in ("ch[0] 7 ch[1] 3", "ch[0],7,ch[1],3")),
         ("A=1.5&B=-2", ("A", "B"), (1.5, -2.0)),
         ("A:1.5/B:-2", ("A", "B"), (1.5, -2.0)),
-        ("Sample #7: A=1.5, B=-2", ("Sample", "A", "B"), (7.0, 1.5, -2.0)),
+        ("Sample #7: A=1.5 unit=nC t_ms=2", ("Sample", "A_nC", "t_ms"), (7.0, 1.5, 2.0)),
         ("1.5,-2*3A", ("", ""), (1.5, -2.0)),
         *((text, ("A",), (4.3,)) for text in ("A:4,3", "A = 4,3 pC", ">A:4,3")),
         (">A:1000:4,3§pC|g", ("t_ms", "A"), (1000.0, 4.3)),
+        ("[00:00:12.345,678] A:1,5 B:2,5", ("t_s", "A", "B"), (12.345678, 1.5, 2.5)),
     ],
 )
 def test_names_and_values_of_a_line(text, names, values):
@@ -78,7 +79,6 @@ def test_digits_in_words_are_no_numbers(text):
 @pytest.mark.parametrize(
     ("text", "values"),
     [
-        ("A: - 3.5, B: 2.5", (-3.5, 2.5)),
         ("A: + 3.5, B: - 2.5", (3.5, -2.5)),  # a board that prints each sign and then the magnitude
         ("- 3, -4,- 5", (-3.0, -4.0, -5.0)),
         ("-3.476E+00-3.443e+00+5.764E-01", (-3.476, -3.443, 0.5764)),
@@ -128,7 +128,6 @@ def test_lines_without_numbers_are_counted_if_they_are_too_many_for_headers():
 
 UNNAMED_NOTATIONS = [
     "{a};{b};{c}",
-    "({a}, {b}, {c})",
     "[{a} {b} {c}]",
     "array([{a}, {b}, {c}])",
     "{{{a}, {b}, {c}}}",
@@ -147,7 +146,6 @@ UNNAMED_NOTATIONS = [
     "\x02{a},{b},{c}\x03",
     "\x1b[2J\x1b[H{a} {b} {c}\x1b[K",
     "{a}\u00a0pC\u00a0{b}\u00a0pC\u00a0{c}\u00a0pC",
-    "12:34:56.789 -> {a},{b},{c}",
     "2026-11-25T12:34:56.789Z,{a},{b},{c}",
     "2026-11-25 12:34:56,789 INFO {a} {b} {c}",
     "[00:00:12.345,678] <inf> app: {a} {b} {c}",
@@ -199,11 +197,19 @@ NOTATIONS = {
     **dict.fromkeys(UNNAMED_NOTATIONS, ()),
     **dict.fromkeys(NAMED_NOTATIONS, "ABC"),
     "{a} uV\t{b} uV\t{c} uV": ("ch1_uV", "ch2_uV", "ch3_uV"),
-    "A: {a} nC, B: {b} nC, C: {c} nC": ("A_nC", "B_nC", "C_nC"),
-    "A={a}C B={b}C C={c}C": ("A_coulomb", "B_coulomb", "C_coulomb"),
+    '{{"A": {{"q": {a}, "unit": "nC"}}, "B": {{"q": {b}, "unit": "nC"}}, "C": {{"q": {c}, "unit": "nC"}}}}': (
+        "A_nC",
+        "B_nC",
+        "C_nC",
+    ),
+    '[{{"unit": "nC", "q": {a}}}, {{"unit": "nC", "q": {b}}}, {{"unit": "nC", "q": {c}}}]': (
+        "ch1_nC",
+        "ch2_nC",
+        "ch3_nC",
+    ),
     "A: {a} C, B: {b} C, C: {c} C": ("A_coulomb", "B_coulomb", "C_coulomb"),
     "A nC: {a} B nC: {b} C nC: {c}": ("A_nC", "B_nC", "C_nC"),
-    "A [nC]: {a}, B [nC]: {b}, C [nC]: {c}": ("ch1_nC", "ch2_nC", "ch3_nC"),
+    "Film A [nC]: {a}, Film B [nC]: {b}, Film C [nC]: {c}": ("ch1_nC", "ch2_nC", "ch3_nC"),
     "Q[0]:{a} Q[1]:{b} Q[2]:{c}": ("Q[0]", "Q[1]", "Q[2]"),
     "Channel 1 = {a} nC, Channel 2 = {b} nC, Channel 3 = {c} nC": ("1_nC", "2_nC", "3_nC"),
     "CH 1: {a}\nCH 2: {b}\nCH 3: {c}": "123",
@@ -283,7 +289,7 @@ MESSAGES = ["Sensor 1 ready", "Sensor 2 ready", "Sensor 3 ready"] + ["load:0x3fc
         (["READ 1", "0,2", "READ 1", "1,2", "READ 1", "1,2"], [(0, 2), (1, 2), (1, 2)]),
         (["0x7FF0 0x8001", "0x7FF9 0x8011"] * 5, [(0x7FF0, 0x8001), (0x7FF9, 0x8011)] * 5),
         # two frames, and then a temperature
-        (["A 1 B 2", "A 3 B 4", "T 5"] * 12, [(1, 2), (3, 4)] * 12),
+        (["ch1,1;ch2,2", "ch1,3;ch2,4", "T 5"] * 12, [(1, 2), (3, 4)] * 12),
         (["5,0x1F", "8,-0x20"] * 5, [(5, 31), (8, -32)] * 5),
         ([f"seq=0x{n:X} A=-{n}" for n in range(12)], [(-n,) for n in range(12)]),
         # two values behind each name, which are no index and value
@@ -311,7 +317,7 @@ def test_column_that_counts_or_has_few_values_is_a_column(notation):
     assert len(feed(*lines)) == 12
 
 
-@pytest.mark.parametrize("notation", ["A: {} B: 3 pC", "{} 3 pC", "A={}, B=3pC", "A,{},B,3 pC"])
+@pytest.mark.parametrize("notation", ["A: {} B: 3 pC", "{} 3 pC", "A,{},B,3 pC"])
 def test_line_in_another_unit_is_rejected(notation):
     """An instrument with automatic ranges writes 850 pC and then 1.2 nC."""
     parser = TextParser()
@@ -322,7 +328,8 @@ def test_line_in_another_unit_is_rejected(notation):
 
 def test_time_of_day_is_the_clock_which_wraps_at_midnight():
     parser = TextParser()
-    frames = feed(*(f"23:59:59.{ms:03d} -> 1,2" for ms in range(900, 1000, 20)), "00:00:00.000 -> 1,2", parser=parser)
+    lines = [f"23:59:59.{ms:03d} -> 1,2" for ms in range(900, 1000, 20)]
+    frames = feed(*lines, "00:00:00 -> 1,2", parser=parser)  # some programs omit a fraction that is zero
     assert [frame.t_us for frame in frames[-2:]] == [86_399_980_000, 0]
     assert parser.t_us_modulus == 86_400_000_000
     assert parser.format == "text: t_s, 2 columns without names"

@@ -52,8 +52,8 @@ _NUMBER = r"(?>[-+]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|(?<!
 """Regular expression of a decimal number, which also matches `nan`, `inf` and the `ovf` of Arduino."""
 
 _PATTERNS = {
-    "time": f"{_TIME}{_FRACTION}{_ZONE}",
-    "coarse_time": f"{_TIME}{_ZONE}",  # whole seconds, which are too coarse for a clock
+    "coarse_time": f"{_TIME}(?!{_FRACTION}{_ZONE}){_ZONE}",  # whole seconds, which are too coarse for a clock
+    "time": f"{_TIME}{_FRACTION}?{_ZONE}",  # some programs omit a fraction that is zero
     "uptime": r"(?<=\b[EWIDV]\s\()[0-9]+(?=\))",
     "key": rf"(?<=^\$)\w+|(?:{_KEY}|{_QUOTED})(?=\s*[:=])",
     "quoted": f"(?:{_QUOTED})",
@@ -100,11 +100,17 @@ _NEAREST_NAME = rf"(?P<word>[kuw]){_SAME_COLUMN}(?P<number>[0t])"
 _SECOND_NAME = rf"(?P<word>[kuw]){_SAME_COLUMN}[kuw]{_SAME_COLUMN}(?P<number>[0t])"
 """Regular expression, for the shape of a line, of the last word but one before a number in the same column."""
 
-_UNIT_BEHIND = r"(?P<number>[0t])[:=]*(?P<word>[kuw])"
-"""Regular expression, for the shape of a line, of a word directly behind a number, which may be its unit."""
+_UNIT_BEHIND = r"(?P<number>[0t])(?:,?k)?[:=]*(?P<word>[kquw])"
+"""Regular expression, for the shape of a line, of a word behind a number, which may be its unit.
 
-_UNIT_BEFORE = r"[kquw]\W*(?P<word>[kquw])\W*(?P<number>[0t])"
-"""Regular expression, for the shape of a line, of a word between the name and the number, which may be its unit."""
+A key may stand between the number and the unit, as in `"value": 3.5, "unit": "nC"`.
+"""
+
+_UNIT_BEFORE = r"[kquw]\W*(?P<word>[kquw])(?:\W*k)?\W*(?P<number>[0t])"
+"""Regular expression, for the shape of a line, of a word between the name and the number, which may be its unit.
+
+A key may stand between the unit and the number, as in `"unit": "nC", "value": 3.5`.
+"""
 
 _IGNORED_AT_END = ",; \t"
 """Marks without a meaning at the end of a line."""
@@ -116,11 +122,12 @@ _SEPARATING_COMMA = (
     r"[0-9]\.[0-9]|[0-9],[0-9]+,[0-9]"  # a number with a decimal point or two commas
     r"|[0-9],[-+.]|[0-9]\s*,\s+[-+.0-9]|[0-9]\s+,"  # before a sign or beside a blank
     r"|,[0-9]+\s*[:=]|,0[xX]"  # before a name or a hexadecimal number
+    r"|[^\W\d][0-9]+,"  # behind the digits of a name, as in `ch1,7;ch2,3`
 )
 """Regular expression of a text that shows that the commas of a line are separators."""
 
-_DECIMAL_COMMA = r"(?<!:[0-9]{2}:[0-9]{2})(?<=[0-9]),(?=[0-9])"
-"""Regular expression of a comma between digits that is not part of a time."""
+_DECIMAL_COMMA = rf"({_TIME}{_FRACTION}?,?)|(?<=[0-9]),(?=[0-9])"
+"""Regular expression of a time, which is a group, or of a comma between digits that is not part of a time."""
 
 _CHARGE_UNITS = {*OTHER_CHARGE_UNITS, "pC"} - {"C"}
 """Units of charge and voltage, except C, which may be the name of an electrode."""
@@ -199,7 +206,7 @@ def parse_line(text: str, *, has_header: bool = False, meanings: Mapping[str, st
     text_with_points = text
     if _has_decimal_commas(text):
         number_pattern = _NUMBER.replace(r"\.[0-9]*", r"(?:\.[0-9]*|,[0-9]+)")
-        text_with_points = re.sub(_DECIMAL_COMMA, ".", text)
+        text_with_points = re.sub(_DECIMAL_COMMA, lambda match: match[1] or ".", text)
     parts = _parts(text_with_points)
     names = _alternating_names(parts, has_header=has_header) or _preceding_names(parts, {SEQ, *meanings})
     names_with_units = _with_units(parts, names)
@@ -219,7 +226,7 @@ def _has_decimal_commas(text: str) -> bool:
     Commas are separators in a line to which one of these statements applies:
 
     - A number has a decimal point or two commas.
-    - A comma stands before a sign, beside a blank or before a name.
+    - A comma stands before a sign, beside a blank, before a name, or behind a name that ends with a digit.
     - Nothing else separates two numbers. In `A:4,3`, it is a decimal comma, because a name belongs to one number.
     - The line has brackets, and not every number has a name with a colon or an equals sign before it.
     """
@@ -244,7 +251,7 @@ def _parts(text: str) -> list[_Part]:
         kind = str(match.lastgroup)
         content = match[0]
         start = match.start()
-        is_unit = kind in ("word", "key") and content in _CHARGE_UNITS
+        is_unit = kind in ("word", "key") and content.strip("[]") in _CHARGE_UNITS
         symbol = "u" if is_unit else _SYMBOLS.get(kind, content[0])
         parts.append(_Part(kind, symbol, content, start, text[start - 1 : start].isspace()))
     for position in _index_positions(parts):
@@ -410,7 +417,8 @@ def _preceding_names(parts: list[_Part], counters: Container[str]) -> list[str]:
 def _with_units(parts: list[_Part], names: list[str]) -> list[str]:
     """Add the unit of charge or voltage of each number to its name, as in `A_nC` for `A = 3.5 nC`.
 
-    The unit stands directly behind the number, or between the name and the number. The unit pC is not added.
+    The unit stands behind the number, or between the name and the number. The unit pC is not added, and counters and
+    clocks have no unit of charge.
 
     Args:
         parts: Parts of the line.
@@ -424,7 +432,7 @@ def _with_units(parts: list[_Part], names: list[str]) -> list[str]:
     for number, (name, *words) in enumerate(zip(names, words_behind, words_before, strict=True), 1):
         unit = next((word.strip("[]") for word in words if word.strip("[]") in units), "")
         ending = "coulomb" if unit == "C" else unit  # `A_C` would be an electrode with the name C
-        is_added = unit and ending not in names
+        is_added = unit and ending not in names and name not in {SEQ, *TIMES_US}
         names_with_units.append(f"{name or f'ch{number}'}_{ending}" if is_added else name)
     return names_with_units
 
@@ -448,7 +456,7 @@ def line_values(pattern: re.Pattern[str], text: str) -> tuple[float, ...] | None
 def _value(number: str) -> float:
     """Return the value of a number, or the seconds from midnight to a time of day. The value of `ovf` is NaN."""
     if ":" in number:  # a time of day, with or without a date and a time zone
-        ((hours, minutes, seconds, fraction),) = re.findall("([0-9]+):([0-9]+):([0-9]+)[.,]([0-9,]+)", number)
+        ((hours, minutes, seconds, fraction),) = re.findall("([0-9]+):([0-9]+):([0-9]+)[.,]?([0-9,]*)", number)
         return 3600.0 * int(hours) + 60.0 * int(minutes) + float(f"{seconds}.{fraction.replace(',', '')}")
     if "x" in number.lower():  # a hexadecimal number
         return float(int(number, 16))
