@@ -37,7 +37,7 @@ _KEY = r"""(?:[0-9]+(?=[^\W\d_]))?(?![0-9()\[\]+.*$|&/-]|#[0-9])(?>(?:[^\s:=,;|&
 _INDEX = r"\[\w*\](?!\s*[,;]?\s*(?:$|[^\W\d]))"  # not the value in `C[7] A[3]`, which stands before a name or the end
 
 _TIME = (
-    r"(?<![\w.:])(?:[0-9]{1,4}[-/.][0-9]{1,2}[-/.][0-9]{1,4}[T ,;]+)?"  # a date
+    r"(?:[0-9]{1,4}[-/.][0-9]{1,2}[-/.][0-9]{1,4}[T ,;]+)?"  # a date
     r"[0-9]{1,2}:[0-9]{2}:[0-9]{2}"
 )
 """Regular expression of a time in whole seconds, with or without a date."""
@@ -52,8 +52,8 @@ _NUMBER = r"(?>[-+]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|(?<!
 """Regular expression of a decimal number, which also matches `nan`, `inf` and the `ovf` of Arduino."""
 
 _PATTERNS = {
-    "coarse_time": f"{_TIME}(?!{_FRACTION}{_ZONE}){_ZONE}",  # whole seconds, which are too coarse for a clock
-    "time": f"{_TIME}{_FRACTION}?{_ZONE}",  # some programs omit a fraction that is zero
+    "coarse_time": rf"(?<![\w.:]){_TIME}(?!{_FRACTION}{_ZONE}){_ZONE}",  # whole seconds, too coarse for a clock
+    "time": rf"(?<![\w.:]){_TIME}{_FRACTION}?{_ZONE}",  # some programs omit a fraction that is zero
     "uptime": r"(?<=\b[EWIDV]\s\()[0-9]+(?=\))",
     "key": rf"(?<=^\$)\w+|(?:{_KEY}|{_QUOTED})(?=\s*[:=])",
     "quoted": f"(?:{_QUOTED})",
@@ -230,7 +230,7 @@ def _has_decimal_commas(text: str) -> bool:
     - Nothing else separates two numbers. In `A:4,3`, it is a decimal comma, because a name belongs to one number.
     - The line has brackets, and not every number has a name with a colon or an equals sign before it.
     """
-    text = re.sub(f"{_TIME}{_FRACTION}?", "", text)
+    text = re.sub(f"{_TIME}{_FRACTION}?(?:{_ZONE})?", "", text)
     number_count = len(re.findall("[0-9]+(?:,[0-9]+)?", text))
     comma_count = len(re.findall("[0-9],[0-9]", text))
     named_count = len(re.findall(r"[:=]\s*[-+]?[0-9]+,[0-9]", text))
