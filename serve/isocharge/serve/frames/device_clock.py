@@ -157,8 +157,8 @@ class DeviceClock:
         """Compute the time of a frame from the clock of the device, and write it into the frame.
 
         If the clock went back by at most `MAX_DELAY_s`, the reading arrived late: for example, another datagram has
-        overtaken it. If the clock went back by more, the device has restarted. A clock that went back by at least half
-        of its range seems to have wrapped.
+        overtaken it. If the clock went back by more, the device has restarted. However, if the clock went back by at
+        least half of its range, it is assumed to have wrapped.
 
         Args:
             frame: The frame, which is changed in place.

@@ -113,7 +113,7 @@ class AutoParser(Parser):
         return TextParser(self._columns, self._meanings)
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Return the frames that end within `data`.
+        """Return the frames whose last byte is in `data`.
 
         Until the format is recognised, the data are passed to the parsers of all formats. The first parser that finds a
         frame receives all further data. The description of the format and the moduli of the counter and the clock are

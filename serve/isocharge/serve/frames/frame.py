@@ -445,7 +445,7 @@ class StuffedParser(DelimitedParser):
         self._decode = decode
 
     def _parse_piece(self, piece: bytes) -> list[Frame]:
-        """Decode the bytes between two delimiters, and return a list with the frame, which is empty without bytes."""
+        """Decode the bytes between two delimiters, and return the frame in a list. Without bytes, the list is empty."""
         if not piece:
             return []
         frame = self._decode(piece)

@@ -379,12 +379,12 @@ def _alternating_names(parts: list[_Part], *, has_header: bool) -> list[str]:
 
 
 def _preceding_names(parts: list[_Part], counters: Container[str]) -> list[str]:
-    """Return the names of the numbers. A number without a name has an empty text.
+    """Return the name of each number, which is an empty text for a number without a name.
 
     The name of a number is the nearest word or key before the number, as in `A: 3.5`, `A -> 3.5` and `<A>3.5</A>`. The
     name must stand behind the previous number and behind the previous separator. If several numbers have the same
-    nearest word, as in `{"A": {"pC": 3.5}, "B": {"pC": 4.1}}`, the word before it is the name. A name that still occurs
-    several times is removed. In these cases, words are not names, either:
+    nearest word, as in `{"A": {"pC": 3.5}, "B": {"pC": 4.1}}`, the word before this word is the name. A name that still
+    occurs several times is removed. Words are not taken for names in these cases, either:
 
     - If no word stands before the first number, but one stands behind the last number, the words are units.
     - If only one of several numbers would have a name, as in `Data: 3.5, 4.1`, the word is taken for a label of the

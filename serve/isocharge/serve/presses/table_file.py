@@ -163,7 +163,9 @@ class CsvTable:
                 raise self._header_error(f"{advice}; missing", [name])
 
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
-        """Convert the cells of the requested columns to numbers, row by row, without checking the numbers.
+        """Convert the cells of the requested columns to numbers, row by row.
+
+        Whether the numbers lie in the ranges of their columns is not checked here.
 
         Raises:
             InputError: If there are too many rows, a row has the wrong number of cells, a cell is not a finite number,
@@ -174,9 +176,10 @@ class CsvTable:
         line_numbers = array("q")
         numbers = array("d")  # the numbers of the first row, then the numbers of the second row, and so on
         for index, (line_number, cells) in enumerate(self._rows):
-            if index == 0 and _is_row_of_units([cells[i] for i in column_indices.values() if i < len(cells)]):
+            requested_cells = [cells[i] for i in column_indices.values() if i < len(cells)]
+            if index == 0 and _is_row_of_units(requested_cells):
                 continue
-            if len(line_numbers) == max_rows:  # this row is one row too many
+            if len(line_numbers) == max_rows:  # the arrays already contain as many rows as are allowed
                 raise self.error(f": expected at most {max_rows:,} presses, got more; split the file")
             self._check_cell_count(line_number, cells)
             line_numbers.append(line_number)

@@ -115,7 +115,8 @@ class Touch(Stage):
         self._setup = setup
         rule = setup.device.rule(TouchRule)
         self._rule = None if rule is None else rule.resolved(has_currents=setup.device.has_currents)
-        # Direction of the charges without an earlier touch, by whether they may have any sign; zero if they may
+        # Expected direction of the charges without an earlier touch. The keys state whether touches may have charges of
+        # any sign. If so, the zero vector accepts every direction.
         n_electrode = len(setup.electrodes)
         self._rest_directions = {False: np.ones(n_electrode), True: np.zeros(n_electrode)}
         self._noise_pC: Array | None = None  # noise of the latest tare
@@ -188,7 +189,8 @@ class Touch(Stage):
         A touch begins if both the charges and the charges above the base exceed the threshold in the expected
         direction. The base decays to zero. If the charges change against this direction, the base becomes the mean of
         the latest charges. While charges of the latest touch may remain, the expected direction is that of the latest
-        touch. Later, the direction is the one that all touches share, or zero if a touch may have any direction.
+        touch. Later, it is that of equal positive charges. If touches may have charges of any sign, it is the zero
+        vector, with which every direction is accepted.
 
         Args:
             frame: The frame.

@@ -90,12 +90,12 @@ class ContactHypothesis(NamedTuple):
     probability: float
 
     def values_after(self, dt_s: float) -> tuple[float, float, float]:
-        """Return x, mm, y, mm, and the force, N, after a time, s, in which the rates are constant."""
+        """Return x (mm), y (mm) and the force (N) a time `dt_s` later, if the rates stay constant."""
         x_mm, y_mm, log_force = (self.mean[VALUES] + dt_s * self.mean[RATES]).tolist()
         return x_mm, y_mm, math.exp(log_force)
 
     def contact_after(self, dt_s: float, misfit: float) -> Contact:
-        """Return the contact, with a given misfit, after a time, s, in which the growth of the covariance is small."""
+        """Return the contact a time `dt_s` later. The time is so short that the covariance is taken as constant."""
         x_mm, y_mm, force_N = self.values_after(dt_s)
         std = np.sqrt(self.covariance.diagonal()[VALUES])  # of x, y and ln F
         correlations = (self.covariance[VALUES, VALUES] / np.outer(std, std))[np.triu_indices(3, 1)]

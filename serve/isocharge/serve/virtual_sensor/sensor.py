@@ -221,8 +221,8 @@ class VirtualSensor:
         Returns:
             The bytes that the sensor sends; empty if the frame is lost because of a fault.
         """
-        # A random number is drawn only if random frames are to be lost. Otherwise, it would change the noise that
-        # belongs to the seed.
+        # Draw a random number only if frames are to be lost at random. An additional number would change the noise of
+        # all later frames, which only the seed is meant to determine.
         lose_share = self._faults.lose_share
         if lose_share > 0.0 and self._rng.random() < lose_share:
             return b""

@@ -302,10 +302,10 @@ def node_counts(film: Film) -> tuple[NodeCount, ...]:
 
 
 def spread_check_presses(domain: Domain, count: int) -> tuple[Array, Array]:
-    """Return presses, distributed over the distances and forces of a domain, at which an interpolation is checked.
+    """Return presses at which an interpolation is checked. They are spread over the area and the forces of a domain.
 
-    The last press lies at the largest distance. The distances of the other presses are the square roots of Chebyshev
-    nodes. The square root distributes the presses over the area of the disk.
+    The last press lies at the largest distance from the centre. The squared distances of the other presses are
+    Chebyshev nodes, because the area of a disk is proportional to its squared radius.
 
     Args:
         domain: Domain of the family that is checked.
@@ -315,16 +315,17 @@ def spread_check_presses(domain: Domain, count: int) -> tuple[Array, Array]:
         Contacts (x, y, F), shape (count, 3), mm and N. Rotations of the probe in addition to its own orientation, shape
         (count,), rad.
     """
-    number = np.arange(float(count))
-    distance = domain.radius * np.append(np.sqrt(chebyshev_nodes(count - 1, 0.0, 1.0)), 1.0)
+    press_index = np.arange(float(count))
+    squared_distance = np.append(chebyshev_nodes(count - 1, 0.0, 1.0), 1.0)  # relative to the squared radius
+    distance = domain.radius * np.sqrt(squared_distance)
 
     # Multiples of the golden ratio (0.618), modulo 1, distribute the logarithms of the forces evenly.
-    force = log_spaced_forces((0.5 + 0.618 * number) % 1.0, domain.force_range)
+    force = log_spaced_forces((0.5 + 0.618 * press_index) % 1.0, domain.force_range)
 
     # The golden angle (2.4 rad) distributes the directions evenly. The rotation of the probe changes by a different
     # angle, so that the rotation and the direction are independent.
-    position = distance * np.exp(2.4j * number)
-    rotation = 0.7 * number
+    position = distance * np.exp(2.4j * press_index)
+    rotation = 0.7 * press_index
     return np.column_stack([position.real, position.imag, force]), rotation
 
 

@@ -309,12 +309,12 @@ class Turns:
 
 
 def _lattice(harmonics: Integers, symmetry_order: int) -> tuple[int, int]:
-    """Find the smallest lattice of turns at which no two harmonics have the same values.
+    """Find the smallest lattice of turns on which any two harmonics differ in at least one value.
 
-    The lattice has n turns and the step s. At the turn j, the direction of the press is pi s j / n, and the rotation of
-    the probe is 2 pi j / n. The harmonic (m, k) of these angles has the phase 2 pi (m s + k) j / n. Two harmonics
-    therefore have the same values at all turns if and only if the remainders of m s + k after the division by n are
-    equal.
+    A turn is a pair of the direction of a press and the rotation of the probe. The lattice has n turns and the step s.
+    At the turn j, the direction of the press is pi s j / n, and the rotation of the probe is 2 pi j / n. The harmonic
+    (m, k) of these angles has the phase 2 pi (m s + k) j / n. Two harmonics therefore have the same values at all turns
+    if and only if the remainders of m s + k after the division by n are equal.
 
     While the rotation increases by one period of the probe, the direction must increase by the same angle plus a
     multiple of half a turn. The difference s - 2 is therefore a multiple of the symmetry order.

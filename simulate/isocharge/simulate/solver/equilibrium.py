@@ -207,8 +207,8 @@ def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
     Returns:
         Smallest and largest principal stress, MPa, tension positive.
     """
-    # Compute the scaled principal stresses without the mean pretension. The uneven part of the pretension is added
-    # before, because it changes the directions of the principal stresses.
+    # Compute the principal stresses, scaled and without the mean pretension. The stress tensor includes the uneven part
+    # of the pretension, because this part changes the directions of the principal stresses.
     uneven_tension = equilibrium.groups.uneven_tension
     without_rest = replace(equilibrium, rest=None)  # so that the stress before the contact is not subtracted
     smallest, largest = principal_stresses(nodal_stress(without_rest) + uneven_tension)
@@ -220,8 +220,9 @@ def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
 
     # Convert the stresses to MPa, and add the mean pretension, which is the same in all directions.
     stress_unit = equilibrium.film.young * equilibrium.groups.squared_amplitude
-    mean_pretension = equilibrium.film.pretension
-    return stress_unit * smallest + mean_pretension, stress_unit * largest + mean_pretension
+    smallest_MPa = stress_unit * smallest + equilibrium.film.pretension
+    largest_MPa = stress_unit * largest + equilibrium.film.pretension
+    return smallest_MPa, largest_MPa
 
 
 def node_slopes(equilibrium: Equilibrium) -> Array:

@@ -355,9 +355,9 @@ def _cross_validated_answers(
     """Estimate the contact and the misfit of each press without using the presses of its fold.
 
     The folds are the parts into which a cross-validation divides the presses. The contact is the answer of a network
-    that was not trained on the press. The misfit is the length of the difference
-    between the level of the press and the level of the most similar contact. Near each press of the other folds, the
-    levels of contacts are approximated by linear functions (planes).
+    that was not trained on the press. The misfit is the length of the difference between the level of the press and the
+    level of the most similar contact. This contact is searched on planes: near each press of the other folds, the level
+    is approximated by a linear function of the contact.
 
     Args:
         fold_networks: Networks, one for each fold, which were trained on the presses of all other folds.
