@@ -61,7 +61,10 @@ def propose(
     is_in_pC = unit_of(capture, positions.values()) == "pC"
     if gain or has_large_offset or not is_in_pC:
         table["gain"] = {"offset": offset} if any(offset.values()) else {}
-        table["gain"] |= gain or ({"pC_per_unit": 1.0} if is_in_pC else {})
+        if gain:
+            table["gain"] |= gain
+        elif is_in_pC:
+            table["gain"]["pC_per_unit"] = 1.0
     return table
 
 

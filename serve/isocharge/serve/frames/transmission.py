@@ -12,7 +12,7 @@ CRC algorithms (Cook, https://reveng.sourceforge.io/crc-catalogue/).
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import reduce
 from operator import xor
 from typing import Literal, NamedTuple
@@ -130,12 +130,14 @@ checksum `sum-8/inverted` is the sum of the bytes with every bit inverted.
 """
 
 
-CRCS = {
-    match.expand(r"crc-\1/\2").lower().rstrip("/"): Checksum(anycrc.Model(match[0]).calc, int(match[1]) // 8)
-    for match in map(re.compile("CRC(8|16|24|32)(?:-(.+))?").fullmatch, (*anycrc.models, *anycrc.aliases))
-    if match is not None
-}
-"""Each CRC of one to four bytes by its names, such as `crc-16/modbus` for the `CRC16-MODBUS` of `anycrc`."""
+def _crcs() -> Iterator[tuple[str, Checksum]]:
+    """Yield each CRC of one to four bytes and each of its names, such as `crc-16/modbus` for `CRC16-MODBUS`."""
+    for name in (*anycrc.models, *anycrc.aliases):
+        match = re.fullmatch(r"CRC(8|16|24|32)(?:-(.+))?", name)
+        if match is not None:
+            suffix = f"/{match[2].lower()}" if match[2] else ""
+            yield f"crc-{match[1]}{suffix}", Checksum(anycrc.Model(name).calc, int(match[1]) // 8)
 
-CHECKSUMS = {**SUMS, **CRCS}
+
+CHECKSUMS = {**SUMS, **dict(_crcs())}
 """All checksums, by name."""

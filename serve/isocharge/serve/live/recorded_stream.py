@@ -120,7 +120,8 @@ class RecordedStream:
         """
         try:
             for chunk in chunks:
-                self._current_chunk = None  # is recorded; a recording that begins now does not contain this chunk
+                # The previous chunk was recorded. A recording that a request begins now must not contain it.
+                self._current_chunk = None
                 while self._requests:
                     execute_request = self._requests.popleft()
                     execute_request()
@@ -140,11 +141,11 @@ class RecordedStream:
                     self._record_chunk()
             self._stream.finish()
         finally:
-            self._record_chunk()  # has an effect only after an interruption
+            self._record_chunk()  # if an interruption has prevented it
             self._end_recording()
 
     def _record_chunk(self) -> None:
-        """Write the latest chunk and its records to the recording. A chunk that is recorded is not written again."""
+        """Write the latest chunk and its records to the recording. The recorder does not write a chunk twice."""
         if self.recorder is not None and self._current_chunk is not None:
             chunk, records = self._current_chunk
             self.recorder.chunk(chunk, [record.to_json() for record in records])

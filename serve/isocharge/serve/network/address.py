@@ -34,7 +34,7 @@ class Address:
         """Open a Unix socket or a TCP socket that listens on this address, and return the socket.
 
         Raises:
-        ListenError: If the address is in use or cannot be used. The message states what to do.
+            ListenError: If the address is in use or cannot be used. The message states what to do.
         """
         try:
             if self.uds is not None:

@@ -229,8 +229,8 @@ class MotionFilter:
         posterior = self.probability * likelihood
         self.probability = np.maximum(posterior / posterior.sum(), np.finfo(float).tiny)
 
-        # Apply the Kalman update to each mode. The last statement is zero except for rounding errors: it completes the
-        # short form of the covariance to the form of Joseph, whose variances do not become negative.
+        # Apply the Kalman update to each mode. Without rounding errors, the last statement would add zero. It turns the
+        # short form of the updated covariance into the form of Joseph, whose variances do not become negative.
         gain = self.covariance[:, :, VALUES] @ precision
         self.mean += (gain @ innovation)[:, :, 0]
         self.covariance -= gain @ self.covariance[:, VALUES]

@@ -32,13 +32,14 @@ from isocharge.serve.network.protocol.inference import InferBody, Json, infer, t
 from isocharge.serve.network.protocol.response import refusal
 from isocharge.serve.network.protocol.routes import ROUTES, Request
 
-(_PROTOCOL_FILE,) = FileDescriptorSet.FromString(files(__package__).joinpath("inference.binpb").read_bytes()).file
-_DESCRIPTOR = (
-    DescriptorPool().AddSerializedFile(_PROTOCOL_FILE.SerializeToString()).services_by_name["GRPCInferenceService"]
-)
-
-SERVICE = _DESCRIPTOR.full_name
+SERVICE = "inference.GRPCInferenceService"
 """Full name of the gRPC service."""
+
+_COMPILED_PROTOCOL = files(__package__).joinpath("inference.binpb").read_bytes()
+(_PROTOCOL,) = FileDescriptorSet.FromString(_COMPILED_PROTOCOL).file
+_POOL = DescriptorPool()
+_POOL.Add(_PROTOCOL)
+_DESCRIPTOR = _POOL.FindServiceByName(SERVICE)
 
 METHODS = {
     method.name: (GetMessageClass(method.input_type), GetMessageClass(method.output_type))
