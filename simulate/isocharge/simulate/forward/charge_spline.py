@@ -253,9 +253,8 @@ def _fit_disk(forward_map: ForwardMap, force: Array, spacing: float) -> "scipy.i
     # Solve the normal equations. Their matrix is positive definite, so the factorisation needs no pivoting.
     normal_matrix = (design.T @ design + penalty.T @ penalty).tocsc()
     right_side = np.ascontiguousarray(design.T @ values.reshape(len(position), -1))
-    coefficients = (
-        factorise(normal_matrix, "MMD_AT_PLUS_A").solve(right_side).reshape(axis_count, axis_count, *values.shape[1:])
-    )
+    solution = factorise(normal_matrix, "MMD_AT_PLUS_A").solve(right_side)
+    coefficients = solution.reshape(axis_count, axis_count, *values.shape[1:])
     return scipy.interpolate.NdBSpline(knots, coefficients, cubic_degree)
 
 
