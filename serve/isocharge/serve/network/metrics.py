@@ -3,9 +3,9 @@
 The objects of the package `prometheus_client` are the only counters. A request updates them in a few microseconds.
 Prometheus reads the counters, and so do the statistics of Triton's protocol.
 
-The log line of a request contains no text that a client has sent. The names of routes, models, statuses and errors are
-defined by this server, and the address of the client comes from the operating system. A client therefore cannot forge a
-log line, fill the disk with long lines, or create new counters.
+The log line of a request contains no text that a client has sent. The names of routes and statuses are defined by this
+server, and the address of the client comes from the operating system. A client therefore cannot forge a log line, fill
+the disk with long lines, or create new counters.
 """
 
 import json
@@ -98,8 +98,6 @@ class Exchange:
         transport: Transport of the request, which is "http" or "grpc".
         route: Name of the route, or "none" if the request could not be read.
         status: HTTP status, or name of the gRPC status. "CANCELLED" if the client has ended a call of gRPC.
-        model: Label `name/version` of the requested model, or None if no loaded model was requested.
-        error: Name of the type of the error, or None if no error occurred.
         duration_us: Time from the complete request to the complete response, us.
         client: Address and port of the client.
     """
@@ -107,8 +105,6 @@ class Exchange:
     transport: str
     route: str = "none"
     status: int | str = "CANCELLED"
-    model: str | None = None
-    error: str | None = None
     duration_us: float = 0.0
     client: str | None = None
 

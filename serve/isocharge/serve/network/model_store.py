@@ -114,11 +114,6 @@ class ModelStore:
         reasons = dict.fromkeys(self.refusals(name, version))  # without repetitions
         raise ModelNotFound("; ".join([f"model {label!r:.200} is not found", f"serving: {available}", *reasons]))
 
-    def label(self, name: str = "", version: str = "") -> str | None:
-        """Return the label `name/version` of the version that `get` returns, or None if the version is not loaded."""
-        versions = self.versions_of(name, version)
-        return versions[-1].metadata.label if versions else None
-
     def versions_of(self, name: str | None = None, version: str = "") -> list[LoadedVersion]:
         """Return loaded versions, sorted by name and number.
 

@@ -26,7 +26,6 @@ from google.protobuf.message_factory import GetMessageClass
 
 from isocharge.common.errors import ModelError, RequestError
 from isocharge.common.structs import convert
-from isocharge.serve.network.metrics import Exchange
 from isocharge.serve.network.protocol.handler import Handler
 from isocharge.serve.network.protocol.inference import InferBody, Json, infer, take_binary_tensor
 from isocharge.serve.network.protocol.response import refusal
@@ -154,7 +153,7 @@ class Service:
             call.route = name
             try:
                 self._limit_open_calls()
-                await self._answer(name, context, call)
+                await self._answer(name, context)
                 call.status = "OK"
             except grpc.aio.InternalError as error:  # the client ended the call while a message was read or sent
                 raise asyncio.CancelledError from error
@@ -162,13 +161,12 @@ class Service:
                 is_late = isinstance(error, TimeoutError)
                 status, message = refusal(RequestError(TIMEOUT_MESSAGE, 408) if is_late else error)
                 call.status = GRPC_STATUSES[status]
-                call.error = type(error).__name__
             finally:
                 self._open_count -= 1
         if message:
             await context.abort(grpc.StatusCode[str(call.status)], message)
 
-    async def _answer(self, name: str, context: grpc.aio.ServicerContext, call: Exchange) -> None:
+    async def _answer(self, name: str, context: grpc.aio.ServicerContext) -> None:
         """Check the token, and answer the messages of a call.
 
         A call of the method `STREAM_METHOD` may contain any number of messages, and every other call contains one
@@ -179,7 +177,6 @@ class Service:
         Args:
             name: Name of the method.
             context: Context of the call, from which messages are read and to which responses are written.
-            call: Properties of the call for the counters and the log, which are updated.
 
         Raises:
             TimeoutError: If the client does not send a message or does not read a response in time.
@@ -191,22 +188,21 @@ class Service:
         timeout_s = self._handler.limits.header_seconds
         while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:
             if name.startswith("RepositoryModel"):  # loading a model takes a long time
-                response = await asyncio.to_thread(self._respond, name, data, call)
+                response = await asyncio.to_thread(self._respond, name, data)
             else:
-                response = self._respond(name, data, call)
+                response = self._respond(name, data)
             async with asyncio.timeout(self._handler.limits.body_seconds):
                 await context.write(response.SerializeToString())
             if name != STREAM_METHOD or self._is_stopping:
                 return
             timeout_s = self._handler.limits.idle_seconds
 
-    def _respond(self, name: str, data: bytes, call: Exchange) -> Any:
+    def _respond(self, name: str, data: bytes) -> Any:
         """Answer one message, and return the response.
 
         Args:
             name: Name of the method.
             data: The serialized message of the request.
-            call: Properties of the call, in which the model is set.
 
         Raises:
             RequestError: If the data are not a message of the expected type.
@@ -219,12 +215,6 @@ class Service:
             raise RequestError(
                 f"expected a {request_type.DESCRIPTOR.name}, got {len(data)} bytes of another kind"
             ) from error
-        # The name and the version of the model are called `model_name` and `model_version` in some messages of the
-        # protocol, and `name` and `version` in other messages. Messages about the server contain none of these fields.
-        model_name = getattr(request, "model_name", "") or getattr(request, "name", "")
-        model_version = getattr(request, "model_version", "") or getattr(request, "version", "")
-        call.model = self._handler.store.label(model_name, model_version)
-
         if name == STREAM_METHOD:
             try:
                 return response_type(infer_response=self._infer(request))
@@ -234,6 +224,10 @@ class Service:
         if name == "ModelInfer":
             return self._infer(request)
 
+        # The name and the version of the model are called `model_name` and `model_version` in some messages of the
+        # protocol, and `name` and `version` in other messages. Messages about the server contain none of these fields.
+        model_name = getattr(request, "model_name", "") or getattr(request, "name", "")
+        model_version = getattr(request, "model_version", "") or getattr(request, "version", "")
         # The body of the equivalent HTTP request has the same fields as the message.
         body = MessageToJson(request, preserving_proto_field_name=True).encode()
         equivalent = Request(self._handler.store, self._handler.traffic, {}, body, model_name, model_version)

@@ -110,18 +110,14 @@ class Application(ABC):
                     raise RequestError(f"expected a body of at most {limit} bytes, got more; send smaller batches", 413)
                 response = self._check_and_answer(method, path, header_values(headers), body)
             except Exception as error:  # every error is sent to the client
-                exchange.error = type(error).__name__
                 response = error_response(error)
             exchange.status = response.status
-            exchange.route, exchange.model = self._identify(path)
+            exchange.route = self._route_name(path)
         return response
 
-    def _identify(self, path: str) -> tuple[str, str | None]:  # noqa: ARG002
-        """Return the name of the route of a path, and the label of the model in the path, for the counters and the log.
-
-        By default, all requests are counted together.
-        """
-        return "page", None
+    def _route_name(self, path: str) -> str:  # noqa: ARG002
+        """Return the name under which a request is counted and logged. By default, it is the same for all requests."""
+        return "page"
 
     @abstractmethod
     def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
@@ -198,10 +194,10 @@ class Handler(Application):
         self.traffic = traffic or Traffic()
         self.traffic.registry.register(store)
 
-    def _identify(self, path: str) -> tuple[str, str | None]:
-        """Return the first path of the route, under which all paths of the route are counted, and the model's label."""
-        route, model = match_path(path)
-        return route.paths[0], self.store.label(**model) if self.traffic.log else None
+    def _route_name(self, path: str) -> str:
+        """Return the first path of the route of a request, under which all paths of the route are counted."""
+        route, _ = match_path(path)
+        return route.paths[0]
 
     def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
         """Check a request, and answer it with the function of its route."""
