@@ -18,7 +18,6 @@ answer has arrived and the connection is quiet.
 
 import importlib
 import io
-import logging
 import os
 import re
 import select
@@ -29,8 +28,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
-
-log = logging.getLogger(__name__)
 
 QUIET_TIME_s = 0.002
 """Silence after which an answer is considered complete, s. Two bytes take this time at 9600 baud."""
@@ -287,8 +284,6 @@ class UdpSocket:
         self._board_ends_lines = False  # whether the board ends its lines, although a line may need several datagrams
         self._datagrams_without_end = 0  # number of successive datagrams without a line feed
         self._is_text = False  # whether the latest datagram is text, which is valid UTF-8 without control characters
-        self._peer: tuple[str, int] | None = None  # sender of the latest datagram
-        self._has_warned = False  # whether a warning about a second sender was given
 
     def receive(self, timeout_s: float) -> bytes:
         """Wait for a datagram, and return it, or return all datagrams that have arrived if they are text.
@@ -317,15 +312,7 @@ class UdpSocket:
         """
         deadline_s = time.monotonic() + timeout_s
         while select.select([self._socket], [], [], max(0.0, deadline_s - time.monotonic()))[0]:
-            previous_peer = self._peer
-            data, self._peer = self._socket.recvfrom(MAX_READ_BYTES)
-            if previous_peer not in (None, self._peer) and not self._has_warned:
-                self._has_warned = True
-                log.warning(
-                    "datagrams from %s:%d and %s:%d are read as those of one board; give each board its own port",
-                    *previous_peer[:2],
-                    *self._peer[:2],
-                )
+            data = self._socket.recv(MAX_READ_BYTES)
             if data:
                 is_utf8 = data.decode("utf-8", "replace").encode() == data  # decoding replaces invalid bytes
                 self._is_text = is_utf8 and _CONTROL_CHARACTER.search(data.removesuffix(b"\0")) is None

@@ -9,8 +9,8 @@ A port is a device path or a URL that pyserial accepts, such as `/dev/ttyACM0`, 
 
 Other packages can add sources. A package that adds a source must declare an entry point in the group
 "isocharge.sources", whose name is the scheme of its URLs. The entry point must refer to a function that accepts a URL
-and returns a context manager of a `Source`. For example, this entry point in pyproject.toml adds URLs such as
-`can://vcan0`:
+and returns a context manager of a `Source`. A line of a recording can contain a chunk of up to 700 kB. For example,
+this entry point in pyproject.toml adds URLs such as `can://vcan0`:
 
     [project.entry-points."isocharge.sources"]
     can = "my_package:open_bus"
@@ -25,14 +25,13 @@ import os
 import sys
 import time
 from collections.abc import Iterator
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-from isocharge.common.errors import InputError, IsochargeError, PortError, PortLost
+from isocharge.common.errors import InputError, PortError, PortLost
 from isocharge.serve.port.file_source import STDIN, Chunk, FileSource, open_file
 from isocharge.serve.port.serial_line import (
-    MAX_READ_BYTES,
     OPEN_ERRORS,
     READ_ERRORS,
     UDP_SCHEME,
@@ -140,15 +139,14 @@ class Port:
         """
         is_path = "://" not in self.url
         path = Path(self.url)
-        with _permission_errors_converted(self.url):
-            if is_path and not path.exists():
-                raise PortError(f"{self.url}: there is no such port: plug the board in, check the name, or wait for it")
-            if is_path and path.is_file():
-                with open_file(path):  # raises another error for a file that does not come from a board
-                    raise InputError(
-                        f"{self.url}: expected a port, got a file; only `isocharge serve stream` reads the bytes of a "
-                        "board from a file"
-                    )
+        if is_path and not path.exists():
+            raise PortError(f"{self.url}: there is no such port: plug the board in, check the name, or wait for it")
+        if is_path and path.is_file():
+            with open_file(path):  # raises another error for a file that does not come from a board
+                raise InputError(
+                    f"{self.url}: expected a port, got a file; only `isocharge serve stream` reads the bytes of a "
+                    "board from a file"
+                )
         try:
             if self.url.startswith(UDP_SCHEME):
                 self._line = UdpSocket(self.url)
@@ -180,13 +178,10 @@ class Port:
     def __iter__(self) -> Iterator[Chunk]:
         """Yield chunks as they arrive. If the port is lost and `reconnect` is true, open the port again.
 
-        After two full chunks in succession, a warning is logged once, because more bytes were waiting after the first.
-
         Raises:
             PortLost: If the port disappears or stays silent for too long, and `reconnect` is false.
             PortError: If the port is not open.
         """
-        full_chunks = 0  # number in succession
         while True:
             wait_start_s = time.monotonic()
             try:
@@ -203,14 +198,6 @@ class Port:
                 log.warning("%s; trying again until it is back", error)
                 chunk = self._read_after_reconnecting()._replace(outage_s=time.monotonic() - wait_start_s)
             self._max_silence_s = self._silence_s
-            if full_chunks < 2:
-                full_chunks = full_chunks + 1 if len(chunk.data) >= MAX_READ_BYTES else 0
-                if full_chunks == 2:
-                    log.warning(
-                        "%s: the program reads more slowly than the board sends: records are late; do less for each "
-                        "record, or lower the frame rate",
-                        self.url,
-                    )
             yield chunk
 
     def read(self, timeout_s: float) -> Chunk | None:
@@ -259,15 +246,6 @@ class Port:
         return chunk
 
 
-@contextlib.contextmanager
-def _permission_errors_converted(url: str) -> Iterator[None]:
-    """If the folder of a path cannot be read in the `with` block, raise a `PortError`."""
-    try:
-        yield
-    except PermissionError as error:
-        raise PortError(f"{url}: its folder cannot be read ({error.strerror}); ask for the right to read it") from error
-
-
 def has_speed(url: str) -> bool:
     """Return whether a port has a baud rate. Sockets and pseudo-terminals have no baud rate."""
     return "://" not in url and not os.path.realpath(url).startswith("/dev/pts/")
@@ -290,64 +268,6 @@ class Source(Protocol):
         """Yield chunks as they arrive, until the source ends."""
 
 
-class AddedSource:
-    """Source of another package, as a context manager whose errors name the package.
-
-    Attributes:
-        is_live: Whether bytes are lost if they are not read in time.
-    """
-
-    def __init__(self, url: str, entry_point: EntryPoint) -> None:
-        """Call the function with which another package opens this URL.
-
-        Args:
-            url: URL of the source.
-            entry_point: Entry point of the function.
-        """
-        self._name = f"{url}: cannot be read by {entry_point.value}"
-        with self._errors_named():
-            self._opened = entry_point.load()(url)
-
-    def __enter__(self) -> Self:
-        """Open the source."""
-        with self._errors_named():
-            self._source: Source = self._opened.__enter__()
-            self.is_live = self._source.is_live
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Close the source."""
-        with self._errors_named():
-            self._opened.__exit__(*error)
-
-    def __iter__(self) -> Iterator[Chunk]:
-        """Yield chunks as they arrive, until the source ends.
-
-        A chunk that is longer than the chunks of a port is divided, so that it fits in a line of a recording.
-        """
-        with self._errors_named():
-            for chunk in self._source:
-                for start in range(0, len(chunk.data), MAX_READ_BYTES):
-                    outage_s = chunk.outage_s if start == 0 else 0.0  # the outage ended with the first part
-                    yield chunk._replace(data=chunk.data[start : start + MAX_READ_BYTES], outage_s=outage_s)
-
-    @contextlib.contextmanager
-    def _errors_named(self) -> Iterator[None]:
-        """Convert errors of the other package in a `with` block, except errors of isocharge (context manager).
-
-        Raises:
-            InputError: If the block raises another error.
-        """
-        try:
-            yield
-        except IsochargeError:
-            raise
-        except Exception as error:
-            raise InputError(
-                f"{self._name} ({type(error).__name__}: {error}); correct or remove the package that adds these sources"
-            ) from error
-
-
 def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> contextlib.AbstractContextManager[Source]:
     """Return a context manager that opens a port, a file or the standard input as a source of chunks.
 
@@ -360,8 +280,7 @@ def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> context
 
     Raises:
         InputError: If the file cannot be read, or is a recording, a table or another file that does not come from a
-            board; or if a package that adds sources cannot open the URL.
-        PortError: If the folder of the path cannot be read.
+            board.
     """
     if url == STDIN:
         return contextlib.nullcontext(FileSource(sys.stdin.fileno(), STDIN))
@@ -369,15 +288,15 @@ def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> context
     scheme, separator, _address = url.partition("://")
     is_path = not separator
     for entry_point in () if is_path else entry_points(group=ENTRY_POINTS, name=scheme):
-        return AddedSource(url, entry_point)
+        added_source: contextlib.AbstractContextManager[Source] = entry_point.load()(url)
+        return added_source
 
     # Wait until the path exists, because the type of a missing path (a file or a port) is unknown.
     path = Path(url)
     deadline_s = time.monotonic() + wait
-    with _permission_errors_converted(url):
-        while is_path and not path.exists() and time.monotonic() < deadline_s:
-            time.sleep(RETRY_PAUSE_s)
-        is_file = is_path and (path.is_file() or path.is_fifo())  # false for a device, and if the path does not exist
+    while is_path and not path.exists() and time.monotonic() < deadline_s:
+        time.sleep(RETRY_PAUSE_s)
+    is_file = is_path and (path.is_file() or path.is_fifo())  # false for a device, and if the path does not exist
     if is_file:
         return open_file(path)
     remaining_s = max(0.0, deadline_s - time.monotonic())
