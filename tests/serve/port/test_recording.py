@@ -1,14 +1,11 @@
 """Files of recordings: their content, incomplete last lines, and files that are refused."""
 
 import json
-import re
 
 import pytest
 
 from isocharge.common.errors import OutputError, OutputExists, RecordingError
-from isocharge.common.progress import listening
 from isocharge.serve import Chunk, Recorder, Recording
-from isocharge.serve.port import recording as recording_module
 
 CHUNKS = [
     Chunk(bytes([number, 255 - number]), 1e9 + 0.1 * number, 1000 * number, outage_s=1.5 if number == 3 else 0.0)
@@ -123,13 +120,3 @@ def test_error_message_contains_the_number_of_a_damaged_line(recorded, line):
     with pytest.raises(RecordingError, match="line 6: damaged") as caught:
         list(Recording(recorded).events())
     assert len(str(caught.value)) < 600
-
-
-def test_reading_reports_progress_after_each_thousand_lines(recorded, monkeypatch):
-    monkeypatch.setattr(recording_module, "PROGRESS_LINES", 3)
-    reports = []
-    with listening(lambda *report: reports.append(report[:3])):
-        list(Recording(recorded).events())
-    text = recorded.read_text()
-    ends = [match.end() for match in re.finditer("\n", text)]
-    assert reports == [("reading", end, len(text)) for end in ends[1::3]]

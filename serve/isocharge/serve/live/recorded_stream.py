@@ -52,8 +52,8 @@ class RecordedStream:
         self.recorder = recorder
         self._latest_recorder = recorder  # recorder of the latest request, which may not have been executed yet
         self._opened_recorder = ExitStack()  # closes the present recorder if it was opened on request
-        # The latest chunk and its records, which may not be recorded yet
-        self._current_chunk: tuple[Chunk, list[PredictionRecord]] | None = None
+        # The latest chunk and its records, if they have not been recorded yet
+        self._unrecorded: tuple[Chunk, list[PredictionRecord]] | None = None
         self._requests: deque[Callable[[], None]] = deque()
         self._preamble = b""  # chunks up to the one with the first frame, which show the layout of the frames
         self._is_recording_new = False  # whether the present recording was requested and has no chunk yet
@@ -120,8 +120,6 @@ class RecordedStream:
         """
         try:
             for chunk in chunks:
-                # The previous chunk was recorded. A recording that a request begins now must not contain it.
-                self._current_chunk = None
                 while self._requests:
                     execute_request = self._requests.popleft()
                     execute_request()
@@ -133,21 +131,25 @@ class RecordedStream:
                 # If the caller closes the generator at a `yield`, the chunk must be recorded with the records that were
                 # yielded until then. Chunk and records are therefore stored for `_record_chunk`.
                 records: list[PredictionRecord] = []
-                self._current_chunk = (chunk, records)
+                self._unrecorded = (chunk, records)
                 for record in self._stream.feed(chunk):
                     records.append(record)
                     yield record
-                if self.recorder is not None:
-                    self._record_chunk()
+                self._record_chunk()
             self._stream.finish()
         finally:
             self._record_chunk()  # if an interruption has prevented it
             self._end_recording()
 
     def _record_chunk(self) -> None:
-        """Write the latest chunk and its records to the recording. The recorder does not write a chunk twice."""
-        if self.recorder is not None and self._current_chunk is not None:
-            chunk, records = self._current_chunk
+        """Write the latest chunk and its records to the recording, unless this was done or tried before.
+
+        If Ctrl-C interrupts the writing, the chunk is missing in the recording.
+        """
+        unrecorded = self._unrecorded
+        self._unrecorded = None
+        if self.recorder is not None and unrecorded is not None:
+            chunk, records = unrecorded
             self.recorder.chunk(chunk, [record.to_json() for record in records])
 
     def _begin_recording(self, recorder: Recorder | None) -> None:

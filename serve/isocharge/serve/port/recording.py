@@ -26,7 +26,6 @@ from msgspec.json import encode
 
 from isocharge.common.errors import RecordingError, cut, is_printable
 from isocharge.common.files import AtomicWriter, StrPath, as_output_errors, bounded_lines
-from isocharge.common.progress import report
 from isocharge.common.structs import WrongKey, parse_json
 from isocharge.serve.model.metadata import ModelLabel
 from isocharge.serve.port.file_source import RECORDING_START, Chunk, Moment, foreign_kind
@@ -39,9 +38,6 @@ KIND = "isocharge_recording"
 
 LONGEST_ENTRY = 1 << 20
 """Length of the longest line, characters. A chunk of 64 KiB in base64 has a tenth of this length."""
-
-PROGRESS_LINES = 1000
-"""Number of lines between two reports of the progress of reading."""
 
 Latency = Annotated[float, Meta(ge=-1e12, le=1e12, description="a latency of some days at most, us")]
 
@@ -91,8 +87,6 @@ class Recorder:
         header = {KIND: VERSION, "model": model, "device": dict(device)} | ({"name": name} if name else {})
         self._first_line = json.dumps(header)
         parse_json(self._first_line, "recording", RecordingError, _Header)
-        self._last_chunk: Chunk | None = None  # chunk of the latest call of `chunk`
-        self._size_before_last_chunk = 0  # size of the file before the last chunk was written, bytes
 
     def open(self) -> None:
         """Create the file, and write its first line.
@@ -117,19 +111,11 @@ class Recorder:
     def chunk(self, chunk: Chunk, records: list[str]) -> None:
         """Write a chunk and the records that were computed from it.
 
-        If Ctrl-C interrupts a call, the caller passes the same chunk again. If the interrupted call has already written
-        the chunk, the file has grown, and the second call writes nothing.
-
         Args:
             chunk: The chunk.
             records: Records of the frames in the chunk, each as a line of JSON.
         """
-        is_same_chunk = chunk is self._last_chunk
-        if is_same_chunk and self._file.tell() > self._size_before_last_chunk:
-            return
         chunk_line = encode({"chunk": chunk}).decode()
-        self._last_chunk = chunk
-        self._size_before_last_chunk = self._file.tell()
         self._write("\n".join([chunk_line, *records]))
 
     def event(self, **event: bool | str | Marker) -> None:
@@ -248,7 +234,7 @@ class Recording:
         return self._parsed_lines(record_type, beginning='{"timestamp"')  # only records begin in this way
 
     def _parsed_lines(self, line_type: type[Line], beginning: str = "") -> Iterator[Line]:
-        """Parse the lines after the first line, yield their content, and report the progress of reading.
+        """Parse the lines after the first line, and yield their content.
 
         An incomplete last line is ignored, because writing it was interrupted.
 
@@ -261,8 +247,6 @@ class Recording:
             RecordingError: If a line other than the last line is damaged.
         """
         line_number = 1
-        read_characters = 0  # about the number of bytes, because nearly all characters have one byte
-        file_bytes = self._path.stat().st_size
         try:
             with self._path.open(encoding="utf-8", errors="replace") as file:
                 for line in bounded_lines(file, LONGEST_ENTRY):
@@ -274,9 +258,6 @@ class Recording:
                     if is_selected and not is_header:
                         yield parse_json(line, "", RecordingError, line_type)
                     line_number += 1
-                    read_characters += len(line)
-                    if line_number % PROGRESS_LINES == 0:
-                        report("reading", min(read_characters, file_bytes), file_bytes)
         except (OSError, ValueError) as error:
             raise RecordingError(f"{self._path}, line {line_number}: damaged ({cut(str(error))})") from error
 
