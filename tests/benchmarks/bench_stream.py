@@ -60,7 +60,7 @@ def play(predictor: Predictor, seconds: float, rate_Hz: float, seed: int) -> dic
     pipe.send("enough")
     played = pipe.recv()
     process.join()
-    return asdict(path.totals()) | {
+    return asdict(path.parser.counts) | {
         "board": played,
         "last_byte_to_record_us": percentiles(latencies, (50, 99, 99.9)),
         "core_share": round(used / wall, 3),

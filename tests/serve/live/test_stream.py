@@ -144,4 +144,4 @@ def test_board_that_restarts_has_the_flag_restart_by_its_clock(predictor, number
         line = f"{number.format(i % 457 % 256)}t_us={5000 * (i % 457)} A=0.1 B=0.2 C=0.3\n".encode()
         flags += [record.flags for record in touch.feed(Chunk(line, 1e9 + 0.005 * i, 5_000_000 * i))]
     assert [index for index, words in enumerate(flags) if "restart" in words] == [457]
-    assert touch.totals().restarts == 1
+    assert touch.parser.counts.restarts == 1

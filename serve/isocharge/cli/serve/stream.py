@@ -165,7 +165,7 @@ def say_missing_records(outputs: Outputs, state: str) -> None:
 
 def summary(touch: TouchStream) -> str:
     """Return the numbers of frames and faults of a stream."""
-    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in asdict(touch.totals()).items())
+    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in asdict(touch.parser.counts).items())
 
 
 def stream_command(
@@ -287,7 +287,7 @@ def stream_command(
     if outputs is None:
         say(f"{port}: the command was stopped before the port was open")
         raise typer.Exit(int(has_expired.is_set()))
-    has_no_frames = not touch.totals().frames
+    has_no_frames = not touch.parser.counts.frames
     if has_no_frames:
         say(f"no frames were recognised; {no_frames_hint(port, device)}")
     say_missing_records(outputs, "incomplete")

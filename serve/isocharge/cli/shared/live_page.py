@@ -207,7 +207,7 @@ class PageFeed:
             return
         recorder = self._stream.recorder if self._stream else None
         self._page.update(
-            counters=asdict(self._touch.totals()),
+            counters=asdict(self._touch.parser.counts),
             rate_Hz=self._page.tape.rate_Hz(),
             model=record.model,
             film=None if record.film is None else structs.asdict(record.film),

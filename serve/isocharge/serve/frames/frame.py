@@ -8,8 +8,7 @@ it never finds a frame.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, field
-from operator import add, sub
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from cobs import cobs
@@ -168,14 +167,6 @@ class FrameCounts:
     malformed: int = 0
     bytes_dropped: int = 0
     reconnects: int = 0
-
-    def __add__(self, other: "FrameCounts") -> "FrameCounts":
-        """Return the sum of each counter."""
-        return FrameCounts(*map(add, astuple(self), astuple(other)))
-
-    def __sub__(self, other: "FrameCounts") -> "FrameCounts":
-        """Return the difference of each counter."""
-        return FrameCounts(*map(sub, astuple(self), astuple(other)))
 
     def count_rejected(self, size: int, error: Exception | None = None) -> None:
         """Count bytes that the parser expected to be one frame, but has rejected.

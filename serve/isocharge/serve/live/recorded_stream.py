@@ -184,13 +184,12 @@ class RecordedStream:
         self._is_recording_new = False
         if not self._preamble:
             return chunk
-        totals = self._stream.totals()  # the first bytes, which are read again below, are already counted
         preamble = chunk._replace(data=self._preamble, outage_s=0.0)
         deque(self._stream.feed(preamble), maxlen=0)
-        self._stream.counts_before_restart = totals - self._stream.parser.counts
         if self.recorder is not None:  # the recording may have been ended before this chunk
             self.recorder.chunk(preamble, [])
-        return chunk._replace(outage_s=max(chunk.outage_s, RESTART_OUTAGE_s)) if totals.frames > 0 else chunk
+        has_frame = self._stream.parser.counts.frames > 0
+        return chunk._replace(outage_s=max(chunk.outage_s, RESTART_OUTAGE_s)) if has_frame else chunk
 
     def _end_recording(self) -> None:
         """End the present recording, and close its recorder unless the caller has opened the recorder."""

@@ -15,7 +15,7 @@ from functools import partial
 from isocharge.common.errors import ModelError, NoFramesError, shown
 from isocharge.serve.flags import RECONNECTED, REPEAT
 from isocharge.serve.frames.device_clock import DeviceClock
-from isocharge.serve.frames.frame import Frame, FrameCounts
+from isocharge.serve.frames.frame import Frame
 from isocharge.serve.live.device import ANY_BOARD, create_stages
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.file_source import Chunk
@@ -57,7 +57,6 @@ class ReadingStream:
     Attributes:
         parser: Parser that finds the frames in the bytes and counts them.
         clock: Clock of the device.
-        counts_before_restart: Counts of the time before the latest `restart`. `totals` adds the counts of the parser.
     """
 
     def __init__(
@@ -83,11 +82,13 @@ class ReadingStream:
         """
         self._device = device
         self._setup = Setup(electrodes, device, predictor, reader, has_any_sign=has_any_sign)
-        self.counts_before_restart = FrameCounts()
-        self._begin()
+        self.restart()
 
-    def _begin(self) -> None:
-        """Create the parser, the clock and the stages of a stream that has not received any byte."""
+    def restart(self) -> None:
+        """Return to the state of a new stream, so that all later results depend only on later bytes.
+
+        The parser, which also counts the frames, the clock and the stages are created anew.
+        """
         self.parser = self._device.parser()
         self.clock = DeviceClock()
         self._stages = create_stages(self._setup)
@@ -99,18 +100,6 @@ class ReadingStream:
         """Discard the tare and the present touch, and measure the tare again from the next quiet frames."""
         for stage in self._stages:
             stage.reset()
-
-    def restart(self) -> None:
-        """Return to the state of a new stream, so that all later results depend only on later bytes.
-
-        Only the counts that `totals` returns also include the frames before the restart.
-        """
-        self.counts_before_restart = self.totals()
-        self._begin()
-
-    def totals(self) -> FrameCounts:
-        """Return the counts of the stream since it began, including the counts before its latest restart."""
-        return self.counts_before_restart + self.parser.counts
 
     def frames(self, chunk: Chunk) -> Iterator[Frame]:
         """Process a chunk, pass each frame whose last byte it contains through all stages, and yield the frame.
@@ -244,9 +233,9 @@ class TouchStream(ReadingStream):
         self._given_name = frame_id
         super().__init__(predictor.metadata.electrodes, device, predictor=predictor)
 
-    def _begin(self) -> None:
-        """Begin a stream as in the base class, with stages that also compute contacts."""
-        super()._begin()
+    def restart(self) -> None:
+        """Return to the state of a new stream as in the base class, with stages that also compute contacts."""
+        super().restart()
         self._set_model(self.predictor)
 
     def _set_model(self, predictor: Predictor) -> None:
