@@ -72,7 +72,8 @@ def new_tracker(**settings):
 
 def track(tracker, contact, t_s, flags=(), charge_pC=None):
     """Process a frame with a tracker, and return the tracked contact and the event."""
-    frame = Frame(None, None, (), clock_s=t_s, flags=list(flags), charge_pC=charge_pC, contact=contact)
+    frame = Frame(None, None, (), flags=list(flags), charge_pC=charge_pC, contact=contact)
+    frame.dt_s = t_s - tracker._time_s
     frame.is_valid = INVALID not in flags
     tracker.step(frame)
     return frame.tracked, frame.event

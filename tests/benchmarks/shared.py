@@ -149,8 +149,9 @@ def track_contacts(tracker: Tracker, t_s: Array, contacts: Array, charge: Array)
     """
     tracker.reset()
     frames = []
-    for time_s, contact, charge_pC in zip(t_s.tolist(), contacts.tolist(), charge, strict=True):
-        frame = Frame(None, None, (), clock_s=time_s, charge_pC=charge_pC, contact=Contact(*contact))
+    steps_s = np.diff(t_s, prepend=t_s[:1]).tolist()
+    for step_s, contact, charge_pC in zip(steps_s, contacts.tolist(), charge, strict=True):
+        frame = Frame(None, None, (), dt_s=step_s, charge_pC=charge_pC, contact=Contact(*contact))
         tracker.step(frame)
         frames.append(frame)
     return frames

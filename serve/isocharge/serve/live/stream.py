@@ -249,9 +249,6 @@ class TouchStream(ReadingStream):
         contact_stages = create_stages(new_setup, needs_contact=True)
         self._setup.use(new_setup.model)
         charge_stages = [stage for stage in self._stages if not stage.needs_contact]
-        previous_stages = self._stages[len(charge_stages) :]  # empty when the stream begins
-        for stage, previous_stage in zip(contact_stages, previous_stages, strict=False):
-            stage.continue_touch(previous_stage)
         self._stages = charge_stages + contact_stages
         self.sections = tuple(stage.section for stage in contact_stages)
         self.predictor = predictor

@@ -224,12 +224,6 @@ class Stage(ABC):
     def reset(self) -> None:  # noqa: B027  # some stages have no state
         """Discard the state of the present touch, because the film is tared again."""
 
-    def continue_touch(self, previous: "Stage") -> None:  # noqa: B027  # most stages begin again
-        """Continue the touch of the stage that this stage replaces because the model changes.
-
-        Both stages have the same class. By default, the stage begins as if nothing touched the film.
-        """
-
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:
         """Return the settings of the stage for C by name, as numbers, truth values or arrays.

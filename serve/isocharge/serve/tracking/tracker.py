@@ -5,7 +5,6 @@ fold, a model predicts only the contacts on one side of the fold. On such a film
 contact directly from the charges.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -128,8 +127,7 @@ class Tracker(Stage):
                 # A contact of the mixture is valid in the whole area for which the file describes the charges.
                 validity = replace(predictor.validity, corners_mm=disk_corners(charges.domain.radius))
                 self._new_filter = partial(ContactMixture, charges, predictor.noise, validity)
-        self._time_s = 0.0  # time of the latest frame on a clock that is never set back
-        self._latest_clock_s = math.inf
+        self._time_s = 0.0  # time of the latest valid frame on a clock that is never set back
         self._events: TouchEvents | None = None  # None without a touch
         self.reset()
 
@@ -142,23 +140,15 @@ class Tracker(Stage):
         self._tracked: TrackedContact | None = None
         self._other: OtherContact | None = None  # another contact that also explains the charges
 
-    def continue_touch(self, previous: Stage) -> None:
-        """Continue the touch of the tracker of another model, so that the end of the touch is reported as an event."""
-        assert isinstance(previous, Tracker)
-        self._time_s = previous._time_s
-        self._latest_clock_s = previous._latest_clock_s
-        self._events = previous._events
-
     def step(self, frame: Frame) -> None:
         """Update the tracked contact with a frame, and add the tracked contact and its event to the frame.
 
         The previous tracked contact is used again if the frame is invalid, or if the filter returns no contact. After a
-        time without a contact of more than `MAX_GAP_s`, a new filter begins.
-
-        If the clock was set back, the touch continues. The time between the two frames is unknown and is not counted.
+        time without a contact of more than `MAX_GAP_s`, a new filter begins. If the clock was set back, the touch
+        continues, because the time between the two frames counts as 0.
         """
-        self._time_s += max(frame.clock_s - self._latest_clock_s, 0.0)
-        self._latest_clock_s = frame.clock_s
+        if frame.is_valid:
+            self._time_s += frame.dt_s
         if frame.contact is not None:
             if self._filter is None or self._time_s - self._filter.time_s > MAX_GAP_s:
                 self._filter = self._new_filter()
