@@ -45,18 +45,6 @@ class Script:
     contact: Array
     rate_Hz: float
 
-    def __post_init__(self) -> None:
-        """Check the shape of the contacts and the frame rate.
-
-        Raises:
-            SceneError: If the contacts have another shape than (n, 3), if n is 0, or if the frame rate is not positive.
-        """
-        if self.contact.ndim != 2 or self.contact.shape[1] != 3 or not len(self.contact) or not self.rate_Hz > 0.0:
-            raise SceneError(
-                "script: expected contacts (x, y, F) of shape (n, 3) with n above 0 and a positive rate, got the shape "
-                f"{self.contact.shape} and {self.rate_Hz} Hz"
-            )
-
     @property
     def touching(self) -> Booleans:
         """Whether something touches the film in each frame, shape (n,)."""
@@ -157,18 +145,8 @@ def wander(
         rate_Hz: Number of frames per second, Hz.
         radius_mm: Radius of the disk that contains all presses, mm.
         force_range_N: Smallest and largest force, N.
-
-    Raises:
-        SceneError: If an argument is outside its range.
     """
     min_force_N, max_force_N = force_range_N
-    has_valid_forces = 0.0 < min_force_N <= max_force_N
-    has_frames = rate_Hz > 0.0 and seconds * rate_Hz >= 1.0
-    if not (has_valid_forces and radius_mm > 0.0 and rest_s >= 0.0 and has_frames):
-        raise SceneError(
-            "wander: expected 0 < smallest <= largest force, a positive radius, no negative rest and at least one frame"
-            f", got {force_range_N} N, {radius_mm} mm, a rest of {rest_s} s and {seconds} s at {rate_Hz} Hz"
-        )
     rng = np.random.default_rng(seed)
     rows = [np.zeros((1, 4))]
     start_s = rest_s
