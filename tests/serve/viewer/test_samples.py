@@ -1,18 +1,13 @@
 """Samples of the live page: their numbers, their storage in a tape, and coalescing."""
 
-from functools import partial
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from isocharge.common.errors import OutputError
 from isocharge.serve.record.record import OtherContact, TrackedContact
 from isocharge.serve.viewer.tape import (
     FLAG_BITS,
-    LIVE_SAMPLES,
     MAX_DRAWN_SAMPLES,
     RecordedTape,
     Tape,
@@ -126,9 +121,3 @@ def test_recorded_tape_stores_all_samples_and_the_largest_force_of_each_piece(re
     assert len(overview) == MAX_DRAWN_SAMPLES
     assert overview.index(1.5) / MAX_DRAWN_SAMPLES == pytest.approx(0.5, abs=0.01)
     assert sum(force > 0 for force in overview) == 1
-
-
-def test_full_disk_is_an_error_of_the_recorded_tape_and_does_not_end_the_process(recorded, monkeypatch):
-    monkeypatch.setattr("tempfile.TemporaryFile", partial(Path("/dev/full").open, "r+b"))
-    with pytest.raises(OutputError, match="cannot be written: No space left on device"):
-        append(recorded, np.arange(LIVE_SAMPLES + 1))

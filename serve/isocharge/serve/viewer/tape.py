@@ -7,14 +7,11 @@ electrode. An unknown number is NaN. If contacts are tracked, a sample contains 
 contact of the frame.
 """
 
-import tempfile
 from bisect import bisect_right
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from isocharge.common.files import as_output_errors
 from isocharge.serve.flags import MEANINGS
 from isocharge.serve.record.record import PredictionRecord
 
@@ -187,7 +184,7 @@ class Tape:
 
 
 class RecordedTape(Tape):
-    """Tape that stores all samples of a recording, in a temporary file if there are many.
+    """Tape that stores all samples of a recording.
 
     If the time of a sample is missing or is earlier than the time of the previous sample, the previous time is stored
     instead. The stored times therefore never decrease.
@@ -199,22 +196,9 @@ class RecordedTape(Tape):
         The times of the samples never decrease: an earlier time, or none, is replaced by the time of the latest sample.
         """
         if self.total == len(self._ring):
-            self._double()
+            self._ring = np.concatenate([self._ring, np.zeros_like(self._ring)])
         time_s, *others = values
         super().append((max(self.timestamp(self.total - 1), time_s or 0.0), *others))
-
-    def _double(self) -> None:
-        """Replace the buffer by a file of twice its size that is mapped to memory.
-
-        Raises:
-            OutputError: If the disk is full. The file is written completely, because an access to a part that the disk
-                cannot store would end the process.
-        """
-        with as_output_errors(Path(tempfile.gettempdir())), tempfile.TemporaryFile() as file:
-            file.write(self._ring.data)
-            file.write(bytes(self._ring.nbytes))
-            file.flush()
-            self._ring = np.memmap(file, self._ring.dtype, "r+")  # the mapping keeps the closed file
 
     def extent(self) -> dict[str, Any]:
         """Return the times of the first and the last sample, the number of samples, and an overview of the forces.
