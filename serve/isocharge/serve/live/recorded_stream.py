@@ -16,7 +16,6 @@ from itertools import islice
 
 from msgspec import structs
 
-from isocharge.common.errors import InputError
 from isocharge.serve.frames.device_clock import elapsed_s
 from isocharge.serve.live.stream import RESTART_OUTAGE_s, TouchStream
 from isocharge.serve.model.predictor import Predictor
@@ -50,7 +49,6 @@ class RecordedStream:
         """
         self._stream = stream
         self.recorder = recorder
-        self._latest_recorder = recorder  # recorder of the latest request, which may not have been executed yet
         self._opened_recorder = ExitStack()  # closes the present recorder if it was opened on request
         # The latest chunk and its records, if they have not been recorded yet
         self._unrecorded: tuple[Chunk, list[PredictionRecord]] | None = None
@@ -64,7 +62,7 @@ class RecordedStream:
         self._requests.append(self._tare)
 
     def request_recording(self, recorder: Recorder | None) -> None:
-        """Request to begin a recording, or to end the present recording if `recorder` is None.
+        """Request to end the present recording and, unless `recorder` is None, to begin another recording.
 
         The file of the recording is created at once. When a recording begins, the stream is restarted and the tare is
         measured again. A replay can therefore compute the same records from the bytes of the recording alone. The
@@ -75,15 +73,11 @@ class RecordedStream:
             recorder: Recorder of the next recording, which this object opens and closes. None to record nothing.
 
         Raises:
-            InputError: If the stream is recorded already.
             OutputExists: If the file exists already.
             OutputError: If the file cannot be created.
         """
         if recorder is not None:
-            if self._latest_recorder is not None:
-                raise InputError(f"the stream is recorded already ({self._latest_recorder.path}); end it first")
             recorder.open()
-        self._latest_recorder = recorder
         self._requests.append(partial(self._begin_recording, recorder))
 
     def request_marker(self, marker: Marker) -> None:
@@ -153,7 +147,7 @@ class RecordedStream:
             self.recorder.chunk(chunk, [record.to_json() for record in records])
 
     def _begin_recording(self, recorder: Recorder | None) -> None:
-        """Begin a recording with an open recorder, or end the present recording if `recorder` is None.
+        """End the present recording and, unless `recorder` is None, begin another recording with an open recorder.
 
         When a new recording begins, the stream is restarted. The records of the new recording therefore depend only on
         the bytes in this recording.
@@ -165,9 +159,6 @@ class RecordedStream:
         self._opened_recorder.push(recorder)
         self._stream.restart()
         self._is_recording_new = True
-        present_label = self._stream.predictor.metadata.label
-        if recorder.model_label != present_label:  # the model has changed since the request
-            recorder.event(use=present_label)
 
     def _record_preamble(self, chunk: Chunk) -> Chunk:
         """Process the first bytes of the stream again, and write them as the first chunk of the new recording.

@@ -64,7 +64,6 @@ class Recorder:
 
     Attributes:
         path: File to which the recording is written.
-        model_label: Label of the model at the beginning of the recording, `name/version`.
         failed: Whether writing has stopped because of an error, for example because the disk is full. All lines that
             were written before the error are complete.
     """
@@ -82,7 +81,6 @@ class Recorder:
             RecordingError: If the first line of the recording could not be read.
         """
         self.path = Path(path)
-        self.model_label = model
         self.failed = False
         header = {KIND: VERSION, "model": model, "device": dict(device)} | ({"name": name} if name else {})
         self._first_line = json.dumps(header)
