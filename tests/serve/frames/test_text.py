@@ -128,7 +128,6 @@ def test_lines_without_numbers_are_counted_if_they_are_too_many_for_headers():
 
 UNNAMED_NOTATIONS = [
     "{a};{b};{c}",
-    "[{a} {b} {c}]",
     "array([{a}, {b}, {c}])",
     "{{{a}, {b}, {c}}}",
     "{a} pC, {b} pC, {c} pC",
@@ -155,7 +154,6 @@ UNNAMED_NOTATIONS = [
 
 NAMED_NOTATIONS = [
     "A: {a} pC, B: {b} pC, C: {c} pC",
-    "A: {a} pC|B: {b} pC|C: {c} pC",
     "A {a} pC B {b} pC C {c} pC",
     "A={a} B={b} C={c}",
     "A{a:+}B{b:+}C{c:+}",
@@ -197,18 +195,22 @@ NOTATIONS = {
     **dict.fromkeys(UNNAMED_NOTATIONS, ()),
     **dict.fromkeys(NAMED_NOTATIONS, "ABC"),
     "{a} uV\t{b} uV\t{c} uV": ("ch1_uV", "ch2_uV", "ch3_uV"),
-    '{{"A": {{"q": {a}, "unit": "nC"}}, "B": {{"q": {b}, "unit": "nC"}}, "C": {{"q": {c}, "unit": "nC"}}}}': (
-        "A_nC",
-        "B_nC",
-        "C_nC",
-    ),
     '[{{"unit": "nC", "q": {a}}}, {{"unit": "nC", "q": {b}}}, {{"unit": "nC", "q": {c}}}]': (
         "ch1_nC",
         "ch2_nC",
         "ch3_nC",
     ),
     "A: {a} C, B: {b} C, C: {c} C": ("A_coulomb", "B_coulomb", "C_coulomb"),
-    "A nC: {a} B nC: {b} C nC: {c}": ("A_nC", "B_nC", "C_nC"),
+    **dict.fromkeys(
+        [
+            "A nC: {a} B nC: {b} C nC: {c}",
+            "A: {a} [nC], B: {b} [nC], C: {c} [nC]",
+            "nC: A={a} B={b} C={c}",
+            '{{"A": {{"q": {a}, "unit": "nC"}}, "B": {{"q": {b}, "unit": "nC"}}, "C": {{"q": {c}, "unit": "nC"}}}}',
+            '{{"unit": "nC", "A": {a}, "B": {b}, "C": {c}}}',
+        ],
+        ("A_nC", "B_nC", "C_nC"),
+    ),
     "Film A [nC]: {a}, Film B [nC]: {b}, Film C [nC]: {c}": ("ch1_nC", "ch2_nC", "ch3_nC"),
     "Q[0]:{a} Q[1]:{b} Q[2]:{c}": ("Q[0]", "Q[1]", "Q[2]"),
     "Channel 1 = {a} nC, Channel 2 = {b} nC, Channel 3 = {c} nC": ("1_nC", "2_nC", "3_nC"),

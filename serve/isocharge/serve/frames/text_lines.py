@@ -23,6 +23,7 @@ line. For example, the shape of `A: 801.2 pC, B: -799.5 pC` is `k:0u,k:0u`.
 import math
 import re
 from collections.abc import Container, Mapping
+from itertools import takewhile
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -100,10 +101,10 @@ _NEAREST_NAME = rf"(?P<word>[kuw]){_SAME_COLUMN}(?P<number>[0t])"
 _SECOND_NAME = rf"(?P<word>[kuw]){_SAME_COLUMN}[kuw]{_SAME_COLUMN}(?P<number>[0t])"
 """Regular expression, for the shape of a line, of the last word but one before a number in the same column."""
 
-_UNIT_BEHIND = r"(?P<number>[0t])(?:,?k)?[:=]*(?P<word>[kquw])"
+_UNIT_BEHIND = r"(?P<number>[0t])(?:[\])}]*,?k)?[\]\[(){}:=]*(?P<word>[kquw])"
 """Regular expression, for the shape of a line, of a word behind a number, which may be its unit.
 
-A key may stand between the number and the unit, as in `"value": 3.5, "unit": "nC"`.
+A key may stand between the number and the unit, as in `"value": 3.5, "unit": "nC"`, and the unit may have brackets.
 """
 
 _UNIT_BEFORE = r"[kquw]\W*(?P<word>[kquw])(?:\W*k)?\W*(?P<number>[0t])"
@@ -417,8 +418,9 @@ def _preceding_names(parts: list[_Part], counters: Container[str]) -> list[str]:
 def _with_units(parts: list[_Part], names: list[str]) -> list[str]:
     """Add the unit of charge or voltage of each number to its name, as in `A_nC` for `A = 3.5 nC`.
 
-    The unit stands behind the number, or between the name and the number. The unit pC is not added, and counters and
-    clocks have no unit of charge.
+    The unit stands behind the number, or between the name and the number. A unit before the first name, as in
+    `nC: A=3.5 B=4.1`, is the unit of all numbers. The unit pC is not added, and counters and clocks have no unit of
+    charge.
 
     Args:
         parts: Parts of the line.
@@ -428,9 +430,13 @@ def _with_units(parts: list[_Part], names: list[str]) -> list[str]:
     words_before = _words(parts, _UNIT_BEFORE)
     # The word `C` may be the name of an electrode, but a word behind several numbers is not a name.
     units = {*OTHER_CHARGE_UNITS} if words_behind.count("C") > 1 else _CHARGE_UNITS - {"pC"}
+    shape_before_numbers, _, _ = _shape(parts).partition("0")
+    first_words = [part.name.strip("[]") for part in parts[: len(shape_before_numbers)]]
+    words_before_names = takewhile(lambda word: word not in names, first_words)
+    common_unit = next((word for word in words_before_names if word in units), "")
     names_with_units = []
     for number, (name, *words) in enumerate(zip(names, words_behind, words_before, strict=True), 1):
-        unit = next((word.strip("[]") for word in words if word.strip("[]") in units), "")
+        unit = next((word.strip("[]") for word in words if word.strip("[]") in units), common_unit)
         ending = "coulomb" if unit == "C" else unit  # `A_C` would be an electrode with the name C
         is_added = unit and ending not in names and name not in {SEQ, *TIMES_US}
         names_with_units.append(f"{name or f'ch{number}'}_{ending}" if is_added else name)
