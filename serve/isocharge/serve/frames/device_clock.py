@@ -70,7 +70,7 @@ class DeviceClock:
     def __init__(self) -> None:
         """Start without a reading."""
         self.rate = 1.0
-        self._latest_chunk: Chunk | None = None
+        self._latest_chunk: Chunk | None = None  # latest chunk with the end of a frame
         self._monotonic_s: float | None = None  # time of the latest chunk of frames without a clock
         self.reset()
 
@@ -81,8 +81,8 @@ class DeviceClock:
         the first reading.
         """
         self._device_us = 0  # clock of the latest reading after the wraps were removed
-        self._chunk_arrival_s: float | None = None  # arrival of the latest chunk
-        self._is_new_arrival = False  # whether the present chunk arrived at another time than the latest chunk
+        self._latest_arrival_s: float | None = None  # arrival of the latest chunk whose bytes were read at once
+        self._is_new_arrival = False  # whether the present chunk arrived at another time than that chunk
 
         self._has_fit = False
         # According to the fit, the host time was `_fitted_host_s` when the clock of the device was `_fitted_us`.
@@ -101,7 +101,7 @@ class DeviceClock:
             frames: The frames, which are changed in place.
             modulus: Time at which the clock wraps to 0, us.
         """
-        if not frames:  # the time is shared by the frames of the next chunk
+        if not frames:  # the next chunk with the end of a frame shares its time among its frames
             return
         previous_chunk = self._latest_chunk or chunk
         self._latest_chunk = chunk
@@ -110,16 +110,20 @@ class DeviceClock:
         if abs(wall_jump_s) > MAX_DELAY_s:  # the wall clock was set
             self._shift_host_times(wall_jump_s)
 
-        # All chunks of a file have the same arrival time, which contains no information. After the first chunk, it is
-        # not known whether this is a file.
-        self._is_new_arrival = self._chunk_arrival_s not in (None, chunk.timestamp)
+        # All chunks of a file have the same arrival time, to which no clock can be fitted. After the first chunk, it is
+        # not known whether the chunks belong to a file.
+        self._is_new_arrival = self._latest_arrival_s not in (None, chunk.timestamp)
+
         if frames[0].t_us is None:
             self._divide_interval(interval_s, chunk.timestamp, frames)
         for frame in frames:
             if frame.t_us is not None:
                 self._stamp_with_device(frame, frame.t_us, modulus, chunk.timestamp)
-        if len(chunk.data) < MAX_READ_BYTES:  # otherwise, the bytes may have waited to be read
-            self._chunk_arrival_s = chunk.timestamp
+
+        # The bytes of a chunk of the largest size may have waited to be read. Its time is then not that of an arrival.
+        is_read_at_once = len(chunk.data) < MAX_READ_BYTES
+        if is_read_at_once:
+            self._latest_arrival_s = chunk.timestamp
             if self._is_new_arrival and self._has_fit:
                 self._fit_arrival(chunk.timestamp)
 
@@ -127,8 +131,8 @@ class DeviceClock:
         """Add the jump of a wall clock that was set to all stored host times."""
         self._fitted_host_s += jump_s
         self._latest_host_s += jump_s
-        if self._chunk_arrival_s is not None:
-            self._chunk_arrival_s += jump_s
+        if self._latest_arrival_s is not None:
+            self._latest_arrival_s += jump_s
 
     def _divide_interval(self, interval_s: float, arrival_s: float, frames: Sequence[Frame]) -> None:
         """Write times into frames without a clock. If later frames of the chunk have a clock, it replaces their times.
@@ -147,7 +151,7 @@ class DeviceClock:
             self._monotonic_s = arrival_s
         else:
             self._monotonic_s += interval_s or len(frames) * self.FILE_INTERVAL_s
-        share_s = 0.0 if self._chunk_arrival_s is None else interval_s / len(frames)
+        share_s = 0.0 if self._latest_arrival_s is None else interval_s / len(frames)
         for n_later, frame in enumerate(reversed(frames)):
             frame.host_s = arrival_s - n_later * share_s
             frame.dt_s = share_s or self.FILE_INTERVAL_s
@@ -171,8 +175,9 @@ class DeviceClock:
             # The modulo makes the step correct even if the clock has wrapped between the readings.
             half_range_us = modulus // 2
             step_us = (t_us - self._device_us + half_range_us) % modulus - half_range_us
-            frame.is_clock_reset = step_us < -MAX_DELAY_s * 1e6
-        if not self._has_fit or step_us < -min(MAX_DELAY_s * 1e6, self._device_us):
+        frame.is_clock_reset = step_us < -MAX_DELAY_s * 1e6
+        is_before_zero = self._device_us + step_us < 0  # the device had not been started
+        if not self._has_fit or frame.is_clock_reset or is_before_zero:
             step_us = 0
             self._begin_fit(t_us, arrival_s)
         else:
@@ -180,15 +185,11 @@ class DeviceClock:
         step_us = max(0, step_us)
         self._predicted_s = self._fitted_host_s + self.rate * (self._device_us - self._fitted_us) * 1e-6
 
-        # A reading is taken before it arrives. If the predicted time is much later than the arrival, the fit is wrong.
-        # The clock of the host or of the device may have been set. Or the program has paused: the readings that waited
-        # for it arrived late, which the fit took for their time, and the readings after them were lost. A provisional
-        # fit is not examined, because its times may be wrong by the length of a chunk.
-        is_fit_examined = self._is_new_arrival and not self._is_fit_provisional
-        if is_fit_examined and self._predicted_s - arrival_s > MAX_LEAD_s:
-            # Only a step in which the clock went back is larger than the clock value. The step was taken for a wrap,
-            # but not enough time has passed for a wrap, so the device has restarted.
-            if t_us < step_us:
+        if self._is_predicted_after(arrival_s):
+            # A clock that advances is never smaller than its step. If it is, the clock went back, which was taken for a
+            # wrap. Since the prediction is wrong, the device has restarted instead.
+            has_restarted = t_us < step_us
+            if has_restarted:
                 frame.is_clock_reset = True
                 self._device_us = t_us
                 step_us = 0
@@ -200,6 +201,20 @@ class DeviceClock:
         frame.device_us = self._device_us
         frame.dt_s = step_us * 1e-6
         frame.clock_s = self._device_us * 1e-6
+
+    def _is_predicted_after(self, arrival_s: float) -> bool:
+        """Return whether the predicted time of a reading is much later than its arrival, so that the fit is wrong.
+
+        A reading is taken before it arrives. The fit is wrong if the clock of the host or of the device was set. The
+        fit is also wrong after the program has paused: it was adjusted to late arrivals of the readings that waited
+        for the program, and further readings were lost. A provisional fit is never considered wrong, because its times
+        may be wrong by the length of a chunk.
+
+        Args:
+            arrival_s: Arrival of the chunk that contains the reading, unix seconds.
+        """
+        is_examined = self._is_new_arrival and not self._is_fit_provisional
+        return is_examined and self._predicted_s - arrival_s > MAX_LEAD_s
 
     def _begin_fit(self, device_us: int, arrival_s: float) -> None:
         """Begin a provisional fit with the present reading.

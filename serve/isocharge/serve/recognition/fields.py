@@ -38,8 +38,7 @@ def possible_meanings(steps: Array, frame_rate_Hz: float, tolerance: float = 0.0
 
     A counter increases by 1. A clock has one of the usual tick rates of boards. At about 1000 frames per second, a
     clock in ms also increases by 1, but it repeats some of its values. A step is only used if it is close to the median
-    step. If a number increases by a power of 256, its high bytes are a counter, and its low bytes belong to the channel
-    behind the counter. Such a number has no meaning.
+    step.
 
     Args:
         steps: Differences of the values of consecutive frames, shape (n,).
@@ -54,16 +53,24 @@ def possible_meanings(steps: Array, frame_rate_Hz: float, tolerance: float = 0.0
     median_step = np.median(steps)
     regular_steps = steps[np.abs(steps - median_step) <= max(1.0, 0.7 * median_step)]
     is_regular = len(regular_steps) >= INTACT_SHARE * len(steps) and regular_steps.min() >= 0.0
-    if not is_regular or np.mean(steps == 0.0) >= INTACT_SHARE:
+    is_constant = np.mean(steps == 0.0) >= INTACT_SHARE
+    if not is_regular or is_constant:
         return
+
+    # If the high bytes of a number are a counter, and its low bytes belong to the channel behind the counter, the
+    # number increases by a power of 256. These rates are listed, so that they are not taken for the rate of a clock.
+    shifted_counter_rates_Hz = [frame_rate_Hz * 256.0**byte_count for byte_count in (1, 2, 3)]
     tick_rate_Hz = float(regular_steps.mean()) * frame_rate_Hz
-    usual_rates_Hz = [*CLOCKS, *(frame_rate_Hz * 256.0**size for size in (1, 2, 3))]  # size of the channel's bytes
-    deviation, nearest_rate_Hz = min((abs(tick_rate_Hz / usual_Hz - 1.0), usual_Hz) for usual_Hz in usual_rates_Hz)
-    clock = CLOCKS.get(nearest_rate_Hz) if deviation < tolerance else None
-    if np.mean(steps == 1.0) >= INTACT_SHARE and (clock is None or steps.all()):
+    known_rates_Hz = (*CLOCKS, *shifted_counter_rates_Hz)
+    deviation, nearest_rate_Hz = min((abs(tick_rate_Hz / known_Hz - 1.0), known_Hz) for known_Hz in known_rates_Hz)
+    is_clock = nearest_rate_Hz in CLOCKS and deviation < tolerance
+
+    increases_by_one = np.mean(steps == 1.0) >= INTACT_SHARE
+    repeats_values = not steps.all()
+    if increases_by_one and not (is_clock and repeats_values):
         yield SEQ, 1.0
-    if clock is not None:
-        yield clock
+    if is_clock:
+        yield CLOCKS[nearest_rate_Hz]
 
 
 def count_wraps(steps: Array) -> int:
@@ -165,9 +172,9 @@ def _number_parts(
 ) -> Iterator[Part]:
     """Yield the possible parts of a frame for bytes that contain a number of a given type.
 
-    Every number may be a channel. A number may also be the frame counter or a clock if its steps, the differences
-    between consecutive frames, are regular. Nothing is yielded for floating-point numbers that are implausibly small or
-    large. Each part has a score, which is lower for a more probable part.
+    Every number may be a channel, and some numbers may also be the frame counter or a clock. Nothing is yielded for
+    floating-point numbers that are implausibly small or large. Each part has a score in bits, which is lower for a more
+    probable part.
 
     Args:
         number_bytes: Bytes of the number, the lowest first, shape (n, size).
@@ -188,28 +195,49 @@ def _number_parts(
         low_zero_byte_count = np.argmax(constant_bytes != 0)
         unit = magnitude * 256.0 ** (low_zero_byte_count - Weights.fraction * size)
 
-    # A counter that overflows restarts at 0. If upper bytes do not change while it wraps, they do not belong to it.
-    counter_steps = steps
-    if type_name[0] == "u":
-        half_range = 1 << (8 * size - 1)
-        counter_steps = (steps + half_range) % (2 * half_range) - half_range
-    name, tick = next(possible_meanings(counter_steps, frame_rate_Hz), ("", 1.0))
-    has_usual_size = size < 8 or tick in (1.0, 1e-3)  # 8 bytes count s, ms, us or ns
-    if name and has_usual_size and count_wraps(counter_steps) <= 0:
-        score = 0.0
-        if size == 3:
-            score += Weights.constant_high * np.count_nonzero(constant_bytes > 0)
-        if name != SEQ:  # the values of a counter need no bits
-            # A bonus for clocks of eight bytes: without it, an `f64` with few digits could score better that consists
-            # of the high bytes of the clock and of the first bytes behind them.
-            score += _bits(counter_steps - np.median(counter_steps), unit, size) - size // 8 * Weights.noise
-        yield Part(name, type_name, size, score, scale=tick)
-
+    counter_or_clock = _counter_or_clock(steps, constant_bytes, type_name, unit, frame_rate_Hz)
+    if counter_or_clock is not None:
+        yield counter_or_clock
     if type_name == "i64":  # times only
         return
     # The magnitude is added to the steps, so that a type has a lower score if its values are close to 0 or, for an
     # unsigned type, close to the middle of its range.
     yield Part(CHANNEL, type_name, size, Weights.channel + _bits(np.append(steps, magnitude), unit, size))
+
+
+def _counter_or_clock(
+    steps: Array, constant_bytes: NDArray[np.int64], type_name: FieldType, unit: float, frame_rate_Hz: float
+) -> Part | None:
+    """Return the part of a frame whose number is the frame counter or a clock, or None if the number can be neither.
+
+    Args:
+        steps: Differences of the values of consecutive frames, shape (n,).
+        constant_bytes: Value of each byte that is constant, and -1 for the other bytes, shape (size,).
+        type_name: Type of the number, such as "u16", "i16" or "f32".
+        unit: Smallest step that the number can represent.
+        frame_rate_Hz: Number of frames per second, Hz.
+    """
+    size = len(constant_bytes)
+    if type_name[0] == "u":  # a counter that overflows restarts at 0: remove the large steps back
+        half_range = 1 << (8 * size - 1)
+        steps = (steps + half_range) % (2 * half_range) - half_range
+    name, tick = next(possible_meanings(steps, frame_rate_Hz), ("", 1.0))
+    has_usual_size = size < 8 or tick in (1.0, 1e-3)  # 8 bytes count s, ms, us or ns
+    # If upper bytes do not change while the number wraps, they do not belong to it.
+    has_foreign_bytes = count_wraps(steps) > 0
+    if not name or not has_usual_size or has_foreign_bytes:
+        return None
+
+    score = 0.0
+    if size == 3:
+        score += Weights.constant_high * np.count_nonzero(constant_bytes > 0)
+    if name != SEQ:  # the values of a counter need no bits
+        score += _bits(steps - np.median(steps), unit, size)
+        if size == 8:
+            # Without this bonus, an `f64` with few digits could have a lower score. It would consist of the high bytes
+            # of the clock and of the first bytes behind them.
+            score -= Weights.noise
+    return Part(name, type_name, size, score, scale=tick)
 
 
 def split_frame(

@@ -12,7 +12,6 @@ All checksums with a name are tried for every possible position of the first byt
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from itertools import islice
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -260,12 +259,18 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
     for size in (4, 3, 2, 1):  # in bytes
         if is_constant[-size:].all():  # a checksum would differ from frame to frame
             continue
-
-        # Try each position for the first covered byte, up to the first byte that is not constant. A checksum covers at
-        # least two bytes. Some frames may be damaged.
-        last_possible_start = min(count_leading(is_constant), len(is_constant) - size - 2)
+        # The first covered byte is at most the first byte that is not constant. A checksum covers at least two bytes.
+        last_start = min(count_leading(is_constant), len(is_constant) - size - 2)
         names = [name for name, checksum in CHECKSUMS.items() if checksum.size == size]
-        for order in ORDERS[:size]:  # a single byte has no byte order
-            checks = (Check(name, order, start) for start in range(last_possible_start + 1) for name in names)
-            fitting = (check for check in checks if sum(map(check.is_correct, frames)) >= INTACT_SHARE * len(frames))
-            yield from islice(fitting, 1)
+        orders = ORDERS if size > 1 else ORDERS[:1]  # a single byte has no byte order
+        for order in orders:
+            candidates = (Check(name, order, start) for start in range(last_start + 1) for name in names)
+            check = next((candidate for candidate in candidates if _fits(candidate, frames)), None)
+            if check is not None:
+                yield check
+
+
+def _fits(check: Check, frames: Sequence[bytes]) -> bool:
+    """Return whether a checksum is correct in nearly all frames. Some frames may be damaged."""
+    correct_count = sum(map(check.is_correct, frames))
+    return correct_count >= INTACT_SHARE * len(frames)

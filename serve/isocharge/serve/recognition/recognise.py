@@ -86,29 +86,31 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
     if len(division.rows()) < MIN_FRAMES:
         return
 
-    # A frame with a sync pattern may begin at any byte that may belong to the pattern.
+    # The frames may begin at several distances from `division.starts`. Find the checksums that fit at each distance.
     has_sync = division.framing == SYNC
-    distances = np.flatnonzero(_may_be_sync(division.rows()))[:MAX_CONSTANT_BYTES].tolist() if has_sync else [0]
+    distances = _possible_distances(division) if has_sync else [0]
     rows_at = {distance: division.rows(distance) for distance in distances}
     checks = [(distance, check) for distance, rows in rows_at.items() for check in find_checks(rows)]
     if not checks:
         checks = [(distance, Check()) for distance in distances]
 
-    # For each byte order and each checksum, find the division of the frame into parts with the lowest score. The parts
-    # are listed once for frames that begin at `starts`. A frame that begins at a distance from there has the same
-    # parts, from this distance to the end and then from the beginning.
+    # List the possible parts of frames that begin at `division.starts`, once for each byte order.
     frame_rate_Hz = len(division.stream) / length / seconds  # as if all bytes of the stream belonged to frames
     wide_rows = division.rows(next_bytes=LARGEST_SIZE)
     parts_of_order = {order: possible_parts(wide_rows, order, frame_rate_Hz) for order in ORDERS}
+
+    # For each byte order and each checksum, find the division of the frame into parts with the lowest score.
     for order, (distance, check) in product(ORDERS, checks):
+        # A frame that begins at the distance has the same parts, from the distance to the end, then from the beginning.
         parts = parts_of_order[order]
-        parts_at_each_byte = (parts[distance:] + parts[:distance])[: length - check.size]
-        # The first byte always belongs to the pattern, even if a damaged frame among these rows hides that it is
-        # constant.
+        parts_at_each_byte = parts[distance:] + parts[:distance]
         rows = rows_at[distance]
-        sync_lengths = range(1, max(1, count_leading(_may_be_sync(rows))) + 1) if has_sync else [0]
-        score, best_parts, sync_length = split_frame(parts_at_each_byte, sync_lengths, check.start)
-        if all(part.name != CHANNEL for part in best_parts):
+        sync_lengths = _possible_sync_lengths(rows) if has_sync else [0]
+        frame_score, best_parts, sync_length = split_frame(
+            parts_at_each_byte[: length - check.size], sync_lengths, check.start
+        )
+        has_channel = any(part.name == CHANNEL for part in best_parts)
+        if not has_channel:
             continue
         sync = usual_bytes(rows)[0][:sync_length].tobytes()
         layout = FrameLayout(
@@ -123,7 +125,25 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
         )
         # Each byte outside of all frames contributes `Weights.noise` bits.
         covered_share = division.covered_share
-        yield covered_share * score / length + (1.0 - covered_share) * Weights.noise, layout
+        yield covered_share * frame_score / length + (1.0 - covered_share) * Weights.noise, layout
+
+
+def _possible_distances(division: FrameDivision) -> list[int]:
+    """Return the possible distances of the beginnings of the frames from `division.starts`, bytes.
+
+    A frame begins with its sync pattern, so that it may begin at any byte that may belong to the pattern.
+    """
+    distances: list[int] = np.flatnonzero(_may_be_sync(division.rows()))[:MAX_CONSTANT_BYTES].tolist()
+    return distances
+
+
+def _possible_sync_lengths(rows: Bytes) -> range:
+    """Return the possible lengths of the sync pattern at the beginning of the frames, bytes.
+
+    The first byte always belongs to the pattern, even if damaged frames hide that it is constant.
+    """
+    max_length = max(1, count_leading(_may_be_sync(rows)))
+    return range(1, max_length + 1)
 
 
 def _may_be_sync(rows: Bytes) -> Booleans:

@@ -33,7 +33,6 @@ from isocharge.serve.record.record import OtherContact, TrackedContact
 from isocharge.serve.tracking.gaussian_components import (
     GAIN_STD,
     INITIAL_RATE_STD,
-    MOTION,
     Components,
     contacts_of,
     predict_components,
@@ -95,12 +94,19 @@ class ContactHypothesis(NamedTuple):
         return x_mm, y_mm, math.exp(log_force)
 
     def contact_after(self, dt_s: float, misfit: float) -> Contact:
-        """Return the contact a time `dt_s` later. The time is so short that the covariance is taken as constant."""
+        """Return the contact a time `dt_s` later. The time is so short that the covariance is taken as constant.
+
+        Args:
+            dt_s: The time, s.
+            misfit: Distance of the measured charges from those of the contact, in standard deviations of the noise.
+        """
         x_mm, y_mm, force_N = self.values_after(dt_s)
-        std = np.sqrt(self.covariance.diagonal()[VALUES])  # of x, y and ln F
-        correlations = (self.covariance[VALUES, VALUES] / np.outer(std, std))[np.triu_indices(3, 1)]
-        x_std_mm, y_std_mm, force_std_N = (std * [1.0, 1.0, force_N]).tolist()
-        return Contact(x_mm, y_mm, force_N, x_std_mm, y_std_mm, force_std_N, misfit, *correlations.tolist())
+        covariance = self.covariance[VALUES, VALUES]  # of x, y and ln F
+        std = np.sqrt(covariance.diagonal())
+        x_std_mm, y_std_mm, log_force_std = std.tolist()
+        correlation_matrix = covariance / np.outer(std, std)
+        correlations = correlation_matrix[np.triu_indices(3, 1)].tolist()  # of x and y, x and F, y and F
+        return Contact(x_mm, y_mm, force_N, x_std_mm, y_std_mm, force_N * log_force_std, misfit, *correlations)
 
     @property
     def moving_probability(self) -> float:
@@ -225,16 +231,19 @@ class ContactMixture:
         grid = np.stack(np.meshgrid(coordinates, coordinates), axis=-1).reshape(-1, 2)
         grid = grid[np.hypot(*grid.T) <= domain.radius]
 
-        std = np.full(MOTION.stop + len(self._charges.electrodes), GAIN_STD)  # of each entry of a state
-        std[POSITION] = coordinates[1] - coordinates[0]
-        std[2] = domain.scale[2]  # of ln F
-        std[RATES] = INITIAL_RATE_STD
+        # Standard deviations of x and y, of ln F, of the rates, and of the logarithms of the gains
+        spacing_mm = coordinates[1] - coordinates[0]
+        _, _, log_force_scale = domain.scale
+        gain_std = np.full(len(self._charges.electrodes), GAIN_STD)
+        std = np.hstack([spacing_mm, spacing_mm, log_force_scale, INITIAL_RATE_STD, gain_std])
+        covariance = np.tile(np.diag(std**2), (len(grid), 1, 1))
 
         # The rates and the logarithms of the gains have the mean 0.
+        _, _, medium_log_force = domain.centre
         mean = np.zeros((len(grid), std.size))
-        mean[:, POSITION] = grid
-        mean[:, 2] = domain.centre[2]  # ln F
-        return Components(mean, np.tile(np.diag(std**2), (len(grid), 1, 1)), np.zeros(len(grid)))
+        mean[:, VALUES] = np.column_stack([grid, np.full(len(grid), medium_log_force)])
+        equal_log_weights = np.zeros(len(grid))
+        return Components(mean, covariance, equal_log_weights)
 
     def _update(self, prior: Components, charge_pC: Array, variance_pC2: Array, iterations: int) -> None:
         """Update components with charges, and store them with their contacts if the charges are explained.

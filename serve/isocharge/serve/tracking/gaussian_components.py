@@ -170,7 +170,7 @@ def update_components(
 
 
 def prune_components(components: Components, max_count: int = 8, merge_distance: float = 0.7) -> Components:
-    """Remove components whose weight is too small for a number, and merge components with a similar motion.
+    """Remove components of negligible weight, and merge components with a similar motion.
 
     If the motions of two components are similar, the less probable component is removed. The weight of the removed
     component is added to the weight of the more probable component.
@@ -190,12 +190,14 @@ def prune_components(components: Components, max_count: int = 8, merge_distance:
     std = np.sqrt(np.diagonal(components.covariance, axis1=1, axis2=2)[:, MOTION])
     kept: list[int] = []
     for row in np.argsort(-log_weight, kind="stable").tolist():  # the most probable component first
-        if np.exp(log_weight[row]) < np.finfo(float).tiny:
+        is_negligible = np.exp(log_weight[row]) < np.finfo(float).tiny
+        if is_negligible:  # all later components have even smaller weights
             break
-        is_similar = (np.abs(motion[kept] - motion[row]) < merge_distance * std[row]).all(axis=1)
+        max_difference = merge_distance * std[row]
+        is_similar = (np.abs(motion[kept] - motion[row]) < max_difference).all(axis=1)
         if is_similar.any():
-            first = kept[is_similar.argmax()]
-            log_weight[first] = np.logaddexp(log_weight[first], log_weight[row])  # add the weights
+            most_probable_row = kept[is_similar.argmax()]  # of the similar components
+            log_weight[most_probable_row] = np.logaddexp(log_weight[most_probable_row], log_weight[row])  # sum
         else:
             kept.append(row)
     return components._replace(log_weight=log_weight).select(kept[:max_count])

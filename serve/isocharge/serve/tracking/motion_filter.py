@@ -124,7 +124,7 @@ class NoiseEstimate:
         """Start with the noise that the model states."""
         self.relative_variance = 1.0
         self._frames = 1  # the noise that the model states has the weight of one frame
-        self._latest: deque[Array] = deque(maxlen=3)  # the latest values and their times, arrays of shape (4,)
+        self._latest: deque[tuple[float, Array]] = deque(maxlen=3)  # time and measured values of the latest frames
 
     def update(self, measured: Array, covariance: Array, t_s: float) -> None:
         """Update the estimate with the values of a frame.
@@ -139,20 +139,23 @@ class NoiseEstimate:
             covariance: Covariance of the measured values as stated by the model, shape (3, 3).
             t_s: Time of the frame, s. Frames within `NOISE_INTERVAL_s` after the previous one are not used.
         """
-        if self._latest and t_s - self._latest[-1][3] < NOISE_INTERVAL_s:
+        if self._latest and t_s - self._latest[-1][0] < NOISE_INTERVAL_s:
             return
-        self._latest.append(np.append(measured, t_s))
+        self._latest.append((t_s, measured))
         if len(self._latest) < 3:
             return
-        # Compare the middle values with the line between the first and the last values. The last entry is the time.
-        first, middle, last = self._latest
-        last_share = (middle - first)[3] / (last - first)[3]
+        # Compare the middle values with the line between the first and the last values.
+        (first_s, first), (middle_s, middle), (last_s, last) = self._latest
+        last_share = (middle_s - first_s) / (last_s - first_s)
         first_share = 1.0 - last_share
-        deviation = (middle - first_share * first - last_share * last)[VALUES]
-        variance_factor = (1.0 + first_share**2 + last_share**2) * deviation.size
-        relative_square = deviation @ np.linalg.solve(covariance, deviation) / variance_factor
+        deviation = middle - first_share * first - last_share * last
 
-        # Update the mean over all frames.
+        # Divide the squared deviation by the value that is expected for the noise that the model states.
+        squared_distance = float(deviation @ np.linalg.solve(covariance, deviation))
+        expected_square = (1.0 + first_share**2 + last_share**2) * deviation.size
+        relative_square = squared_distance / expected_square
+
+        # Update the mean over all frames. A deviation counts as at most three standard deviations.
         self._frames += 1
         limited_square = min(relative_square, 3.0**2 * self.relative_variance)
         self.relative_variance += (limited_square - self.relative_variance) / self._frames
@@ -194,6 +197,11 @@ class MotionFilter:
             Whether the frame belongs to the contact. Otherwise, the modes are only predicted. The result is also False
             if rounding errors have made a covariance useless.
         """
+        self._predict(dt_s)
+        return self._update(measured, covariance)
+
+    def _predict(self, dt_s: float) -> None:
+        """Replace the modes by their prediction a time `dt_s` later, s. The mode may change within this time."""
         # Mix the states of the previous modes (columns) for each new mode (row). The position and the force start or
         # stop to change independently, so the probability of a change of both is the product of the two probabilities.
         change = min(dt_s / MEAN_MODE_TIME_s, 0.5)
@@ -215,6 +223,17 @@ class MotionFilter:
         self.mean = (transition @ mean[:, :, None])[:, :, 0]
         self.covariance = transition @ mixed_covariance @ transition.swapaxes(1, 2) + noise
 
+    def _update(self, measured: Array, covariance: Array) -> bool:
+        """Update the predicted modes and their probabilities with measured values.
+
+        Args:
+            measured: Measured x, y and ln F, shape (3,).
+            covariance: Covariance of the noise, shape (3, 3).
+
+        Returns:
+            Whether the modes were updated: False if the measured values are too far from the prediction of each mode,
+            or if rounding errors have made a covariance useless.
+        """
         # Compute the Mahalanobis distance of the measured values from the prediction of each mode.
         innovation = (measured - self.mean[:, VALUES])[:, :, None]  # shape (4, 3, 1)
         precision = np.linalg.inv(self.covariance[:, VALUES, VALUES] + covariance)  # shape (4, 3, 3)
