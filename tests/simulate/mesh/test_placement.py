@@ -108,7 +108,7 @@ def test_no_element_is_folded_and_the_footprint_has_the_area_centroid_and_load_o
     """
     probe, at, mesh, placed = scene
     assert placed.weights.min() > 0.0
-    assert placed.mass.min() > 0.0
+    assert placed.node_weights.min() > 0.0
     assert mesh.copies * placed.weights.sum() == pytest.approx(np.pi, rel=3e-3)
     distance = float(np.hypot(*at)) / RADIUS
     exact = 1e-9 if isinstance(probe, Polygon) else 1e-4

@@ -34,7 +34,7 @@ class BackPressure:
     @cached_property
     def weights(self) -> Array:
         """Weights with which nodal deflections are integrated over the meshed part of the film, shape (n_node,)."""
-        return self.mesh.gather(self.mesh.mass)
+        return self.mesh.gather(self.mesh.node_weights)
 
     def energy(self, deflection: Array) -> float:
         """Compute the energy of the static pressure and of the trapped air for the meshed part of the film.

@@ -383,7 +383,7 @@ class Bending:
         self.mesh = mesh
         self.stiffness = stiffness
         self._laplace = mesh.laplace  # L, shape (n_element, n_local, n_local)
-        self._mass = mesh.gather(mesh.mass)  # diagonal of M, shape (n_node,)
+        self._mass = mesh.gather(mesh.node_weights)  # diagonal of M, shape (n_node,)
 
     @cached_property
     def _blocks(self) -> tuple[Array, Array, Array]:
@@ -393,7 +393,7 @@ class Bending:
         added to the block of W.
         """
         mesh = self.mesh
-        mass = np.eye(mesh.mass.shape[1]) * mesh.mass[:, None]  # M
+        mass = np.eye(mesh.template.xi.size) * mesh.node_weights[:, None]  # M
         coupling = np.sqrt(self.stiffness) * (self._laplace - BENDING_SHIFT * mass)  # sqrt(beta) (L - s M), symmetric
         shifted_laplace = 2.0 * BENDING_SHIFT * self._laplace - BENDING_SHIFT**2 * mass  # 2 s L - s^2 M
         deflection_block = self.stiffness * shifted_laplace
@@ -401,7 +401,7 @@ class Bending:
         # Eliminate the unknowns mu of interior nodes. Their block -M is diagonal.
         interior = mesh.template.is_interior
         interior_coupling = coupling[:, interior]  # shape (n_element, n_interior, n_local)
-        interior_mass = mesh.mass[:, interior, None]
+        interior_mass = mesh.node_weights[:, interior, None]
         deflection_block += interior_coupling.transpose(0, 2, 1) @ (interior_coupling / interior_mass)
         coupling[:, interior] = 0.0
         return deflection_block, coupling.transpose(0, 2, 1), -mass

@@ -99,6 +99,7 @@ class Blocks:
         """
         self.resolution = resolution
         self.topology = topology
+        # A press with a footprint that fills the innermost circle is symmetric, so half of the film is sufficient.
         self.half = topology.fills_circle and not whole
 
         # The core polygon is divided into one quadrilateral for each corner. A quadrilateral consists of n_half_edge *
@@ -125,7 +126,11 @@ class Blocks:
 
     @property
     def footprint(self) -> slice:
-        """Indices of the elements that fill the footprint."""
+        """Indices of the elements that fill the footprint.
+
+        A polygonal footprint consists of the core polygon. A curved footprint also contains the first layer of elements
+        around the core polygon.
+        """
         if self.topology.is_curved:
             return slice(0, self.n_quad + self.n_sector)
         return slice(0, self.n_quad)
@@ -141,37 +146,43 @@ class Blocks:
         return np.linspace(0.0, math.tau / self.copies, self.n_sector + 1)
 
     @cached_property
-    def core_outline(self) -> Array:
-        """Points along the edges of the core polygon, shape (n_sector + 1, n_corner + 1).
+    def half_edge_ends(self) -> Array:
+        """Ends of all half edges of the core polygon in the meshed part, shape (2 * n_meshed_corner + 1, n_corner + 1).
 
-        The core polygon is the part of the footprint whose elements have straight sides. Each point is a weighted sum
-        of the corners and the centroid of the core polygon, and is described by its weights. The points are ordered
-        anticlockwise. The first point is the middle of the edge before the first corner.
+        The core polygon is the part of the footprint whose elements have straight sides. Along its boundary, the
+        middles of the edges and the corners alternate anticlockwise. The first point is the middle of the edge before
+        the first corner. The last point is the middle of the edge after the last corner of the meshed part. Each point
+        is a weighted sum of all corners and of the centroid, and is described by its row of weights.
         """
-        # Weights of the corners, and of the middle of the edge after each corner. The weights of a corner are 1 for the
-        # corner itself, and 0 for all other corners and for the centroid.
-        corners = np.eye(self.n_corner + 1)[:-1]
-        middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
+        # The weights of a corner are 1 for the corner itself, and 0 for all other corners and for the centroid.
+        corners = np.eye(self.n_corner, self.n_corner + 1)
+        middles_before = 0.5 * (corners + np.roll(corners, 1, axis=0))  # of the edge before each corner
+        closed_boundary = np.empty((2 * self.n_corner + 1, self.n_corner + 1))
+        closed_boundary[:-1:2] = middles_before
+        closed_boundary[1::2] = corners
+        closed_boundary[-1] = middles_before[0]
+        return closed_boundary[: 2 * self.n_meshed_corner + 1]
 
-        # Middles and corners alternate along the outline. The line between two of them is half an edge, which is
-        # divided into `n_half_edge` equal parts.
-        half_edge_ends = np.empty((2 * self.n_meshed_corner + 1, self.n_corner + 1))
-        half_edge_ends[0] = middles[-1]
-        half_edge_ends[1::2] = corners[: self.n_meshed_corner]
-        half_edge_ends[2::2] = middles[: self.n_meshed_corner]
-        return divide_intervals(half_edge_ends.T, self.n_half_edge).T
+    @cached_property
+    def core_outline(self) -> Array:
+        """Points at equal distances along each half edge of the core polygon, shape (n_sector + 1, n_corner + 1).
+
+        The points are the inner ends of the sides between the sectors. They are described by weights, as in
+        `half_edge_ends`.
+        """
+        return divide_intervals(self.half_edge_ends.T, self.n_half_edge).T
 
     @cached_property
     def inner_corner_weights(self) -> Array:
-        """Weights that describe the corners of the elements inside the innermost circle.
+        """Weights that describe the corners of the elements inside the innermost circle of the mesh.
 
         The shape is (n_inner, 4, n_corner + 1). The four corners of an element are the first and the last corner of its
         inner side, and the first and the last corner of its outer side. Each corner is a weighted sum of the corners
         and the centroid of the core polygon. The weights of a corner on a curved side are zero, because
         `Placement.sides` computes the curved sides.
 
-        The elements are those of the core polygon, followed by one or two layers of elements that surround the core
-        polygon up to the innermost circle.
+        The elements of the core polygon come first. One or two layers of `n_sector` elements each follow, which
+        surround the core polygon up to the innermost circle.
         """
         weights = np.zeros((self.n_inner, 4, self.n_corner + 1))
         weights[: self.n_quad] = self._core_element_corners()
@@ -186,21 +197,23 @@ class Blocks:
     def _core_element_corners(self) -> Array:
         """Return the corners of the elements in the core polygon.
 
-        The elements that belong to a corner of the core polygon fill a quadrilateral between the corner, the centroid
-        of the core polygon, and the middles of both adjacent edges. It consists of n_half_edge * n_half_edge elements.
+        The core polygon is divided into one quadrilateral for each of its corners. The inner side of a quadrilateral
+        extends from the centroid of the core polygon to the middle of the edge after the corner. The outer side extends
+        from the middle of the edge before the corner to the corner. A quadrilateral is divided into a square grid of
+        n_half_edge * n_half_edge elements.
 
         Returns:
-            First and last corner of the inner side, and first and last corner of the outer side of each element, as
-            weights, shape (n_quad, 4, n_corner + 1). The elements are ordered corner by corner.
+            First and last corner of the inner side, and first and last corner of the outer side of each element, shape
+            (n_quad, 4, n_corner + 1). The last axis contains the weights of the corners and of the centroid of the core
+            polygon, whose weighted sum is the corner. The elements are ordered quadrilateral by quadrilateral.
         """
-        # Corners of the quadrilaterals. There are `n_half_edge` steps along the outline between a middle and a corner.
-        centroid = np.eye(self.n_corner + 1)[-1]
-        middles = self.core_outline[:: 2 * self.n_half_edge]
-        corners = self.core_outline[self.n_half_edge :: 2 * self.n_half_edge]
+        centroid = np.eye(self.n_corner + 1)[-1]  # has the weight 1 for itself
+        middles = self.half_edge_ends[::2]
+        corners = self.half_edge_ends[1::2]
 
-        # Interpolate bilinearly on the grid of the corners of all elements, from the inner to the outer side. The axes
+        # Divide the inner and the outer side, and then the lines from the inner to the outer side. The axes of the grid
         # are the radial and the angular direction, the quadrilateral and the weight.
-        n_grid = self.n_half_edge + 1
+        n_grid = self.n_half_edge + 1  # points along a side
         inner_side = np.linspace(centroid, middles[1:], n_grid)
         outer_side = np.linspace(middles[:-1], corners, n_grid)
         grid = np.linspace(inner_side, outer_side, n_grid)
@@ -211,7 +224,8 @@ class Blocks:
         outer_first = grid[1:, :-1]
         outer_last = grid[1:, 1:]
         element_corners = np.stack([inner_first, inner_last, outer_first, outer_last], axis=3)
-        return np.moveaxis(element_corners, 2, 0).reshape(-1, 4, self.n_corner + 1)
+        by_quadrilateral = np.moveaxis(element_corners, 2, 0)
+        return by_quadrilateral.reshape(self.n_quad, 4, self.n_corner + 1)
 
     def rotated_elements(self, steps: int, steps_per_turn: int) -> Integers:
         """Return how the elements are renumbered by a rotation of the probe that maps the mesh onto itself.
@@ -221,19 +235,20 @@ class Blocks:
         sectors are numbered layer by layer and ring by ring, and anticlockwise within each layer or ring.
 
         Args:
-            steps: Number of steps by which the probe is rotated.
+            steps: Number of steps by which the probe is rotated anticlockwise.
             steps_per_turn: Number of steps in a full turn.
 
         Returns:
-            Index of the element that takes the place of each element, shape (n_element,).
+            For each element, the index of the element whose place it takes, shape (n_element,).
         """
-        # The rotation maps corners onto corners, so it is a rotation by a whole number of corners.
+        # The rotation maps corners onto corners, so it is a rotation by a whole number of corners. At each corner, two
+        # half edges meet, and each element along them begins a sector.
         corner_shift = steps * self.n_corner // steps_per_turn
         sector_shift = 2 * self.n_half_edge * corner_shift
         core_elements = np.arange(self.n_quad).reshape(self.n_meshed_corner, -1)  # one row for each corner
         sectors = np.arange(self.n_quad, self.n_element).reshape(-1, self.n_sector)  # one row for each layer and ring
 
-        # The place of an element is taken by the element that lies anticlockwise of it by the shift.
+        # Each element takes the place of the element that lies anticlockwise of it by the shift.
         rotated_core = np.roll(core_elements, -corner_shift, axis=0)
         rotated_sectors = np.roll(sectors, -sector_shift, axis=1)
         return np.concatenate([rotated_core.ravel(), rotated_sectors.ravel()])

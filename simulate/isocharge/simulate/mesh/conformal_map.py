@@ -140,8 +140,9 @@ def sector_angles(
 
     Args:
         blocks: The elements.
-        inner_points: Points x + iy on the inner boundary of the last layer, shape (..., 2 * n_meshed_corner + 1), in
-            film radii. They belong to the corners of the core polygon and to the points half-way between the corners.
+        inner_points: Points x + iy on the inner boundary of the last layer inside the circle, shape
+            (..., 2 * n_meshed_corner + 1), in film radii. They belong to the middles of the edges and to the corners of
+            the core polygon, which alternate.
         centroid: Position of the centroid of the footprint on the x axis, shape (...), in film radii.
         centre: Position of the centre of the circle on the x axis, shape (...), in film radii.
         radius: Radius of the circle, shape (...), in film radii.
@@ -158,7 +159,7 @@ def sector_angles(
     circle_radius = radius[..., None]
 
     # Compute the intersections of the rays with the circle, relative to the centre of the circle.
-    inner_radius = np.abs(inner_points - circle_centre).max(axis=-1, keepdims=True)
+    inner_radius = np.abs(inner_points - circle_centre).max(axis=-1, keepdims=True)  # of the farthest point
     ray_angle = _ray_angles(blocks, inner_points - ray_origin, circle_radius / inner_radius)
     ray = np.exp(1j * ray_angle)  # unit vectors, shape (..., n_sector + 1)
     intersection = _intersections_with_circle(ray_origin - circle_centre, ray, circle_radius)
@@ -188,42 +189,57 @@ def _intersections_with_circle(origin: Array, ray: Complexes, radius: Array) -> 
 def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) -> Array:
     """Compute the directions of rays that extend from the centroid of the footprint to the innermost circle.
 
-    Outside the circle, each ray continues as the side of a sector. Each of the given points on an inner boundary has a
-    ray. The ray points to the point, and is then rotated a little so that the rays become more evenly spaced. All other
-    rays divide the angle between two such rays into equal parts.
+    Outside the circle, each ray continues as the side of a sector. One ray belongs to each of the given points on an
+    inner boundary. This ray has the direction of the point, and is then rotated a little so that the rays become more
+    evenly spaced. All other rays divide the angle between two rays of points into equal parts.
 
     Args:
         blocks: The elements.
-        inner_points: Points x + iy on the inner boundary, relative to the centroid, shape (..., n_point): one point for
-            each corner of the core polygon, and one point half-way between each two corners.
+        inner_points: Points x + iy on the inner boundary, relative to the centroid, shape (..., n_point). Middles of
+            edges and corners of the inner boundary alternate.
         radius_ratio: Radius of the innermost circle divided by the largest distance of these points from its centre,
             shape (..., 1).
 
     Returns:
         Angles, shape (..., n_sector + 1), rad.
     """
-    # Directions of the inner points, and evenly spaced directions with the same mean, each of shape (..., n_point)
+    # Directions of the inner points, and evenly spaced directions, each of shape (..., n_point). The mean of both is
+    # the same. The last direction is omitted from the mean, because it repeats the first one after a full turn.
     inner_angle = np.unwrap(np.angle(inner_points))
     angle_from_first = np.linspace(0.0, math.tau / blocks.copies, inner_angle.shape[-1])
     first_even_angle = np.mean((inner_angle - angle_from_first)[..., :-1], axis=-1, keepdims=True)
     even_angle = first_even_angle + angle_from_first
 
-    # Compute the largest rotation. Elements would fold where a ray meets the middle of an edge at a small angle, so the
-    # largest rotation decreases with the cosine of the smallest of these angles.
-    middle = inner_points[..., :-1:2]
-    half_edge = inner_points[..., 1::2] - middle
-    angle_at_middle = np.angle(half_edge / middle)
-    largest_cosine = np.abs(np.cos(angle_at_middle)).max(axis=-1, keepdims=True)
-    max_rotation = 0.2 * (1.0 - largest_cosine)  # rad
-
     # Rotate each direction by up to half of the difference from the even direction. If the circle is close to the inner
     # points, the rotation is small. The function `tanh` limits the rotation smoothly.
+    max_rotation = _max_ray_rotation(inner_points)
     relative_gap = np.minimum((radius_ratio - 1.0) / CLEARANCE, 1.0)
     unlimited_rotation = 0.5 * relative_gap * (even_angle - inner_angle)
     rotation = max_rotation * np.tanh(unlimited_rotation / max_rotation)
 
     # Add the rays between the rays of the inner points.
     return divide_intervals(inner_angle + rotation, blocks.n_half_edge)
+
+
+def _max_ray_rotation(inner_points: Complexes) -> Array:
+    """Compute the largest angle by which rays may be rotated from the directions of points on an inner boundary.
+
+    Elements would fold where a ray meets an edge of the boundary at a small angle. The largest rotation is therefore
+    0.2 rad if the ray to the middle of each edge is perpendicular to the edge. It decreases to zero with the cosine of
+    the smallest angle between an edge and the ray to its middle.
+
+    Args:
+        inner_points: Points x + iy on the inner boundary, relative to the origin of the rays, shape (..., n_point).
+            Middles of edges and corners of the boundary alternate, beginning and ending with a middle.
+
+    Returns:
+        Angle, shape (..., 1), rad.
+    """
+    middle = inner_points[..., :-1:2]
+    corner_after_middle = inner_points[..., 1::2]
+    angle_at_middle = np.angle((corner_after_middle - middle) / middle)  # from the ray to the edge
+    largest_cosine = np.abs(np.cos(angle_at_middle)).max(axis=-1, keepdims=True)
+    return np.asarray(0.2 * (1.0 - largest_cosine))
 
 
 def rim_angles(angle: Array, map_parameter: Array, template_radius: Array) -> Array:
@@ -249,10 +265,12 @@ def rim_angles(angle: Array, map_parameter: Array, template_radius: Array) -> Ar
 
 
 def map_stretch(map_parameter: Array, radius: Array | float) -> Array:
-    """Compute the factor with which `stretch_angles` converts angles on the film into angles in the template plane.
+    """Compute the factor by which the inverse conformal map multiplies the tangents of half of the angles on a circle.
 
-    The angles on the film are measured around the centre of the image of a circle of the template plane. On the rim,
-    the factor is also the ratio of lengths in the template plane to lengths on the film, next to the press.
+    The conformal map converts a circle around the origin of the template plane into a circle on the film. The angles on
+    the film are measured around the centre of this circle. The factor converts them into angles in the template plane
+    (`stretch_angles`). On the rim, the factor is also the ratio of lengths in the template plane to lengths on the
+    film, at the point of the rim that is next to the press.
 
     Args:
         map_parameter: Parameter c of the conformal map, shape (...).
@@ -269,7 +287,7 @@ def stretch_angles(angle: Array, factor: Array) -> Array:
     """Change each angle such that the tangent of half of the angle is multiplied by a factor.
 
     The conformal map with the parameter c also changes angles in this way. For points at the distance r from the
-    origin, it multiplies the tangent of half of the angle by (1 - c r) / (1 + c r). On the rim, r is 1.
+    origin, the map multiplies the tangent of half of the angle by (1 - c r) / (1 + c r). On the rim, r is 1.
 
     Args:
         angle: Angles, shape (..., n), rad.
@@ -278,7 +296,7 @@ def stretch_angles(angle: Array, factor: Array) -> Array:
     Returns:
         Changed angles, shape (..., n), rad. Each angle remains in the same full turn.
     """
-    full_turns = math.tau * np.round(angle / math.tau)
+    full_turns = math.tau * np.round(angle / math.tau)  # the tangent of half of the angle does not contain them
     half_angle = 0.5 * (angle - full_turns)
     return full_turns + 2.0 * np.arctan(factor[..., None] * np.tan(half_angle))
 

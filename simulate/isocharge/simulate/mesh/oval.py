@@ -35,14 +35,17 @@ def oval_displacement(points: Complexes, oval: Complexes) -> Complexes:
     Returns:
         Displacements x + iy, same shape, in film radii.
     """
-    return np.asarray(points * np.abs(points) ** 2 * (np.conj(oval) * points**2).real)
+    squared_distance = np.abs(points) ** 2
+    angular_factor = (np.conj(oval) * points**2).real  # squared distance times e cos(2 (angle - alpha))
+    return np.asarray(points * squared_distance * angular_factor)
 
 
 def circular_distance(distance: Array, oval: Complexes, reach: float) -> Array:
-    """Compute the distance of a press from the centre of the circular film.
+    """Convert the distance of a press from the centre of an oval film into its distance on the circular film.
 
-    A footprint that touches the rim of the oval film also touches the rim of the circular film. The displacement of the
-    footprint increases with the fifth power of the distance, up to that of the rim.
+    The circular film is deformed into the oval film, which displaces the press in the radial direction. The
+    displacement increases with the fifth power of the distance. A footprint that touches the rim is displaced like the
+    rim, so it touches the rim of both films.
 
     Args:
         distance: Distance of the press from the centre of the oval film, any shape, in film radii.
@@ -52,5 +55,6 @@ def circular_distance(distance: Array, oval: Complexes, reach: float) -> Array:
     Returns:
         Distance before the displacement, same shape, in film radii.
     """
-    largest_distance = 1.0 + oval.real - reach  # of a footprint that touches the rim
-    return np.asarray(distance - oval.real * (distance / largest_distance) ** 5)
+    rim_displacement = oval.real  # of the rim in the direction of the press
+    largest_distance = 1.0 + rim_displacement - reach  # of a footprint that touches the rim
+    return np.asarray(distance - rim_displacement * (distance / largest_distance) ** 5)

@@ -95,28 +95,29 @@ class Placement:
         # Corners of the core polygon on the circular film, followed by the centroid of the footprint. The centroid is a
         # real number, because the press lies on the x axis.
         real_centroid = distance / film_radius
-        centroid = circular_distance(real_centroid, np.asarray(oval), probe.reach / film_radius)
+        reach = probe.reach / film_radius
+        centroid = circular_distance(real_centroid, np.asarray(oval), reach)
         rotation_factor: Complexes = np.exp(1j * np.broadcast_to(rotation, centroid.shape))
         rotation_and_scale = rotation_factor / film_radius
+        core_corners = _on_film(probe.core(), centroid, rotation_and_scale)
+        corners = np.concatenate([core_corners, centroid[..., None]], axis=-1)
 
-        def on_film(footprint_points: Complexes) -> Complexes:
-            """Convert points relative to the centroid, mm, into points of the circular film, in film radii."""
-            return centroid[..., None] + rotation_and_scale[..., None] * footprint_points
-
-        corners = np.concatenate([on_film(probe.core()), centroid[..., None]], axis=-1)
-
-        # The innermost circle is the boundary of a circular footprint, or encloses the footprint with a gap. The last
-        # layer of elements inside the circle connects the circle to an inner boundary. The inner boundary is the edge
-        # of the core polygon, or the edge of a curved footprint that is not circular. `inner_points` are the points of
-        # the inner boundary that belong to the corners of the core polygon and to the points half-way between them.
-        inner_points: Complexes = np.asarray(corners @ blocks.core_outline[:: blocks.n_half_edge].T)
+        # The innermost circle is the boundary of a circular footprint, or encloses the footprint with a gap.
         if probe.topology.fills_circle:
             centre = centroid
-            radius = np.full(centroid.shape, probe.reach / film_radius)
+            radius = np.full(centroid.shape, reach)
         else:
-            centre, radius = enclosing_circle(on_film(probe.outline), centroid)
-            if isinstance(probe, CurvedProbe) and probe.topology.is_curved:
-                inner_points = on_film(probe.boundary(blocks.boundary_parameter[:: blocks.n_half_edge]))
+            outline = _on_film(probe.outline, centroid, rotation_and_scale)
+            centre, radius = enclosing_circle(outline, centroid)
+
+        # The last layer of elements inside the circle connects the circle to an inner boundary. The inner boundary is
+        # the edge of the core polygon, or the edge of the footprint if there are two layers. `inner_points` are the
+        # points of the inner boundary that belong to the middles of the edges and to the corners of the core polygon.
+        inner_points: Complexes = np.asarray(corners @ blocks.half_edge_ends.T)
+        if blocks.n_layer == 2:
+            assert isinstance(probe, CurvedProbe)
+            boundary = probe.boundary(blocks.boundary_parameter[:: blocks.n_half_edge])
+            inner_points = _on_film(boundary, centroid, rotation_and_scale)
 
         # Compute the conformal map of the innermost circle, and the angles and depths of the elements around it.
         map_parameter, template_radius = automorphism_onto(centre, radius)
@@ -232,8 +233,8 @@ class Placement:
             Points x + iy of the circular film, shape (..., n), in film radii.
         """
         assert isinstance(self.probe, CurvedProbe)
-        centroid = self.corners[..., -1:]
-        return centroid + self.rotation_and_scale[..., None] * self.probe.boundary(parameter)
+        centroid = self.corners[..., -1]
+        return _on_film(self.probe.boundary(parameter), centroid, self.rotation_and_scale)
 
     def element_points(self, blocks: Blocks) -> Complexes:
         """Compute the film points of the nodes of all elements for a single placement.
@@ -260,7 +261,7 @@ class Placement:
             Points x + iy of the circular film, shape (n_inner, (order + 1)^2), in film radii.
         """
         radial, angular = _unit_coordinates(blocks)
-        placement_of_element = self[None][np.zeros(blocks.n_inner, dtype=np.intp)]
+        placement_of_element = self[None][np.zeros(blocks.n_inner, dtype=np.intp)]  # this placement for each element
         inner, outer = placement_of_element.sides(blocks, np.arange(blocks.n_inner), angular[None])
         points: Complexes = _interpolate(inner, outer, radial)
         return points
@@ -278,9 +279,10 @@ class Placement:
         Returns:
             Points x + iy of the inner sides and of the outer sides, each of shape (n, k), in film radii.
         """
-        # Straight sides. The weights of the corners of curved sides are zero.
-        corners = np.einsum("nkc,nc->kn", blocks.inner_corner_weights[element], self.corners)
-        inner_first, inner_last, outer_first, outer_last = corners[:, :, None]  # each of shape (n, 1)
+        # Compute the sides as if they were straight. The points of curved sides are replaced below. The four corners of
+        # an element (i) are sums over the corners and the centroid of the core polygon (j).
+        element_corners = np.einsum("nij,nj->in", blocks.inner_corner_weights[element], self.corners)
+        inner_first, inner_last, outer_first, outer_last = element_corners[:, :, None]  # each of shape (n, 1)
         inner = _interpolate(inner_first, inner_last, angular)
         outer = _interpolate(outer_first, outer_last, angular)
 
@@ -326,7 +328,22 @@ class Placement:
         log_radius = (1.0 - depth) * np.log(self.template_radius)
         template_points = np.exp(log_radius + 1j * angle)
         circular_points = self.to_film(template_points)
-        return (circular_points + self.displacement(circular_points, depth)).reshape(-1, radial.size)
+        film_points = circular_points + self.displacement(circular_points, depth)
+        return film_points.reshape(-1, radial.size)  # one row for each element
+
+
+def _on_film(footprint_points: Complexes, centroid: Array | Complexes, rotation_and_scale: Complexes) -> Complexes:
+    """Convert points of a footprint into points of the circular film.
+
+    Args:
+        footprint_points: Points x + iy relative to the centroid of the footprint, shape (n,) or (..., n), mm.
+        centroid: Position of the centroid on the circular film, shape (...), in film radii.
+        rotation_and_scale: Factor that rotates the points and converts them from mm to film radii, shape (...).
+
+    Returns:
+        Points x + iy, shape (..., n), in film radii.
+    """
+    return centroid[..., None] + rotation_and_scale[..., None] * footprint_points
 
 
 def _interpolate(start: Any, end: Any, share: Array) -> Any:

@@ -117,11 +117,12 @@ def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tu
     element, coordinates = _locate_in_rings(placement, blocks, template_points)
     is_inside = np.abs(template_points) <= placement.template_radius[:, None]
     if np.any(is_inside):
+        # The corners of the elements are the same for all points of a row, and are computed once for each row.
         row_of_point, _ = np.nonzero(is_inside)  # for each point inside the circle
-        used_rows, used_row_of_point = np.unique(row_of_point, return_inverse=True)
-        corners = _inner_corners(placement[used_rows], blocks)[used_row_of_point]
+        rows, index_in_rows = np.unique(row_of_point, return_inverse=True)
+        corners_of_rows = _inner_corners(placement[rows], blocks)
         element[is_inside], coordinates[:, is_inside] = _locate_inside(
-            placement[row_of_point], blocks, circular_points[is_inside], corners
+            placement[row_of_point], blocks, circular_points[is_inside], corners_of_rows[index_in_rows]
         )
 
     # Convert the coordinates from the range from 0 to 1 to the range from -1 to 1.
@@ -143,20 +144,26 @@ def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Comp
     Returns:
         Index of the element, shape (k, n). Radial and angular coordinate in the element from 0 to 1, shape (2, k, n).
     """
+    # The depth increases from 0 on the innermost circle to 1 on the rim.
     depth = placement.depth(template_points)
-    ring, radial = _locate_in_intervals(placement.ring_depths.T[..., None], depth)
+    ring_edges = placement.ring_depths.T[..., None]  # shape (n_ring + 1, k, 1)
+    ring, radial = _locate_in_intervals(ring_edges, depth)
 
     # Angles at which the sides of the sectors lie at the depths of the points, shape (n_sector + 1, k, n). Along a
     # side, the angle changes linearly from its value on the innermost circle to its value on the rim.
-    circle_angles = placement.circle_angles.T[..., None]
-    side_angles = circle_angles + depth * (placement.rim_angles.T[..., None] - circle_angles)
+    circle_angles = placement.circle_angles.T[..., None]  # shape (n_sector + 1, k, 1)
+    rim_angles = placement.rim_angles.T[..., None]
+    side_angles = circle_angles + depth * (rim_angles - circle_angles)
 
     # If the whole film is meshed, add full turns such that each angle lies within one turn after the first side.
     angle = np.angle(template_points)
     if not blocks.half:
         angle = side_angles[0] + np.mod(angle - side_angles[0], math.tau)
     sector, angular = _locate_in_intervals(side_angles, angle)
-    return blocks.n_inner + ring * blocks.n_sector + sector, np.stack([radial, angular])
+
+    # The elements inside the innermost circle are numbered before the sectors of all rings.
+    element = blocks.n_inner + ring * blocks.n_sector + sector
+    return element, np.stack([radial, angular])
 
 
 def _locate_in_intervals(edges: Array, values: Array) -> tuple[Integers, Array]:
@@ -182,10 +189,10 @@ def _locate_inside(
     """Find the elements that contain points inside the innermost circle of the mesh.
 
     A straight line is drawn through each side of an element. The signed distance of a point from the line is positive
-    if the point and the element lie on the same side of the line. Therefore the smallest of the four distances is
-    positive for points inside an element with straight sides. The elements are tried in the order of this distance,
-    beginning with the largest. Most points lie in the first element that is tried. Near curved sides, a further element
-    may be needed.
+    if the point and the element lie on the same side of the line. For points inside an element with straight sides, the
+    smallest of the four distances is therefore positive. For each point, the elements are tried in the order of their
+    smallest distances, beginning with the largest. Most points lie in the first element that is tried. Near curved
+    sides, a further element may be needed.
 
     Args:
         placement: n placements, one for each point.
@@ -197,6 +204,7 @@ def _locate_inside(
     Returns:
         Index of the element, shape (n,). Radial and angular coordinate in the element from 0 to 1, shape (2, n).
     """
+    # Each side runs from its start to its end with the element on its left.
     inner_first, inner_last, outer_first, outer_last = np.moveaxis(corners, -1, 0)
     sides = ((inner_first, outer_first), (outer_last, inner_last), (inner_last, inner_first), (outer_first, outer_last))
     distances = [_distance_to_left(start, end, points[:, None]) for start, end in sides]
@@ -230,9 +238,12 @@ def _inner_corners(placement: Placement, blocks: Blocks) -> Complexes:
         Corners x + iy, shape (n, n_inner, 4), in film radii. They are the first and the last corner of the inner side,
         and the first and the last corner of the outer side of each element.
     """
+    # The corners are the ends of the inner and the outer side, at the angular coordinates 0 and 1. The sides of all
+    # elements are computed for each placement.
     n_placement = len(placement.template_radius)
-    index, element = np.divmod(np.arange(n_placement * blocks.n_inner), blocks.n_inner)
-    sides = placement[index].sides(blocks, element, np.array([[0.0, 1.0]]))
+    placement_index = np.repeat(np.arange(n_placement), blocks.n_inner)
+    element = np.tile(np.arange(blocks.n_inner), n_placement)
+    sides = placement[placement_index].sides(blocks, element, np.array([[0.0, 1.0]]))
     return np.concatenate(sides, axis=1).reshape(n_placement, blocks.n_inner, 4)
 
 
@@ -272,7 +283,7 @@ def _local_coordinates(placement: Placement, blocks: Blocks, points: Complexes, 
         new_coordinates = np.clip(coordinates + step, -0.1, 1.1)  # the point may leave the element a little
         largest_step = np.abs(new_coordinates - coordinates).max()
         coordinates = new_coordinates
-        if largest_step < 1e-13:  # the step is a rounding error
+        if largest_step < 1e-13:  # the steps of all points are rounding errors
             break
     return coordinates
 
