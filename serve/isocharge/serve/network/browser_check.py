@@ -84,8 +84,8 @@ class AccessCheck:
         """
         host = headers.get(b"host", b"").decode("latin-1").lower()
         name = _name_in(host)
-        is_served = self._any_host or name in self._host_names or ip_address(name) is not None
-        if host and not is_served:  # HTTP/1.0 does not require the header, but browsers always send it
+        is_own_name = self._any_host or name in self._host_names or ip_address(name) is not None
+        if host and not is_own_name:  # HTTP/1.0 does not require the header, but browsers always send it
             raise RequestError(
                 f"Host: expected an IP address or one of {', '.join(sorted(self._host_names))}, got {shown(host)}; use "
                 "the server's address, or name the host by --allow-host (allowed_hosts of asgi_app)",
@@ -213,7 +213,6 @@ def _name_in(host: str) -> str:
         host: Value of the header `Host`, or the part of the header `Origin` after the scheme.
     """
     try:
-        name = urlsplit(f"//{host}").hostname or "?"
+        return (urlsplit(f"//{host}").hostname or "?").removesuffix(".")
     except ValueError:
         return "?"
-    return name.removesuffix(".")

@@ -51,14 +51,19 @@ class Statistics(NamedTuple):
     def of_all_versions(cls) -> "Statistics":
         """Create the metrics of all versions, which have no values before `of` is called."""
         labels = ("model", "version")
-        description = "Time to read, compute and write an inference, without the network."
         return cls(
             Counter("isocharge_presses", "Presses that were answered.", labels, registry=None),
             Counter("isocharge_misfit_alarms", "Presses with the flag misfit.", labels, registry=None),
             Counter(
                 "isocharge_inferences_refused", "Requests for an inference that were refused.", labels, registry=None
             ),
-            Histogram("isocharge_inference_seconds", description, labels, registry=None, buckets=LATENCY_BOUNDS_S),
+            Histogram(
+                "isocharge_inference_seconds",
+                "Time to read, compute and write an inference, without the network.",
+                labels,
+                registry=None,
+                buckets=LATENCY_BOUNDS_S,
+            ),
         )
 
     def of(self, name: str, version: int) -> "Statistics":
@@ -95,18 +100,12 @@ class Exchange:
     """Properties of a request and of its response, for the counters and the log.
 
     Attributes:
-        transport: Transport of the request, which is "http" or "grpc".
         route: Name of the route, or "none" if the request could not be read.
         status: HTTP status, or name of the gRPC status. "CANCELLED" if the client has ended a call of gRPC.
-        duration_us: Time from the complete request to the complete response, us.
-        client: Address and port of the client.
     """
 
-    transport: str
     route: str = "none"
     status: int | str = "CANCELLED"
-    duration_us: float = 0.0
-    client: str | None = None
 
 
 class RequestLog(logging.Handler):
@@ -124,8 +123,8 @@ class RequestLog(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a line with a message of the module `logging`. The line also contains the traceback, if any."""
-        level = record.levelname.lower()
-        self.write_line(level=level, event="message", logger=record.name, message=self.format(record))
+        message = self.format(record)
+        self.write_line(level=record.levelname.lower(), event="message", logger=record.name, message=message)
 
     def write_line(self, **properties: Any) -> None:
         """Write a line about an event, which begins with the present time."""
@@ -175,13 +174,17 @@ class Traffic:
             Properties of the request and of the response, which the block sets.
         """
         start_ns = time.perf_counter_ns()
-        exchange = Exchange(transport)
+        exchange = Exchange()
         try:
             yield exchange
         finally:
             self._requests(transport, exchange.route, exchange.status).inc()
             if self.log is not None:
-                exchange.duration_us = (time.perf_counter_ns() - start_ns) / 1000
-                exchange.client = "%s:%d" % client if isinstance(client, tuple) else client  # noqa: UP031 - fast
-                level = "error" if exchange.status in (500, "INTERNAL") else "info"  # errors of the server itself
-                self.log.write_line(level=level, event="request", **vars(exchange))
+                self.log.write_line(
+                    level="error" if exchange.status in (500, "INTERNAL") else "info",  # errors of the server itself
+                    event="request",
+                    transport=transport,
+                    **vars(exchange),
+                    duration_us=(time.perf_counter_ns() - start_ns) / 1000,
+                    client="%s:%d" % client if isinstance(client, tuple) else client,  # noqa: UP031 - fast
+                )

@@ -139,7 +139,7 @@ class ModelStore:
         A row contains the name of the model, and the number and the state of the version. If the version was refused or
         unloaded, the row also contains the reason. The number is empty if no version of a model was found.
         """
-        new_names = [name for name in self._folders() if not self._find(name)]
+        new_models = [Version(name, 0) for name in self._folders() if not self._find(name)]
         return [
             {
                 "name": row.name,
@@ -147,7 +147,7 @@ class ModelStore:
                 "state": "READY" if row.loaded else "UNAVAILABLE",
                 "reason": row.reason,
             }
-            for row in sorted([*self._find(), *(Version(name, 0) for name in new_names)])
+            for row in sorted([*self._find(), *new_models])
         ]
 
     def load_all(self) -> None:
@@ -212,23 +212,24 @@ class ModelStore:
             folder: Folder of the model, or None if there is no such folder.
         """
         earlier = {row.number: row._replace(reason="") for row in self._find(name) if row.loaded}
-        rows: dict[int, Version] = {}
+        present: dict[int, Version] = {}  # by number
         try:
             folders = version_folders(folder) if folder else {}
         except ModelError as error:  # the folder cannot be listed
             folders = {}
-            rows[0] = Version(name, 0, reason=str(error))
+            present[0] = Version(name, 0, reason=str(error))
         for number, version_folder in folders.items():
             try:
                 loaded = LoadedVersion(version_folder, self._statistics.of(name, number))
-                rows[number] = Version(name, number, loaded)
+                present[number] = Version(name, number, loaded)
             except Exception as error:  # any error in one folder must not affect the other models
-                row = earlier.get(number, Version(name, number))
+                version = earlier.get(number, Version(name, number))  # keep what was loaded from the old files
                 reason = str(error) if isinstance(error, ModelError) else f"{version_folder}: {error!r}"
-                rows[number] = row._replace(reason=reason)
-        if not rows or any(row.reason for row in rows.values()):
-            rows = earlier | rows
-        self._versions = self._versions | {name: sorted(rows.values())}
+                present[number] = version._replace(reason=reason)
+
+        is_incomplete = not present or any(version.reason for version in present.values())
+        versions = earlier | present if is_incomplete else present
+        self._versions = self._versions | {name: sorted(versions.values())}
 
     def collect(self) -> Iterator[Metric]:
         """Yield the metrics of all models for Prometheus. A registry calls this method."""

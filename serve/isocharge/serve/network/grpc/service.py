@@ -66,7 +66,8 @@ def read_request(message: Any) -> tuple[InferBody, bytes]:
                 "name": tensor.name,
                 "datatype": tensor.datatype,
                 "shape": [*tensor.shape],
-                # The name of the list of numbers depends on their type. An empty list was not sent.
+                # Numbers of the type FP32 are in the list `fp32_contents`, for example. The list is empty if the client
+                # has sent raw contents instead, and `InferBody` states this by None.
                 "data": [*getattr(tensor.contents, f"{tensor.datatype.lower()}_contents", ())] or None,
             }
             for tensor in message.inputs
@@ -223,7 +224,18 @@ class Service:
                 return response_type(error_message=message)
         if name == "ModelInfer":
             return self._infer(request)
+        return ParseDict(self._answer_like_http(name, request), response_type())
 
+    def _answer_like_http(self, name: str, request: Any) -> Json:
+        """Answer a message with the route of the HTTP server, and return the fields of the response.
+
+        Args:
+            name: Name of the method, which is not a method for inferences.
+            request: The message.
+
+        Raises:
+            IsochargeError: If the request is refused.
+        """
         # The name and the version of the model are called `model_name` and `model_version` in some messages of the
         # protocol, and `name` and `version` in other messages. Messages about the server contain none of these fields.
         model_name = getattr(request, "model_name", "") or getattr(request, "name", "")
@@ -236,10 +248,8 @@ class Service:
         except ModelError:
             if name not in ("ServerReady", "ModelReady"):
                 raise
-            answer = {"ready": False}  # gRPC has no status for this answer
-        if name in ANSWER_FIELDS:
-            answer = {ANSWER_FIELDS[name]: answer}
-        return ParseDict(answer, response_type())
+            return {"ready": False}  # gRPC has no status for this answer
+        return {ANSWER_FIELDS[name]: answer} if name in ANSWER_FIELDS else answer
 
     def _infer(self, request: Any) -> Any:
         """Run a model on the charges of a ModelInferRequest, and return the ModelInferResponse."""

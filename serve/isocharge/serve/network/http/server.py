@@ -86,10 +86,10 @@ class Connection(HttpToolsProtocol):
         """
         limit = self._limits.header_bytes
         while data and not self.transport.is_closing():
-            size = limit + 1 - self._pending_bytes  # a byte more than permitted
-            self._pending_bytes += len(data[:size])
-            super().data_received(data[:size])
-            data = data[size:]
+            piece = data[: limit + 1 - self._pending_bytes]  # one byte more than permitted shows that it is too much
+            data = data[len(piece) :]
+            self._pending_bytes += len(piece)  # the parser may reset this number in the next line
+            super().data_received(piece)
             if self._pending_bytes > limit:
                 self.refuse(431, f"the request line and headers are longer than {limit} bytes")
                 return
@@ -243,14 +243,13 @@ class HttpServer(uvicorn.Server):
             InputError: If a TLS file cannot be used.
             ListenError: If the address is in use or cannot be used.
         """
-        traffic = application.traffic
         limits = _within_open_files(application.limits)
         tls_context = tls.context() if tls else None
         self._address = address
         self._socket = address.listen()
         config = uvicorn.Config(
             application,
-            http=partial(Connection, limits, traffic),  # type: ignore[arg-type]
+            http=partial(Connection, limits, application.traffic),  # type: ignore[arg-type]
             lifespan="off",
             ws="none",
             log_config=None,
@@ -265,7 +264,7 @@ class HttpServer(uvicorn.Server):
         )
         super().__init__(config)
         self.url = address.url(self._socket, secure=tls is not None)
-        traffic.open.labels("http").set_function(lambda: len(self.server_state.connections))
+        application.traffic.open.labels("http").set_function(lambda: len(self.server_state.connections))
 
     def run(self, beside: AbstractAsyncContextManager[Any] | None = None) -> None:  # type: ignore[override]
         """Answer requests until `stop` is called, and then finish the requests that have already begun.

@@ -52,9 +52,8 @@ class Application(ABC):
     async def __call__(self, scope: Message, receive: Channel, send: Channel) -> None:
         """Answer one HTTP request. If the client disconnects before its request is complete, nothing is sent.
 
-        WebSockets are refused. The start and the end of the program need no work (lifespan of ASGI).
-
-        A server that stops cancels requests that it cannot finish in time. The client of such a request is told so.
+        WebSockets are refused. The start and the end of the program need no work (lifespan of ASGI). A server that
+        stops cancels requests that it cannot finish in time, and their clients receive the status 503.
 
         Args:
             scope: Method, path, headers and client of the request.
@@ -70,16 +69,11 @@ class Application(ABC):
                 await send({"type": f"lifespan.{event}.complete"})
             return
         try:
-            # Stop reading as soon as the body is larger than allowed. The application then refuses the body.
-            body = bytearray()
-            message: Message = {"more_body": True}
-            while message.get("more_body") and len(body) <= self.limits.body_bytes:
-                message = await receive()
-                if message["type"] == "http.disconnect":
-                    return
-                body += message.get("body", b"")
+            body = await self._read_body(receive)
+            if body is None:
+                return
             path = scope["path"].removeprefix(scope.get("root_path", ""))  # the root path belongs to a mounting program
-            request = (scope["method"], path, scope["headers"], bytes(body), scope.get("client"))
+            request = (scope["method"], path, scope["headers"], body, scope.get("client"))
             if path.startswith(self.blocking_paths):
                 response = await asyncio.to_thread(self.answer, *request)
             else:  # most answers take only microseconds
@@ -89,6 +83,23 @@ class Application(ABC):
             response = json_response({"error": error}, 503)
         await send({"type": "http.response.start", "status": response.status, "headers": response.headers})
         await send({"type": "http.response.body", "body": response.body})
+
+    async def _read_body(self, receive: Channel) -> bytes | None:
+        """Receive the body of a request, and return it, or None if the client disconnects before its end.
+
+        If the body is larger than allowed, its rest is not received. The method `answer` then refuses the request.
+
+        Args:
+            receive: Function that returns the next part of the request.
+        """
+        body = bytearray()
+        message: Message = {"more_body": True}
+        while message.get("more_body") and len(body) <= self.limits.body_bytes:
+            message = await receive()
+            if message["type"] == "http.disconnect":
+                return None
+            body += message.get("body", b"")
+        return bytes(body)
 
     def answer(self, method: str, path: str, headers: Iterable[Header], body: bytes, client: Client = None) -> Response:
         """Answer one request, count the request, and log the request if there is a log.
@@ -141,8 +152,9 @@ def check_method(path: str, method: str, allowed: str) -> None:
         RequestError: If the method is not the only method that is allowed for the path.
     """
     if method != allowed:
-        message = f"{path}: expected the method {allowed}, got {method[:20]}"
-        raise RequestError(message, 405, (b"allow", allowed.encode()))
+        raise RequestError(
+            f"{path}: expected the method {allowed}, got {method[:20]}", 405, (b"allow", allowed.encode())
+        )
 
 
 _PATTERNS = [
@@ -160,8 +172,7 @@ def match_path(path: str) -> tuple[Route, dict[str, str]]:
     If the server has no route for the path, the route is `UNKNOWN`.
     """
     for pattern, route in _PATTERNS:
-        path_match = pattern.fullmatch(path)
-        if path_match:
+        if path_match := pattern.fullmatch(path):
             return route, path_match.groupdict()
     return UNKNOWN, {}
 
@@ -208,7 +219,7 @@ class Handler(Application):
         if route is UNKNOWN:
             raise RequestError(f"{path[:200]}: nothing is served under this path; see /openapi.json", 404)
         # A HEAD request is answered like a GET request. The server then sends the response without its body.
-        if (method, route.method) != ("HEAD", "GET"):
+        if method != "HEAD" or route.method != "GET":
             check_method(path, method, route.method)
         body = decompress(body, headers.get(b"content-encoding", b"").lower(), self.limits.body_bytes)
         answer = route.respond(Request(self.store, self.traffic, headers, body, **model))

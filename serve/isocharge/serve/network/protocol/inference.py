@@ -130,9 +130,10 @@ def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...
     try:
         charges = np.frombuffer(binary, dtype) if tensor.data is None else np.asarray(tensor.data, np.float64)
     except ValueError:  # an incomplete number, or rows of different lengths
-        charges = np.empty(0)
-    is_sent_twice = binary and tensor.data is not None
-    if is_sent_twice or charges.shape not in (tuple(shape), (count,)):
+        charges = np.empty(0)  # is refused below, because its shape is not accepted
+    is_sent_twice = binary and tensor.data is not None  # as a binary tensor and as a list
+    accepted_shapes = (tuple(shape), (count,))
+    if is_sent_twice or charges.shape not in accepted_shapes:
         raise RequestError(
             f"input {INPUT!r}: expected {count} numbers for the shape {shape}, flat or in rows of equal length, or "
             f"{count} binary numbers of {dtype.itemsize} bytes each, got an array of the shape {charges.shape} and "

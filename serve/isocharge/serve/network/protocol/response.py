@@ -79,8 +79,9 @@ def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
     if encoding in (b"", b"identity"):
         return body
     if encoding not in (b"gzip", b"x-gzip", b"deflate"):  # the encoding `deflate` of HTTP is the zlib format
-        name = shown(encoding.decode("latin-1"))
-        raise RequestError(f"Content-Encoding: expected gzip, deflate or identity, got {name}", 415)
+        raise RequestError(
+            f"Content-Encoding: expected gzip, deflate or identity, got {shown(encoding.decode('latin-1'))}", 415
+        )
     decompressor = zlib.decompressobj(zlib.MAX_WBITS | 32)  # recognises gzip and deflate
     try:
         plain_body = decompressor.decompress(body, limit + 1)  # the additional byte shows that the limit is exceeded

@@ -26,14 +26,14 @@ from isocharge.serve.network.protocol.inference import (
 )
 from isocharge.serve.network.protocol.response import Response, json_response, response_of
 
-EXTENSIONS = (
+EXTENSIONS = [
     "binary_tensor_data",
     "model_configuration",
     "model_repository",
     "model_repository(unload_dependents)",
     "parameters",
     "statistics",
-)
+]
 """Extensions of the protocol that the servers support."""
 
 PLATFORM = "onnxruntime_onnx"
@@ -91,7 +91,7 @@ def _show_openapi(_: Request) -> Response:
 
 def _show_server(_: Request) -> Json:
     """Return the name and the version of the server, and the extensions of the protocol that it supports."""
-    return {"name": "isocharge", "version": package_version(), "extensions": list(EXTENSIONS)}
+    return {"name": "isocharge", "version": package_version(), "extensions": EXTENSIONS}
 
 
 def _show_metrics(request: Request) -> Response:
@@ -134,10 +134,12 @@ def _show_statistics(request: Request) -> Json:
     if request.name:
         _ = request.loaded  # raises ModelNotFound
     selected = request.store.versions_of(request.name or None, request.version)
-    rows = [
-        {"name": loaded.metadata.name, "version": loaded.version, **loaded.statistics.to_json()} for loaded in selected
-    ]
-    return {"model_stats": rows}
+    return {
+        "model_stats": [
+            {"name": loaded.metadata.name, "version": loaded.version, **loaded.statistics.to_json()}
+            for loaded in selected
+        ]
+    }
 
 
 def _show_model(request: Request) -> Json:
@@ -183,7 +185,7 @@ def _infer(request: Request) -> Response:
     loaded = request.loaded
     if not request.body and b"upgrade" in request.headers:  # uvicorn discards the body of a request for an upgrade
         raise RequestError("Upgrade: this server reads no body after this header; set the client to HTTP/1.1")
-    header_length = request.headers.get(b"inference-header-content-length")
+    header_length = request.headers.get(b"inference-header-content-length")  # length of the JSON text, bytes
     with loaded.statistics.refused.count_exceptions(), loaded.statistics.latency.time():
         body, binary = read_infer(request.body, header_length)
         content = infer(loaded, body, binary)
