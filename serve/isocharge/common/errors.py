@@ -277,11 +277,12 @@ def package_version() -> str:
 
 
 def lazy_names(package: str, *extras: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Return the attributes `__getattr__`, `__dir__` and `__all__` of a package with public names.
+    """Return the attributes `__getattr__`, `__dir__` and `__all__` of a package whose public names are imported late.
 
-    A public name is imported when it is used for the first time. Python calls `__getattr__` for each attribute that the
-    package does not contain. The public names and their modules are stated once, as imports that only type checkers
-    execute. A repeated name after `as` shows type checkers that the name is public:
+    A public name is imported when it is used for the first time, because Python calls `__getattr__` for each attribute
+    that the package does not contain yet. The package states its public names and their modules once, as imports that
+    only type checkers execute. This function finds these imports in the source of the package. A repeated name after
+    `as` states that the name is public:
 
         if TYPE_CHECKING:
             from isocharge.simulate.solver.press import press as press
@@ -291,13 +292,16 @@ def lazy_names(package: str, *extras: str) -> tuple[Callable[[str], Any], Callab
     Args:
         package: Name of the package.
         *extras: Extras of pyproject.toml that the package needs.
+
+    Returns:
+        Function that imports a public name, function that returns a new list of the public names, and the public names.
     """
     source = pkgutil.get_data(package, "__init__.py") or b""
     imports = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ImportFrom)]
-    modules = {alias.name: node.module or "" for node in imports for alias in node.names if alias.asname}
-    public_names = sorted(modules)
+    module_by_name = {alias.name: node.module or "" for node in imports for alias in node.names if alias.asname}
+    public_names = sorted(module_by_name)
 
-    def look_up(name: str) -> Any:
+    def import_public_name(name: str) -> Any:
         """Import a public name, and store it in the package, so that Python no longer calls this function for it.
 
         Raises:
@@ -306,12 +310,12 @@ def lazy_names(package: str, *extras: str) -> tuple[Callable[[str], Any], Callab
         """
         if name == "__version__":
             return package_version()
-        if name not in modules:
+        if name not in module_by_name:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         with require(*extras):
-            value = getattr(import_module(modules[name]), name)
+            value = getattr(import_module(module_by_name[name]), name)
         setattr(sys.modules[package], name, value)
         return value
 
-    # Tab completion suggests only the public names.
-    return look_up, public_names.copy, public_names
+    list_public_names = public_names.copy  # as `__dir__`, so that tab completion suggests only the public names
+    return import_public_name, list_public_names, public_names

@@ -199,7 +199,7 @@ def _prefix(where: str) -> str:
     return f"{where}: " if where else ""
 
 
-_WRONG_KEY = re.compile(r"Object (missing required|contains unknown) field `(.*)`$", re.DOTALL)
+_KEY_ERROR = re.compile(r"Object (missing required|contains unknown) field `(.*)`$", re.DOTALL)
 """Message of msgspec about a key that is missing or unknown."""
 
 
@@ -207,7 +207,8 @@ def _describe_mistake(value: Any, expected_type: Any, error: msgspec.ValidationE
     """Return a description of a mistake, with the names of the keys that lead to the wrong value.
 
     The items of a table or of a list are converted separately. If an item cannot be converted, the mistake is in this
-    item. If all items can be converted, the table or the list itself is wrong, for example because a key is missing.
+    item, and the function calls itself for the item. If all items can be converted, the table or the list itself is
+    wrong, for example because a key is missing.
 
     Args:
         value: Value from TOML or JSON.
@@ -230,13 +231,16 @@ def _describe_mistake(value: Any, expected_type: Any, error: msgspec.ValidationE
     if isinstance(cause, WrongKey):
         key_path = _join(path, cause.key)
         return f"{key_path}: {cause}" if str(cause) else f"key {key_path!r} is missing"
-    wrong_key = _WRONG_KEY.match(str(error))
-    if wrong_key is None:
+
+    key_error = _KEY_ERROR.match(str(error))
+    if key_error is None:  # the value has a wrong type, or is beyond its bounds
         expected = _describe_schema(msgspec.json.schema(expected_type))
         return f"{_prefix(path)}expected {expected}, got {shown(value)}"
-    kind, name = wrong_key.groups()
+
+    kind, name = key_error.groups()
     if kind == "missing required":
         return f"key {_join(path, name)!r} is missing"
+
     known_keys = list(map(str, item_types))
     similar_keys = difflib.get_close_matches(cut(name), known_keys, n=1)
     advice = f"did you mean {similar_keys[0]!r}? Known are" if similar_keys else "known are"
@@ -254,24 +258,35 @@ def _item_types(value: Any, expected_type: Any) -> dict[str | int, Any]:
         expected_type: Type that the value may have.
     """
     members = list(_union_members(expected_type))
+    structs = [member for member in members if isinstance(member, type) and issubclass(member, Struct)]
     types: dict[str | int, Any] = {}
     if isinstance(value, Mapping):
-        # The items of a struct are its fields, and the tag if there is one.
-        structs = [member for member in members if isinstance(member, type) and issubclass(member, Struct)]
-        tags = tuple(struct.__struct_config__.tag for struct in structs)
-        for struct in structs:
-            config = struct.__struct_config__  # all structs of a union have the same tag key
-            if config.tag_field is not None:
-                types[config.tag_field] = Literal[tags]
-            if value.get(config.tag_field) == config.tag:  # both are None if the struct has no tag
-                types |= {field.encode_name: field.type for field in msgspec.structs.fields(struct)}
-    for member in members:  # the items of dictionaries and lists
-        arguments = get_args(member)
+        types |= _field_types(value, structs)
+    for member in members:  # the items of dictionaries, lists and tuples
+        arguments = get_args(member)  # for example (str, float) for dict[str, float]
         if isinstance(value, Mapping) and get_origin(member) is dict:
             types |= dict.fromkeys(value, arguments[1])
         elif isinstance(value, list | tuple) and get_origin(member) in (list, tuple):
             is_uniform = len(arguments) == 1 or Ellipsis in arguments
             types |= enumerate(arguments[:1] * len(value) if is_uniform else arguments)
+    return types
+
+
+def _field_types(table: Mapping[str, Any], structs: list[Any]) -> dict[str | int, Any]:
+    """Return the types of the keys that a table may have, if the keys are declared by structs.
+
+    Args:
+        table: Table from TOML or JSON.
+        structs: Structs that may declare the keys. If there are several structs, all have the same tag key.
+    """
+    tags = tuple(struct.__struct_config__.tag for struct in structs)
+    types: dict[str | int, Any] = {}
+    for struct in structs:
+        config = struct.__struct_config__
+        if config.tag_field is not None:
+            types[config.tag_field] = Literal[tags]
+        if table.get(config.tag_field) == config.tag:  # both are None if the struct has no tag
+            types |= {field.encode_name: field.type for field in msgspec.structs.fields(struct)}
     return types
 
 
@@ -357,7 +372,7 @@ def _describe_number(noun: str, schema: Mapping[str, Any]) -> str:
         schema: JSON schema that contains the bounds.
     """
     words = {"exclusiveMinimum": "above", "minimum": "from", "maximum": "to", "exclusiveMaximum": "to below"}
-    # The bounds +-`MAX_FLOAT` exclude only infinity, and are not mentioned.
+    # The bounds +-`MAX_FLOAT` exclude only infinity, and are not mentioned. A missing bound is treated like these.
     bounds = {word: schema[key] for key, word in words.items() if abs(schema.get(key, MAX_FLOAT)) != MAX_FLOAT}
     if bounds == {"above": 0}:
         return f"a positive {noun}"
