@@ -72,6 +72,7 @@ class Series:
         n_chunk = len(coordinates) // CHUNK_SIZE + 1  # at least one chunk, even if there are no points
         evaluated_chunks = []
         for chunk in np.array_split(coordinates, n_chunk):
+            # Shapes (points, n_term) and (points, n_force)
             position_terms, force_terms = chebyshev_terms(chunk, degree=n_x - 1, force_degree=n_force - 1)
 
             # Sum over the products of polynomials in x and y: (points, n_term) @ (n_term, n_force * 4 * n_electrode).
@@ -85,7 +86,7 @@ class Series:
             chunk_values = force_terms[:, None, :] @ force_coefficients
             evaluated_chunks.append(chunk_values[:, 0, :])
         values = np.concatenate(evaluated_chunks).reshape(len(coordinates), 4, n_electrode)
-        if excess.any():
+        if excess.any():  # add the sum of excess times derivative over the three coordinates (index s)
             values[:, 0] += np.einsum("ns,nsk->nk", excess, values[:, 1:])
         return values
 
@@ -262,7 +263,8 @@ class ChargeSeries:
         value = np.einsum("nk,nske->nse", weights, node_values) + np.einsum("nd,nsde->nse", directions, total_change)
         value_per_MPa = np.einsum("nk,nke->ne", weight_slopes, node_values[:, 0])
         value_per_MPa += np.einsum("nd,nde->ne", directions, change_per_MPa[:, 0])
-        value_per_state = np.stack([value_per_MPa, *total_change[:, 0].swapaxes(0, 1)], axis=2)
+        value_per_direction = total_change[:, 0].swapaxes(0, 1)  # shape (K, n, n_electrode)
+        value_per_state = np.stack([value_per_MPa, *value_per_direction], axis=2)
 
         charge_pC, charge_per_value, by_contact = self._charges(value, nearest, excess)
         return ModelValues(charge_pC + self.offset_pC, by_contact, charge_per_value[:, :, None] * value_per_state)

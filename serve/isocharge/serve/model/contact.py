@@ -126,15 +126,19 @@ def add_covariance(contacts: Singles, covariance: Array) -> Singles:
         contacts: The ten numbers of n contacts, shape (n, 10).
         covariance: Covariance of the additional error of x, y and the force, shape (n, 3, 3), mm and N.
     """
-    total = contacts.astype(float)
-    std = total[:, STD_COLUMNS]  # of x, y and the force, shape (n, 3)
-    total_std = np.sqrt(std**2 + np.diagonal(covariance, axis1=1, axis2=2))
-    # The covariances of the pairs (x, y), (x, F) and (y, F), shape (n, 3), are correlations times standard deviations.
-    first, second = [0, 0, 1], [1, 2, 2]
-    pair_covariance = total[:, CORRELATION_COLUMNS] * std[:, first] * std[:, second] + covariance[:, first, second]
-    total[:, CORRELATION_COLUMNS] = pair_covariance / (total_std[:, first] * total_std[:, second])
-    total[:, STD_COLUMNS] = total_std
-    return total.astype(np.float32)
+    result = contacts.astype(float)
+    std = result[:, STD_COLUMNS]  # of x, y and the force, shape (n, 3)
+    extra_variance = np.diagonal(covariance, axis1=1, axis2=2)
+    total_std = np.sqrt(std**2 + extra_variance)
+
+    # Indices of the pairs (x, y), (x, F) and (y, F). A covariance is a correlation times two standard deviations.
+    first = [0, 0, 1]
+    second = [1, 2, 2]
+    pair_covariance = result[:, CORRELATION_COLUMNS] * std[:, first] * std[:, second]
+    total_pair_covariance = pair_covariance + covariance[:, first, second]
+    result[:, CORRELATION_COLUMNS] = total_pair_covariance / (total_std[:, first] * total_std[:, second])
+    result[:, STD_COLUMNS] = total_std
+    return result.astype(np.float32)
 
 
 CORRELATION_RIDGE = 1e-5

@@ -231,17 +231,18 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
             ModelError: If the format version is not supported, or a key is missing or wrong.
         """
         place = f"{where}: metadata"
+        names = [name for name in cls.__struct_fields__ if name in props]
+        metadata = None
         try:
-            names = [name for name in cls.__struct_fields__ if name in props]
             values = {name: parse_json(props[name], f"{place}: {name}", ModelError, object) for name in names}
-            # The version is checked before the other keys, because other versions may have other keys.
             version = values.get("format_version", FORMAT_VERSION)
-            if version == FORMAT_VERSION:
-                return convert(values, cls, place, ModelError)
+            if version == FORMAT_VERSION:  # the fields of another version may have another meaning
+                metadata = convert(values, cls, place, ModelError)
         except ModelError as error:
             raise ModelError(f"{error}; export the model again") from error
-        # The metadata have another version of the format.
-        raise ModelError(
-            f"{place} format {shown(version)} is not supported (this version reads {FORMAT_VERSION}); export it again "
-            "or upgrade isocharge"
-        )
+        if metadata is None:
+            raise ModelError(
+                f"{place} format {shown(version)} is not supported (this version reads {FORMAT_VERSION}); export it "
+                "again or upgrade isocharge"
+            )
+        return metadata

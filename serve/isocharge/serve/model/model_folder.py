@@ -300,19 +300,36 @@ def load_checked_model(folder: Path) -> Model:
             golden vectors, or if the folders have another name and version than the metadata.
     """
     model = load_model(folder)
-    name, version = folder.absolute().parts[-2:]
-    is_other_version = version != str(model.metadata.version)
-    is_other_name = name not in (model.metadata.name, "..")
-    if version.isdecimal() and (is_other_version or is_other_name):
-        raise ModelError(
-            f"{folder}: expected {name}/{version}, as the folders are called, got {model.metadata.label}; move it into "
-            "folders of that name and version, or export it again"
-        )
+    _check_folder_names(folder, model.metadata)
+    # A companion file may be missing, or may lie in the folder without a checksum in `golden.json`.
     existing_names = {path.name for path in folder.glob("*.npz")}
-    for name in sorted(existing_names | model.golden.files.keys()):
-        read_checked(folder, name, model.golden)
+    for companion_name in sorted(existing_names | model.golden.files.keys()):
+        read_checked(folder, companion_name, model.golden)  # raises an error if the file is not the expected one
     check_golden(model)
     return model
+
+
+def _check_folder_names(folder: Path, metadata: ModelMetadata) -> None:
+    """Check that a version folder and its parent are named after the version and the name of the model.
+
+    A version folder may have another name than a number, for example while it is prepared. It is then not checked.
+
+    Args:
+        folder: The version folder. If its path ends in `..` and a version, as in `../1`, only the version is checked.
+        metadata: Metadata of the model in the folder.
+
+    Raises:
+        ModelError: If the names differ from the metadata.
+    """
+    name, version = folder.absolute().parts[-2:]
+    is_version_folder = version.isdecimal()
+    is_other_version = version != str(metadata.version)
+    is_other_name = name not in (metadata.name, "..")
+    if is_version_folder and (is_other_version or is_other_name):
+        raise ModelError(
+            f"{folder}: expected {name}/{version}, as the folders are called, got {metadata.label}; move it into "
+            "folders of that name and version, or export it again"
+        )
 
 
 def write_model(
@@ -396,6 +413,7 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
     name = folder.resolve().name
     if not NAME.fullmatch(name):
         raise ModelError(f"model name {name!r}: expected letters, digits, '-', '_' and '.'; rename the folder")
+
     config_path = folder / "config.pbtxt"
     versions = version_folders(folder)
     is_model_folder = config_path.exists() or versions
@@ -409,13 +427,14 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
             f"{config_path}: describes a model other than {name!r} with the electrodes {electrodes}; use another model "
             "name or, if the folder was copied or renamed, its old name"
         )
-    used_electrodes = electrodes
+
+    last_electrodes = electrodes  # of the last version that can be read; if there is none, the new ones
     for existing in versions.values():
         with suppress(ModelError):  # a damaged version does not prevent a new one
-            used_electrodes = load_model(existing).metadata.electrodes
-    if used_electrodes != electrodes:
+            last_electrodes = load_model(existing).metadata.electrodes
+    if last_electrodes != electrodes:
         raise ModelError(
-            f"{folder}: expected the electrodes {used_electrodes} of its last version in this order, because programs "
+            f"{folder}: expected the electrodes {last_electrodes} of its last version in this order, because programs "
             f"send their charges in it, got {electrodes}; use another model name or this order"
         )
     return target
@@ -428,10 +447,9 @@ def triton_config(name: str, n_electrode: int) -> str:
         name: Name of the model.
         n_electrode: Number of electrodes.
     """
-    head = f'name: "{name}"\nplatform: "onnxruntime_onnx"\nmax_batch_size: {MAX_BATCH}\n'
-    parts = [head]
+    config = f'name: "{name}"\nplatform: "onnxruntime_onnx"\nmax_batch_size: {MAX_BATCH}\n'
     for list_name, widths in (("input", {INPUT: n_electrode}), ("output", OUTPUTS)):
         # The widths do not contain the batch dimension, because Triton adds it.
         lines = [f'  {{ name: "{tensor}" data_type: TYPE_FP32 dims: [ {width} ] }}' for tensor, width in widths.items()]
-        parts.append(f"{list_name} [\n" + ",\n".join(lines) + "\n]\n")
-    return "".join(parts)
+        config += f"{list_name} [\n" + ",\n".join(lines) + "\n]\n"
+    return config

@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import ArrayLike
 
-from isocharge.common.arrays import Singles
+from isocharge.common.arrays import Array, Singles
 from isocharge.common.errors import ChargeError, shown
 from isocharge.common.files import StrPath
 from isocharge.common.structs import WrongKey, convert
@@ -155,17 +155,21 @@ class Predictor:
         flags = self.validity.flags(contact)
         if BEYOND in flags and not self._has_warned.is_set():
             self._has_warned.set()
-            log.warning(
-                "%s: the charges %s pC on %s are far from those of any press in the training, and %s cannot be a "
-                "measurement; check the unit, the gain and the tare, and with `isocharge serve doctor "
-                "--check-electrodes` whether wires are swapped. Further contacts of this kind are not logged; "
-                "Predictor.flags reports each of them",
-                self.metadata.label,
-                charge_pC,
-                " ".join(self.metadata.electrodes),
-                contact,
-            )
+            self._warn_of_beyond(charge_pC, contact)
         return contact, flags
+
+    def _warn_of_beyond(self, charge_pC: ArrayLike, contact: Contact) -> None:
+        """Log a warning about the charges of a contact that is too far away or too strong to be a measurement."""
+        log.warning(
+            "%s: the charges %s pC on %s are far from those of any press in the training, and %s cannot be a "
+            "measurement; check the unit, the gain and the tare, and with `isocharge serve doctor --check-electrodes` "
+            "whether wires are swapped. Further contacts of this kind are not logged; Predictor.flags reports each of "
+            "them",
+            self.metadata.label,
+            charge_pC,
+            " ".join(self.metadata.electrodes),
+            contact,
+        )
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
         """Return the reasons why a contact may be wrong: `outside`, `beyond`, `misfit` and `stress`.
@@ -226,10 +230,8 @@ class Predictor:
     def _predict_with_noise(self, charge_pC: Singles) -> Contacts:
         """Compute the contacts of n presses whose charges have more noise than those of the training.
 
-        Each charge is raised and lowered by the standard deviation of its additional noise. Half of the difference
-        between the two contacts is the effect of the additional noise of this charge (central difference). The effects
-        of all charges are added to the covariance. The misfit is divided by the ratio of the present noise to the noise
-        of the training (root mean square over the electrodes).
+        The effects of the additional noise of all charges are added to the covariance of each contact. The misfit is
+        divided by the ratio of the present noise to the noise of the training (root mean square over the electrodes).
 
         Args:
             charge_pC: Touch charges, shape (n, electrodes), pC.
@@ -239,17 +241,35 @@ class Predictor:
         relative_extra = extra_variance / np.maximum(model_variance, np.finfo(float).tiny)  # a model may have no noise
         noise_ratio = np.sqrt(1.0 + relative_extra.mean(axis=1))
 
-        # Charges without a change, and with each charge raised and lowered, shape (1 + 2 electrodes, n, electrodes)
-        n_electrode = charge_pC.shape[1]
-        steps = np.sqrt(extra_variance) * np.eye(n_electrode)[:, np.newaxis]
-        no_step = np.zeros_like(steps[:1])
-        changed_pC = (charge_pC + np.concatenate([no_step, steps, -steps])).astype(np.float32)
-        contacts, *changed = self.predict_rows(changed_pC.reshape(-1, n_electrode)).reshape(*changed_pC.shape[:2], 10)
-        raised, lowered = np.split(np.array(changed, float)[..., :3], 2)
-        effects = 0.5 * (raised - lowered)  # changes of x, mm, y, mm, and the force, N, shape (electrodes, n, 3)
-        covariance = np.einsum("kni,knj->nij", effects, effects)
+        contacts, effects = self._noise_effects(charge_pC, np.sqrt(extra_variance))
+        covariance = np.einsum("kni,knj->nij", effects, effects)  # sum over the electrodes (index k)
         misfit = (contacts[:, COLUMNS["misfit"]] / noise_ratio[:, np.newaxis]).astype(np.float32)
         return Contacts(*add_covariance(contacts, covariance).T)._replace(misfit=misfit[:, 0])
+
+    def _noise_effects(self, charge_pC: Singles, extra_std_pC: Array) -> tuple[Singles, Array]:
+        """Compute contacts, and how much the additional noise of each charge changes them.
+
+        Each charge is raised and lowered by the standard deviation of its additional noise. Half of the difference
+        between the two contacts is the effect of the noise of this charge (central difference).
+
+        Args:
+            charge_pC: Touch charges, shape (n, electrodes), pC.
+            extra_std_pC: Standard deviations of the additional noise, shape (n, electrodes), pC.
+
+        Returns:
+            The ten numbers of each contact, shape (n, 10). Changes of x, mm, y, mm, and the force, N, by the noise of
+            each electrode, shape (electrodes, n, 3).
+        """
+        n_press, n_electrode = charge_pC.shape
+        steps = extra_std_pC * np.eye(n_electrode)[:, np.newaxis]  # each changes one charge of every press
+        no_step = np.zeros_like(steps[:1])
+        changed_pC = (charge_pC + np.concatenate([no_step, steps, -steps])).astype(np.float32)
+
+        # All presses are predicted in one batch: first without a change, then with each charge raised, then lowered.
+        rows = self.predict_rows(changed_pC.reshape(-1, n_electrode))
+        contacts, *changed = rows.reshape(1 + 2 * n_electrode, n_press, 10)
+        raised, lowered = np.split(np.array(changed, float)[..., :3], 2)
+        return contacts, 0.5 * (raised - lowered)
 
     def predict_rows(self, charges: Singles) -> Singles:
         """Compute the contacts of n presses, with the standard deviations for the noise of the training.

@@ -152,19 +152,20 @@ class RobustProblem:
         """
         point = self.evaluate(start_state, start_contacts)
         damping = FIRST_DAMPING
-        rejected = 0
+        rejected_count = 0  # successive unsuccessful steps
         for _ in range(max_steps):
             state_step, contact_step = self.step(point, damping)
             state = np.clip(point.state + state_step, *state_bounds)
             contacts = np.clip(point.contacts + contact_step, *contact_bounds)
             trial = self.evaluate(state, contacts)
-            if not trial.cost <= point.cost:  # also if the cost is not a number
+            is_successful = trial.cost <= point.cost  # False if the cost is not a number
+            if not is_successful:
                 damping *= DAMPING_FACTOR
-                rejected += 1
-                if rejected > MAX_REJECTED_STEPS:
+                rejected_count += 1
+                if rejected_count > MAX_REJECTED_STEPS:
                     break
                 continue
-            rejected = 0
+            rejected_count = 0
             damping /= DAMPING_FACTOR
             improvement = point.cost - trial.cost
             point = trial
@@ -211,20 +212,45 @@ class RobustProblem:
     def normal_equations(self, point: RobustPoint, damping: float) -> tuple[Array, Array, Array, Array]:
         """Compute the normal equations of a step of the state, from which the contacts are eliminated.
 
-        The whitened derivatives of press i are C_i with respect to its contact and S_i with respect to the state. For a
-        step ds of the state, the contact moves by du_i = a_i - B_i ds, with a_i = M_i^-1 (C_i' r_i + W m_i) and
-        B_i = M_i^-1 C_i' S_i. The residuals of the charges are r_i, and those of the measured coordinates are m_i, in
-        standard deviations. W is the diagonal matrix of the inverse standard deviations of the coordinates, and M_i is
-        C_i' C_i + W^2 with a damped diagonal. The normal matrix and the right side of the state are sums over the
-        presses. Each term is multiplied by the weight of its press, which is small if the residuals are large.
+        The normal matrix and the right side are sums over the presses. Each term is multiplied by the weight of its
+        press, which is small if the residuals are large.
 
         Args:
             point: State and contacts.
             damping: Damping of the contacts, relative to the diagonal of their normal matrices.
 
         Returns:
-            Normal matrix, shape (p, p), and right side, shape (p,), of the state. The shifts a_i, shape (n, 3), and the
-            matrices B_i, shape (n, 3, p).
+            Normal matrix, shape (p, p), and right side, shape (p,), of the state. The shifts of the contacts, shape
+            (n, 3), and their matrices, shape (n, 3, p), as `_contact_shifts` returns them.
+        """
+        contact_shift, contact_by_state = self._contact_shifts(point, damping)
+
+        # Schur complement: the parts of the derivatives and of the residuals that no change of the contacts explains
+        n_state = point.state.size
+        remaining_slopes = (point.by_state - point.by_contact @ contact_by_state).reshape(-1, n_state)
+        remaining_residual = point.residual - (point.by_contact @ contact_shift[:, :, None])[:, :, 0]
+        weighted_slopes = (point.weights[:, None, None] * point.by_state).reshape(-1, n_state)
+        normal_matrix = self._precision + weighted_slopes.T @ remaining_slopes
+        prior_side = self._precision @ (self._prior_mean - point.state)
+        right_side = prior_side + weighted_slopes.T @ remaining_residual.ravel()
+        symmetric_matrix = 0.5 * (normal_matrix + normal_matrix.T)  # despite rounding errors
+        return symmetric_matrix, right_side, contact_shift, contact_by_state
+
+    def _contact_shifts(self, point: RobustPoint, damping: float) -> tuple[Array, Array]:
+        """Compute how the contacts move, as a linear function of the step of the state.
+
+        The whitened derivatives of press i are C_i with respect to its contact and S_i with respect to the state. For a
+        step ds of the state, the contact moves by du_i = a_i - B_i ds, with a_i = M_i^-1 (C_i' r_i + W m_i) and
+        B_i = M_i^-1 C_i' S_i. The residuals of the charges are r_i, and those of the measured coordinates are m_i, in
+        standard deviations. W is the diagonal matrix of the inverse standard deviations of the coordinates, and M_i is
+        C_i' C_i + W^2 with a damped diagonal.
+
+        Args:
+            point: State and contacts.
+            damping: Damping of the contacts, relative to the diagonals of the matrices C_i' C_i + W^2.
+
+        Returns:
+            The shifts a_i, shape (n, 3), and the matrices B_i, shape (n, 3, p).
         """
         transposed = point.by_contact.swapaxes(1, 2)
         contact_matrix = transposed @ point.by_contact  # becomes M_i
@@ -237,18 +263,7 @@ class RobustProblem:
         contact_side = charge_part + self._contact_weight * point.contact_residual
         mixed = transposed @ point.by_state  # shape (n, 3, p)
         solution = np.linalg.solve(contact_matrix, np.concatenate([contact_side[:, :, None], mixed], axis=2))
-        contact_shift = solution[:, :, 0]
-        contact_by_state = solution[:, :, 1:]
-
-        # Schur complement: the parts of the derivatives and of the residuals that no change of the contacts explains
-        n_state = point.state.size
-        remaining_slopes = (point.by_state - point.by_contact @ contact_by_state).reshape(-1, n_state)
-        remaining_residual = point.residual - (point.by_contact @ contact_shift[:, :, None])[:, :, 0]
-        weighted = (point.weights[:, None, None] * point.by_state).reshape(-1, n_state)
-        normal_matrix = self._precision + weighted.T @ remaining_slopes
-        right_side = self._precision @ (self._prior_mean - point.state) + weighted.T @ remaining_residual.ravel()
-        symmetric_matrix = 0.5 * (normal_matrix + normal_matrix.T)  # despite rounding errors
-        return symmetric_matrix, right_side, contact_shift, contact_by_state
+        return solution[:, :, 0], solution[:, :, 1:]
 
     def step(self, point: RobustPoint, damping: float) -> tuple[Array, Array]:
         """Compute a damped Gauss-Newton step of the state, shape (p,), and of the contacts, shape (n, 3)."""

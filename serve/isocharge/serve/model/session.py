@@ -322,17 +322,21 @@ def read_golden(path: Path) -> Golden:
     Raises:
         ModelError: If the file is missing or damaged.
     """
+    advice = "the file is damaged or missing: copy or export the model again"
     try:
         golden = read_json(path, "golden vectors", ModelError, Golden)
+    except ModelError as error:
+        raise ModelError(f"{error}; {advice}") from error
+    try:
         n_press = len(golden.charge_pC)
         for name, width in OUTPUTS.items():
-            sizes = (*np.shape(golden.outputs[name]), len(golden.tolerance.floor[name]))
-            if sizes != (n_press, width, width):
+            shape = np.shape(golden.outputs[name])
+            n_floor = len(golden.tolerance.floor[name])
+            if shape != (n_press, width) or n_floor != width:
                 raise ValueError(
                     f"{name}: expected {n_press} rows of {width} numbers, and {width} floors, got an array of shape "
-                    f"{sizes[:-1]} and {sizes[-1]} floors"
+                    f"{shape} and {n_floor} floors"
                 )
-    except (ModelError, ValueError, KeyError) as error:  # rows of different lengths, or a missing entry
-        where = "" if isinstance(error, ModelError) else f"{path}: "
-        raise ModelError(f"{where}{error}; the file is damaged or missing: copy or export the model again") from error
+    except (ValueError, KeyError) as error:  # also for rows of different lengths, or a missing entry
+        raise ModelError(f"{path}: {error}; {advice}") from error
     return golden
