@@ -86,21 +86,26 @@ class ErrorSummary:
         is_known = ~np.isnan(error).any(axis=1)
         if not is_known.any():
             return None
-        size = np.linalg.norm(error[is_known], axis=1)
-        rms, noise, rig = (
-            float(np.sqrt(np.mean(np.sum(part[is_known] ** 2, axis=1)))) for part in (error, noise_std, rig_std)
-        )
+        magnitude = np.linalg.norm(error[is_known], axis=1)
+        rms = _rms_of_vectors(error[is_known])
+        noise = _rms_of_vectors(noise_std[is_known])
+        rig = _rms_of_vectors(rig_std[is_known])
         explained = math.hypot(noise, rig)
         return cls(
-            presses=size.size,
+            presses=magnitude.size,
             rms=rms,
-            median=float(np.median(size)),
-            max=float(size.max()),
+            median=float(np.median(magnitude)),
+            max=float(magnitude.max()),
             noise=noise,
             rig=rig,
             explained=explained,
             beyond=math.sqrt(max(rms**2 - explained**2, 0.0)),  # the errors may happen to be smaller than expected
         )
+
+
+def _rms_of_vectors(components: Array) -> float:
+    """Return the root mean square of the lengths of vectors, whose components have the shape (n, components)."""
+    return float(np.sqrt(np.mean(np.sum(components**2, axis=1))))
 
 
 @dataclass(frozen=True)
@@ -187,9 +192,10 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     is_selected = is_compared & ~is_bad
     selected_count = int(is_selected.sum())
     agreement = Agreement.from_errors(errors, is_selected)
+    # The errors and the standard deviations, each of shape (n, 3). The columns before that of the force are x and y.
     parts = (errors.error[is_selected], errors.noise_std[is_selected], errors.rig_std[is_selected])
     position = ErrorSummary.from_errors(*(part[:, :FORCE] for part in parts))
-    force = ErrorSummary.from_errors(*(100.0 * part[:, FORCE:] for part in parts))
+    force = ErrorSummary.from_errors(*(100.0 * part[:, FORCE:] for part in parts))  # in percent
     misfit_text = _misfit_statement(errors, is_selected, metadata)  # empty unless too many presses have a large misfit
 
     fits = None  # remains None if there are too few presses for a verdict

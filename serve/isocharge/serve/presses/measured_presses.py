@@ -329,10 +329,9 @@ def _check_electrodes(electrodes: Collection[str]) -> None:
         PressError: If there are no names, if there are too many names, or if one of the names is not allowed.
     """
     are_different = len(set(electrodes)) == len(electrodes)
-    are_names = all(
-        name not in PRESS_RULES and name.isprintable() and name == name.strip() and name for name in electrodes
-    )
-    if not (0 < len(electrodes) <= MAX_ELECTRODES and are_different and are_names):
+    are_texts = all(name and name.isprintable() and name == name.strip() for name in electrodes)
+    have_other_meaning = not PRESS_RULES.keys().isdisjoint(electrodes)
+    if not 0 < len(electrodes) <= MAX_ELECTRODES or not are_different or not are_texts or have_other_meaning:
         raise PressError(
             f"electrodes: expected 1 to {MAX_ELECTRODES} different names of printable characters, without blanks "
             f"at their ends, none of {', '.join(PRESS_RULES)}, got {shown(electrodes)}; "

@@ -60,13 +60,17 @@ class StdFactor(NamedTuple):
         Returns:
             The factor.
         """
-        degrees = np.isfinite(error).sum(axis=1)
-        squared_size = np.nansum((error / std) ** 2, axis=1)[degrees > 0]
-        scores = np.sort(np.sqrt(squared_size / np.take(REGION_QUANTILES, degrees[degrees > 0] - 1)))
-        # The k-th smallest score is at least the quantile p of all scores if at most k - 1 of the n scores lie below
-        # this quantile. The scores are independent, so the number below the quantile has a binomial distribution.
-        rank = np.argmax(binomial_distribution(len(scores), COVERAGE) >= CONFIDENCE)
-        return cls(float(scores[rank]), len(scores))
+        known_count = np.isfinite(error).sum(axis=1)  # number of known errors of each press
+        is_known = known_count > 0
+        chi_squared = np.nansum((error / std) ** 2, axis=1)[is_known]
+        region_chi_squared = np.take(REGION_QUANTILES, known_count[is_known] - 1)  # on the surface of the region
+        scores = np.sort(np.sqrt(chi_squared / region_chi_squared))
+
+        # The score at index k is at least the quantile `COVERAGE` of all future scores if at most k of the n scores lie
+        # below this quantile. The scores are independent, so the number below it has a binomial distribution. The index
+        # is the first for which this probability reaches `CONFIDENCE`.
+        index = np.argmax(binomial_distribution(len(scores), COVERAGE) >= CONFIDENCE)
+        return cls(float(scores[index]), len(scores))
 
 
 def binomial_distribution(count: int, probability: float) -> Array:

@@ -141,7 +141,9 @@ class CsvTable:
         return columns
 
     def refuse_similar_names(self, columns: Iterable[str], names: Iterable[str]) -> None:
-        """Refuse a column whose name is nearly that of a missing column, but has other case, brackets, blanks or units.
+        """Refuse a column whose name is probably a misspelling of the name of a missing column.
+
+        The two names differ only in case, punctuation, blanks or a unit at the end, as `a (pC)` and `A` do.
 
         Args:
             columns: Names of the columns of the file that are checked.
@@ -150,22 +152,25 @@ class CsvTable:
         Raises:
             InputError: If a column has such a name.
         """
-        absent_names = {
-            spelling: name
-            for name in names
-            if name not in self.header
-            for spelling in _spellings(name) | _spellings(f"{name}_pC")
-        }
+        missing_name_of_spelling: dict[str, str] = {}
+        for name in names:
+            if name not in self.header:
+                spellings = _spellings(name) | _spellings(f"{name}_pC")  # the latter also match the column `ApC`
+                missing_name_of_spelling |= dict.fromkeys(spellings, name)
         for column in columns:
-            for spelling in _spellings(column) & absent_names.keys():
-                name = absent_names[spelling]
-                advice = f"rename {shown(column)} to {shown(name)} and check its unit, or remove the column"
-                raise self._header_error(f"{advice}; missing", [name])
+            for spelling in _spellings(column) & missing_name_of_spelling.keys():
+                missing_name = missing_name_of_spelling[spelling]
+                advice = f"rename {shown(column)} to {shown(missing_name)} and check its unit, or remove the column"
+                raise self._header_error(f"{advice}; missing", [missing_name])
 
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
         """Convert the cells of the requested columns to numbers, row by row.
 
         Whether the numbers lie in the ranges of their columns is not checked here.
+
+        Args:
+            rules: Rules of the requested columns, by the names of the columns.
+            max_rows: Largest number of rows that is accepted.
 
         Raises:
             InputError: If there are too many rows, a row has the wrong number of cells, a cell is not a finite number,
@@ -192,15 +197,24 @@ class CsvTable:
                         f"{shown(cell)}{self._cell_advice(cell)}"
                     )
                 numbers.append(number)
+            # A fraction in any other column of the row also determines the meaning of the mark.
             self._is_mark_certain = self._is_mark_certain or self._has_fraction(cells)
+        self._check_mark()
+        rows = np.asarray(numbers, dtype=np.float64).reshape(len(line_numbers), len(column_indices))
+        values = dict(zip(column_indices, rows.T, strict=True))
+        return NumberColumns(values, line_numbers)
+
+    def _check_mark(self) -> None:
+        """Check that the numbers of the file have shown whether their mark is a decimal mark.
+
+        Raises:
+            InputError: If the mark may also be a separator of thousands.
+        """
         if self._mark and not self._is_mark_certain:
             raise self.error(
                 f": every number with the mark {self._mark!r} may have a decimal mark or a separator of thousands; "
                 "write commas between the columns, decimal points and no separators of thousands"
             )
-        rows = np.asarray(numbers, dtype=np.float64).reshape(len(line_numbers), len(column_indices))
-        values = dict(zip(column_indices, rows.T, strict=True))
-        return NumberColumns(values, line_numbers)
 
     def _cell_advice(self, cell: str) -> str:
         """Return advice for a cell that is not a number, for the end of an error message; empty if there is none."""
@@ -211,14 +225,16 @@ class CsvTable:
 
     def _has_fraction(self, cells: list[str]) -> bool:
         """Return whether a cell of any column has a fraction such as 0.5, whose mark does not separate thousands."""
-        texts = (cell.strip().lstrip("+-") for cell in cells if self._mark)
+        if not self._mark:
+            return False
+        texts = (cell.strip().lstrip("+-") for cell in cells)
         return any(text.startswith(f"0{self._mark}") and _NUMBER.fullmatch(text) for text in texts)
 
     def _number(self, text: str) -> float | None:
         """Return the number in a cell: NaN for an empty cell, and None for a cell without a finite number.
 
-        The first number with a decimal mark determines the decimal mark of the file. The mark is certain as soon as it
-        cannot be a separator of thousands.
+        The first number with a mark determines the decimal mark of the file, which is stored. It is also stored whether
+        the mark is certain, because a number has shown that the mark cannot be a separator of thousands.
 
         Args:
             text: The cell, without blanks at its ends.
@@ -228,14 +244,14 @@ class CsvTable:
         match = _NUMBER.fullmatch(text)
         if match is None:
             return None
-        mark = match[1] or match[2]
-        if mark and mark != self._mark:
-            if self._mark:
+        mark = match[1] or match[2]  # the groups of a mark after a digit, and of a mark at the beginning
+        if mark:
+            self._mark = self._mark or mark
+            if mark != self._mark:
                 return None
-            self._mark = mark
-        if mark and not self._is_mark_certain:
-            is_point_between_commas = (self._separator, mark) == (",", ".")
-            self._is_mark_certain = is_point_between_commas or _THOUSANDS.fullmatch(text) is None
+            if not self._is_mark_certain:
+                is_point_between_commas = self._separator == "," and mark == "."
+                self._is_mark_certain = is_point_between_commas or _THOUSANDS.fullmatch(text) is None
         number = float(text.replace(",", "."))
         return number if math.isfinite(number) else None
 
@@ -268,7 +284,7 @@ class CsvTable:
         )
 
     def _checked_lines(self, lines: Iterable[str]) -> Iterator[str]:
-        """Yield the lines of a text without a byte order mark.
+        """Check each line of a text, and yield the lines without the byte order mark at the beginning of the text.
 
         Args:
             lines: Lines of the text, each with its line end.
@@ -279,23 +295,35 @@ class CsvTable:
         line_number = 0
         try:
             for line_number, line in enumerate(lines, start=1):
-                if line_number == 1 and line.startswith(_PARQUET_START):
-                    raise self.error(
-                        ": expected a CSV file, got a Parquet file; convert it to CSV, for example in Python with "
-                        "pandas.read_parquet(FILE).to_csv(NEW, index=False)"
-                    )
-                wrong_byte = _WRONG_BYTE.search(line)
-                if wrong_byte:  # the file is binary, or text in another encoding
-                    raise self.error(
-                        f", line {line_number}: the byte 0x{ord(wrong_byte[0]) & 0xFF:02x} is not text in UTF-8: "
-                        "export the file as CSV in UTF-8; convert other text with: iconv -f UTF-16 (or WINDOWS-1252) "
-                        "-t UTF-8 FILE > NEW.csv"
-                    )
+                self._check_line(line_number, line)
                 yield line.removeprefix("\ufeff") if line_number == 1 else line
         except InputError:  # is a ValueError, too
             raise
         except ValueError as cause:  # the next line is too long
             raise self.error(f", line {line_number + 1}: not CSV text in UTF-8 ({cause})") from cause
+
+    def _check_line(self, line_number: int, line: str) -> None:
+        """Check that a line is text in UTF-8.
+
+        Args:
+            line_number: Number of the line; 1 for the first line of the file.
+            line: The line. Each byte that is not UTF-8 was replaced by a surrogate, as `surrogateescape` does.
+
+        Raises:
+            InputError: If the file is a Parquet file, or the line contains a byte that is not text in UTF-8.
+        """
+        if line_number == 1 and line.startswith(_PARQUET_START):
+            raise self.error(
+                ": expected a CSV file, got a Parquet file; convert it to CSV, for example in Python with "
+                "pandas.read_parquet(FILE).to_csv(NEW, index=False)"
+            )
+        wrong_character = _WRONG_BYTE.search(line)
+        if wrong_character:  # the file is binary, or text in another encoding
+            wrong_byte = ord(wrong_character[0]) & 0xFF  # the surrogate U+DCxx stands for the byte 0xxx
+            raise self.error(
+                f", line {line_number}: the byte 0x{wrong_byte:02x} is not text in UTF-8: export the file as CSV in "
+                "UTF-8; convert other text with: iconv -f UTF-16 (or WINDOWS-1252) -t UTF-8 FILE > NEW.csv"
+            )
 
     def _numbered_rows(self, lines: Iterable[str], lines_above: int) -> Iterator[tuple[int, list[str]]]:
         """Yield the line number and the cells of each row that is neither blank nor a comment.
@@ -358,11 +386,16 @@ def _find_header(lines: Sequence[str], names: Collection[str]) -> tuple[int, str
     lines_without_comments = ["" if line.startswith("# ") else line for line in lines]
     uncommented_lines = [line.removeprefix("# ") for line in lines]
     for lines_above, line in chain(enumerate(lines_without_comments), enumerate(uncommented_lines)):
-        separator = max(_SEPARATORS, key=partial(_header_score, line, names))
+        separator = _best_separator(line, names)
         name_count, _ = _header_score(line, names, separator)
         if name_count > 0:
             return lines_above, separator, line
-    return 0, max(_SEPARATORS, key=partial(_header_score, lines[0], names)), lines[0]
+    return 0, _best_separator(lines[0], names), lines[0]
+
+
+def _best_separator(line: str, names: Collection[str]) -> str:
+    """Return the separator that divides a line into the most names with a meaning, and then into the most cells."""
+    return max(_SEPARATORS, key=partial(_header_score, line, names))
 
 
 def _header_score(line: str, names: Collection[str], separator: str) -> tuple[int, int]:
