@@ -115,7 +115,6 @@ WRONG = [
     ("[tare]\nframes = 50.5\n", r"tare\.frames: expected a whole number from 1 to 1000000000, got 50\.5"),
     ("[track]\nlasting = 1\n", r"track\.lasting: expected a number from 0 to below 1, got 1"),
     ("[tare]\nframes = 0\n", r"tare\.frames: expected a whole number from 1 to 1000000000, got 0"),
-    ("[tare]\nframes = 3000\n", r"tare\.patience: expected at least the 3000 frames of a tare, or 0 .*, got 2000"),
     ("[tare]\non = 1\n", r"tare\.on: expected true or false, got 1"),
     ("[touch]\nfloor_pC = -3\n", r"touch\.floor_pC: expected a number from 0 to .*, got -3"),
     ("[touch]\nrelease_share = 5\n", r"touch\.release_share: expected a number from 0 to below 1, got 5"),

@@ -13,7 +13,6 @@ from msgspec import Meta, structs
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import DeviceError, TareError
-from isocharge.common.structs import WrongKey
 from isocharge.common.toml_text import toml_key
 from isocharge.serve.flags import TARE
 from isocharge.serve.frames.frame import Frame
@@ -43,15 +42,6 @@ class TareRule(Rule, frozen=True, kw_only=True):
     offset_limit_pC: Setting = 100.0
     patience: Count = 2000
     relax_s: Divisor = 2.0
-
-    def __post_init__(self) -> None:
-        """Check that the search can find enough frames.
-
-        Raises:
-            WrongKey: If the search would end before it has the frames of a tare.
-        """
-        if 0 < self.patience < self.frames:
-            raise WrongKey("patience", f"at least the {self.frames} frames of a tare, or 0 for no limit", self.patience)
 
     def unrest(self, mean_pC: Array, noise_pC: Array) -> str:
         """Return why something seems to touch the film in some frames; empty if nothing touches it.
