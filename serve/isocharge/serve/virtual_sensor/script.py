@@ -56,7 +56,7 @@ class Faults(Settings, frozen=True, kw_only=True):
 
     Attributes:
         lose_share: Fraction of the frames that are not sent, dimensionless.
-        corrupt_share: Fraction of the bytes that are changed, dropped or followed by a random byte, dimensionless.
+        corrupt_share: Fraction of the bytes in which a bit is flipped, dimensionless.
     """
 
     lose_share: Fraction = 0.0
@@ -162,9 +162,7 @@ def wander(
 
 
 def corrupt(data: bytes, fraction: float, rng: np.random.Generator) -> bytes:
-    """Damage a random fraction of the bytes, as a faulty cable would damage them.
-
-    A damaged byte has one flipped bit, is dropped, or is followed by a wrong byte, each with the same probability.
+    """Flip one bit in a random fraction of the bytes, as a faulty cable would damage them.
 
     Args:
         data: The bytes before the damage.
@@ -174,9 +172,6 @@ def corrupt(data: bytes, fraction: float, rng: np.random.Generator) -> bytes:
     Returns:
         The bytes after the damage.
     """
-    damaged = bytearray(data)
-    for index in reversed(np.flatnonzero(rng.random(len(data)) < fraction).tolist()):  # later indices do not change
-        flipped = data[index] ^ (1 << rng.integers(8))
-        replacements = (bytes([flipped]), b"", bytes([data[index], flipped]))
-        damaged[index : index + 1] = replacements[rng.integers(3)]
-    return bytes(damaged)
+    is_damaged = rng.random(len(data)) < fraction
+    flipped_bit = np.uint8(1) << rng.integers(8, size=len(data), dtype=np.uint8)
+    return bytes(np.frombuffer(data, np.uint8) ^ (is_damaged * flipped_bit))
