@@ -56,7 +56,6 @@ def test_form_of_a_target_chooses_the_output(target, form):
             )
         ),
         (["json", "csv"], "at most one on standard output"),
-        (["a.csv", "a.csv"], "expected targets that differ"),
     ],
 )
 def test_wrong_targets_are_refused(targets, message):
@@ -153,12 +152,6 @@ def test_ctrl_c_while_an_output_closes_spoils_no_other_output(record, tmp_path, 
         outputs.__exit__(None, None, None)
     assert path.read_text("utf-8") == record().to_json() + "\n"
     assert outputs.not_written == {"mine": None}  # the command must not report success
-
-
-def test_added_kind_that_cannot_tell_what_it_accepts_is_named(add_kind):
-    add_kind(raise_error, None)
-    with pytest.raises(InputError, match=r"output mine \(mine:KIND\): .* 'touch.txt' \(RuntimeError: not open\)"):
-        output_kind("touch.txt")
 
 
 @live_and_replayed

@@ -137,7 +137,7 @@ def command_outputs(targets: Sequence[str] | None, touch: TouchStream, *, is_liv
         is_live: Whether the records come from a sensor.
 
     Raises:
-        InputError: If a target has none of the forms, two targets are equal, or two targets write to standard output.
+        InputError: If a target has none of the forms, or two targets write to standard output.
     """
     context = OutputContext(
         electrodes=touch.predictor.metadata.electrodes,

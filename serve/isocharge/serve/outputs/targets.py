@@ -72,7 +72,7 @@ def output_kind(target: str) -> OutputKind:
         target: Target of an output, such as `json` or `touch.csv`.
 
     Raises:
-        InputError: If no kind accepts the target, or a package that adds a kind cannot be used.
+        InputError: If no kind accepts the target.
     """
     for kind in OUTPUT_KINDS:
         if kind.accepts(target):
@@ -81,17 +81,10 @@ def output_kind(target: str) -> OutputKind:
     # No built-in kind accepts the target. Try the kinds of other packages, and collect their forms for the message.
     forms = [target_forms()]
     for entry_point in entry_points(group=ENTRY_POINTS):
-        try:
-            added_kind: OutputKind = entry_point.load()
-            if added_kind.accepts(target):
-                return added_kind
-            forms.append(added_kind.form)
-        except Exception as error:  # also if the entry point is no `OutputKind`
-            raise InputError(
-                f"output {entry_point.name} ({entry_point.value}): cannot be used for {shown(target)} "
-                f"({type(error).__name__}: {error}); correct or remove the package that adds it"
-            ) from error
-
+        added_kind: OutputKind = entry_point.load()
+        if added_kind.accepts(target):
+            return added_kind
+        forms.append(added_kind.form)
     raise InputError(f"output {shown(target)}: expected one of the forms {', '.join(forms)}")
 
 
@@ -107,15 +100,12 @@ class Outputs:
         """Determine the kind of output for each target, without opening the outputs.
 
         Args:
-            targets: Targets of the outputs, such as `json` or `touch.csv`.
+            targets: Targets of the outputs, such as `json` or `touch.csv`. A target that occurs twice has one output.
             context: Properties of the stream, which are passed to each output.
 
         Raises:
-            InputError: If no kind of output accepts a target, two targets are equal, or two targets write to standard
-                output.
+            InputError: If no kind of output accepts a target, or two targets write to standard output.
         """
-        if len(set(targets)) < len(targets):
-            raise InputError(f"outputs {shown(list(targets))}: expected targets that differ; remove one of them")
         kinds = {target: output_kind(target) for target in targets if target != NO_OUTPUT}
         stdout_targets = [target for target, kind in kinds.items() if kind.is_standard_output]
         if len(stdout_targets) > 1:
