@@ -92,12 +92,16 @@ class BackPressure:
         Args:
             deflection: Scaled deflection W at the nodes, shape (n_node,).
         """
+        # The pressure of the air rises by p0 x / (1 - x), where the displaced share x is the compression times the
+        # displaced volume. This is the derivative of the pressure with respect to the volume.
         displaced_share = self._displaced_share(deflection)
         pressure_per_volume = self.groups.ambient_pressure * self.groups.compression / (1.0 - displaced_share) ** 2
+
+        # A change of the deflection displaces the volume `copies` times, once for each copy of the mesh.
         return float(self._copies * pressure_per_volume)
 
     def _volume(self, deflection: Array) -> float:
-        """Compute the integral of the scaled deflection W over the whole film."""
+        """Compute the integral of the scaled deflection W over the whole film, which the copies of the mesh cover."""
         return self._copies * float(self.weights @ deflection)
 
     def _displaced_share(self, deflection: Array) -> float:

@@ -194,8 +194,10 @@ class Membrane:
             Derivatives, shape (n_element, n_point, 2, 3). The last two axes are the coordinate and the displacement
             component.
         """
-        slopes = self.mesh.stacked_gradient @ field[self.mesh.template.nodes]  # shape (n_element, n_point * 2, 3)
-        return slopes.reshape(*self.mesh.gauss_gradient.shape[:3], 3)
+        mesh = self.mesh
+        n_element, n_point, _, _ = mesh.gauss_gradient.shape
+        slopes = mesh.stacked_gradient @ field[mesh.template.nodes]  # shape (n_element, n_point * 2, 3)
+        return slopes.reshape(n_element, n_point, 2, 3)
 
     def _deformation_gradient(self, slopes: Array) -> Array:
         """Compute the scaled deformation gradient F.
@@ -214,10 +216,10 @@ class Membrane:
         return deformation
 
     def energy(self, field: Array) -> float:
-        """Compute the stretching energy integral( E' : C : E' / 2 + tau (tr E' - div U) ) of a field.
+        """Compute the stretching energy of a field: the integral of the energy densities of elasticity and pretension.
 
-        Here, E' is the scaled strain, C is the elasticity matrix, tau is the scaled pretension, and U is the in-plane
-        displacement.
+        The elastic energy density is E' : C : E' / 2, where E' is the scaled strain and C is the elasticity matrix. The
+        energy density of the pretension T is T : (E' - sym grad U), where U is the in-plane displacement.
 
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
@@ -228,13 +230,15 @@ class Membrane:
         # The last two axes are the coordinate and the displacement component, shape (n_element, n_point, 2, 3).
         slopes = self._slopes(field)
         scaled_strain = strain(slopes, self.groups.squared_amplitude)
-        energy_density = 0.5 * np.sum(scaled_strain * (scaled_strain @ self.groups.elasticity), axis=-1)
+        scaled_stress = scaled_strain @ self.groups.elasticity
+        elastic_density = 0.5 * np.sum(scaled_strain * scaled_stress, axis=-1)
 
-        # The difference tr E' - div U is half of the weighted sum of the squared slopes. The weights are A^2 for the
-        # slopes of U1 and U2, and 1 for the slopes of W, where A is the amplitude.
-        pretension_products = slopes * (self._pretension_matrix @ slopes)
-        energy_density += 0.5 * np.sum(pretension_products @ self._slope_weights, axis=-1)
-        return float(np.sum(energy_density * self.mesh.weights))
+        # The difference E' - sym grad U contains only products of two slopes of the same displacement component. The
+        # density is the sum of T_ab U_i,a U_i,b weight_i / 2 over the coordinates a and b and the components i, with W
+        # as the third component U_3.
+        products_by_component = slopes * (self._pretension_matrix @ slopes)
+        pretension_density = 0.5 * np.sum(products_by_component @ self._slope_weights, axis=-1)
+        return float(np.sum((elastic_density + pretension_density) * self.mesh.weights))
 
     def forces(self, field: Array) -> Array:
         """Compute the internal forces of the elements, which are the gradient of the stretching energy.
@@ -279,8 +283,8 @@ class Membrane:
         slopes = self._slopes(field)
         deformation = self._deformation_gradient(slopes)
 
-        # The total stress (S11, S22, S12) is the sum of the elastic stress and the pretension. The total stress is
-        # multiplied by the integration weights.
+        # The total stress (S11, S22, S12) is the sum of the elastic stress and the pretension. Multiply the stress and
+        # the material stiffness by the integration weights.
         elastic_stress = strain(slopes, self.groups.squared_amplitude) @ self.groups.elasticity
         total_stress = elastic_stress + self._pretension + added_tension * EQUAL_TENSION
         weighted_stress = _symmetric_matrix(total_stress * mesh.weights[..., None])
@@ -292,7 +296,8 @@ class Membrane:
         transposed_gradient = np.ascontiguousarray(mesh.stacked_gradient.transpose(0, 2, 1))
         matrix = np.zeros((n_element, unknowns_per_node, n_local, unknowns_per_node, n_local))
         for i, j in combinations_with_replacement(range(3), 2):
-            # Second derivatives with respect to the slopes. The stress contributes only to the diagonal blocks.
+            # Second derivatives of the energy density with respect to the slopes of the components i and j, shape
+            # (n_element, n_point, 2, 2). The stress contributes only if both components are the same.
             slope_stiffness = weighted_stiffness[..., i, :, j].copy()
             if i == j:
                 slope_stiffness += self._slope_weights[i] * weighted_stress
@@ -327,7 +332,7 @@ class Membrane:
         strain_derivative[..., 1, :, 2] = deformation[..., 0, :]  # d 2 E12 / d U_i,2
 
         n_element, n_point, _, _ = deformation.shape
-        derivatives = strain_derivative.reshape(n_element, n_point, 6, 3)  # one row for each slope
+        derivatives = strain_derivative.reshape(n_element, n_point, 6, 3)  # B, with one row for each of the six slopes
         stiffness = derivatives @ self.groups.elasticity @ derivatives.swapaxes(-1, -2)
         return stiffness.reshape(n_element, n_point, 2, 3, 2, 3)
 
@@ -410,7 +415,7 @@ class Bending:
         """Compute the Laplacian m = -M^-1 L W of the deflection W.
 
         The matrix L contains the integrals of dot(grad p, grad q) for all pairs of basis functions p and q. The mass
-        matrix M contains the integrals of p q, computed with the quadrature rule of the nodes.
+        matrix M contains the integrals of p q. With the quadrature rule of the nodes, M is diagonal.
 
         Args:
             deflection: Scaled deflection W at the nodes, shape (n_node,).
@@ -420,8 +425,8 @@ class Bending:
         """
         deflection_column = deflection[self.mesh.template.nodes][..., None]  # shape (n_element, n_local, 1)
         element_values = (self._laplace @ deflection_column)[..., 0]
-        weak_laplacian = self.mesh.gather(element_values)  # L W, shape (n_node,)
-        return -weak_laplacian / self._mass
+        integrals = self.mesh.gather(element_values)  # L W, shape (n_node,)
+        return -integrals / self._mass
 
     def energy(self, deflection: Array) -> float:
         """Compute the bending energy of a deflection.
@@ -436,6 +441,9 @@ class Bending:
 
     def forces(self, deflection: Array) -> Array:
         """Compute the internal forces of the elements, which are the gradient of the bending energy.
+
+        The gradient of the energy beta / 2 * W L^T M^-1 L W is -beta L m, where m = -M^-1 L W is the Laplacian of the
+        deflection W, L and M are matrices of the mesh, and beta is the bending stiffness.
 
         Args:
             deflection: Scaled deflection W at the nodes, shape (n_node,).

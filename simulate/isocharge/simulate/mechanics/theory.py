@@ -252,7 +252,7 @@ class DimensionlessGroups:
             squared_amplitude=squared_amplitude,
             load=force / force_unit,
             tension=film.pretension / tension_unit,
-            bending=slenderness(film) / squared_amplitude if bending else 0.0,
+            bending=bending_stiffness(film) / squared_amplitude if bending else 0.0,
             elasticity=elasticity(film, angle),
             uneven_tension=rotate_stress(deviator, -angle) / tension_unit,
             side_load=(side_load.real, side_load.imag),
@@ -279,7 +279,7 @@ class DimensionlessGroups:
         """
         film_stiffness = MEMBRANE_STIFFNESS * max(self.tension, 0.0) + PLATE_STIFFNESS * self.bending
         air_stiffness = AIR_SHAPE * self.ambient_pressure * self.compression
-        return float(_root(film_stiffness + air_stiffness, self.load))
+        return float(_cubic_root(film_stiffness + air_stiffness, self.load))
 
     @property
     def static_height(self) -> float:
@@ -294,7 +294,7 @@ class DimensionlessGroups:
         air_stiffness = 0.5 * np.pi * self.ambient_pressure * self.compression
         linear_factor = 4.0 * max(self.tension, 0.0) + 64.0 * self.bending + air_stiffness
         cubic_factor = 1.0 / 0.662**3
-        height = _root(linear_factor / cubic_factor, abs(self.static_pressure) / cubic_factor)
+        height = _cubic_root(linear_factor / cubic_factor, abs(self.static_pressure) / cubic_factor)
         return math.copysign(height, self.static_pressure)
 
 
@@ -313,16 +313,22 @@ def side_force_unit(film: Film, squared_amplitude: Array | float) -> Any:
     return film.young * film.thickness * film.radius * squared_amplitude
 
 
-def slenderness(film: Film) -> float:
-    """Compute the dimensionless bending stiffness b of a film.
+def bending_stiffness(film: Film) -> float:
+    """Compute the bending stiffness of a film in units of E h a^2.
 
-    The value is the bending stiffness divided by E h a^2, with Young's modulus E, the thickness h and the radius a.
+    Here, E is Young's modulus, h is the thickness and a is the radius of the film. The bending stiffness of a plate is
+    E h^3 / (12 (1 - poisson^2)).
     """
     return (film.thickness / film.radius) ** 2 / (12.0 * (1.0 - film.poisson**2))
 
 
 def amplitude_squared(film: Film, force: Array | float) -> Any:
-    """Compute the square A^2 of the amplitude of a press. The docstring of the module defines the amplitude.
+    """Compute the square A^2 of the amplitude of a press.
+
+    The amplitude A is the approximate deflection of the centre under a force at the centre, in film radii. It solves
+    the equation A^3 + linear_factor A = F / (E h a), where F is the force, E is Young's modulus, h is the thickness and
+    a is the radius of the film. The cubic term is the resistance of a membrane without pretension. The linear term is
+    the resistance of the pretension and of bending.
 
     Args:
         film: The film.
@@ -331,11 +337,13 @@ def amplitude_squared(film: Film, force: Array | float) -> Any:
     Returns:
         A^2, of the shape and type of `force`.
     """
-    linear_factor = MEMBRANE_STIFFNESS * max(film.pretension, 0.0) / film.young + PLATE_STIFFNESS * slenderness(film)
-    return _root(linear_factor, force / (film.young * film.thickness * film.radius)) ** 2
+    pretension_factor = MEMBRANE_STIFFNESS * max(film.pretension, 0.0) / film.young
+    linear_factor = pretension_factor + PLATE_STIFFNESS * bending_stiffness(film)
+    amplitude = _cubic_root(linear_factor, force / (film.young * film.thickness * film.radius))
+    return amplitude**2
 
 
-def _root(linear_factor: float, right_side: Array | float) -> Any:
+def _cubic_root(linear_factor: float, right_side: Array | float) -> Any:
     """Return the real root x of the cubic equation x^3 + linear_factor * x = right_side.
 
     Args:
@@ -363,12 +371,15 @@ INDUCED_STRAIN = 0.44
 def bending_length(film: Film, force: float) -> float:
     """Compute the distance from the clamped edge over which the film is bent, in film radii.
 
+    The distance is sqrt(D / N), where D is the bending stiffness and N is the tension force per length at the edge.
+
     Args:
         film: The film.
         force: Force of the press, N.
     """
     groups = DimensionlessGroups.of(film, force, bending=True)
-    tension = max(groups.tension, 0.0) + INDUCED_STRAIN * groups.height**2
+    induced_tension = INDUCED_STRAIN * groups.height**2
+    tension = max(groups.tension, 0.0) + induced_tension
     return math.sqrt(groups.bending / tension)
 
 

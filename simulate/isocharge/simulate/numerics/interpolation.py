@@ -98,6 +98,7 @@ def lagrange_values(nodes: Array, points: Array) -> Array:
     Returns:
         Value of each polynomial at each point, shape (m, n). Each row adds up to one.
     """
+    # Each node y contributes the factor (x - y) / (node - y) to the polynomials of all other nodes.
     values = np.ones((points.size, nodes.size))
     for index, node in enumerate(nodes):
         is_other = np.arange(nodes.size) != index
@@ -117,8 +118,10 @@ def basis(order: int, points: Array) -> tuple[Array, Array]:
         Values and derivatives, each of shape (m, order + 1).
     """
     coefficients = modal_matrix(order)  # one column of Legendre coefficients for each polynomial
-    legendre_values = legvander(points, order)
-    return legendre_values @ coefficients, legendre_values[:, :-1] @ legder(coefficients)
+    legendre_values = legvander(points, order)  # one column for each degree from 0 to `order`
+    values = legendre_values @ coefficients
+    derivatives = legendre_values[:, :-1] @ legder(coefficients)  # the degree of a derivative is lower by one
+    return values, derivatives
 
 
 def tensor_values(order: int, xi: Array, eta: Array) -> Array:
@@ -264,19 +267,22 @@ class Turns:
             has_directions: Whether the angle d varies. It does not vary if the film is axisymmetric, so that d has no
                 effect, or if the probe keeps its orientation on the film, so that d is zero.
         """
+        # Choose the pairs (m, k) of the terms of the series.
+        has_rotations = period > 0.0
         largest_m = len(largest_harmonics) - 1 if has_directions else 0
-        pairs: list[tuple[int, int]] = []  # (m, k) of each term
+        pairs: list[tuple[int, int]] = []
         for m in range(-largest_m, largest_m + 1):
-            largest_k = largest_harmonics[abs(m)] if period else 0
+            largest_k = largest_harmonics[abs(m)] if has_rotations else 0
             pairs.extend((m, k) for k in range(-largest_k, largest_k + 1))
         harmonics = np.array(pairs)
-        symmetry_order = round(math.tau / period) if period else 1
-        n_turn, step = _lattice(harmonics, symmetry_order)
+
+        # Choose the angles. Only even harmonics of d occur, so half a turn is the period of d.
+        symmetry_order = round(math.tau / period) if has_rotations else 1
+        n_turn, step = _smallest_lattice(harmonics, symmetry_order)
         turn = np.arange(n_turn)
         return cls(
-            # Only even harmonics of d occur, so half a turn is the period of d.
             direction=np.pi * step * turn / n_turn if has_directions else np.zeros(n_turn),
-            rotation=math.tau * turn / n_turn if period else np.zeros(n_turn),
+            rotation=math.tau * turn / n_turn if has_rotations else np.zeros(n_turn),
             harmonics=harmonics * np.array([2, 1]),  # (2 m, k)
             symmetry_order=symmetry_order,
         )
@@ -288,33 +294,38 @@ class Turns:
         return list(zip(self.direction[:n_solved].tolist(), self.rotation[:n_solved].tolist(), strict=True))
 
     def weights(self, direction: Array, rotation: Array) -> Array:
-        """Compute the weights that interpolate between the turns.
+        """Compute the weights with which values at all turns are interpolated at other presses.
+
+        A turn is a pair of a direction and a rotation at which presses are solved. The values depend on both angles
+        like a Fourier series, so the value at a press is a weighted sum of the values at all turns.
 
         Args:
-            direction: Directions of the presses as in the attribute `direction`, shape (n,), rad.
-            rotation: Rotations of the probe as in the attribute `rotation`, shape (n,) or (1,), rad.
+            direction: Directions from the centre of the film to the presses, plus the rotation of a probe that is not
+                axisymmetric, shape (n,), rad.
+            rotation: Rotations of the probe relative to the line from the centre to the press, shape (n,) or (1,), rad.
 
         Returns:
             Weights, shape (n, n_turn). The weights of each press sum to 1.
         """
-        # Phase of each term of the Fourier series at the presses and at the turns
+        # Phase of each term exp(i phase) of the Fourier series at the presses and at the turns
         press_angles = np.stack(np.broadcast_arrays(direction, rotation), axis=1)
         press_phase = press_angles @ self.harmonics.T  # shape (n, n_term)
         turn_angles = np.stack([self.direction, self.rotation], axis=1)
         turn_phase = turn_angles @ self.harmonics.T  # shape (n_turn, n_term)
 
         # A weight is the sum of exp(i (phase at the press - phase at the turn)) over the terms, divided by `n_turn`.
+        n_turn = self.rotation.size
         sum_over_terms = np.exp(1j * press_phase) @ np.exp(-1j * turn_phase).T
-        return np.asarray(sum_over_terms.real / self.rotation.size)
+        return np.asarray(sum_over_terms.real / n_turn)
 
 
-def _lattice(harmonics: Integers, symmetry_order: int) -> tuple[int, int]:
+def _smallest_lattice(harmonics: Integers, symmetry_order: int) -> tuple[int, int]:
     """Find the smallest lattice of turns on which any two harmonics differ in at least one value.
 
-    A turn is a pair of the direction of a press and the rotation of the probe. The lattice has n turns and the step s.
-    At the turn j, the direction of the press is pi s j / n, and the rotation of the probe is 2 pi j / n. The harmonic
-    (m, k) of these angles has the phase 2 pi (m s + k) j / n. Two harmonics therefore have the same values at all turns
-    if and only if the remainders of m s + k after the division by n are equal.
+    A turn is a pair of the direction d of a press and the rotation r of the probe. A lattice has n turns and the step
+    s, and the turn j has the angles d = pi s j / n and r = 2 pi j / n. The harmonic exp(i (2 m d + k r)) has the phase
+    2 pi (m s + k) j / n at the turn j. Two harmonics therefore have the same values at all turns if and only if the
+    remainders of m s + k after the division by n are equal.
 
     While the rotation increases by one period of the probe, the direction must increase by the same angle plus a
     multiple of half a turn. The difference s - 2 is therefore a multiple of the symmetry order.
@@ -326,11 +337,14 @@ def _lattice(harmonics: Integers, symmetry_order: int) -> tuple[int, int]:
     Returns:
         Number of turns, which is a multiple of the symmetry order, and step.
     """
+    # There must be at least as many turns as harmonics. The search ends, because a lattice with sufficiently many turns
+    # separates all harmonics.
     period_count = math.ceil(len(harmonics) / symmetry_order)
-    while True:  # a lattice with more turns than pairs of angles separates all harmonics
+    while True:
         n_turn = symmetry_order * period_count
         for step in range(2 % symmetry_order, n_turn, symmetry_order):
-            remainders = (harmonics @ (step, 1)) % n_turn
-            if len(set(remainders.tolist())) == len(harmonics):
+            remainders = (harmonics @ (step, 1)) % n_turn  # of m s + k
+            all_remainders_differ = len(set(remainders.tolist())) == len(harmonics)
+            if all_remainders_differ:
                 return n_turn, step
         period_count += 1

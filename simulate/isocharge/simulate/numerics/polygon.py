@@ -29,7 +29,7 @@ The length of a mitre is proportional to 1 / (1 + cos(angle)). The largest allow
 
 
 def area_of(corners: Array) -> float:
-    """Compute the signed area of a polygon, which is positive if the corners are anticlockwise.
+    """Compute the signed area of a polygon by the shoelace formula. It is positive if the corners are anticlockwise.
 
     Args:
         corners: Corners (x, y), shape (n, 2).
@@ -119,10 +119,11 @@ def area_in_disk(corners: Complexes, centre: complex, radius: Array | float) -> 
 
 
 def gauss_quadrilaterals(corners: Complexes, line_area: Array, count: int) -> tuple[Complexes, Array]:
-    """Compute the points and weights of a Gauss rule for quadrilaterals, triangles and lines.
+    """Compute the points and weights of a Gauss rule for each of several quadrilaterals, triangles and lines.
 
-    A bilinear function maps the rule of the unit square into each quadrilateral. An integral over a line is a mean
-    along the line, multiplied by an area that the line represents.
+    A bilinear function maps the points of the rule for the unit square into each quadrilateral. The weights are
+    multiplied by the determinant of the Jacobian of this function. For a line, the determinant is zero, and the weights
+    are multiplied by the area that the line represents instead.
 
     Args:
         corners: Corners x + iy, anticlockwise, shape (n, 4). The last two corners of a triangle are equal. A line is a
@@ -134,17 +135,22 @@ def gauss_quadrilaterals(corners: Complexes, line_area: Array, count: int) -> tu
         Points x + iy, and weights, each of shape (n, count^2). The weights add up to the area of the quadrilateral or
         to the area that the line represents.
     """
-    # The digits in the name of a corner are its coordinates s and t in the unit square.
-    z00, z10, z11, z01 = corners.T[:, :, None]  # each of shape (n, 1)
+    # Coordinates s and t, and weights of the points in the unit square, each of shape (count^2,)
     line_points, line_weights = gauss_line(count)
     s = np.repeat(line_points, count)
     t = np.tile(line_points, count)
+    square_weights = np.outer(line_weights, line_weights).ravel()
+
+    # Map the points into the quadrilaterals. The digits in the name of a corner are its coordinates s and t.
+    z00, z10, z11, z01 = corners.T[:, :, None]  # each of shape (n, 1)
     s_derivative = (z10 - z00) * (1.0 - t) + (z11 - z01) * t
     t_derivative = (z01 - z00) * (1.0 - s) + (z11 - z10) * s
     points = z00 * (1.0 - t) + z01 * t + s * s_derivative
-    determinant = cross_product(s_derivative, t_derivative)  # of the Jacobian of the points
-    square_weights = np.outer(line_weights, line_weights).ravel()
-    return points, square_weights * (determinant + line_area[:, None])
+    determinant = cross_product(s_derivative, t_derivative)  # of the Jacobian; zero for a line
+
+    # One of the two summands is zero.
+    area_factor = determinant + line_area[:, None]
+    return points, square_weights * area_factor
 
 
 def halve_quadrilaterals(corners: Complexes) -> Complexes:
@@ -156,10 +162,13 @@ def halve_quadrilaterals(corners: Complexes) -> Complexes:
     Returns:
         Corners x + iy, shape (2 n, 4): first one half of all quadrilaterals, and then the other half.
     """
-    # Renumber the corners such that the longest side connects the first two corners or the last two corners.
+    # Renumber the corners such that the longest side is the first side, between the first and the second corner, or the
+    # third side, between the third and the fourth corner.
     next_corners = np.roll(corners, -1, axis=1)
-    side_lengths = np.abs(next_corners - corners)
-    must_renumber = side_lengths[:, 1::2].max(axis=1) > side_lengths[:, ::2].max(axis=1)
+    side_lengths = np.abs(next_corners - corners)  # of the sides that begin at the corners
+    longer_of_first_and_third = side_lengths[:, ::2].max(axis=1)
+    longer_of_second_and_fourth = side_lengths[:, 1::2].max(axis=1)
+    must_renumber = longer_of_second_and_fourth > longer_of_first_and_third
     first, second, third, fourth = np.where(must_renumber[:, None], next_corners, corners).T
 
     # Divide the quadrilaterals between the middles of the two opposite sides.
@@ -204,11 +213,13 @@ def union_triangles(
     region = region_of(front)
     if back:
         region = shapely.intersection(region, region_of(back))
-    # The polygons of the region, without points and lines at which polygons only touch
+    # Select the polygons of the region. Points and lines at which polygons only touch have less than two dimensions.
     parts = shapely.get_parts(region)
     polygons = shapely.multipolygons(parts[shapely.get_dimensions(parts) == 2])
     divided_outlines = shapely.segmentize(polygons, max_side)
     triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(divided_outlines))
+
+    # The outline of a triangle repeats its first corner at the end.
     return [shapely.get_coordinates(triangle)[:3] for triangle in shapely.orient_polygons(triangles)]
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.structs import plain_values
-from isocharge.simulate.mechanics.theory import Theory, bending_length, slenderness
+from isocharge.simulate.mechanics.theory import Theory, bending_length, bending_stiffness
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.numerics.interpolation import gauss_reference_square, modal_matrix
 from isocharge.simulate.numerics.polygon import to_corners
@@ -133,7 +133,7 @@ def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> f
     slope = np.cbrt(force / (np.pi * probe.reach * film.thickness * film.young))
     pretension_strain = max(film.pretension, 0.0) / film.young
     strain = pretension_strain + 0.5 * slope**2
-    squared_length_ratio = slenderness(film) / strain * (film.radius / probe.reach) ** 2
+    squared_length_ratio = bending_stiffness(film) / strain * (film.radius / probe.reach) ** 2
     probe_weight = 0.5 + 5.0 * pretension_strain / strain  # empirical, for an electrode beside the footprint
     return float(BENDING_WEIGHT * length + probe_weight * squared_length_ratio)
 
