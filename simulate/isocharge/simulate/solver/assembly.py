@@ -32,7 +32,7 @@ from scipy.sparse import csc_matrix, eye_array
 from scipy.sparse.linalg import SuperLU, splu
 from threadpoolctl import ThreadpoolController
 
-from isocharge.common.arrays import Array
+from isocharge.common.arrays import Array, Integers
 from isocharge.simulate.mechanics.energy import ElasticFilm
 from isocharge.simulate.mesh.template import Template
 
@@ -70,12 +70,13 @@ class Assembly:
         self.free = _free_unknowns(mesh, unknowns_per_node, odd)
 
         # Compute the local indices of the unknowns on the sides of an element and in its interior. Within an element,
-        # the unknowns are numbered component by component. `mechanics.energy.Bending` has eliminated the auxiliary
-        # unknown of the interior nodes.
+        # the unknowns are numbered component by component. The interior nodes have only the components U1, U2 and W,
+        # because `mechanics.energy.Bending` has eliminated their auxiliary unknown.
         component = np.arange(unknowns_per_node)[:, None]
+        displacement_component = component[:3]
         n_local = mesh.is_interior.size
         self._side_indices = (component * n_local + np.flatnonzero(~mesh.is_interior)).ravel()
-        self._interior_indices = (component[:3] * n_local + np.flatnonzero(mesh.is_interior)).ravel()
+        self._interior_indices = (displacement_component * n_local + np.flatnonzero(mesh.is_interior)).ravel()
 
         # Compute the global indices of the unknowns of each element. Globally, the unknowns are numbered node by node.
         unknown = (unknowns_per_node * mesh.nodes[:, None] + component).reshape(len(mesh.nodes), -1)
@@ -88,14 +89,24 @@ class Assembly:
         self.skeleton = np.flatnonzero(is_in_skeleton & self.free.ravel())
         self._set_pattern()
 
-        # Renumber the skeleton unknowns by the minimum-degree method, so that the factors have few nonzero entries.
-        # SuperLU returns its column order only after a factorisation. The factorised matrix has the pattern of the
-        # skeleton matrix and a dominant diagonal, because such a matrix needs no pivoting.
+        # Sort the skeleton unknowns, and compute the pattern of the sorted unknowns.
+        self.skeleton = self.skeleton[self._elimination_order()]
+        self._set_pattern()
+
+    def _elimination_order(self) -> Integers:
+        """Return an order of the skeleton unknowns in which the factors of their matrix have few nonzero entries.
+
+        The order is computed by the minimum-degree method. SuperLU returns it only after a factorisation. Therefore a
+        matrix is factorised that has the pattern of the skeleton matrix and a dominant diagonal, because such a matrix
+        needs no pivoting.
+
+        Returns:
+            Indices into `skeleton` in the order of elimination, shape (n_skeleton,).
+        """
         pattern = self._skeleton_matrix(np.ones(self._indices.size))
         dominant_matrix = csc_matrix(pattern + pattern.sum() * eye_array(pattern.shape[0]))
-        new_number = factorise(dominant_matrix, "MMD_AT_PLUS_A").perm_c
-        self.skeleton = self.skeleton[np.argsort(new_number)]
-        self._set_pattern()
+        new_number = factorise(dominant_matrix, "MMD_AT_PLUS_A").perm_c  # of each present number
+        return np.argsort(new_number)
 
     def _set_pattern(self) -> None:
         """Determine which entries of the skeleton matrix may be nonzero, and where the element matrices are added.
@@ -160,8 +171,8 @@ class Assembly:
         side_block = element_matrix[:, sides[:, None], sides]  # C
         schur_complement = side_block - coupling.transpose(0, 2, 1) @ reduced_coupling
 
-        # Add the Schur complements of all elements. All entries of fixed unknowns are added to the last number of the
-        # result, which is not used.
+        # Add the Schur complements of all elements. All entries of fixed unknowns are added to a further number behind
+        # the nonzero entries, which is not used.
         entry_count = self._indices.size + 1
         skeleton_entries = np.bincount(self._entry_positions, schur_complement.ravel(), entry_count)[:-1]
         skeleton_factor = factorise(self._skeleton_matrix(skeleton_entries), "NATURAL")

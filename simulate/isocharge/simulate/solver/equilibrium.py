@@ -86,14 +86,14 @@ class Equilibrium(NewtonResult):
 
         If the stress exceeds the limit at which PVDF yields, the summary contains a warning.
         """
-        (depth,) = deflection(self, np.array([self.at]))
+        (probe_deflection,) = deflection(self, np.array([self.at]))
         _, largest_stress = principal_stress(self)
         exceeds_limit = largest_stress > DEFAULT_STRESS_LIMIT
         warning = f", beyond {DEFAULT_STRESS_LIMIT:g} MPa: PVDF yields" if exceeds_limit else ""
         x, y = self.at
         return (
             f"Equilibrium({self.force:g} N under {self.probe.notation} at ({x:g}, {y:g}) mm: {self.status}, deflection "
-            f"{depth:.4g} mm, stress up to {largest_stress:.3g} MPa{warning})"
+            f"{probe_deflection:.4g} mm, stress up to {largest_stress:.3g} MPa{warning})"
         )
 
 
@@ -255,9 +255,10 @@ def _continuous_slope(equilibrium: Equilibrium) -> Array:
         n_local, 2).
     """
     template = equilibrium.mesh.template
+    element_slope = node_slopes(equilibrium)[..., 2]  # of W, shape (n_element, n_local, 2)
     slope_sum = np.zeros((template.n_node, 2))
-    np.add.at(slope_sum, template.nodes, node_slopes(equilibrium)[..., 2])
-    element_count = np.bincount(template.nodes.ravel())
+    np.add.at(slope_sum, template.nodes, element_slope)
+    element_count = np.bincount(template.nodes.ravel())  # number of elements that share each node
     slope = slope_sum / element_count[:, None]
     slope[template.on_rim] = 0.0
     slope[template.on_axis, 1] = 0.0  # the deflection is symmetric about the axis of a half mesh

@@ -65,17 +65,18 @@ def highest_mode_share(mesh: PlacedMesh, slope: Array) -> float:
     Returns:
         Mean of the shares in all elements, weighted with the areas of the elements and the squares of the slopes.
     """
-    # Convert the values on the square grid of nodes into coefficients of products of Legendre polynomials in xi and
-    # eta, shape (n_element, 2, n_node, n_node).
-    n_node = mesh.resolution.order + 1  # along a side of an element
+    # Convert the values on the square grid of nodes into coefficients of products of Legendre polynomials in eta and
+    # xi. The last two axes are the nodes or the degrees in eta and in xi, of which there are `nodes_per_side`.
+    nodes_per_side = mesh.resolution.order + 1
     nodes_to_modes = modal_matrix(mesh.resolution.order)
-    nodal_slope = slope.transpose(0, 2, 1).reshape(len(slope), 2, n_node, n_node)
+    slope_by_component = slope.transpose(0, 2, 1)  # shape (n_element, 2, n_local)
+    nodal_slope = slope_by_component.reshape(len(slope), 2, nodes_per_side, nodes_per_side)
     coefficients = nodes_to_modes @ nodal_slope @ nodes_to_modes.T
 
     # The power of a mode is the sum of its mean squares in both slopes. The mean square of the Legendre polynomial of
     # degree n is 1 / (2 n + 1).
-    mean_square = 1.0 / (2.0 * np.arange(n_node) + 1.0)
-    power = (coefficients**2 * np.outer(mean_square, mean_square)).sum(axis=1)  # shape (n_element, n_node, n_node)
+    mean_square = 1.0 / (2.0 * np.arange(nodes_per_side) + 1.0)
+    power = (coefficients**2 * np.outer(mean_square, mean_square)).sum(axis=1)  # one power for each pair of degrees
     total_power = power.sum(axis=(1, 2))
     lower_power = power[:, :-1, :-1].sum(axis=(1, 2))  # of modes without the highest degree in xi and in eta
     highest_power = np.maximum(total_power - lower_power, 0.0)
@@ -111,10 +112,11 @@ def mesh_error(equilibrium: Equilibrium) -> float:
 def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> float:
     """Estimate the relative error that omitted bending causes in a charge.
 
-    The error has two parts. The first part is proportional to the bending length at the clamp. The second part is
-    proportional to the squared ratio of the bending length at the footprint to the reach R of the footprint, and is
-    larger if most of the tension at the footprint is pretension. The slope w' of the film at the footprint follows from
-    the vertical force 2 pi R h S w' = F and the induced stress S = E w'^2 / 2, so that w'^3 = F / (pi R h E).
+    The error has two parts. The part of the clamp is proportional to the bending length at the clamp. The part of the
+    footprint is proportional to the squared ratio of the bending length at the footprint to the reach R of the
+    footprint, and is larger if most of the tension at the footprint is pretension. The slope w' of the film at the
+    footprint follows from the vertical force 2 pi R h S w' = F and the induced stress S = E w'^2 / 2, so that
+    w'^3 = F / (pi R h E).
 
     Args:
         film: The film, with Young's modulus E and thickness h.
@@ -123,19 +125,24 @@ def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> f
         theory: The theory.
 
     Returns:
-        The error; zero with bending, and infinite for a thick film without bending.
+        The error, which is zero if the theory includes bending, and infinite for a thick film otherwise.
     """
     if theory.bending:
         return 0.0
-    length = bending_length(film, force)
-    if length > MAX_MEMBRANE_BENDING_LENGTH:
+    clamp_length = bending_length(film, force)  # in film radii
+    if clamp_length > MAX_MEMBRANE_BENDING_LENGTH:
         return np.inf
+    clamp_error = BENDING_WEIGHT * clamp_length
+
+    # Stresses at the footprint, divided by Young's modulus
     slope = np.cbrt(force / (np.pi * probe.reach * film.thickness * film.young))
-    pretension_strain = max(film.pretension, 0.0) / film.young
-    strain = pretension_strain + 0.5 * slope**2
-    squared_length_ratio = bending_stiffness(film) / strain * (film.radius / probe.reach) ** 2
-    probe_weight = 0.5 + 5.0 * pretension_strain / strain  # empirical, for an electrode beside the footprint
-    return float(BENDING_WEIGHT * length + probe_weight * squared_length_ratio)
+    pretension = max(film.pretension, 0.0) / film.young
+    tension = pretension + 0.5 * slope**2
+
+    # The squared bending length at the footprint, in film radii, is the bending stiffness divided by the tension.
+    squared_length_ratio = bending_stiffness(film) / tension * (film.radius / probe.reach) ** 2
+    footprint_weight = 0.5 + 5.0 * pretension / tension  # empirical, for an electrode beside the footprint
+    return float(clamp_error + footprint_weight * squared_length_ratio)
 
 
 def estimated_error(equilibrium: Equilibrium) -> float:
@@ -155,8 +162,8 @@ PATCH_RING_RADII = (0.0, 0.1, 0.22, 0.4, 0.6, 0.8)
 """Radii of the rings on which square patches are placed to compare the charges of two meshes, in film radii."""
 
 
-def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
-    """Compute the largest relative difference between two equilibria of the same press.
+def relative_difference(solved: Equilibrium, reference: Equilibrium) -> float:
+    """Compute the largest relative difference of an equilibrium from another equilibrium of the same press.
 
     The function compares the deflections at the probe, and the charges that square patches of the film would collect.
     The charges are compared for a biaxial film and for a uniaxial film. The patches lie on rings around the centre of
@@ -164,30 +171,32 @@ def relative_difference(one: Equilibrium, other: Equilibrium) -> float:
     largest charge of all patches on the same ring.
 
     Args:
-        one: First equilibrium.
-        other: Second equilibrium. The differences are relative to its deflection and its charges.
+        solved: The equilibrium.
+        reference: The other equilibrium. The differences are relative to its deflection and its charges.
 
     Returns:
         Relative difference, dimensionless.
     """
     # Centres x + iy of the patches, shape (n_ring, patches_per_ring), mm
     patches_per_ring = 12
-    film_radius = one.film.radius
+    film_radius = solved.film.radius
     unit_circle = np.exp(2j * np.pi * np.arange(patches_per_ring) / patches_per_ring)
     rings_around_centre = film_radius * np.array(PATCH_RING_RADII)[:, None] * unit_circle
-    ring_around_footprint = complex(*one.at) + one.probe.reach * unit_circle
+    ring_around_footprint = complex(*solved.at) + solved.probe.reach * unit_circle
     patch_centres = np.concatenate([rings_around_centre, ring_around_footprint[None]])
 
     # Largest difference of the charges, relative to the largest charge on the same ring
-    one_charge = _patch_charges(one, patch_centres)
-    other_charge = _patch_charges(other, patch_centres)
-    largest_on_ring = np.maximum(np.abs(other_charge).max(axis=1, keepdims=True), 1e-300)
-    charge_difference = float((np.abs(one_charge - other_charge) / largest_on_ring).max())
+    charges = _patch_charges(solved, patch_centres)
+    reference_charges = _patch_charges(reference, patch_centres)
+    largest_on_ring = np.abs(reference_charges).max(axis=1, keepdims=True)
+    charge_unit = np.maximum(largest_on_ring, 1e-300)  # the limit avoids a division by zero
+    charge_difference = float((np.abs(charges - reference_charges) / charge_unit).max())
 
     # Relative difference of the deflections at the centroid of the footprint
-    (one_deflection,) = deflection(one, np.array([one.at]))
-    (other_deflection,) = deflection(other, np.array([one.at]))
-    deflection_difference = abs(float(one_deflection / other_deflection) - 1.0)
+    position = np.array([solved.at])
+    (solved_deflection,) = deflection(solved, position)
+    (reference_deflection,) = deflection(reference, position)
+    deflection_difference = abs(float(solved_deflection / reference_deflection) - 1.0)
     return max(charge_difference, deflection_difference)
 
 
@@ -201,8 +210,8 @@ def _patch_charges(equilibrium: Equilibrium, centres: Complexes) -> Array:
         centres: Centres x + iy of the patches, shape (n_ring, n_patch), mm.
 
     Returns:
-        Charges per area in arbitrary units, shape (n_ring, n_patch, 2). The last axis is the kind of film. The part of
-        a patch outside the film does not contribute.
+        Charges per area in arbitrary units, shape (n_ring, n_patch, 2). The last axis contains the charge of the
+        biaxial film and the charge of the uniaxial film. The part of a patch outside the film does not contribute.
     """
     # Integration points of all patches, six along each side. The coordinates xi and eta range from -1 to 1.
     film_radius = equilibrium.film.radius
@@ -220,8 +229,11 @@ def _patch_charges(equilibrium: Equilibrium, centres: Complexes) -> Array:
     patch_stress = stress.reshape(*centres.shape, -1, 3)  # shape (n_ring, n_patch, n_point, 3)
     mean_stress = 0.25 * (weights @ patch_stress)
 
-    # The coefficients d31 and d32 of a biaxial film are equal. On a uniaxial film, d31 is about ten times d32.
-    coefficients = np.array([[1.0, 10.0], [1.0, 1.0]])  # one column for each kind of film
+    # The charge per area is d31 s11 + d32 s22. The coefficients d31 and d32 of a biaxial film are equal. On a uniaxial
+    # film, d31 is about ten times d32.
+    biaxial_coefficients = [1.0, 1.0]
+    uniaxial_coefficients = [10.0, 1.0]
+    coefficients = np.stack([biaxial_coefficients, uniaxial_coefficients], axis=1)
     return np.asarray(mean_stress[..., :2] @ coefficients)
 
 

@@ -127,25 +127,7 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
             f"{probe.reach:.4g} mm"
         )
 
-    farthest = farthest_distance(film, probe, at)
-    outline = complex(*at) + probe.outline
-    relative_distance = film.relative_distance(outline)
-    if not (farthest < film.radius * (1.0 - 1e-6) and relative_distance.max() < 1.0):
-        worst_angle = np.angle(outline[relative_distance.argmax()])
-        raise SceneError(
-            f"probe off the film: centre ({at[0]:.4g}, {at[1]:.4g}) mm, farthest point of {probe.notation} "
-            f"{probe.farthest_distance(at):.4g} mm from the film's centre, the rim "
-            f"{film.rim_distance(worst_angle):.4g} mm from it there"
-        )
-    rim_distance = film.radius - farthest
-    min_rim_distance = MIN_RIM_DISTANCE * probe.reach
-    is_curved_but_not_round = probe.topology.is_curved and not probe.topology.fills_circle
-    if is_curved_but_not_round and rim_distance < min_rim_distance:
-        raise SceneError(
-            f"{probe.notation} at ({at[0]:.4g}, {at[1]:.4g}) mm comes within {rim_distance:.3g} mm of the rim: "
-            f"expected at least {min_rim_distance:.3g} mm, because the mesh around the footprint would be too thin; "
-            "press farther inside"
-        )
+    _check_position(film, probe, at)
 
     # The squared amplitude is of the order of the strains.
     with np.errstate(over="ignore"):  # the amplitude of a huge force is infinite, and is refused
@@ -154,6 +136,42 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
         raise SceneError(
             f"force {force:.4g} N stretches a film of {film.thickness:.4g} mm beyond small strains: expected "
             f"(F / (E h a))^(2/3) up to {MAX_AMPLITUDE2:g}, got {squared_amplitude:.3g}"
+        )
+
+
+def _check_position(film: Film, probe: Probe, at: tuple[float, float]) -> None:
+    """Raise an error if a footprint is not completely on the film, or so close to the rim that no mesh fits.
+
+    Args:
+        film: The film.
+        probe: The probe.
+        at: Centroid (x, y) of the footprint, mm.
+
+    Raises:
+        SceneError: If the footprint is at this position not on the film, or is too close to the rim.
+    """
+    # On an oval film, `farthest_distance` is less than the radius exactly if the footprint lies on the film. A NaN in
+    # the position makes both comparisons false.
+    farthest = farthest_distance(film, probe, at)
+    outline = complex(*at) + probe.outline
+    relative_distance = film.relative_distance(outline)
+    is_on_film = farthest < film.radius * (1.0 - 1e-6) and relative_distance.max() < 1.0
+    if not is_on_film:
+        worst_angle = np.angle(outline[relative_distance.argmax()])
+        raise SceneError(
+            f"probe off the film: centre ({at[0]:.4g}, {at[1]:.4g}) mm, farthest point of {probe.notation} "
+            f"{probe.farthest_distance(at):.4g} mm from the film's centre, the rim "
+            f"{film.rim_distance(worst_angle):.4g} mm from it there"
+        )
+
+    rim_distance = film.radius - farthest
+    min_rim_distance = MIN_RIM_DISTANCE * probe.reach
+    is_curved_but_not_round = probe.topology.is_curved and not probe.topology.fills_circle
+    if is_curved_but_not_round and rim_distance < min_rim_distance:
+        raise SceneError(
+            f"{probe.notation} at ({at[0]:.4g}, {at[1]:.4g}) mm comes within {rim_distance:.3g} mm of the rim: "
+            f"expected at least {min_rim_distance:.3g} mm, because the mesh around the footprint would be too thin; "
+            "press farther inside"
         )
 
 
@@ -172,8 +190,11 @@ def farthest_distance(film: Film, probe: Probe, at: tuple[float, float]) -> floa
     direction = math.atan2(y, x)
     oval = film_oval(film, direction)
     with np.errstate(all="ignore"):  # the caller refuses a huge distance or NaN
-        distance = circular_distance(np.hypot(x, y) / film.radius, oval, probe.reach / film.radius)
-    return probe.rotated(-direction).farthest_distance((film.radius * float(distance), 0.0))
+        centroid_distance = circular_distance(np.hypot(x, y) / film.radius, oval, probe.reach / film.radius)
+
+    # Rotate the press onto the positive x axis.
+    rotated_probe = probe.rotated(-direction)
+    return rotated_probe.farthest_distance((film.radius * float(centroid_distance), 0.0))
 
 
 def layer_for(film: Film, force: float) -> float:
@@ -239,9 +260,10 @@ class LoadCase:
 
 
 def choose_mesh(case: LoadCase) -> PlacedMesh:
-    """Return the coarsest mesh whose predicted error is small enough, or the finest mesh if no mesh is sufficient.
+    """Return the coarsest mesh whose predicted error is at most half of the required accuracy.
 
-    The error is predicted from the shapes of the elements.
+    The error is predicted from the shapes of the elements. If no mesh is sufficient, the finest mesh is returned, as
+    long as its error is moderate.
 
     Args:
         case: The press and the required accuracy.
@@ -249,16 +271,17 @@ def choose_mesh(case: LoadCase) -> PlacedMesh:
     Raises:
         SceneError: If the press is so close to the rim that even the finest mesh is too distorted.
     """
-    for resolution in _candidate_resolutions(case):
+    max_error = 0.5 * case.settings.accuracy  # the other half is for the omitted terms of the theory
+    *coarser_resolutions, finest_resolution = _candidate_resolutions(case)
+    for resolution in coarser_resolutions:
         mesh = case.place(resolution)
-        error = mesh.shape_error
-        if error <= 0.5 * case.settings.accuracy:  # the other half is for the omitted terms of the theory
+        if mesh.shape_error <= max_error:
             return mesh
 
-    # No mesh is sufficient. The last mesh, which is the finest, is still used if its error is moderate.
-    if error > MAX_SHAPE_ERROR:
-        raise too_near_the_rim(case, resolution)
-    return mesh
+    finest_mesh = case.place(finest_resolution)
+    if finest_mesh.shape_error > max(max_error, MAX_SHAPE_ERROR):
+        raise too_near_the_rim(case, finest_resolution)
+    return finest_mesh
 
 
 def needs_second_mesh(case: LoadCase) -> bool:
@@ -292,7 +315,8 @@ def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:
 def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
     """Generate the resolutions that are tried for a press, from coarse to fine.
 
-    For presses in the inner half of the film, the first resolution is sufficient.
+    For presses in the inner half of the film, the first resolution is sufficient. The other resolutions have a higher
+    order and several times as many elements around the innermost circle.
 
     Args:
         case: The press and the required accuracy.
@@ -316,68 +340,75 @@ def _first_resolution(case: LoadCase) -> Resolution:
     Args:
         case: The press and the required accuracy.
     """
-    film = case.film
-    probe = case.probe
+    has_bending = case.settings.theory.bending
 
     # Place a coarse mesh to obtain the conformal map, which is the same for all meshes under the press.
     coarse_resolution = Resolution(order=2, around=8, rings=1)
-    placement = place(film, probe, case.at, coarse_resolution, layer=0.1).placement
-
-    # A footprint that is not circular is enclosed by a circle with a gap. If this circle does not fit on the film, the
-    # mesh needs more elements around the circle.
-    enclosing_extent = farthest_distance(film, probe, case.at) + CLEARANCE * probe.reach
-    is_crowded = not probe.topology.fills_circle and enclosing_extent > film.radius
+    placement = place(case.film, case.probe, case.at, coarse_resolution, layer=0.1).placement
 
     # A better accuracy than the default `ACCURACY` requires a higher polynomial order. The factors are empirical.
+    first_order = 5 if has_bending else 4
     extra_order = max(0, math.ceil(1.4 * math.log10(ACCURACY / case.settings.accuracy)))
-    first_order = 5 if case.settings.theory.bending else 4
 
     # A small radius of the innermost circle and the stretch of the conformal map require more rings (empirical
     # factors).
+    rings_for_radius = -1.3 * math.log(float(placement.template_radius))
     rings_for_stretch = min(2.0 * math.log(map_stretch(placement.map_parameter, 1.0)), 4.0)
-    rings = math.ceil(-1.3 * math.log(float(placement.template_radius)) + rings_for_stretch)
-    resolution = Resolution(
-        order=first_order + extra_order,
-        around=16 if is_crowded or _is_very_uneven(film, case.force) else 8,
-        rings=max(3, rings) + extra_order // 2,
-        rim=_thin_ring_count(placement, case.layer) if case.settings.theory.bending else 0,
-    )
-    if film.has_back_pressure:
+    rings = max(3, math.ceil(rings_for_radius + rings_for_stretch)) + extra_order // 2
+    thin_rings = _thin_ring_count(placement, case.layer) if has_bending else 0
+    if case.film.has_back_pressure:
         # Without these rings, the error of a charge of a slack film on a cavity is 0.5 % even with order 8.
-        resolution = replace(resolution, rings=resolution.rings + 6, rim=resolution.rim + 2)
-    return resolution
+        rings += 6
+        thin_rings += 2
+    around = 16 if _needs_more_sectors(case) else 8
+    return Resolution(order=first_order + extra_order, around=around, rings=rings, rim=thin_rings)
 
 
-def _is_very_uneven(film: Film, force: float) -> bool:
-    """Return whether the uneven part of the pretension is not small compared with the stress that the force causes.
+def _needs_more_sectors(case: LoadCase) -> bool:
+    """Return whether eight elements around the innermost circle of the mesh are too few for a press.
 
-    The deflection around the probe then depends strongly on the direction.
+    They are too few in two cases. In the first case, the footprint is not circular, and the circle that encloses it
+    with the full gap does not fit on the film. In the second case, the uneven part of the pretension is not small
+    compared with the stress that the force causes. The deflection around the probe then depends strongly on the
+    direction.
+
+    Args:
+        case: The press.
     """
-    load_stress = film.young * amplitude_squared(film, force)
-    return bool(np.hypot(*film.deviator) > MAX_UNEVENNESS * load_stress)
+    film = case.film
+    probe = case.probe
+    enclosing_extent = farthest_distance(film, probe, case.at) + CLEARANCE * probe.reach
+    is_crowded = not probe.topology.fills_circle and enclosing_extent > film.radius
+
+    load_stress = film.young * amplitude_squared(film, case.force)
+    uneven_stress = np.hypot(*film.deviator)
+    return is_crowded or bool(uneven_stress > MAX_UNEVENNESS * load_stress)
 
 
 def _thin_ring_count(placement: Placement, total_width: float) -> int:
-    """Compute the number of thin rings at the rim.
+    """Compute the number of thin rings at the rim of the mesh.
 
-    At the clamped rim, the film bends within a narrow strip, the boundary layer. The mesh is created in a unit disk,
-    the template plane, and a conformal map maps the disk onto the film. In the template plane, the strip is widest next
-    to the probe, and narrowest on the opposite side of the film. Each thin ring is a third as wide as the previous one,
-    and the widths of the rings cover the range from the largest to the smallest width of the strip.
+    At the clamped rim, the film bends within a narrow strip. The mesh is created in a unit disk, the template plane,
+    and a conformal map maps the disk onto the film. In the template plane, the strip is widest next to the probe, and
+    narrowest on the opposite side of the film. Each thin ring is a third as wide as the previous one. The number of
+    rings increases with the logarithm of the ratio of both widths, so that the rings resolve the strip on all sides.
 
     Args:
         placement: Placement of the mesh under the press.
         total_width: Width of the strip on the film, in film radii.
     """
-    # The widths of the strip in the template plane are divided by the range of ln(r) that all rings cover. The upper
-    # limit of 1 / 8 keeps the thin rings near the rim.
+    # Widths of the strip in the template plane. On the opposite side, a strip that is wider than 0.2 film radii is
+    # resolved like a strip of this width.
     stretch = float(map_stretch(placement.map_parameter, 1.0))
-    log_range = -math.log(placement.template_radius)
-    max_width = 1.0 / 8.0
-    largest_width = min(total_width * stretch / log_range, max_width)
-    smallest_width = min(min(total_width, 0.2) / stretch / log_range, max_width)
+    width_next_to_probe = total_width * stretch
+    opposite_width = min(total_width, 0.2) / stretch
 
-    # Each further ring is narrower by a factor of three. At least two rings are needed: with a single ring, the error
-    # of a charge reaches 0.4 %.
-    factors_of_three = math.log(largest_width / smallest_width, 3.0)
+    # Divide the widths by the range of ln(r) that all rings cover. The upper limit keeps the thin rings near the rim.
+    log_range = -math.log(placement.template_radius)
+    max_share = 1.0 / 8.0
+    largest_share = min(width_next_to_probe / log_range, max_share)
+    smallest_share = min(opposite_width / log_range, max_share)
+
+    # At least two rings are needed: with a single ring, the error of a charge reaches 0.4 %.
+    factors_of_three = math.log(largest_share / smallest_share, 3.0)
     return max(2, 1 + math.floor(THIN_RINGS_PER_FACTOR * factors_of_three))

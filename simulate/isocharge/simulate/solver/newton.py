@@ -110,7 +110,8 @@ def solve_newton(
     """
     free = assembly(elastic.mesh.template, elastic.unknowns_per_node, False).free[:, :3]
     iterate = _Iterate(elastic, free, first_field)
-    for iteration in range(MAX_ITERATIONS + 1):
+    iteration = 0
+    while True:
         relative_residual = iterate.relative_residual
         if not np.isfinite(relative_residual):
             return iterate.result(iteration, "failed", "the residual is not a finite number")
@@ -119,26 +120,17 @@ def solve_newton(
         if iteration == MAX_ITERATIONS:
             return iterate.result(iteration, "failed", f"not converged after {iteration} steps")
 
-        # Compute the Newton step.
+        # Take a step with a new tangent, and further steps with the same tangent.
         stabilising_tension = _stabilising_tension(elastic, relative_residual)
         solve = factor_tangent(elastic, iterate.field, stabilising_tension)
         step = solve(-iterate.residual)
         if iterate.size_of(step) <= ROUND_OFF:
             return iterate.result(iteration, "converged", f"converged to round-off in {iteration} steps")
-
-        # Close to the equilibrium, take the full step if it halves the residual, even if it increases the energy. The
-        # flat equilibrium of a compressed film can have a slightly higher energy than the wrinkled equilibrium.
-        # Otherwise search for the length of a step that lowers the energy.
-        after_full_step = iterate.after(step)
-        next_iterate: _Iterate | None
-        if relative_residual <= full_steps_below and after_full_step.relative_residual < 0.5 * relative_residual:
-            next_iterate = after_full_step
-        else:
-            next_iterate = _line_search(iterate, _descent_step(iterate, step))
+        next_iterate = _take_step(iterate, step, full_steps_below)
         if next_iterate is None:
             return iterate.result(iteration, "failed", "no step lowers the energy any more")
         iterate = _chord_steps(next_iterate, solve, relative_residual, tolerance)
-    raise AssertionError("the loop returns")  # the last iteration returns in every case
+        iteration += 1
 
 
 @dataclass(frozen=True)
@@ -218,6 +210,28 @@ def _stabilising_tension(elastic: ElasticFilm, relative_residual: float) -> floa
     return STABILISING_TENSION * elastic.groups.induced_tension * min(1.0, relative_residual)
 
 
+def _take_step(iterate: _Iterate, step: Array, full_steps_below: float) -> _Iterate | None:
+    """Take a full Newton step, or a shorter or modified step that lowers the energy.
+
+    Close to the equilibrium, the full step is taken if it halves the residual, even if it increases the energy. The
+    reason is that the flat equilibrium of a compressed film can have a slightly higher energy than the wrinkled
+    equilibrium. In all other cases, a line search determines a step that lowers the energy.
+
+    Args:
+        iterate: Present iterate.
+        step: Newton step, shape (n_node, 3).
+        full_steps_below: Relative residual below which the iterate is close to the equilibrium.
+
+    Returns:
+        The iterate after the step; None if no step lowers the energy.
+    """
+    if iterate.relative_residual <= full_steps_below:
+        after_full_step = iterate.after(step)
+        if after_full_step.relative_residual < 0.5 * iterate.relative_residual:
+            return after_full_step
+    return _line_search(iterate, _descent_step(iterate, step))
+
+
 def _chord_steps(iterate: _Iterate, solve: SolveTangent, previous_residual: float, tolerance: float) -> _Iterate:
     """Take further steps with the factorised tangent of the last Newton step, as long as they reduce the residual.
 
@@ -249,7 +263,7 @@ def _chord_steps(iterate: _Iterate, solve: SolveTangent, previous_residual: floa
     return iterate
 
 
-def _descent_step(iterate: _Iterate, step: Array) -> Array:
+def _descent_step(iterate: _Iterate, newton_step: Array) -> Array:
     """Return the Newton step if it is a descent direction of the energy, and a modified step otherwise.
 
     The residual is the gradient of the energy. A step is therefore a descent direction if its scalar product with the
@@ -258,12 +272,13 @@ def _descent_step(iterate: _Iterate, step: Array) -> Array:
 
     Args:
         iterate: Present iterate.
-        step: Newton step, shape (n_node, 3).
+        newton_step: Newton step, shape (n_node, 3).
 
     Returns:
         The step, shape (n_node, 3). If no tension is sufficient, the step may not be a descent direction.
     """
     elastic = iterate.elastic
+    step = newton_step
     # The first tension is a twentieth of the stabilising tension at a relative residual of one.
     added_tension = 0.05 * STABILISING_TENSION * elastic.groups.induced_tension
     for _ in range(12):

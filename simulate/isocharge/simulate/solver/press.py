@@ -180,8 +180,11 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
     result = solve_newton(elastic, _first_field(start, elastic), case.settings.tolerance)
     if result.status == "failed":
         result = _solve_by_load_steps(case, result, elastic)
-    deflection_under_probe = mesh.load @ result.field[:, 2]  # mean, weighted with the pressure
-    if deflection_under_probe < 0.0 and case.film.static_pressure == 0.0:  # a compressed film can bulge to either side
+
+    # A compressed film can bulge to either side. Under a static pressure, a film may bulge against the push.
+    mean_deflection = mesh.load @ result.field[:, 2]  # under the probe, weighted with its pressure
+    has_static_pressure = case.film.static_pressure != 0.0
+    if mean_deflection < 0.0 and not has_static_pressure:
         result = replace(result, status="failed", message="the film bulges against the push")
 
     equilibrium = Equilibrium(
@@ -196,9 +199,9 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
         seconds=process_time() - case.began,
         **vars(result),
     )
-    if case.film.static_pressure == 0.0:
-        return equilibrium
-    return _with_rest(equilibrium, case.settings.tolerance)
+    if has_static_pressure:
+        return _with_rest(equilibrium, case.settings.tolerance)
+    return equilibrium
 
 
 def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
@@ -274,12 +277,12 @@ def _solve_by_load_steps(case: LoadCase, failed: NewtonResult, full_load: Elasti
     """
     solved_force = 0.0  # largest force with an equilibrium; 0 if there is none
     force_factor = 2.0  # ratio of the next force to `solved_force`
-    iterations = failed.iterations
+    iterations = failed.iterations  # of all solves
     field = first_iterate(full_load)
     force = case.force / 16.0
     for _ in range(12):
-        # An equilibrium with a smaller force is close to the solution, so full Newton steps are allowed at once.
-        full_steps_below = np.inf if solved_force else UNSTABILISED_BELOW
+        # The field under a smaller force is close to the solution, so full Newton steps are allowed from the start.
+        full_steps_below = np.inf if solved_force > 0.0 else UNSTABILISED_BELOW
         elastic = _elastic_film(case, full_load.mesh, force)
         result = solve_newton(elastic, field, case.settings.tolerance, full_steps_below)
         iterations += result.iterations
@@ -291,7 +294,7 @@ def _solve_by_load_steps(case: LoadCase, failed: NewtonResult, full_load: Elasti
         if result.status == "converged":
             solved_force = force
             field = result.field
-        elif solved_force == 0.0:
+        elif solved_force == 0.0:  # even the first force has no equilibrium
             break
         else:
             force_factor = np.sqrt(force_factor)
@@ -313,12 +316,12 @@ def _first_field(start: Equilibrium | None, elastic: ElasticFilm) -> Array:
     if start is None:
         return first_iterate(elastic)
 
-    # Compare the blocks, and the resolution except for the order.
+    # Both meshes have the same elements if the topology, the symmetry and the resolution except for the order agree.
     template = elastic.mesh.template
     start_template = start.mesh.template
     start_resolution = replace(start_template.resolution, order=template.resolution.order)
-    start_blocks = (start_template.topology, start_template.half, start_resolution)
-    if start_blocks != (template.topology, template.half, template.resolution):
+    start_elements = (start_template.topology, start_template.half, start_resolution)
+    if start_elements != (template.topology, template.half, template.resolution):
         return first_iterate(elastic)
 
     # Evaluate the field of each element at the nodes of its new order. A node of several elements is assigned several

@@ -89,10 +89,12 @@ def _add_tension(solved: Equilibrium, value: float, direction: tuple[float, floa
         value: Size of the added tension in this unit.
         direction: Components (T11, T22, T12) of an added tension of the size 1.
     """
-    unit = 1.0 + solved.groups.tension  # divided by E A^2, like all tensions in `groups`
+    groups = solved.groups
+    tension_unit = 1.0 + groups.tension  # divided by E A^2, like all tensions in `groups`
+
     # The solver adds `uneven_tension` to the mean pretension, so it may also contain a change of the mean pretension.
-    tension = solved.groups.uneven_tension + value * unit * np.array(direction)
-    return replace(solved, groups=replace(solved.groups, uneven_tension=tension))
+    changed_tension = groups.uneven_tension + value * tension_unit * np.array(direction)
+    return replace(solved, groups=replace(groups, uneven_tension=changed_tension))
 
 
 def _add_stiffness(solved: Equilibrium, log_ratio: float, angle: float) -> Equilibrium:
@@ -200,7 +202,7 @@ def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
         elastic = solved.elastic
         solve_even = factor_tangent(elastic, solved.field)
         solve_odd = factor_tangent(elastic, solved.field, odd=True)
-        # The two halves of the film displace opposite amounts of air in an odd change, so the pressure of trapped air
+        # In an odd change, the two halves of the film displace opposite amounts of air, so the pressure of trapped air
         # remains constant.
         solved_for_odd = solved
         if elastic.back_pressure is not None:
