@@ -289,7 +289,6 @@ MESSAGES = ["Sensor 1 ready", "Sensor 2 ready", "Sensor 3 ready"] + ["load:0x3fc
         ([*MESSAGES, "1,2,3", "4,5,6", "7,8,9"], [(1, 2, 3), (4, 5, 6), (7, 8, 9)]),
         # an echo
         (["READ 1", "0,2", "READ 1", "1,2", "READ 1", "1,2"], [(0, 2), (1, 2), (1, 2)]),
-        (["0x7FF0 0x8001", "0x7FF9 0x8011"] * 5, [(0x7FF0, 0x8001), (0x7FF9, 0x8011)] * 5),
         # two frames, and then a temperature
         (["ch1,1;ch2,2", "ch1,3;ch2,4", "T 5"] * 12, [(1, 2), (3, 4)] * 12),
         (["5,0x1F", "8,-0x20"] * 5, [(5, 31), (8, -32)] * 5),
@@ -311,6 +310,11 @@ def test_line_with_the_number_and_the_charge_of_one_channel_is_no_frame(notation
     lines = [notation.format(t=1000 + k, n=n, q=n + k % 7 / 4) for k in range(20) for n in numbers]
     del lines[7::10]  # lost lines
     assert feed(*lines) == []
+
+
+@pytest.mark.parametrize("notation", ["{:04X} {:04X}", "{:x},{:x}"])
+def test_hexadecimal_numbers_without_their_prefix_are_not_read_as_decimal_numbers(notation):
+    assert feed(*(notation.format(2045 + k % 9, 2054 - k % 7) for k in range(200))) == []
 
 
 @pytest.mark.parametrize("notation", ["{0},5,7", "{1},{2}.5,-{0},{3}", "{4},0,{0}.5", "{2},{3},{4}", "50{1},5,7"])

@@ -30,6 +30,7 @@ bits, and a clock in s is assumed to be a time of day.
 """
 
 import json
+import re
 from collections import deque
 from collections.abc import Mapping, Sequence
 from string import ascii_uppercase
@@ -304,7 +305,9 @@ class TextParser(DelimitedParser):
         new_names = next((names for names in (self._columns, *headers) if len(names) == unnamed_count), ())
         layout = Layout(frame_lines, new_names, self._meanings)
         has_other_columns = self._columns and "" in layout.names
-        return None if has_other_columns or _has_channel_number(layout, lines) else layout
+        if has_other_columns or _has_hexadecimal_digits(layout, lines) or _has_channel_number(layout, lines):
+            return None
+        return layout
 
     def _set_layout(self, layout: Layout) -> None:
         """Set the layout, the attribute `format`, which describes the layout, and the modulus of the clock."""
@@ -370,6 +373,20 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
     texts = [{line.text for line in lines[position::cycle_length]} for position in range(cycle_length)]
     varying = [line for line, texts_of_line in zip(cycle, texts, strict=True) if len(texts_of_line) > 1]
     return varying if len(varying) == 1 else []
+
+
+def _has_hexadecimal_digits(layout: Layout, lines: Sequence[Line]) -> bool:
+    """Return whether the numbers are hexadecimal without the prefix 0x, because other lines have digits such as 07FD.
+
+    Args:
+        layout: Layout of a frame.
+        lines: The lines since the beginning.
+    """
+    other_texts = [line.text for line in lines if not layout.patterns[0].fullmatch(line.text)]
+    shape, *other_shapes = [
+        re.sub(r"\b[0-9][0-9A-Fa-f]*\b", "0", text) for text in (layout.lines[0].text, *other_texts)
+    ]
+    return len(layout.patterns) == 1 and shape in other_shapes
 
 
 def _has_channel_number(layout: Layout, lines: Sequence[Line]) -> bool:

@@ -311,10 +311,11 @@ def _skeleton(parts: list[_Part], names: list[str], number_pattern: str) -> tupl
             patterns.append(r"\s*+")
         elif part.is_after_blank:
             patterns.append(r"\s++")
+        is_unit = previous_kind in ("number", "hexadecimal") and not part.is_after_blank  # of the number before it
         if part.is_number:
             pattern = number_pattern if part.kind == "number" else _PATTERNS[part.kind]
             patterns.append(f"({pattern})")
-        elif part.kind in ("key", "mark") or part.name in fixed_words:
+        elif part.kind in ("key", "mark") or part.name in fixed_words or is_unit:
             patterns.append(re.escape(part.content))
         else:
             patterns.append(_PATTERNS[part.kind])
