@@ -26,7 +26,7 @@ from pty import STDIN_FILENO
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import InputError, IsochargeError, shown
+from isocharge.common.errors import InputError, IsochargeError, cut, shown
 from isocharge.common.files import bounded_lines
 from isocharge.serve.presses.number_columns import ColumnRule, NumberColumns
 
@@ -141,7 +141,7 @@ class CsvTable:
         return columns
 
     def refuse_similar_names(self, columns: Iterable[str], names: Iterable[str]) -> None:
-        """Refuse a column whose name is probably a misspelling of the name of a missing column.
+        """Refuse columns whose names are probably misspellings of the names of missing columns.
 
         The two names differ only in case, punctuation, blanks or a unit at the end, as `a (pC)` and `A` do.
 
@@ -150,18 +150,22 @@ class CsvTable:
             names: Names of columns that have a meaning.
 
         Raises:
-            InputError: If a column has such a name.
+            InputError: If a column has such a name. The message lists all such columns.
         """
         missing_name_of_spelling: dict[str, str] = {}
         for name in names:
             if name not in self.header:
                 spellings = _spellings(name) | _spellings(f"{name}_pC")  # the latter also match the column `ApC`
                 missing_name_of_spelling |= dict.fromkeys(spellings, name)
-        for column in columns:
-            for spelling in _spellings(column) & missing_name_of_spelling.keys():
-                missing_name = missing_name_of_spelling[spelling]
-                advice = f"rename {shown(column)} to {shown(missing_name)} and check its unit, or remove the column"
-                raise self._header_error(f"{advice}; missing", [missing_name])
+        name_of_column = {
+            column: missing_name_of_spelling[spelling]
+            for column in columns
+            for spelling in _spellings(column) & missing_name_of_spelling.keys()
+        }
+        if name_of_column:
+            renames = ", ".join(f"{shown(column)} to {shown(name)}" for column, name in name_of_column.items())
+            advice = f"rename {cut(renames)} and check the units, or remove these columns"
+            raise self._header_error(f"{advice}; missing", [*name_of_column.values()])
 
     def _read_columns(self, rules: Mapping[str, ColumnRule], max_rows: int) -> NumberColumns:
         """Convert the cells of the requested columns to numbers, row by row.
