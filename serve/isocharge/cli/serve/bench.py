@@ -31,6 +31,11 @@ def bench_command(
     with shown_progress():
         timings = take_turns(contenders, seconds)
 
-    report = {"model": loaded.metadata.label, "seconds": seconds, "machine": machine()}
-    report |= {"timings": [timing._asdict() for timing in timings], "errors": dict(loaded.metadata.errors)}
+    report = {
+        "model": loaded.metadata.label,
+        "seconds": seconds,
+        "machine": machine(),
+        "timings": [timing._asdict() for timing in timings],
+        "errors": dict(loaded.metadata.errors),
+    }
     show_result(report, json=json)

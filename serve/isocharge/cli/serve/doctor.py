@@ -91,14 +91,7 @@ def doctor_command(
         return
     if write:
         check_new_output(write)
-    electrodes: tuple[str, ...] = ()  # for any model
-    if model and model.endswith(".toml"):  # a sensor file, as long as the film has no model
-        from isocharge.simulate import load_sensor
-
-        electrodes = load_sensor(model).electrode_names
-        model = None
-    elif model:
-        electrodes = Predictor(model, models=models).metadata.electrodes
+    electrodes = _electrodes_of(model, models)
     gain = None if pC_per_unit is None else {"pC_per_unit": _parse_gain(pC_per_unit)}
     if device and (gain or request):
         option, section = ("--pc-per-unit", "gain") if gain else ("--request", "frames")
@@ -121,11 +114,13 @@ def doctor_command(
     )
     if not json:
         show_result(brief_report(examination), json=False)
+
     obstacle = ""  # reason why no device file can be written
     if examination.touch:
         obstacle = "the film was touched: take the finger away, and try again"
     elif write is not None and device is None and examination.unit != "pC":
         obstacle = "the charge of one unit is missing: add the option that is named above"
+
     found_channels = None
     if check_wiring and examination.good and not obstacle:
         wiring = _check_wiring(examination)
@@ -135,12 +130,31 @@ def doctor_command(
             show("\n".join(wiring.sentences))
     if json:
         show_json(asdict(examination) | {"found_channels": found_channels})
+
     if obstacle:
         say(f"no device file can be written, because {obstacle}")
     if obstacle or not examination.good:
         raise typer.Exit(1)
     if write:
-        _write_device_file(write, examination, model or "MODEL")
+        has_model = model and not model.endswith(".toml")  # otherwise, the printed command contains a placeholder
+        _write_device_file(write, examination, str(model) if has_model else "MODEL")
+
+
+def _electrodes_of(model: str | None, models: Path | None) -> tuple[str, ...]:
+    """Return the names of the electrodes for which the channels of a board are searched.
+
+    Args:
+        model: Value of `--model`: a model, a sensor file if the film has no model yet, or None. Without a value, no
+            names are returned, and any names are accepted.
+        models: Value of `--models`.
+    """
+    if not model:
+        return ()
+    if model.endswith(".toml"):
+        from isocharge.simulate import load_sensor
+
+        return load_sensor(model).electrode_names
+    return Predictor(model, models=models).metadata.electrodes
 
 
 def _check_wiring(examination: Examination) -> ElectrodeCheck:

@@ -70,16 +70,17 @@ def recording_picture(samples: Samples, title: str) -> Figure:
     start_s = samples["timestamp"][0]
     time_s = samples["timestamp"] - start_s
     flag_bits = samples["flags"].astype(int)
-    flags = {flag: time_s[flag_bits & bit > 0] for flag, bit in FLAG_BITS.items() if (flag_bits & bit).any()}
+    # Times of the records with each flag that occurs, by the name of the flag
+    flag_times_s = {flag: time_s[(flag_bits & bit) > 0] for flag, bit in FLAG_BITS.items() if (flag_bits & bit).any()}
     figure = new_figure(12.0, 8.6)
     figure.suptitle(f"{title}: {len(time_s)} records; faint points: ± 2 standard deviations", parse_math=False)
     charge_axes, position_axes, force_axes, flag_axes = figure.subplots(
-        4, 1, sharex=True, height_ratios=(1.0, 1.0, 0.8, 0.1 * (1 + len(flags)))
+        4, 1, sharex=True, height_ratios=(1.0, 1.0, 0.8, 0.1 * (1 + len(flag_times_s)))
     )
 
     charge_axes.set_prop_cycle(color=COLOURS)
     for name in samples.dtype.names or ():
-        if name.startswith("charge_pC."):
+        if name.startswith("charge_pC."):  # one column of charges for each electrode
             charge_axes.plot(time_s, samples[name], ".", ms=2.0, label=name.removeprefix("charge_pC."))
     for quantity, unit, axes in (("x", "mm", position_axes), ("y", "mm", position_axes), ("force", "N", force_axes)):
         values = samples[f"{quantity}_{unit}"]
@@ -87,15 +88,17 @@ def recording_picture(samples: Samples, title: str) -> Figure:
         (points,) = axes.plot(time_s, values, ".", ms=2.0, label=quantity)
         for limit in (values - two_std, values + two_std):
             axes.plot(time_s, limit, ".", ms=1.0, alpha=0.3, color=points.get_color())
-    for row, flag_time_s in enumerate(flags.values()):
+    for row, flag_time_s in enumerate(flag_times_s.values()):  # a row of marks for each flag
         flag_axes.plot(flag_time_s, np.full(len(flag_time_s), row), "|", color=INK)
 
-    flag_axes.set(yticks=range(len(flags)), yticklabels=flags, ylim=(-0.7, max(len(flags), 1) - 0.3))
+    n_flag = len(flag_times_s)
+    flag_axes.set(yticks=range(n_flag), yticklabels=flag_times_s, ylim=(-0.7, max(n_flag, 1) - 0.3))
     flag_axes.set_xlabel(f"time since {datetime.fromtimestamp(start_s, UTC):%Y-%m-%d %H:%M:%S} UTC, s")
     labels = {charge_axes: "touch charge, pC", position_axes: "position, mm", force_axes: "force, N"}
     for axes, label in labels.items():
         axes.set_ylabel(label)
         axes.grid(alpha=0.3)
-        if axes.get_legend_handles_labels()[0]:
+        handles, _ = axes.get_legend_handles_labels()
+        if handles:  # the legend is above the axes, at the right
             axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), fontsize=8, ncols=8, markerscale=4.0)
     return figure

@@ -83,24 +83,25 @@ def write_records(records: Iterable[PredictionRecord], writers: Iterable[Callabl
         records: The records.
         writers: Functions that write a record, which are called in their order.
     """
-    is_tare_new = True
-    untared_pC: Mapping[str, float | None] | None = None
+    is_tare_printed = False
+    untared_pC: Mapping[str, float | None] | None = None  # latest charges while the tare is measured, otherwise None
+    has_failed = False
     try:
         for record in records:
             for write in writers:
                 write(record)
             if TARE in record.flags:  # the tare is being measured
-                is_tare_new = True
+                is_tare_printed = False
                 untared_pC = record.charge_raw_pC
-            elif is_tare_new and record.tare_pC is not None:  # an invalid record has no tare
-                is_tare_new = False
+            elif not is_tare_printed and record.tare_pC is not None:  # an invalid record has no tare
+                is_tare_printed = True
                 untared_pC = None
                 say(f"tared: {_listed(record.tare_pC)}")
     except Exception:
-        untared_pC = None  # the error states why the stream ended
+        has_failed = True
         raise
     finally:  # also after Ctrl-C
-        if untared_pC:
+        if untared_pC and not has_failed:  # an error states itself why the stream has ended
             say(
                 "caution: no tare, because the stream ended before the film had rested near zero for long enough; the "
                 f"last charges are {_listed(untared_pC)}; leave the film alone longer, or state an offset of the board "
@@ -272,10 +273,11 @@ def stream_command(
             # The page must not begin a recording if the command itself records the stream.
             new_recorder = None if recorder else partial(Recorder, device=board.table, name=name)
             writers.append(PageFeed(page, touch, stream, new_recorder).write)
+        # The sum of currents, the corrections and tracking need the time between frames.
         needs_time = board.has_currents or not {LeakRule, HumRule, ThermalRule, TrackRule}.isdisjoint(board.rules)
         is_repeatable = isinstance(source, FileSource) and source.is_on_disk
         if needs_time and is_repeatable:
-            writers.insert(0, _require_time)
+            writers.insert(0, _require_time)  # is called first, and refuses the file at its first record without a time
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
             with no_frames_advice_added(port, device):
@@ -292,7 +294,8 @@ def stream_command(
         say(f"no frames were recognised; {no_frames_hint(port, device)}")
     say_missing_records(outputs, "incomplete")
     is_recording_incomplete = recorder and recorder.failed
-    if is_recording_incomplete or outputs.has_incomplete_file or (has_no_frames and has_expired.is_set()):
+    has_waited_in_vain = has_no_frames and has_expired.is_set()
+    if is_recording_incomplete or outputs.has_incomplete_file or has_waited_in_vain:
         raise typer.Exit(1)
 
 

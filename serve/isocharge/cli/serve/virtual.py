@@ -15,7 +15,7 @@ from isocharge.cli.shared.virtual_sensor import film_charges, measure_function, 
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
 from isocharge.common.files import check_new_output
-from isocharge.serve import VirtualSensor, encode_frame, encode_text
+from isocharge.serve import Script, VirtualSensor, encode_frame, encode_text
 from isocharge.serve.virtual_sensor.script import VirtualScript, load_script
 from isocharge.simulate import (
     Circle,
@@ -88,21 +88,19 @@ def virtual_command(
         if not isinstance(footprint, Circle):
             raise InputError(f"--film: expected a --probe like circle:1.0, whose radius is drawn, too, got {probe!r}")
         played_sensor, footprint = virtual_film(played_sensor, footprint, film)
-    if scripted_presses is not None and scripted_presses.touching.any():  # the map must contain the presses
-        x_mm, y_mm, force_N = scripted_presses.contact.T
-        radius = max(radius, ROUNDING_MARGIN * float(np.nanmax(np.hypot(x_mm, y_mm))))
-        force_max = max(force_max, ROUNDING_MARGIN * float(force_N.max()))
+    min_force, _ = DEFAULT_PLAYED_FORCE_RANGE
+    map_radius, map_force_max = _map_limits(scripted_presses, radius, force_max)
     with shown_progress(), solving_executor(played_sensor.film) as executor:
         forward_map = ForwardMap.build(
             played_sensor,
             footprint,
-            radius=radius,
-            force_range=(DEFAULT_PLAYED_FORCE_RANGE[0], force_max),
+            radius=map_radius,
+            force_range=(min_force, map_force_max),
             executor=executor,
         )
     player = VirtualSensor(
         film_charges(forward_map),
-        scripted_presses or random_script(forward_map, rate, force_max, rest),
+        scripted_presses or random_script(forward_map, rate, map_force_max, rest),
         noise=measure_function(amplifier, len(forward_map.electrodes), rate),
         encode=encode_frame if frames == "binary" else partial(encode_text, notation=frames),
         faults=settings.faults,
@@ -119,3 +117,19 @@ def virtual_command(
     )
     if player.paused_s > 0.0:
         say(f"the sensor paused for {player.paused_s:.1f} s in all, because this computer was busy")
+
+
+def _map_limits(scripted_presses: Script | None, radius: float, max_force: float) -> tuple[float, float]:
+    """Return the radius (mm) and the largest force (N) of a forward map that contains all presses of a script.
+
+    Args:
+        scripted_presses: Presses of a script; None for random presses.
+        radius: Smallest radius of the map, mm.
+        max_force: Smallest value of the largest force of the map, N.
+    """
+    if scripted_presses is None:
+        return radius, max_force
+    x_mm, y_mm, force_N = scripted_presses.contact.T
+    map_radius = np.fmax.reduce(ROUNDING_MARGIN * np.hypot(x_mm, y_mm), initial=radius)  # ignores NaN between presses
+    map_max_force = np.max(ROUNDING_MARGIN * force_N, initial=max_force)
+    return float(map_radius), float(map_max_force)

@@ -85,13 +85,23 @@ def show_result(result: Mapping[str, Any], *, json: bool) -> None:
     width = max(map(len, values))
     next_line = "\n" + " " * (width + 2)
     for name, value in values.items():
-        rows = value
-        if isinstance(value, dict) and value and all(isinstance(item, dict) for item in value.values()):
-            rows = [{"": key} | item for key, item in value.items()]
-        if isinstance(rows, list) and rows and isinstance(rows[0], dict):
+        rows = _table_rows(value)
+        if rows:
             show("\n".join([f"{name}:", *_table_lines(rows)]))
         else:
             show(f"{name:<{width}}  {_value_text(value, separator=next_line)}")
+
+
+def _table_rows(value: Any) -> list[dict[str, Any]]:
+    """Return the rows of a table if a value is a list or a dictionary of dictionaries, and no rows otherwise.
+
+    The keys of a dictionary of dictionaries become the first column, which has no name.
+    """
+    if isinstance(value, dict) and all(isinstance(item, dict) for item in value.values()):
+        return [{"": key} | item for key, item in value.items()]
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return value
+    return []
 
 
 def _table_lines(rows: list[dict[str, Any]]) -> list[str]:
