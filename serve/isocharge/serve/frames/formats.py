@@ -12,7 +12,6 @@ continues with the frame that begins after the next zero byte.
 import binascii
 import struct
 from collections.abc import Mapping
-from functools import cached_property
 
 from cobs import cobs
 
@@ -103,14 +102,7 @@ class AutoParser(Parser):
     def __init__(self, columns: tuple[str, ...] = (), meanings: Mapping[str, str] | None = None) -> None:
         """Begin without a recognised format. The class describes the arguments."""
         super().__init__("nothing recognised yet")
-        self._columns = columns
-        self._meanings = meanings
-        self._binary = BinaryParser()
-
-    @cached_property
-    def _text(self) -> TextParser:
-        """Parser of text, which is created when bytes arrive that are no binary frame."""
-        return TextParser(self._columns, self._meanings)
+        self._parsers: list[Parser] = [BinaryParser(), TextParser(columns, meanings)]  # of all possible formats
 
     def feed(self, data: bytes) -> list[Frame]:
         """Return the frames whose last byte is in `data`.
@@ -119,19 +111,17 @@ class AutoParser(Parser):
         frame receives all further data. The description of the format and the moduli of the counter and the clock are
         copied from the parser together with each frame, because the parser may determine them only after many frames.
         """
-        parser = self.recognised or self._binary
-        frames = parser.feed(data)
-        if not (frames or self.recognised):
-            parser = self._text
+        for parser in self._parsers:
             frames = parser.feed(data)
-        if frames:
-            self.recognised = parser
-            self.counts = parser.counts
-            self.format = parser.format
-            self.seq_modulus = parser.seq_modulus
-            self.t_us_modulus = parser.t_us_modulus
-            return frames
-        self.unread_line = parser.unread_line or self.unread_line
+            if frames:
+                self._parsers = [parser]
+                self.recognised = parser
+                self.counts = parser.counts
+                self.format = parser.format
+                self.seq_modulus = parser.seq_modulus
+                self.t_us_modulus = parser.t_us_modulus
+                return frames
+            self.unread_line = parser.unread_line or self.unread_line
         if self.recognised is None:  # a recognised parser counts its bytes itself
             self.counts.bytes_dropped += len(data)
         return []
@@ -142,8 +132,8 @@ class AutoParser(Parser):
         A format that was recognised stays recognised.
         """
         super().reset()
-        self._binary.reset()
-        self._text.reset()
+        for parser in self._parsers:
+            parser.reset()
 
 
 class TextFrames(FrameSection, tag="text", frozen=True):
