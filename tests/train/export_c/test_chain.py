@@ -238,11 +238,6 @@ def test_failed_first_tare_is_reported_after_the_patience_of_the_board(build):
     assert not (flags & TARE_FAILED).any()
 
 
-def test_tare_that_is_too_long_for_c_is_refused():
-    with pytest.raises(DeviceError, match=r"board: tare.frames: expected a whole number from 1 to 10000.*got 50000"):
-        device_header(device_from_table({"tare": {"frames": 50_000, "patience": 0}}, "board"), ELECTRODES)
-
-
 def test_stage_without_code_in_c_is_refused_by_its_name(monkeypatch):
     monkeypatch.setattr(Hum, "section", "notch")
     board = device_from_table({"hum": {}}, "board")

@@ -6,21 +6,18 @@ follows a slow drift of the charge at rest.
 
 import math
 from collections import deque
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from msgspec import Meta, structs
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import DeviceError, TareError
+from isocharge.common.errors import TareError
 from isocharge.common.toml_text import toml_key
 from isocharge.serve.flags import TARE
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.signal_chain.leak import LeakRule
 from isocharge.serve.signal_chain.stage import LARGEST, Count, Divisor, Rule, Setting, Setup, Stage
-
-MAX_TARE_FRAMES_IN_C = 10_000
-"""Largest number of frames of a tare in C, which limits the memory that the C program needs."""
 
 
 class TareRule(Rule, frozen=True, kw_only=True):
@@ -196,18 +193,3 @@ class Tare(Stage):
             f"cannot tare on the last {len(self._latest_pC)} frames: {reason}; if the board rests there without a "
             f"touch, say so in a device file: {setting}"
         )
-
-    @classmethod
-    def c_settings(cls, setup: Setup) -> dict[str, Any]:
-        """Return the settings.
-
-        Raises:
-            DeviceError: If the tare is too long for the memory of the C program.
-        """
-        rule = setup.device.rule(TareRule)
-        if rule is not None and rule.frames > MAX_TARE_FRAMES_IN_C:
-            raise DeviceError(
-                f"{setup.device.where}: tare.frames: expected a whole number from 1 to {MAX_TARE_FRAMES_IN_C} for a "
-                f"signal chain in C, which stores all frames of the tare, got {rule.frames}"
-            )
-        return super().c_settings(setup)
