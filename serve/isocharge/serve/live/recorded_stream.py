@@ -169,8 +169,8 @@ class RecordedStream:
             chunk: The next chunk of the stream.
 
         Returns:
-            The next chunk. If frames have arrived between the first bytes and this chunk, they are missing in the
-            recording. The chunk then states an outage, so that the tare and the clock begin again.
+            The next chunk. Frames that have arrived between the first bytes and this chunk are missing in the recording.
+            The chunk therefore states an outage, so that the tare and the clock begin again.
         """
         self._is_recording_new = False
         if not self._preamble:
@@ -179,8 +179,7 @@ class RecordedStream:
         deque(self._stream.feed(preamble), maxlen=0)
         if self.recorder is not None:  # the recording may have been ended before this chunk
             self.recorder.chunk(preamble, [])
-        has_frame = self._stream.parser.counts.frames > 0
-        return chunk._replace(outage_s=max(chunk.outage_s, RESTART_OUTAGE_s)) if has_frame else chunk
+        return chunk._replace(outage_s=max(chunk.outage_s, RESTART_OUTAGE_s))
 
     def _end_recording(self) -> None:
         """End the present recording, and close its recorder unless the caller has opened the recorder."""
