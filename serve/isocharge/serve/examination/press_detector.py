@@ -80,18 +80,11 @@ def _detect_touches(levels: Array, times_s: Array, noise: Array) -> Booleans:
     return is_touched
 
 
-def touch_sentence(
-    names: Sequence[str],
-    values: Array,
-    times_s: Array,
-    unit: str,
-    min_noise_pC: float = 1.0,
-    max_slow_change_pC: float = 100.0,
-) -> str:
+def touch_sentence(names: Sequence[str], values: Array, times_s: Array, unit: str, min_noise_pC: float = 1.0) -> str:
     """Return a sentence about a touch of a film that should be at rest; empty if the film is not touched.
 
-    If the values are in pC, a large slow change is a touch, too. Otherwise the smallest change of a touch is derived
-    from the noise only. If the time is too short, no touch is found.
+    If the values are not in pC, the smallest change of a touch is derived from the noise only. If the time is too
+    short, no touch is found.
 
     Args:
         names: Names of the channels.
@@ -100,22 +93,16 @@ def touch_sentence(
         unit: Unit of the values.
         min_noise_pC: Smallest noise of a channel in pC. With the default, the smallest touch is 20 pC. A press of 0.01
             N on a film of 25 um causes 40 pC.
-        max_slow_change_pC: Largest change during the whole time without a touch, pC. The default is the largest offset
-            that a tare accepts.
     """
-    is_in_pC = unit == "pC"
-    block_times_s, levels, is_touched = touched_blocks(values, times_s, min_noise_pC if is_in_pC else 0.0)
-    if levels.size == 0:
+    min_noise = min_noise_pC if unit == "pC" else 0.0
+    block_times_s, levels, is_touched = touched_blocks(values, times_s, min_noise)
+    if not is_touched.any():
         return ""
-    total_changes = np.ptp(levels, axis=0)
-    largest_change = total_changes.max()
-    is_slow_touch = is_in_pC and largest_change > max_slow_change_pC
-    if not (is_touched.any() or is_slow_touch):
-        return ""
-    name = printable(names[int(np.argmax(total_changes))])
+    changes = np.ptp(levels, axis=0)
+    name = printable(names[int(np.argmax(changes))])
     begin_s = block_times_s[np.argmax(is_touched)]
     return (
-        f"an untouched film: channel {name} changes by {largest_change:.4g} {unit} about {begin_s:.1f} s after the "
+        f"an untouched film: channel {name} changes by {changes.max():.4g} {unit} about {begin_s:.1f} s after the "
         "first frame, as under a touch; take the finger away, and try again"
     )
 

@@ -169,8 +169,8 @@ class RecordedStream:
             chunk: The next chunk of the stream.
 
         Returns:
-            The next chunk. Frames that have arrived between the first bytes and this chunk are missing in the recording.
-            The chunk therefore states an outage, so that the tare and the clock begin again.
+            The next chunk. Frames that have arrived between the first bytes and this chunk are missing in the
+            recording. The chunk therefore states an outage, so that the tare and the clock begin again.
         """
         self._is_recording_new = False
         if not self._preamble:
