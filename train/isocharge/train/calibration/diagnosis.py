@@ -351,7 +351,8 @@ def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: st
     alternatives = "; or ".join(find_mistakes(presses, charges)[:3])
     if alternatives:
         return PressError(
-            f"{statement}. A film would explain them if {alternatives}. Nothing was changed: correct the file"
+            f"{statement}. A film would explain them if {alternatives}. Nothing was changed: correct the file or the "
+            "options"
         )
     return PressError(
         f"{statement}; is it this layout and this probe ({charges.prior.probe.notation}), do the places and forces "
