@@ -69,13 +69,13 @@ class McapFile(FileOutput):
         self._flush_time_s = time.monotonic()
         self._writer = Writer(self._file)  # type: ignore[arg-type]  # uses only write, tell and flush
         # Topic, encoding of the messages, name of the schema, notation of the schema, and the schema of each channel
+        ros2_records = (RECORD_TOPIC, "cdr", STRING, "ros2msg", DEFINITIONS[STRING])
+        json_records = (RECORD_TOPIC, "json", SCHEMA_NAME, "jsonschema", json.dumps(record_schema(electrodes)))
         channels = [
-            (RECORD_TOPIC, "json", SCHEMA_NAME, "jsonschema", json.dumps(record_schema(electrodes))),
+            ros2_records if is_ros2 else json_records,
             (WRENCH_TOPIC, "cdr", WRENCH, "ros2msg", DEFINITIONS[WRENCH]),
             (POSE_TOPIC, "cdr", POSE, "ros2msg", DEFINITIONS[POSE]),
         ]
-        if is_ros2:
-            channels[0] = (RECORD_TOPIC, "cdr", STRING, "ros2msg", DEFINITIONS[STRING])
         self._channels: dict[str, int] = {}  # identifier of the channel of each topic
         self._writer.start(profile="ros2", library="isocharge")
         for topic, encoding, schema_name, schema_encoding, schema in channels:

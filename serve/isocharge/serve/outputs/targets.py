@@ -205,19 +205,12 @@ class Outputs:
         """
         try:
             if queue is not None:
-                queue.close()
-                if queue.error is not None:
-                    self._handle_error(target, queue.error)
-                if queue.lost > 0:
-                    self.not_written.setdefault(target, queue.lost)
+                self._close_queue(target, queue)
                 if queue.is_stuck:  # the thread is still in `write` of the output, which therefore cannot be closed
                     return
             has_failed = target not in self._writers
             if self._is_discarded or has_failed:
-                discard_or_close = getattr(output, "discard", output.close)
-                discard_or_close()
-                if self._is_discarded and self._context.is_live and isinstance(output, FileOutput):
-                    output.path.unlink()  # another output could not be opened, so the file has no records
+                self._discard(output)
             else:
                 output.close()
         except KeyboardInterrupt:  # in a replay, the command then removes the file
@@ -230,3 +223,22 @@ class Outputs:
                 self._handle_error(target, error)
         if self._is_discarded:
             self.not_written[target] = None  # the number of missing records is unknown
+
+    def _close_queue(self, target: str, queue: WriterQueue[PredictionRecord]) -> None:
+        """Write the waiting records of an output, and handle the error of its thread and the records that were lost.
+
+        Raises:
+            Exception: The error of standard output.
+        """
+        queue.close()
+        if queue.error is not None:
+            self._handle_error(target, queue.error)
+        if queue.lost > 0:
+            self.not_written.setdefault(target, queue.lost)
+
+    def _discard(self, output: Output) -> None:
+        """Discard an output or, if it has no method `discard`, close it. Remove a file without records."""
+        discard_or_close = getattr(output, "discard", output.close)
+        discard_or_close()
+        if self._is_discarded and self._context.is_live and isinstance(output, FileOutput):
+            output.path.unlink()  # another output could not be opened, so the file has no records
