@@ -54,13 +54,14 @@ def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
     """Return the fields of a struct in the order of their declaration.
 
     The annotation of each field contains a sentence that describes the value, and the section of the device file that
-    adds an optional field. An attribute without such an annotation is no field of the JSON object.
+    adds an optional field, as in `Annotated[str | None, "Event that begins.", "track"]`. An attribute without such an
+    annotation is no field of the JSON object.
     """
     fields: list[Field] = []
     for name, annotation in get_type_hints(struct, include_extras=True).items():  # with the metadata of `Annotated`
         if get_origin(annotation) is not Annotated:
             continue
-        declared_type, meaning, *section = get_args(annotation)
+        declared_type, meaning, *section = get_args(annotation)  # `section` is empty for a field of every record
         may_be_null = isinstance(declared_type, UnionType)  # the other alternative is None
         value_type = get_args(declared_type)[0] if may_be_null else declared_type
         parts = () if value_type in JSON_TYPES else fields_of(value_type)

@@ -185,19 +185,22 @@ class LivePage(Application):
         return json_response({})
 
     def _read(self, request: Read) -> dict[str, Any]:
-        """Return the samples that a browser does not have yet and, if it has changed, the state of the stream."""
+        """Return the samples that a browser does not have yet and, if it has changed, the state of the stream.
+
+        Without a number of the first sample in the request, the samples of the last `HISTORY_S` seconds are returned.
+        """
         tape = self.tape
         version = self._version
-        stop = tape.total
-        start_s, shown_until_s = tape.span()
-        if request.until_s is not None:
-            shown_until_s = start_s + request.until_s
-            stop = tape.first_number_after(shown_until_s)
-        first = tape.first_number_after(shown_until_s - HISTORY_S) if request.first is None else request.first
+        stop = tape.total  # number after that of the last sample to return
+        oldest_time_s, end_s = tape.span()
+        if request.until_s is not None:  # the browser shows an earlier part of a recording
+            end_s = oldest_time_s + request.until_s
+            stop = tape.first_number_after(end_s)
+        first = tape.first_number_after(end_s - HISTORY_S) if request.first is None else request.first
         samples = coalesce(tape.samples(first, stop), request.most)
         content: dict[str, Any] = {
             "first": stop,  # number of the first sample of the next request
-            "missed": max(tape.oldest - first, 0),
+            "missed": max(tape.oldest - first, 0),  # samples that were overwritten before the browser asked for them
             "sent_s": time.time(),
             "samples": samples.tolist(),
         }

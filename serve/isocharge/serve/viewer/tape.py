@@ -197,8 +197,9 @@ class RecordedTape(Tape):
         """
         if self.total == len(self._ring):
             self._ring = np.concatenate([self._ring, np.zeros_like(self._ring)])
-        time_s, *others = values
-        super().append((max(self.timestamp(self.total - 1), time_s or 0.0), *others))
+        time_s, *others = values  # the time is the first number of a sample
+        latest_time_s = self.timestamp(self.total - 1)
+        super().append((max(latest_time_s, time_s or 0.0), *others))
 
     def extent(self) -> dict[str, Any]:
         """Return the times of the first and the last sample, the number of samples, and an overview of the forces.

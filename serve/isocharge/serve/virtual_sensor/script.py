@@ -93,8 +93,9 @@ class VirtualScript(Settings, frozen=True):
         """
         if not self.presses:
             return None
-        duration_s = self.presses[-1][0] - self.presses[0][0]
-        return _interpolate(np.array(self.presses), np.arange(0.0, duration_s, 1.0 / rate_Hz), rate_Hz)
+        rows = np.array(self.presses)  # (seconds, x_mm, y_mm, force_N)
+        duration_s = np.ptp(rows[:, 0])
+        return _interpolate(rows, np.arange(0.0, duration_s, 1.0 / rate_Hz), rate_Hz)
 
 
 def _interpolate(rows: Array, t_s: Array, rate_Hz: float, min_force_N: float = 0.0) -> Script:
@@ -148,17 +149,21 @@ def wander(
     """
     min_force_N, max_force_N = force_range_N
     rng = np.random.default_rng(seed)
-    rows = [np.zeros((1, 4))]
+    rows = [np.zeros((1, 4))]  # (seconds, x_mm, y_mm, force_N); the script begins without a force
     start_s = rest_s
     while start_s < seconds:
+        # A press has four rows. The force rises at the first point, changes on the way to the last point, and falls.
         end_s = start_s + rng.uniform(*PRESS_DURATION_S)
-        distance_mm = radius_mm * np.sqrt(rng.uniform(size=2))  # distributes the points evenly over the disk
-        position = np.repeat(distance_mm * np.exp(2j * np.pi * rng.uniform(size=2)), 2)  # x + iy of the four rows
-        first_force_N, last_force_N = min_force_N * (max_force_N / min_force_N) ** rng.uniform(size=2)
         time_s = [start_s, start_s + RAMP_S, end_s - RAMP_S, end_s]
-        rows.append(np.column_stack([time_s, position.real, position.imag, [0.0, first_force_N, last_force_N, 0.0]]))
+        distance_mm = radius_mm * np.sqrt(rng.uniform(size=2))  # distributes the two points evenly over the disk
+        points = distance_mm * np.exp(2j * np.pi * rng.uniform(size=2))  # x + iy
+        position = np.repeat(points, 2)  # first, first, last, last
+        first_force_N, last_force_N = min_force_N * (max_force_N / min_force_N) ** rng.uniform(size=2)  # even in ln F
+        force_N = [0.0, first_force_N, last_force_N, 0.0]
+        rows.append(np.column_stack([time_s, position.real, position.imag, force_N]))
         start_s = end_s + rng.uniform(*PAUSE_DURATION_S)
-    return _interpolate(np.concatenate(rows), np.arange(round(seconds * rate_Hz)) / rate_Hz, rate_Hz, min_force_N)
+    frame_time_s = np.arange(round(seconds * rate_Hz)) / rate_Hz
+    return _interpolate(np.concatenate(rows), frame_time_s, rate_Hz, min_force_N)
 
 
 def corrupt(data: bytes, fraction: float, rng: np.random.Generator) -> bytes:
