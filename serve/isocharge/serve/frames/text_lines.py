@@ -101,7 +101,7 @@ _NEAREST_NAME = rf"(?P<word>[kuw]){_SAME_COLUMN}(?P<number>[0t])"
 _SECOND_NAME = rf"(?P<word>[kuw]){_SAME_COLUMN}[kuw]{_SAME_COLUMN}(?P<number>[0t])"
 """Regular expression, for the shape of a line, of the last word but one before a number in the same column."""
 
-_UNIT_BEHIND = r"(?P<number>[0t])(?:[\])}]*,?k)?[\]\[(){}:=]*(?P<word>[kquw])"
+_UNIT_BEHIND = r"(?P<number>[0t])(?:[\])}]*,?k)?[\]\[(){}:=]*(?P<word>[quw])"
 """Regular expression, for the shape of a line, of a word behind a number, which may be its unit.
 
 A key may stand between the number and the unit, as in `"value": 3.5, "unit": "nC"`, and the unit may have brackets.
@@ -429,8 +429,9 @@ def _with_units(parts: list[_Part], names: list[str]) -> list[str]:
     """
     words_behind = _words(parts, _UNIT_BEHIND)
     words_before = _words(parts, _UNIT_BEFORE)
-    # The word `C` may be the name of an electrode, but a word behind several numbers is not a name.
-    units = {*OTHER_CHARGE_UNITS} if words_behind.count("C") > 1 else _CHARGE_UNITS - {"pC"}
+    # The word `C` may be the name of an electrode or a degree, but behind several other numbers it is a unit of charge.
+    is_coulomb = words_behind.count("C") > 1 + names.count("C")
+    units = {*OTHER_CHARGE_UNITS} if is_coulomb else _CHARGE_UNITS - {"pC"}
     shape_before_numbers, _, _ = _shape(parts).partition("0")
     first_words = [part.name.strip("[]") for part in parts[: len(shape_before_numbers)]]
     words_before_names = takewhile(lambda word: word not in names, first_words)
