@@ -42,7 +42,7 @@ SAMPLES = 100_000
 def direct_errors(forward_map: ForwardMap, sensor: Sensor, orientation: Orientation, count: int) -> np.ndarray:
     """Compare the charges of random presses with direct solves, and return the largest error of each press."""
     sweep = Sweep(RADIUS_mm, FORCES_N, samples=count, seed=7, orientation=orientation)
-    presses = sweep.over([forward_map.probe])
+    presses = sweep.presses([forward_map.probe])
     interpolated = forward_map.charges(presses.contact, presses.rotation)
     expected = solved_charges(sensor, forward_map.probe, presses.contact, rotation=presses.rotation)
     divisor = np.maximum(np.abs(expected), 0.1 * np.abs(expected).max(axis=1, keepdims=True))
@@ -64,7 +64,7 @@ def main() -> None:
                 sensor, probe, RADIUS_mm, FORCES_N, orientation=orientation, executor=executor
             )
             map_s = time.perf_counter() - start
-            presses = Sweep(RADIUS_mm, FORCES_N, samples=SAMPLES, orientation=orientation).over([probe])
+            presses = Sweep(RADIUS_mm, FORCES_N, samples=SAMPLES, orientation=orientation).presses([probe])
             start = time.perf_counter()
             forward_map.charges(presses.contact, presses.rotation)
             charges_s = time.perf_counter() - start

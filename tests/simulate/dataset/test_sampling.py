@@ -24,7 +24,7 @@ sweeps = st.builds(
 @settings(deadline=None, max_examples=50)
 @given(sweeps, st.integers(1, 3))
 def test_presses_lie_within_the_ranges_and_have_the_requested_number(sweep, count):
-    presses = sweep.over(PROBES[:count])
+    presses = sweep.presses(PROBES[:count])
     low, high = sweep.force_range
     x, y, force = presses.contact.T
     assert np.hypot(x, y).max() <= sweep.radius * (1.0 + 1e-15)
@@ -43,7 +43,7 @@ def test_presses_are_uniform_in_the_logarithm_of_the_force():
 def test_presses_depend_on_seed_and_probe():
     first, other = (Sweep(samples=100, seed=seed).contacts() for seed in (5, 6))
     assert np.all(first != other)
-    two = Sweep(samples=100).over((Circle(1.0), Circle(1.0))).contact
+    two = Sweep(samples=100).presses((Circle(1.0), Circle(1.0))).contact
     assert np.all(two[::2] != two[1::2])
 
 
@@ -66,4 +66,4 @@ def test_presses_depend_on_seed_and_probe():
 )
 def test_impossible_sweep_raises_scene_error(settings, message):
     with pytest.raises(SceneError, match=message):
-        Sweep(**settings).over(PROBES if settings else ())
+        Sweep(**settings).presses(PROBES if settings else ())

@@ -44,7 +44,7 @@ def identify_command(
 
     The errors are Cramer-Rao limits, in mm for the position and in percent for the force. No unbiased method has
     smaller errors. The command also computes the mirror region, which lies outside the working area. A press in the
-    mirror region has the same charges as a press inside the working area and therefore cannot be noticed.
+    mirror region has the same charges as another press inside the working area and is therefore mistaken for it.
 
     Example: isocharge simulate identify three-25um-biaxial --probe circle:1.0 --error 0.5 -o limits
     """
@@ -67,9 +67,9 @@ def identify_command(
                 save_picture(mirror_picture(described_sensor, identification.mirror), folder / "mirror.png")
             (folder / "identify.json").write_text(json_module.dumps(results, indent=1))
 
-    # Print the results and a summary in sentences, which state the working area.
-    limits = "limits_in_working_area"
-    show_result(results if json else {limits: results[limits]}, json=json)
+    # Print all results as JSON, or the main results as text. Print sentences about the working area on stderr.
+    main_results = {"limits_in_working_area": results["limits_in_working_area"]}
+    show_result(results if json else main_results, json=json)
     say(identification.area.summary)
     if identification.mirror is not None:
         say(identification.mirror.summary)

@@ -66,6 +66,7 @@ def point_command(
 
     Example: isocharge simulate point three-25um-biaxial --probe triangle:4.0@30 --at 3,-2 --force 1.0
     """
+    # Check and read the options.
     if not math.isfinite(temperature):
         raise InputError(f"--temperature: expected a finite number of kelvin, got {temperature}")
 
@@ -76,6 +77,7 @@ def point_command(
     if any(applied_side_force) and friction:
         raise InputError("--side-force and --friction: expected one of them, because friction gives the side force")
 
+    # Solve the press.
     settings = SolveSettings(accuracy=accuracy, theory=theory_by_name(theory))
     film = film_sensor.film
     position = parse_pair(at, "--at: expected two numbers in mm like '3,-2'")
@@ -85,14 +87,17 @@ def point_command(
         applied_side_force = friction_force(equilibrium, friction)
         equilibrium = press(film, footprint, position, force, settings, side_force=applied_side_force)
 
+    # Collect the results.
     warming_charge = thermal_charge(film_sensor, temperature)
     charge = touch_charge(film_sensor, equilibrium) + warming_charge
     charge_pC = dict(zip(film_sensor.electrode_names, charge.tolist(), strict=True))
-    report = {"charge_pC": charge_pC, **summary(equilibrium)}
+    results = {"charge_pC": charge_pC, **summary(equilibrium)}
     if any(applied_side_force):
-        report["side_force_N"] = list(applied_side_force)
-    warnings = report["warnings"] if json else report.pop("warnings")
-    error = report["estimated_error"]
+        results["side_force_N"] = list(applied_side_force)
+
+    # Add warnings about the options to the warnings about the press.
+    warnings = results["warnings"]
+    error = results["estimated_error"]
     if error is None:  # infinite
         warnings.append(f"a {theory} does not describe this film at all; omit --theory")
     elif error > accuracy:
@@ -102,6 +107,8 @@ def point_command(
             "--temperature changes no charge, because the sensor file has neither pyro_uC_per_m2_K nor "
             "expansion_ppm_per_K"
         )
-    show_result(report, json=json)
+    if not json:
+        del results["warnings"]  # the sentences below contain them
+    show_result(results, json=json)
     for warning in warnings:
         say(f"caution: {warning}")

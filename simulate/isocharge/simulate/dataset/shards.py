@@ -157,21 +157,10 @@ def write_files(folder: Path, name: str, sensor: Sensor, shards: Iterable[Sample
         DatasetError: If a column of a shard has a wrong shape or type or contains a number that is not finite, or if a
             file is too large.
     """
-    entries: list[dict[str, Any]] = []
-    for index, samples in enumerate(shards):
-        file_name = f"shard-{index:05d}.npz"
-        _check_samples(samples, len(sensor.electrodes), file_name)
-        columns = samples.columns()
-        buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, **columns)
-        data = buffer.getvalue()
-        if len(data) > MAX_SHARD_BYTES:
-            raise DatasetError(
-                f"{file_name}: expected at most {MAX_SHARD_BYTES} bytes, got {len(data)}; make smaller shards"
-            )
-        write_whole(folder / file_name, data)
-        n_outside = int(columns["outside"].sum())
-        entries.append({"file": file_name, "samples": len(samples), "outside": n_outside, "sha256": sha256_of(data)})
+    entries = [
+        _write_shard(folder, f"shard-{index:05d}.npz", samples, len(sensor.electrodes))
+        for index, samples in enumerate(shards)
+    ]
     manifest = {
         "format_version": FORMAT_VERSION,
         "package_version": metadata.version("isocharge"),
@@ -184,6 +173,36 @@ def write_files(folder: Path, name: str, sensor: Sensor, shards: Iterable[Sample
     }
     write_whole(folder / "manifest.json", (json.dumps(manifest, indent=2) + "\n").encode())
     write_whole(folder / "README.md", data_card(name, manifest).encode())
+
+
+def _write_shard(folder: Path, file_name: str, samples: Samples, n_electrode: int) -> dict[str, Any]:
+    """Check the samples of a shard, and write them into a file.
+
+    Args:
+        folder: Folder of the dataset.
+        file_name: Name of the file.
+        samples: Samples of the shard.
+        n_electrode: Number of electrodes of the sensor.
+
+    Returns:
+        Entry of the manifest that describes the shard.
+
+    Raises:
+        DatasetError: If a column has a wrong shape or type or contains a number that is not finite, or if the file is
+            too large.
+    """
+    _check_samples(samples, n_electrode, file_name)
+    columns = samples.columns()
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **columns)
+    data = buffer.getvalue()
+    if len(data) > MAX_SHARD_BYTES:
+        raise DatasetError(
+            f"{file_name}: expected at most {MAX_SHARD_BYTES} bytes, got {len(data)}; make smaller shards"
+        )
+    write_whole(folder / file_name, data)
+    n_outside = int(columns["outside"].sum())
+    return {"file": file_name, "samples": len(samples), "outside": n_outside, "sha256": sha256_of(data)}
 
 
 def data_card(name: str, manifest: dict[str, Any]) -> str:
@@ -243,10 +262,12 @@ def _check_samples(samples: Samples, n_electrode: int, shard_label: str) -> None
         raise DatasetError(
             f"{shard_label}: expected columns of shapes {expected_shapes}, at least one sample, got {shapes}"
         )
-    # The kinds of NumPy are U: text; b: truth values; f, i, u: floats, signed and unsigned integers.
+    # NumPy denotes the kind of the elements of an array by a letter: U for text, b for truth values, f for floats, and
+    # i and u for signed and unsigned integers.
     kinds_and_content = {"probe": ("U", "text"), "outside": ("b", "truth values")}
+    numeric_kinds_and_content = ("fiu", "numbers")
     for name, column in columns.items():
-        expected_kinds, expected_content = kinds_and_content.get(name, ("fiu", "numbers"))
+        expected_kinds, expected_content = kinds_and_content.get(name, numeric_kinds_and_content)
         if column.dtype.kind not in expected_kinds:
             raise DatasetError(f"{shard_label}: column {name}: expected {expected_content}, got {column.dtype}")
         if expected_content == "numbers" and not np.isfinite(column).all():

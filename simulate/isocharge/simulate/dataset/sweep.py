@@ -121,7 +121,8 @@ class Sweep:
 
     def contacts(self) -> Array:
         """Return the contacts (x, y, F) of a sweep with one probe, shape (n, 3), mm and N."""
-        contact, _ = self._draw(self.samples, (0,), 0.0, self.radius)
+        first_stream = (0,)  # of random numbers
+        contact, _ = self._draw(self.samples, first_stream, 0.0, self.radius)
         return contact
 
     def outside_presses(self, outer_radius: float) -> SweepPresses:
@@ -130,10 +131,11 @@ class Sweep:
         Args:
             outer_radius: Radius of the larger circle, mm.
         """
-        contact, _ = self._draw(self.outside, (0, 1), self.radius, outer_radius)
+        outside_stream = (0, 1)  # of random numbers, which no probe uses
+        contact, _ = self._draw(self.outside, outside_stream, self.radius, outer_radius)
         return SweepPresses(np.full(self.outside, OUTSIDE_PROBE), contact, np.zeros(self.outside))
 
-    def over(self, probes: Sequence[Probe]) -> SweepPresses:
+    def presses(self, probes: Sequence[Probe]) -> SweepPresses:
         """Return the presses of a sweep with several probes.
 
         Successive presses cycle through the probes. The rotations are uniformly distributed over a full turn, or zero
@@ -147,16 +149,16 @@ class Sweep:
         """
         if not probes:
             raise SceneError("probes: expected at least one, got none")
-        # Each probe has a sequence of points of its own.
-        probe = np.arange(self.samples) % len(probes)
+        # Each probe has a stream of random numbers of its own.
+        probe_index = np.arange(self.samples) % len(probes)  # of each press
         contact = np.empty((self.samples, 3))
         rotation = np.zeros(self.samples)
         for index in range(len(probes)):
-            rows = np.flatnonzero(probe == index)
+            rows = np.flatnonzero(probe_index == index)
             contact[rows], turn_fraction = self._draw(rows.size, (index,), 0.0, self.radius)
             if self.orientation == "random":
                 rotation[rows] = math.tau * turn_fraction
-        return SweepPresses(probe, contact, rotation)
+        return SweepPresses(probe_index, contact, rotation)
 
     def _draw(
         self, count: int, stream: tuple[int, ...], inner_radius: float, outer_radius: float
@@ -168,8 +170,8 @@ class Sweep:
 
         Args:
             count: Number of contacts.
-            stream: Numbers that select a sequence of random numbers: `(index,)` for the probe with this index, or
-                `(0, 1)` for the presses outside the disk.
+            stream: Numbers that are appended to the seed and select a stream of random numbers: `(index,)` for the
+                probe with this index, or `(0, 1)` for the presses outside the disk.
             inner_radius: Radius of the inner circle, mm.
             outer_radius: Radius of the outer circle, mm.
 
@@ -177,7 +179,7 @@ class Sweep:
             Contacts (x, y, F), shape (count, 3), mm and N. Rotations, shape (count,), in full turns.
         """
         # A Sobol sequence is balanced if the number of points is a power of two. Draw the next larger power of two, and
-        # use the first `count` points. A probe may have no presses if there are more probes than presses.
+        # use the first `count` points. If there are more probes than presses, a probe has no presses.
         rng = np.random.default_rng([self.seed, *stream])
         log2_count = math.ceil(math.log2(max(count, 2)))
         points = scipy.stats.qmc.Sobol(4, rng=rng).random_base2(log2_count)[:count]
@@ -243,7 +245,7 @@ def run_sweep(
         raise SceneError("maps: expected one forward map of this sensor for each probe, in the order of the probes")
 
     # The presses are computed before files are written, because SciPy ignores an interrupt during this computation.
-    presses = sweep.over(probes)
+    presses = sweep.presses(probes)
 
     # BLAS is faster with one thread, because the matrices are small.
     thread_title = "solving the film up to the clamp"
@@ -252,8 +254,8 @@ def run_sweep(
         outside_job = thread.submit(outside_map, sensor, probes, sweep, executor=executor)
         maps = maps or solve_maps(sensor, probes, sweep, settings, executor=executor)
         whole_film = outside_job.result()
-        shards = _shards(sweep, presses, _shard_size(probes, shard), whole_film)
-        samples = _samples(maps, whole_film, shards, executor)
+        shards = _divide_into_shards(sweep, presses, _shard_size(probes, shard), whole_film)
+        samples = _compute_samples(maps, whole_film, shards, executor)
         write_files(draft, folder.name, sensor, samples, _manifest_entries(maps, whole_film, sweep))
     return folder
 
@@ -307,12 +309,16 @@ def outside_map(
         The map; None if the sweep has no presses outside, because none are requested, the ring is too narrow, or the
         film cannot be solved up to the clamp. The last case is logged as a warning.
     """
-    probe = Circle(max(probe.under(sweep.force_range[1]).reach for probe in probes))
-    ring_width = outermost_distance(sensor.film, probe) - sweep.radius
+    _, max_force = sweep.force_range
+    largest_reach = max(probe.under(max_force).reach for probe in probes)
+    disk_probe = Circle(largest_reach)
+
+    # The ring lies between the radius of the sweep and the outermost possible press.
+    ring_width = outermost_distance(sensor.film, disk_probe) - sweep.radius
     if sweep.outside == 0 or ring_width < MIN_RING_WIDTH * sensor.film.radius:
         return None
     try:
-        return whole_film_map(sensor, probe, sweep.force_range, executor=executor)
+        return whole_film_map(sensor, disk_probe, sweep.force_range, executor=executor)
     except (SceneError, SolveError) as error:
         _log.warning("presses outside %g mm are not simulated: %s", sweep.radius, error)
         return None
@@ -374,13 +380,15 @@ def _manifest_entries(maps: Sequence[ForwardMap], whole_film: ForwardMap | None,
     }
 
 
-def _shards(sweep: Sweep, presses: SweepPresses, size: int, whole_film: ForwardMap | None) -> list[SweepPresses]:
-    """Divide the presses of a sweep into shards.
+def _divide_into_shards(
+    sweep: Sweep, presses: SweepPresses, size: int, whole_film: ForwardMap | None
+) -> list[SweepPresses]:
+    """Add the presses outside the radius of a sweep to the other presses, and divide all presses into shards.
 
     Args:
+        sweep: Definition of the presses.
         presses: Presses within the radius of the sweep.
         size: Number of presses in a shard. The last shard may have fewer.
-        sweep: Definition of the presses.
         whole_film: Map of the presses outside the radius, which get shards of their own; None if there are none.
     """
     parts = [presses]
@@ -390,7 +398,7 @@ def _shards(sweep: Sweep, presses: SweepPresses, size: int, whole_film: ForwardM
 
 
 def _shard_size(probes: Sequence[Probe], largest: int) -> int:
-    """Return the number of samples in a shard.
+    """Return the number of samples in a shard, which is smaller than `largest` if the file would become too large.
 
     A sample contains the notation of its probe, which is long for a polygon with many corners. The notations fill at
     most half of the largest file.
@@ -403,7 +411,7 @@ def _shard_size(probes: Sequence[Probe], largest: int) -> int:
     return min(largest, MAX_SHARD_BYTES // (2 * bytes_per_notation))
 
 
-def _samples(
+def _compute_samples(
     maps: Sequence[ForwardMap],
     whole_film: ForwardMap | None,
     shards: Sequence[SweepPresses],
@@ -435,10 +443,11 @@ def _samples_of_shard(maps: Sequence[ForwardMap], presses: SweepPresses) -> Samp
         maps: Forward map of each probe, and of the whole film if presses lie outside the radius of the sweep.
         presses: Presses of the shard.
     """
+    # The index of a probe is also the index of its map. The index `OUTSIDE_PROBE` selects the last map.
     charge = np.empty((len(presses), len(maps[0].electrodes)))
-    for probe in np.unique(presses.probe).tolist():  # index of the map; `OUTSIDE_PROBE` is that of the last map
-        rows = np.flatnonzero(presses.probe == probe)
-        charge[rows] = maps[probe].charges(presses.contact[rows], presses.rotation[rows])
+    for index in np.unique(presses.probe).tolist():
+        rows = np.flatnonzero(presses.probe == index)
+        charge[rows] = maps[index].charges(presses.contact[rows], presses.rotation[rows])
 
     probe_notations = np.array([forward_map.probe.notation for forward_map in maps])
     probe_angles = np.array([forward_map.probe.angle for forward_map in maps])

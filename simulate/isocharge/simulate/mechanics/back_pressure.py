@@ -101,9 +101,17 @@ class BackPressure:
         return float(self._copies * pressure_per_volume)
 
     def _volume(self, deflection: Array) -> float:
-        """Compute the integral of the scaled deflection W over the whole film, which the copies of the mesh cover."""
+        """Compute the displaced volume, which is the integral of the scaled deflection over the whole film.
+
+        Args:
+            deflection: Scaled deflection W at the nodes of the meshed part of the film, shape (n_node,).
+        """
         return self._copies * float(self.weights @ deflection)
 
     def _displaced_share(self, deflection: Array) -> float:
-        """Compute the share V / V0 of the volume of the air that the film displaces."""
+        """Compute the share V / V0 of the volume of the air that the film displaces, dimensionless.
+
+        Args:
+            deflection: Scaled deflection W at the nodes, shape (n_node,).
+        """
         return self.groups.compression * self._volume(deflection)

@@ -289,10 +289,7 @@ class Placement:
         # The outer sides of the last layer lie on the innermost circle.
         in_last_layer = element >= blocks.n_inner - blocks.n_sector
         sector = (element[:, None] - blocks.n_quad) % blocks.n_sector  # not used for elements of the core polygon
-        first_angle = np.take_along_axis(self.circle_angles, sector, axis=1)
-        last_angle = np.take_along_axis(self.circle_angles, sector + 1, axis=1)
-        circle_angle = _interpolate(first_angle, last_angle, angular)
-        circle_points = self.to_film(self.template_radius[:, None] * np.exp(1j * circle_angle))
+        circle_points = self._circle_points(sector, angular)
         outer[in_last_layer] = circle_points[in_last_layer]
 
         # If there are two layers, the boundary of the footprint separates them.
@@ -304,6 +301,23 @@ class Placement:
             outer[in_first_layer] = boundary_points[in_first_layer]
             inner[in_last_layer] = boundary_points[in_last_layer]
         return inner, outer
+
+    def _circle_points(self, sector: Integers, angular: Array) -> Complexes:
+        """Compute points of the circular film that lie on the innermost circle of the mesh.
+
+        The object contains n placements.
+
+        Args:
+            sector: Index of the sector that contains the points, shape (n, 1).
+            angular: Angular coordinates of the points in their sectors from 0 to 1, shape (n, k) or (1, k).
+
+        Returns:
+            Points x + iy of the circular film, shape (n, k), in film radii.
+        """
+        first_angle = np.take_along_axis(self.circle_angles, sector, axis=1)
+        last_angle = np.take_along_axis(self.circle_angles, sector + 1, axis=1)
+        angle = _interpolate(first_angle, last_angle, angular)  # in the template plane
+        return self.to_film(self.template_radius[:, None] * np.exp(1j * angle))
 
     def _ring_element_points(self, blocks: Blocks) -> Complexes:
         """Compute the film points of the nodes of the elements between the innermost circle of the mesh and the rim.

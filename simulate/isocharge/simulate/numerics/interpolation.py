@@ -32,9 +32,15 @@ def lobatto_nodes(order: int) -> Array:
 
 @lru_cache(maxsize=32)
 def lobatto_quadrature(order: int) -> Array:
-    """Return the quadrature weights of the nodes that `lobatto_nodes` returns, shape (order + 1,).
+    """Return the quadrature weights of the Gauss-Lobatto-Legendre nodes on the interval [-1, 1].
 
-    The Gauss-Lobatto rule with n + 1 nodes integrates every polynomial of degree 2 n - 1 or less exactly.
+    The rule integrates every polynomial of degree 2 * order - 1 or less exactly.
+
+    Args:
+        order: Order of the nodes that `lobatto_nodes` returns.
+
+    Returns:
+        Weights, shape (order + 1,). They add up to 2, the length of the interval.
     """
     return _read_only(2.0 / (order * (order + 1) * eval_legendre(order, lobatto_nodes(order)) ** 2))
 

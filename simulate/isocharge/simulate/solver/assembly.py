@@ -87,11 +87,11 @@ class Assembly:
         is_in_skeleton = np.zeros(self.free.size, dtype=bool)
         is_in_skeleton[self.side_unknowns.ravel()] = True
         self.skeleton = np.flatnonzero(is_in_skeleton & self.free.ravel())
-        self._set_pattern()
+        self._compute_sparsity_pattern()
 
         # Sort the skeleton unknowns, and compute the pattern of the sorted unknowns.
         self.skeleton = self.skeleton[self._elimination_order()]
-        self._set_pattern()
+        self._compute_sparsity_pattern()
 
     def _elimination_order(self) -> Integers:
         """Return an order of the skeleton unknowns in which the factors of their matrix have few nonzero entries.
@@ -108,13 +108,14 @@ class Assembly:
         new_number = factorise(dominant_matrix, "MMD_AT_PLUS_A").perm_c  # of each present number
         return np.argsort(new_number)
 
-    def _set_pattern(self) -> None:
+    def _compute_sparsity_pattern(self) -> None:
         """Determine which entries of the skeleton matrix may be nonzero, and where the element matrices are added.
 
-        The skeleton matrix is the matrix of the unknowns on the sides of the elements, and is the sum of the matrices
-        of all elements. Only the nonzero entries of the skeleton matrix are stored, in an array that is ordered column
-        by column (compressed sparse column format). The method stores the position of each entry of each element matrix
-        in this array. Entries that belong to a fixed unknown get the position after the last nonzero entry.
+        The skeleton matrix is the matrix of the unknowns in `skeleton`, and is the sum of the matrices of all elements.
+        Only its nonzero entries are stored, in an array that is ordered column by column (compressed sparse column
+        format). The method sets three attributes. `_entry_positions` contains the position of each entry of each
+        element matrix in this array. Entries that belong to a fixed unknown get the position after the last nonzero
+        entry. `_indices` and `_indptr` contain the rows of the nonzero entries and the starts of the columns.
         """
         # Number the unknowns of the skeleton matrix. Fixed unknowns have the number -1.
         n_skeleton = self.skeleton.size
@@ -137,8 +138,7 @@ class Assembly:
         positions[is_free] = pattern_position
         self._entry_positions = positions.ravel()
 
-        # Compute the row of each nonzero entry, and the position of the first nonzero entry of each column. Both arrays
-        # are part of the compressed sparse column format.
+        # Compute the row of each nonzero entry, and the position of the first nonzero entry of each column.
         pattern_column, pattern_row = np.divmod(pattern_codes, n_skeleton)
         entries_per_column = np.bincount(pattern_column, minlength=n_skeleton)
         self._indices = pattern_row.astype(np.int32)
@@ -302,7 +302,14 @@ def factor_tangent(
     pressure_per_volume = air_stiffness / (1.0 + air_stiffness * response_volume)
 
     def solve_with_air(right: Array) -> Array:
-        """Solve for the displacements at the nodes; see `SolveTangent`."""
+        """Solve the linear system with the stiffness of the film and of the air.
+
+        Args:
+            right: Right-hand side for (U1, U2, W) at the nodes, shape (n_node, 3).
+
+        Returns:
+            Solution (U1, U2, W) at the nodes, shape (n_node, 3).
+        """
         field_without_air = solve_film(right)
         volume = float(weights @ field_without_air[:, 2])
         return field_without_air - pressure_per_volume * volume * response

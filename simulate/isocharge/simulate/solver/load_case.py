@@ -255,7 +255,7 @@ class LoadCase:
         return layer_for(self.film, self.force) if layer == "auto" else layer
 
     def place(self, resolution: Resolution) -> PlacedMesh:
-        """Create the mesh under this press with a given resolution."""
+        """Create the mesh under this press with a given resolution. With a side force, the whole film is meshed."""
         return place(self.film, self.probe, self.at, resolution, self.layer, whole=any(self.side_force))
 
 

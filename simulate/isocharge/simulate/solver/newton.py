@@ -185,7 +185,13 @@ class _Iterate:
         return float(np.sqrt(step_energy / work))
 
     def result(self, iterations: int, status: Literal["converged", "failed"], message: str) -> NewtonResult:
-        """Return the result of a solve whose last iterate is this object."""
+        """Return the result of a solve whose last iterate is this object.
+
+        Args:
+            iterations: Number of Newton steps with a new tangent.
+            status: Status of the solve.
+            message: Description of the outcome in one sentence.
+        """
         return NewtonResult(
             field=self.field, status=status, message=message, iterations=iterations, residual=self.relative_residual
         )

@@ -116,7 +116,7 @@ def _add_stiffness(solved: Equilibrium, log_ratio: float, angle: float) -> Equil
 
 
 def _add_oval(solved: Equilibrium, value: float, direction: complex) -> Equilibrium:
-    """Make the clamp of the film oval.
+    """Make the clamp of the film oval. The displacements at the nodes are unchanged.
 
     Args:
         solved: The press.
@@ -124,24 +124,30 @@ def _add_oval(solved: Equilibrium, value: float, direction: complex) -> Equilibr
         direction: exp(2 i alpha), where alpha is the angle from the direction of the press to the longer axis.
     """
     placement = solved.mesh.placement
-    return _placed_anew(solved, placement.probe, placement.oval + value * direction)
+    return _place_mesh_again(solved, placement.probe, placement.oval + value * direction)
 
 
 def _add_radius(solved: Equilibrium, value: float) -> Equilibrium:
-    """Increase the radius of a round probe by a value in mm."""
+    """Increase the radius of a round probe. The displacements at the nodes are unchanged.
+
+    Args:
+        solved: The press.
+        value: Increase of the radius, mm.
+    """
     placement = solved.mesh.placement
     assert isinstance(placement.probe, RoundProbe)
     larger_probe = replace(placement.probe, radius=placement.probe.radius + value)
-    return _placed_anew(solved, larger_probe, placement.oval)
+    return _place_mesh_again(solved, larger_probe, placement.oval)
 
 
-def _placed_anew(solved: Equilibrium, probe: Probe, oval: complex | Complexes) -> Equilibrium:
-    """Return a press with the same displacements at the nodes of a mesh for another probe or another clamp.
+def _place_mesh_again(solved: Equilibrium, probe: Probe, oval: complex | Complexes) -> Equilibrium:
+    """Place the mesh of a press again for another probe or another clamp, with unchanged displacements at its nodes.
 
     Args:
         solved: The press.
         probe: Probe for which the mesh is placed, of the same topology.
-        oval: Shape of the clamp in the frame of the press.
+        oval: Shape of the clamp in the frame of the press, e exp(2 i alpha): the semi-axes are 1 + e and 1 - e film
+            radii, and alpha is the angle from the direction of the press to the longer axis.
     """
     mesh = solved.mesh
     distance = np.array(np.hypot(*solved.at))
