@@ -237,6 +237,23 @@ def error_prefix(where: str, error_class: type[IsochargeError]) -> Iterator[None
 
 
 @contextmanager
+def error_advice(advice: str, error_class: type[IsochargeError]) -> Iterator[None]:
+    """Append advice to the message of each error that the `with` block raises.
+
+    Args:
+        advice: What the user can do, which follows the message and a semicolon.
+        error_class: Class of the errors whose messages are changed. All other exceptions are not changed.
+
+    Raises:
+        error_class: If the block raises an error of this class. The new error has the longer message.
+    """
+    try:
+        yield
+    except error_class as error:
+        raise error_class(f"{error}; {advice}") from error
+
+
+@contextmanager
 def require(*extras: str) -> Iterator[None]:
     """If an import in the `with` block fails, raise an error with the command that installs the extras.
 

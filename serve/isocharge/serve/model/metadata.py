@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Meta, Struct, structs, to_builtins
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import ModelError, is_printable, shown
+from isocharge.common.errors import ModelError, error_advice, is_printable, shown
 from isocharge.common.structs import Finite, NotNegative, Positive, Settings, Text, WrongKey, convert, parse_json
 
 FORMAT_VERSION = 1
@@ -232,17 +232,14 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         """
         place = f"{where}: metadata"
         names = [name for name in cls.__struct_fields__ if name in props]
-        metadata = None
-        try:
+        with error_advice("export the model again", ModelError):
             values = {name: parse_json(props[name], f"{place}: {name}", ModelError, object) for name in names}
-            version = values.get("format_version", FORMAT_VERSION)
-            if version == FORMAT_VERSION:  # the fields of another version may have another meaning
-                metadata = convert(values, cls, place, ModelError)
-        except ModelError as error:
-            raise ModelError(f"{error}; export the model again") from error
-        if metadata is None:
+
+        version = values.get("format_version", FORMAT_VERSION)
+        if version != FORMAT_VERSION:  # the fields of another version may have another meaning
             raise ModelError(
                 f"{place} format {shown(version)} is not supported (this version reads {FORMAT_VERSION}); export it "
                 "again or upgrade isocharge"
             )
-        return metadata
+        with error_advice("export the model again", ModelError):
+            return convert(values, cls, place, ModelError)

@@ -175,7 +175,7 @@ class RobustProblem:
 
     def state_covariance(self, point: RobustPoint) -> Array:
         """Compute the covariance of the state in the problem that is linearised at a point, shape (p, p)."""
-        normal_matrix, *_ = self.normal_equations(point, damping=0.0)
+        normal_matrix, _ = self._normal_equations(point, *self._contact_shifts(point, damping=0.0))
         return np.asarray(np.linalg.inv(normal_matrix))
 
     def evaluate(self, state: Array, contacts: Array) -> RobustPoint:
@@ -209,7 +209,9 @@ class RobustProblem:
             cost=float(press_cost.sum() + 0.5 * deviation @ self._precision @ deviation),
         )
 
-    def normal_equations(self, point: RobustPoint, damping: float) -> tuple[Array, Array, Array, Array]:
+    def _normal_equations(
+        self, point: RobustPoint, contact_shift: Array, contact_by_state: Array
+    ) -> tuple[Array, Array]:
         """Compute the normal equations of a step of the state, from which the contacts are eliminated.
 
         The normal matrix and the right side are sums over the presses. Each term is multiplied by the weight of its
@@ -217,14 +219,12 @@ class RobustProblem:
 
         Args:
             point: State and contacts.
-            damping: Damping of the contacts, relative to the diagonal of their normal matrices.
+            contact_shift: Shifts a_i of the contacts, as `_contact_shifts` returns them, shape (n, 3).
+            contact_by_state: Matrices B_i, as `_contact_shifts` returns them, shape (n, 3, p).
 
         Returns:
-            Normal matrix, shape (p, p), and right side, shape (p,), of the state. The shifts of the contacts, shape
-            (n, 3), and their matrices, shape (n, 3, p), as `_contact_shifts` returns them.
+            Normal matrix, shape (p, p), and right side, shape (p,), of the state.
         """
-        contact_shift, contact_by_state = self._contact_shifts(point, damping)
-
         # Schur complement: the parts of the derivatives and of the residuals that no change of the contacts explains
         n_state = point.state.size
         remaining_slopes = (point.by_state - point.by_contact @ contact_by_state).reshape(-1, n_state)
@@ -234,7 +234,7 @@ class RobustProblem:
         prior_side = self._precision @ (self._prior_mean - point.state)
         right_side = prior_side + weighted_slopes.T @ remaining_residual.ravel()
         symmetric_matrix = 0.5 * (normal_matrix + normal_matrix.T)  # despite rounding errors
-        return symmetric_matrix, right_side, contact_shift, contact_by_state
+        return symmetric_matrix, right_side
 
     def _contact_shifts(self, point: RobustPoint, damping: float) -> tuple[Array, Array]:
         """Compute how the contacts move, as a linear function of the step of the state.
@@ -267,7 +267,8 @@ class RobustProblem:
 
     def step(self, point: RobustPoint, damping: float) -> tuple[Array, Array]:
         """Compute a damped Gauss-Newton step of the state, shape (p,), and of the contacts, shape (n, 3)."""
-        normal_matrix, right_side, contact_shift, contact_by_state = self.normal_equations(point, damping)
-        damped = normal_matrix + damping * np.diag(np.diag(normal_matrix))
-        state_step = np.linalg.solve(damped, right_side)
+        contact_shift, contact_by_state = self._contact_shifts(point, damping)
+        normal_matrix, right_side = self._normal_equations(point, contact_shift, contact_by_state)
+        damped_matrix = normal_matrix + damping * np.diag(np.diag(normal_matrix))
+        state_step = np.linalg.solve(damped_matrix, right_side)
         return np.asarray(state_step), contact_shift - contact_by_state @ state_step

@@ -27,7 +27,7 @@ import onnxruntime as ort
 from msgspec import Meta, Struct, json
 
 from isocharge.common.arrays import Singles
-from isocharge.common.errors import ModelError, cut
+from isocharge.common.errors import ModelError, cut, error_advice
 from isocharge.common.files import sha256_of
 from isocharge.common.structs import Finite, NotNegative, Text, read_json
 from isocharge.serve.model.contact import CORRELATION_COLUMNS, STD_COLUMNS
@@ -322,21 +322,28 @@ def read_golden(path: Path) -> Golden:
     Raises:
         ModelError: If the file is missing or damaged.
     """
-    advice = "the file is damaged or missing: copy or export the model again"
-    try:
+    with error_advice("the file is damaged or missing: copy or export the model again", ModelError):
         golden = read_json(path, "golden vectors", ModelError, Golden)
-    except ModelError as error:
-        raise ModelError(f"{error}; {advice}") from error
-    try:
-        n_press = len(golden.charge_pC)
-        for name, width in OUTPUTS.items():
-            shape = np.shape(golden.outputs[name])
-            n_floor = len(golden.tolerance.floor[name])
-            if shape != (n_press, width) or n_floor != width:
-                raise ValueError(
-                    f"{name}: expected {n_press} rows of {width} numbers, and {width} floors, got an array of shape "
-                    f"{shape} and {n_floor} floors"
-                )
-    except (ValueError, KeyError) as error:  # also for rows of different lengths, or a missing entry
-        raise ModelError(f"{path}: {error}; {advice}") from error
+        try:
+            _check_sizes(golden)
+        except (ValueError, KeyError) as error:
+            raise ModelError(f"{path}: {error}") from error
     return golden
+
+
+def _check_sizes(golden: Golden) -> None:
+    """Check that each output has a row for each press, and a number and a floor for each of its columns.
+
+    Raises:
+        ValueError: If an output has another size, or rows of different lengths.
+        KeyError: If an output or its floors are missing.
+    """
+    n_press = len(golden.charge_pC)
+    for name, width in OUTPUTS.items():
+        shape = np.shape(golden.outputs[name])
+        n_floor = len(golden.tolerance.floor[name])
+        if shape != (n_press, width) or n_floor != width:
+            raise ValueError(
+                f"{name}: expected {n_press} rows of {width} numbers, and {width} floors, got an array of shape "
+                f"{shape} and {n_floor} floors"
+            )

@@ -23,11 +23,11 @@ from isocharge.cli.shared.options import (
     SensorOption,
     StressLimitOption,
 )
-from isocharge.cli.shared.port_hints import no_frames_advice_added
+from isocharge.cli.shared.port_hints import no_frames_hint
 from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
-from isocharge.common.errors import OutputError, PressError, error_prefix
+from isocharge.common.errors import NoFramesError, OutputError, PressError, error_advice, error_prefix
 from isocharge.common.files import as_output_errors, check_new_output
 from isocharge.serve import ReadingStream, load_device, open_source
 from isocharge.serve.live.steady_press import PressWatch
@@ -133,7 +133,9 @@ def press_command(
         )
         try:
             with (
-                no_frames_advice_added(port, device),  # first, because it changes the errors of the next two
+                error_advice(
+                    no_frames_hint(port, device), NoFramesError
+                ),  # first, because it changes the errors of the next two
                 # A machine goes on while the port is lost, so its session must end.
                 open_source(port, baud=baud, reconnect=contacts is None, request=board.request) as source,
                 closing(PressEvents(source, stream, PressWatch(problem.electrodes), keyboard)) as events,
