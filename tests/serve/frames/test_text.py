@@ -93,8 +93,8 @@ def test_sign_with_blanks_before_its_number(text, values):
     assert names_and_values(text)[1] == values
 
 
-@pytest.mark.parametrize("text", ["3.5  - 2.5   1.5", "3.5 pC - 2.5 pC", "3.5+ 2.5- 1.5+"])
-def test_minus_that_may_be_a_sign_or_a_separator_is_not_read(text):
+@pytest.mark.parametrize("text", ["3.5  - 2.5   1.5", "3.5 pC - 2.5 pC", "3.5+ 2.5- 1.5+", "A:18,537 B:18,402 T:23.5"])
+def test_minus_or_comma_that_may_be_a_part_of_a_number_or_a_separator_is_not_read(text):
     assert parse_line(clean_text(text)).names == ()
 
 

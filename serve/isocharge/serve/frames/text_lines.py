@@ -116,8 +116,15 @@ A key may stand between the unit and the number, as in `"unit": "nC", "value": 3
 _IGNORED_AT_END = ",; \t"
 """Marks without a meaning at the end of a line."""
 
-_UNCLEAR_SIGN = r"(?:^|[\s;])[-+]?[0-9.]+(?:(?:\s*[fnpuµμm]?[CV])?\s+-\s+[.0-9]|-(?:[\s,;]|$))"
-"""Regular expression of a minus after a number, as in `3.5 - 2.5` and `3.5-`, which may be a sign or a separator."""
+_UNCLEAR = (
+    r"(?:^|[\s;])[-+]?[0-9.]+(?:(?:\s*[fnpuµμm]?[CV])?\s+-\s+[.0-9]|-(?:[\s,;]|$))"
+    r"|(?:[:=>]\s*[-+]?[0-9]+,[0-9]++(?!\s*[:=]|,[-+.0-9]).*){2}"
+)
+"""Regular expression of a text whose numbers are not clear.
+
+A minus after a number, as in `3.5 - 2.5` and `3.5-`, may be a sign or a separator. Commas behind several names, as in
+`A=18,537 B=18,402 T=23.5`, may be decimal commas or separators, of thousands or of columns.
+"""
 
 _SEPARATING_COMMA = (
     r"[0-9]\.[0-9]|[0-9],[0-9]+,[0-9]"  # a number with a decimal point or two commas
@@ -191,7 +198,7 @@ class Line(NamedTuple):
 def parse_line(text: str, *, has_header: bool = False, meanings: Mapping[str, str] = MappingProxyType({})) -> Line:
     """Take the numbers out of a line of text.
 
-    A line with an unclear minus is returned without numbers.
+    A line with an unclear minus or comma is returned without numbers.
 
     Args:
         text: The line, as `clean_text` returns it.
@@ -244,8 +251,8 @@ def _has_decimal_commas(text: str) -> bool:
 
 
 def _parts(text: str) -> list[_Part]:
-    """Divide a line into its parts; empty for a line with an unclear minus."""
-    if re.search(_UNCLEAR_SIGN, text):
+    """Divide a line into its parts; empty for a line with an unclear minus or comma."""
+    if re.search(_UNCLEAR, text):
         return []
     parts = []
     for match in _PART.finditer(text.rstrip(_IGNORED_AT_END)):
