@@ -149,15 +149,13 @@ def parse_json(text: str | bytes, where: str, error_class: type[InputError], tar
     """
     try:
         return msgspec.json.decode(text, type=target_type)
-    except (ValueError, RecursionError) as decoding_error:
-        cause = decoding_error  # the name after `as` exists only in this clause
-
-    # The text is either not JSON, or JSON with wrong content. Decoding without a type distinguishes the two cases.
-    try:
-        content = msgspec.json.decode(text)
-    except (ValueError, RecursionError):
-        raise error_class(f"{_prefix(where)}expected JSON, got {shown(text)} ({cut(str(cause))})") from cause
-    return convert(content, target_type, where, error_class)
+    except (ValueError, RecursionError) as cause:
+        # The text is either not JSON, or JSON with wrong content. Decoding without a type distinguishes the two cases.
+        try:
+            content = msgspec.json.decode(text)
+        except (ValueError, RecursionError):
+            raise error_class(f"{_prefix(where)}expected JSON, got {shown(text)} ({cut(str(cause))})") from cause
+        return convert(content, target_type, where, error_class)
 
 
 def convert(value: object, target_type: type[T], where: str, error_class: type[InputError]) -> T:

@@ -15,7 +15,7 @@ from isocharge.cli.shared.virtual_sensor import film_charges, measure_function, 
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE, DEFAULT_RADIUS
 from isocharge.common.errors import InputError
 from isocharge.common.files import check_new_output
-from isocharge.serve import Script, VirtualSensor, encode_frame, encode_text
+from isocharge.serve import VirtualSensor, encode_frame, encode_text
 from isocharge.serve.virtual_sensor.script import VirtualScript, load_script
 from isocharge.simulate import (
     Circle,
@@ -89,7 +89,13 @@ def virtual_command(
             raise InputError(f"--film: expected a --probe like circle:1.0, whose radius is drawn, too, got {probe!r}")
         played_sensor, footprint = virtual_film(played_sensor, footprint, film)
     min_force, _ = DEFAULT_PLAYED_FORCE_RANGE
-    map_radius, map_force_max = _map_limits(scripted_presses, radius, force_max)
+    map_radius = radius
+    map_force_max = force_max
+    if scripted_presses is not None:  # the map must contain all presses of the script
+        x_mm, y_mm, force_N = scripted_presses.contact.T
+        distance_mm = np.hypot(x_mm, y_mm)
+        map_radius = float(np.fmax.reduce(ROUNDING_MARGIN * distance_mm, initial=radius))  # ignores NaN between presses
+        map_force_max = float(np.max(ROUNDING_MARGIN * force_N, initial=force_max))
     with shown_progress(), solving_executor(played_sensor.film) as executor:
         forward_map = ForwardMap.build(
             played_sensor,
@@ -117,19 +123,3 @@ def virtual_command(
     )
     if player.paused_s > 0.0:
         say(f"the sensor paused for {player.paused_s:.1f} s in all, because this computer was busy")
-
-
-def _map_limits(scripted_presses: Script | None, radius: float, max_force: float) -> tuple[float, float]:
-    """Return the radius (mm) and the largest force (N) of a forward map that contains all presses of a script.
-
-    Args:
-        scripted_presses: Presses of a script; None for random presses.
-        radius: Smallest radius of the map, mm.
-        max_force: Smallest value of the largest force of the map, N.
-    """
-    if scripted_presses is None:
-        return radius, max_force
-    x_mm, y_mm, force_N = scripted_presses.contact.T
-    map_radius = np.fmax.reduce(ROUNDING_MARGIN * np.hypot(x_mm, y_mm), initial=radius)  # ignores NaN between presses
-    map_max_force = np.max(ROUNDING_MARGIN * force_N, initial=max_force)
-    return float(map_radius), float(map_max_force)

@@ -154,22 +154,18 @@ class Predictor:
 
         flags = self.validity.flags(contact)
         if BEYOND in flags and not self._has_warned.is_set():
-            self._has_warned.set()
-            self._warn_of_beyond(charge_pC, contact)
+            self._has_warned.set()  # the warning is logged only once
+            log.warning(
+                "%s: the charges %s pC on %s are far from those of any press in the training, and %s cannot be a "
+                "measurement; check the unit, the gain and the tare, and with `isocharge serve doctor "
+                "--check-electrodes` whether wires are swapped. Further contacts of this kind are not logged; "
+                "Predictor.flags reports each of them",
+                self.metadata.label,
+                charge_pC,
+                " ".join(self.metadata.electrodes),
+                contact,
+            )
         return contact, flags
-
-    def _warn_of_beyond(self, charge_pC: ArrayLike, contact: Contact) -> None:
-        """Log a warning about the charges of a contact that is too far away or too strong to be a measurement."""
-        log.warning(
-            "%s: the charges %s pC on %s are far from those of any press in the training, and %s cannot be a "
-            "measurement; check the unit, the gain and the tare, and with `isocharge serve doctor --check-electrodes` "
-            "whether wires are swapped. Further contacts of this kind are not logged; Predictor.flags reports each of "
-            "them",
-            self.metadata.label,
-            charge_pC,
-            " ".join(self.metadata.electrodes),
-            contact,
-        )
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
         """Return the reasons why a contact may be wrong: `outside`, `beyond`, `misfit` and `stress`.

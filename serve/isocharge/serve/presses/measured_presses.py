@@ -275,8 +275,9 @@ def _electrode_columns(table: CsvTable) -> tuple[str, ...]:
     Raises:
         PressError: If the name of a column is similar to a name in `PRESS_RULES`. The name is then probably misspelt.
     """
-    electrodes = tuple(name for name in table.header if name and name not in {TEMPERATURE, *PRESS_RULES})
-    table.refuse_similar_names(electrodes, (TEMPERATURE, *PRESS_RULES))
+    other_names = (TEMPERATURE, *PRESS_RULES)
+    electrodes = tuple(name for name in table.header if name and name not in other_names)
+    table.refuse_similar_names(electrodes, other_names)
     return electrodes
 
 
@@ -329,9 +330,10 @@ def _check_electrodes(electrodes: Collection[str]) -> None:
         PressError: If there are no names, if there are too many names, or if one of the names is not allowed.
     """
     are_different = len(set(electrodes)) == len(electrodes)
-    are_texts = all(name and name.isprintable() and name == name.strip() for name in electrodes)
-    have_other_meaning = not PRESS_RULES.keys().isdisjoint(electrodes)
-    if not 0 < len(electrodes) <= MAX_ELECTRODES or not are_different or not are_texts or have_other_meaning:
+    are_names = all(
+        name not in PRESS_RULES and name.isprintable() and name == name.strip() and name for name in electrodes
+    )
+    if not (0 < len(electrodes) <= MAX_ELECTRODES and are_different and are_names):
         raise PressError(
             f"electrodes: expected 1 to {MAX_ELECTRODES} different names of printable characters, without blanks "
             f"at their ends, none of {', '.join(PRESS_RULES)}, got {shown(electrodes)}; "

@@ -125,16 +125,16 @@ class CsvTable:
                 is damaged or has more than `max_rows` rows, or if a cell violates the rule of its column.
         """
         known_rules = {**required, **optional}
-        self.refuse_similar_names((name for name in self.header if name not in known_rules), known_rules)
+        other_names = [name for name in self.header if name not in known_rules]
+        self.refuse_similar_names(other_names, known_rules)
         missing_names = [name for name in required if name not in self.header]
         if missing_names:
             raise self._header_error("missing", missing_names)
         repeated_names = [name for name in known_rules if self.header.count(name) > 1]
         if repeated_names:
             raise self._header_error("repeated", repeated_names)
-        ignored_names = [name for name in self.header if name not in known_rules]
-        if ignored_names:
-            log.warning("%s: ignored columns: %s", self._where, shown(ignored_names))
+        if other_names:
+            log.warning("%s: ignored columns: %s", self._where, shown(other_names))
         chosen_rules = {name: rule for name, rule in known_rules.items() if name in self.header}
         columns = self._read_columns(chosen_rules, max_rows)
         columns.check(chosen_rules, f"{self._where}, ", self._error_class)
