@@ -31,8 +31,7 @@ MAX_LOOP_GAIN = 0.5
 MAX_DELAY_s = 1.0
 """Largest time by which an arrival may be later than predicted, s.
 
-After a longer delay, the fit starts again, because the clock of the device was set or the device was reset. A larger
-difference between the wall clock and the monotonic time of the host means that the wall clock was set.
+After a longer delay, the fit starts again, because the device was reset, or one of the two clocks was set.
 """
 
 MAX_LEAD_s = 0.3
@@ -106,9 +105,6 @@ class DeviceClock:
         previous_chunk = self._latest_chunk or chunk
         self._latest_chunk = chunk
         interval_s = elapsed_s(previous_chunk, chunk)
-        wall_jump_s = chunk.timestamp - previous_chunk.timestamp - interval_s
-        if abs(wall_jump_s) > MAX_DELAY_s:  # the wall clock was set
-            self._shift_host_times(wall_jump_s)
 
         # All chunks of a file have the same arrival time, to which no clock can be fitted. After the first chunk, it is
         # not known whether the chunks belong to a file.
@@ -126,13 +122,6 @@ class DeviceClock:
             self._latest_arrival_s = chunk.timestamp
             if self._is_new_arrival and self._has_fit:
                 self._fit_arrival(chunk.timestamp)
-
-    def _shift_host_times(self, jump_s: float) -> None:
-        """Add the jump of a wall clock that was set to all stored host times."""
-        self._fitted_host_s += jump_s
-        self._latest_host_s += jump_s
-        if self._latest_arrival_s is not None:
-            self._latest_arrival_s += jump_s
 
     def _divide_interval(self, interval_s: float, arrival_s: float, frames: Sequence[Frame]) -> None:
         """Write times into frames without a clock. If later frames of the chunk have a clock, it replaces their times.
