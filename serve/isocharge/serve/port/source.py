@@ -113,10 +113,10 @@ class Port:
     def __enter__(self) -> Self:
         """Open the port, and discard the bytes in its buffer.
 
-        If the port cannot be opened, try again until `wait` seconds have passed. A wrong URL is not tried again.
+        If the port cannot be opened, try again until `wait` seconds have passed.
 
         Raises:
-            PortError: If the port cannot be opened within `wait` seconds, or its URL is wrong.
+            PortError: If the port cannot be opened within `wait` seconds.
             InputError: If the port is a file.
         """
         deadline_s = time.monotonic() + self._wait
@@ -124,9 +124,8 @@ class Port:
             try:
                 self._open()
                 return self
-            except PortError as error:
-                is_wrong_url = isinstance(error.__cause__, ValueError)  # another attempt would fail, too
-                if is_wrong_url or time.monotonic() >= deadline_s:
+            except PortError:
+                if time.monotonic() >= deadline_s:
                     raise
                 time.sleep(RETRY_PAUSE_s)
 
