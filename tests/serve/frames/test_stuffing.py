@@ -22,7 +22,6 @@ from isocharge.serve.frames.transmission import CHECKSUMS, STUFFINGS
         ("slip", "DB", "expected DC or DD after the byte DB"),
         ("slip", "DB 01", "expected DC or DD after the byte DB"),
         ("hdlc", "31 7D", "expected a byte after 7D"),
-        ("cobs", "05 11", "not encoded with COBS"),
     ],
 )
 def test_damaged_stuffing_is_refused_with_the_reason(name, stuffed, reason):

@@ -27,24 +27,11 @@ class Stuffing(NamedTuple):
     Attributes:
         delimiter: The byte between frames.
         decode: Function that converts the bytes between two delimiters to the bytes of the frame. It raises ValueError
-            for bytes that no encoder produces.
+            or `cobs.DecodeError` for bytes that no encoder produces.
     """
 
     delimiter: bytes
     decode: Callable[[bytes], bytes]
-
-
-def cobs_decode(stuffed: bytes) -> bytes:
-    """Decode bytes that are encoded with COBS.
-
-    Raises:
-        ValueError: If a distance points beyond the end, or `stuffed` contains a zero.
-    """
-    try:
-        decoded: bytes = cobs.decode(stuffed)
-    except cobs.DecodeError as error:
-        raise ValueError(f"the bytes are not encoded with COBS: {error}") from error
-    return decoded
 
 
 def _slip_decode(stuffed: bytes) -> bytes:
@@ -81,7 +68,7 @@ def _hdlc_decode(stuffed: bytes) -> bytes:
 
 
 STUFFINGS: dict[Literal["cobs", "slip", "hdlc"], Stuffing] = {
-    "cobs": Stuffing(b"\x00", cobs_decode),
+    "cobs": Stuffing(b"\x00", cobs.decode),
     "slip": Stuffing(b"\xc0", _slip_decode),
     "hdlc": Stuffing(b"\x7e", _hdlc_decode),
 }

@@ -16,6 +16,7 @@ from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
+from cobs import cobs
 from numpy.typing import NDArray
 
 from isocharge.serve.frames.frame_layout import DATAGRAM, SYNC, ByteOrder, Framing
@@ -151,7 +152,7 @@ def _stuffed_frames(name: Framing, stuffing: Stuffing, data: bytes) -> Iterator[
     encoded_frames = [frame for frame in data.split(stuffing.delimiter)[1:-1] if frame]
     decoded_frames = []
     for encoded_frame in encoded_frames:
-        with suppress(ValueError):  # the frame is damaged, because no encoder produces it
+        with suppress(ValueError, cobs.DecodeError):  # the frame is damaged, because no encoder produces it
             decoded_frames.append(stuffing.decode(encoded_frame))
     length, count = _most_common_length(decoded_frames)
     has_frame_length = MIN_FRAME_BYTES <= length <= MAX_FRAME_BYTES
