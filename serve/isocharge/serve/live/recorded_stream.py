@@ -270,9 +270,9 @@ def replay(
         elif event.use is not None:
             if load is not None:
                 stream.use(load(event.use))
-        elif chunk is None:
+        elif event.tare:
             stream.tare()
-        else:
+        elif chunk is not None:
             due_s = due_s + elapsed_s(previous_chunk, chunk) if previous_chunk else time.monotonic()
             previous_chunk = chunk
             if real_time:

@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self, TypeVar
 
-from msgspec import Meta, Struct, structs
+from msgspec import Meta, Struct
 from msgspec.json import encode
 
 from isocharge.common.errors import RecordingError, cut, is_printable
@@ -141,8 +141,8 @@ class Recorder:
 class Event(Struct):
     """A line of a recording after the first line.
 
-    A record contains `latency_us` and keys that are ignored. A chunk, a request for a new tare, a change of the model
-    and a marker each contain one of the other keys.
+    A record contains `latency_us`. A chunk, a request for a new tare, a change of the model and a marker each contain
+    one of the other keys. All further keys are ignored.
 
     Attributes:
         latency_us: Latency of a record, us.
@@ -157,15 +157,6 @@ class Event(Struct):
     use: ModelLabel | None = None
     marker: Marker | None = None
     chunk: Chunk | None = None
-
-    def __post_init__(self) -> None:
-        """Check that the line contains a record or an event.
-
-        Raises:
-            WrongKey: If the line has no known key.
-        """
-        if all(value is None for value in structs.astuple(self)):
-            raise WrongKey("latency_us")
 
 
 class Recording:
