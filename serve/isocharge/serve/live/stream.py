@@ -10,7 +10,6 @@ import math
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from functools import partial
 
 from isocharge.common.errors import ModelError, NoFramesError, shown
 from isocharge.serve.flags import RECONNECTED, REPEAT
@@ -282,17 +281,16 @@ class TouchStream(ReadingStream):
             TareError: If the film is touched during the whole search for a tare.
             PortError: If the stream has contained no intact frame in many bytes.
         """
-        return map(partial(self._record, chunk), self._received_frames(chunk))
+        for frame in self.frames(chunk):
+            yield self._record(chunk, frame)
 
     def _record(self, chunk: Chunk, frame: Frame) -> PredictionRecord:
-        """Pass a frame through all stages, and return its prediction record.
+        """Return the prediction record of a frame.
 
         Args:
             chunk: The chunk that contains the last byte of the frame.
-            frame: The frame before the stages.
+            frame: The frame after all stages.
         """
-        for stage in self._stages:
-            stage.step(frame)
         if frame.contact is not None:
             contact_fields = frame.contact._asdict()
         else:
