@@ -69,8 +69,8 @@ def stress_sum(forward_map, contact, points_mm):
     rules = [PieceRule(np.zeros_like(index), index, points_mm.reshape(-1, 1), np.ones((n_point, 1)))]
     pieces = SimpleNamespace(electrode=index, kind=np.zeros_like(index), rules=lambda *_: rules)
     x, y, force = np.array(contact)[:, None]
-    pressed = forward_map.pressed(x + 1j * y, force, np.zeros(1), EVEN_FIELD, np.array([[1.0, 1.0, 0.0]]))
-    return pressed.charges(pieces)[0, :, 0].reshape(points_mm.shape)
+    density = forward_map.charge_density(x + 1j * y, force, np.zeros(1), EVEN_FIELD, np.array([[1.0, 1.0, 0.0]]))
+    return density.integrate(pieces)[0, :, 0].reshape(points_mm.shape)
 
 
 def table(values):

@@ -97,15 +97,18 @@ def differences(
         Derivatives with respect to (x, y, ln F), shape (n, k, 3), in the unit of the values per mm, per mm and per 1;
         fewer along the last axis if `variables` selects fewer.
     """
-    # Step each variable up and down, and evaluate the function once.
-    step_matrix = np.diag(steps)[variables, None]  # shape (n_variable, 1, 3)
-    stepped = with_log_force(contact) + np.stack([step_matrix, -step_matrix])  # shape (2, n_variable, n, 3)
-    stepped[..., 2] = np.exp(stepped[..., 2])
+    # Increase and decrease one variable of each contact at a time.
+    centre = with_log_force(contact)
+    offsets = np.diag(steps)[variables, None]  # changes of (x, y, ln F) for each variable, shape (n_variable, 1, 3)
+    stepped = np.stack([centre + offsets, centre - offsets])  # shape (2, n_variable, n, 3)
+    stepped[..., 2] = np.exp(stepped[..., 2])  # from ln F to F
+
     stepped_values = function(stepped.reshape(-1, 3))
-    values_up, values_down = stepped_values.reshape(*stepped.shape[:-1], stepped_values.shape[1])
-    distance = 2.0 * np.asarray(steps)[variables]
-    derivatives = (values_up - values_down) / distance[:, None, None]  # shape (n_variable, n, k)
-    return np.moveaxis(derivatives, 0, 2)
+    n_value = stepped_values.shape[1]
+    increased, decreased = stepped_values.reshape(*stepped.shape[:3], n_value)  # each of shape (n_variable, n, k)
+    distance = 2.0 * np.asarray(steps)[variables, None, None]
+    derivatives = (increased - decreased) / distance
+    return np.moveaxis(derivatives, 0, 2)  # from (n_variable, n, k) to (n, k, n_variable)
 
 
 def check_electrode_count(n_electrode: int) -> None:

@@ -10,7 +10,6 @@ interpolates its stress fields between forces in the same way. The interpolation
 further error.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -203,7 +202,8 @@ def _scaled_charges(forward_map: ForwardMap, force: Array, position: Array) -> A
     """
     sensor = forward_map.sensor
     solved_force = forward_map.family.force
-    solved_charge = forward_map.charges_by_force(position)[..., 0].swapaxes(0, 1)  # shape (n, n_force, n_electrode)
+    stress_charge = forward_map.charges_by_force(position)[..., 0]  # shape (n_solved_force, n, n_electrode)
+    solved_charge = stress_charge.swapaxes(0, 1)  # shape (n, n_solved_force, n_electrode)
     solved_charge /= amplitude_squared(sensor.film, solved_force)[:, None]
 
     # A sensor with d33 has more spline forces than solved forces. Interpolate the charges to the spline forces.
@@ -234,28 +234,40 @@ def _fit_disk(forward_map: ForwardMap, force: Array, spacing: float) -> "scipy.i
     # The ends of the interval occur four times among the knots, so that the spline is defined on the whole interval. A
     # cubic spline has 4 coefficients fewer than knots along each axis.
     radius = forward_map.domain.radius
-    cells = int(np.clip(np.ceil(2.0 * radius / spacing), 8, MAX_CELLS))
+    cells = int(np.clip(np.ceil(2.0 * radius / spacing), 8, MAX_CELLS))  # at least 8 on a small domain
     line_knots = np.concatenate([[-radius] * 3, np.linspace(-radius, radius, cells + 1), [radius] * 3])
     knots = (line_knots, line_knots)
     axis_count = line_knots.size - 4  # number of coefficients along an axis
     position = radius * _fit_positions(cells)
-    values = _scaled_charges(forward_map, force, position)  # shape (n, n_force, n_electrode)
+    scaled_charge = _scaled_charges(forward_map, force, position)  # shape (n, n_force, n_electrode)
 
     # The design matrix converts the coefficients into the values of the spline. The matrix of SciPy has no columns for
     # the last coefficients if they do not affect any position, so it is created again with its full shape.
     cubic_degree = 3
     entries = scipy.interpolate.NdBSpline.design_matrix(position, knots, cubic_degree)
     design = csr_array((entries.data, entries.indices, entries.indptr), shape=(len(position), axis_count**2))
-    differences = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(axis_count - 3, axis_count))
-    identity = eye_array(axis_count)
-    penalty = SMOOTHING * vstack([kron(differences, identity), kron(identity, differences)])
+    penalty = SMOOTHING * _third_differences(axis_count)
 
     # Solve the normal equations. Their matrix is positive definite, so the factorisation needs no pivoting.
     normal_matrix = (design.T @ design + penalty.T @ penalty).tocsc()
-    right_side = np.ascontiguousarray(design.T @ values.reshape(len(position), -1))
-    solution = factorise(normal_matrix, "MMD_AT_PLUS_A").solve(right_side)
-    coefficients = solution.reshape(axis_count, axis_count, *values.shape[1:])
+    right_side = np.ascontiguousarray(design.T @ scaled_charge.reshape(len(position), -1))
+    solution = factorise(normal_matrix, "MMD_AT_PLUS_A").solve(right_side)  # one column for each force and electrode
+    coefficients = solution.reshape(axis_count, axis_count, *scaled_charge.shape[1:])
     return scipy.interpolate.NdBSpline(knots, coefficients, cubic_degree)
+
+
+def _third_differences(count: int) -> "scipy.sparse.sparray":
+    """Return the matrix that computes the third differences of the coefficients of a spline along both axes.
+
+    Args:
+        count: Number of coefficients along each axis.
+
+    Returns:
+        Sparse matrix, shape (2 * (count - 3) * count, count^2). The first half of its rows are the differences along x.
+    """
+    line_differences = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(count - 3, count))
+    identity = eye_array(count)
+    return vstack([kron(line_differences, identity), kron(identity, line_differences)])
 
 
 def _fit_positions(cells: int) -> Array:
@@ -272,7 +284,9 @@ def _fit_positions(cells: int) -> Array:
     """
     # In units of the side of a cell, the diameter of the disk is `cells`. The constants 16 and 8 ensure that there are
     # enough positions if there are only a few cells.
-    inner_count = int(1.6 * np.pi * (0.5 * cells) ** 2) + 16
-    edge_count = int(math.tau * cells) + 8
+    disk_area = np.pi * (0.5 * cells) ** 2
+    circumference = np.pi * cells
+    inner_count = int(1.6 * disk_area) + 16
+    edge_count = int(2.0 * circumference) + 8
     edge_positions = to_corners(np.exp(2j * np.pi * np.arange(edge_count) / edge_count))
     return np.concatenate([sunflower(inner_count), edge_positions])

@@ -97,13 +97,17 @@ class FilmSlopes:
         solved_map = ForwardMap.build_unchecked(
             sensor, probe, domain, count, settings, read=_stress_and_changes, executor=executor
         )
-        # The first field is the stress, and the other fields are its changes. Single precision is enough for
-        # derivatives, and halves the time in which they are interpolated.
+        # At each node, the first field is the stress, and the other fields are its changes. Divide the table into the
+        # tables of two maps.
         n_press = len(solved_map.table)
-        fields = solved_map.table.reshape(n_press, -1, 1 + len(FILM_FIELDS), 3)
+        n_field = 1 + len(FILM_FIELDS)
+        fields = solved_map.table.reshape(n_press, -1, n_field, 3)  # shape (n_press, n_node, n_field, 3)
         stress = fields[:, :, 0].reshape(n_press, -1)
-        changes: np.ndarray = fields[:, :, 1:].reshape(n_press, -1).astype(np.float32)
-        return cls(replace(solved_map, table=stress), replace(solved_map, table=changes))
+        changes = fields[:, :, 1:].reshape(n_press, -1)
+
+        # Single precision is enough for derivatives, and halves the time in which they are interpolated.
+        single_changes: np.ndarray = changes.astype(np.float32)
+        return cls(replace(solved_map, table=stress), replace(solved_map, table=single_changes))
 
     def jacobian(self, contact: Array) -> dict[str, Array]:
         """Compute the derivatives of the charges with respect to the properties of the film.
@@ -124,21 +128,34 @@ class FilmSlopes:
         film = self.film.sensor.film
         charge_without_crosstalk = self.fields.field_charges(contact, FILM_IS_ODD).swapaxes(1, 2)
         field_charge = self.film.sensor.calibration.read(charge_without_crosstalk)  # shape (n, n_field, n_electrode)
+
+        # The fields of a tension are the changes by a tension of this unit (MPa). Convert them into changes per MPa.
         tension_unit = film.young * amplitude_squared(film, contact[:, 2]) + film.pretension
         field_charge[:, TENSION_FIELDS] /= tension_unit[:, None, None]
 
-        # The axes of an even field are along and across the direction of the press, at the angle t from the x axis.
-        # The axes of an odd field are rotated by 45 degrees from them. Rotate both to the axes x and y.
-        directed = field_charge[:, SCALAR_FIELDS:]  # pairs of an even and an odd field
-        even_and_odd = directed[:, ::2] + 1j * directed[:, 1::2]
+        # After the fields without a direction, even and odd fields alternate. The axes of an even field are along and
+        # across the direction of the press, at the angle t from the x axis. The axes of an odd field are rotated by 45
+        # degrees from them. Rotate both to the axes x and y.
+        directed_charge = field_charge[:, SCALAR_FIELDS:]  # a view, through which `field_charge` is changed
+        even = directed_charge[:, ::2]
+        odd = directed_charge[:, 1::2]
         direction = np.arctan2(contact[:, 1], contact[:, 0])[:, None, None]  # t
-        components = even_and_odd * np.exp(2j * direction)
-        directed[:, ::2] = components.real
-        directed[:, 1::2] = components.imag
+        components = (even + 1j * odd) * np.exp(2j * direction)
+        directed_charge[:, ::2] = components.real
+        directed_charge[:, 1::2] = components.imag
         return {field.name: field_charge[:, index] for index, field in enumerate(FILM_FIELDS)}
 
 
 def _stress_and_changes(solved: Equilibrium, surface: Surface) -> Array:
-    """Compute the scaled stress at the nodes and its changes, shape (n_element, n_local, 1 + n_field, 3)."""
+    """Compute the scaled stress under a press and its changes with the properties of the film.
+
+    Args:
+        solved: Equilibrium of the film under the press.
+        surface: Surface at which the stress is read: the middle, the top or the bottom of the film.
+
+    Returns:
+        Values at the nodes of the mesh, shape (n_element, n_local, 1 + n_field, 3): the stress (s11, s22, s12) in the
+        frame of the probe, followed by its change for each of the `FILM_FIELDS`.
+    """
     stress = probe_frame_stress(solved, surface)
     return np.concatenate([stress[:, :, None], stress_changes(solved, surface)], axis=2)

@@ -159,11 +159,11 @@ class Family:
 
         # Choose the directions of the presses and the rotations of the probe. The period is the smallest rotation after
         # which the stress repeats. If the probe keeps its orientation on the film, film and probe rotate together. The
-        # period of the film is half a turn, and the common period is a multiple of both.
+        # film is the same after half a turn, so both are the same after half a turn or only after a full turn.
         period = probe.period
         is_oriented = orientation == "fixed" and not film.is_axisymmetric and not probe.is_axisymmetric
         if is_oriented:
-            symmetry_order = round(math.tau / period)
+            symmetry_order = round(math.tau / period)  # of the probe
             period = math.tau / math.gcd(symmetry_order, 2)
         has_directions = not film.is_axisymmetric and not is_oriented
         turns = Turns.spread(count.largest_harmonics, period, has_directions=has_directions)
@@ -183,10 +183,10 @@ class Family:
                 is axisymmetric.
 
         Returns:
-            Weights, shape (n, n_distance * n_force * n_turn), dimensionless. An interpolated value is
-            the sum over the nodes of the weight of a node times the value at this node.
+            Weights, shape (n, n_distance * n_force * n_turn), dimensionless. An interpolated value is the sum over the
+            nodes of the weight of a node times the value at this node.
         """
-        # Interpolation weights along each axis
+        # Compute the interpolation weights along each axis. The direction of a turn includes the rotation of the probe.
         node_coordinates = distance_coordinate(self.distance / self.film_radius)
         press_coordinates = distance_coordinate(np.abs(position) / self.film_radius)
         distance_weights = lagrange_values(node_coordinates, press_coordinates)
@@ -222,14 +222,17 @@ class Family:
             Values that `read` computes, shape (n_distance, n_force, n_solved_turn, n_value), dimensionless. The method
             `unfold` extends stresses to all rotations.
         """
+        # A place is a distance and a turn. The presses at one place are solved in one job.
         turns = self.turns.solved
         places = [(distance, turn) for distance in self.distance.tolist() for turn in turns]
-        solve_place = partial(self._solve_chain, sensor, probe, settings, read)
+        solve_place = partial(self._solve_forces, sensor, probe, settings, read)
         values_of_places = track(in_order(executor, solve_place, places), "solving the film", len(places))
-        values = np.stack(list(values_of_places)).reshape(self.distance.size, len(turns), self.force.size, -1)
-        return values.swapaxes(1, 2)
 
-    def _solve_chain(
+        # Split the axis of the places into the axes of the distances and of the turns.
+        values = np.stack(list(values_of_places)).reshape(self.distance.size, len(turns), self.force.size, -1)
+        return values.swapaxes(1, 2)  # from (distance, turn, force, value) to (distance, force, turn, value)
+
+    def _solve_forces(
         self,
         sensor: Sensor,
         probe: Probe,
@@ -237,22 +240,23 @@ class Family:
         read: Reading,
         place: tuple[float, tuple[float, float]],
     ) -> Array:
-        """Solve one press for each force, all at one position and rotation, one after the other.
+        """Solve the presses with all forces of the family at one position and rotation, one after the other.
 
         Args:
             sensor: Sensor with the film, and with the surface at which the stress is read.
             probe: Probe that presses the film.
             settings: Theory, mesh and width of the thin rings at the rim.
             read: Function that computes the returned values from each solved press.
-            place: Distance from the centre of the film, mm, and the angles of a turn, rad: the direction of the press,
-                and the rotation of the probe. The direction contains the rotation.
+            place: Distance from the centre of the film, mm, and the two angles of a turn, rad. The second angle is the
+                rotation of the probe. The first angle is the direction of the press plus this rotation.
 
         Returns:
             Values that `read` computes, shape (n_force, n_value).
         """
-        # The film is rotated by the opposite of the angle of the press, so that the press lies on the positive x axis.
-        distance, (direction, rotation) = place
-        film = sensor.film.rotated(rotation - direction)
+        # Rotate the film by the opposite of the direction of the press, so that the press lies on the positive x axis.
+        distance, (direction_plus_rotation, rotation) = place
+        direction = direction_plus_rotation - rotation
+        film = sensor.film.rotated(-direction)
         rotated_probe = probe.rotated(rotation)
         values_of_forces = []
         equilibrium = None
@@ -279,18 +283,23 @@ class Family:
             the order of the columns of `weights`.
         """
         symmetry_order = self.turns.symmetry_order
+        n_value = solved.shape[-1]
         if symmetry_order == 1:  # the copies below would need four times the memory of a large table
-            return solved.reshape(-1, solved.shape[-1])
-        solved_period = solved.reshape(*solved.shape[:-1], mesh.n_element, -1, 3)
+            return solved.reshape(-1, n_value)
+
+        # Shape (n_distance, n_force, n_solved_turn, n_element, n_local, 3)
+        solved_stress = solved.reshape(*solved.shape[:-1], mesh.n_element, -1, 3)
         stress_of_periods = []
         for period_index in range(symmetry_order):
             angle = math.tau * period_index / symmetry_order
             rotated_elements = mesh.rotated_elements(period_index, symmetry_order)
-            reordered_stress = solved_period[..., rotated_elements, :, :]
+            renumbered_stress = solved_stress[..., rotated_elements, :, :]
             # The stress itself does not change, but its components refer to a frame that was rotated by `angle`.
-            stress_of_periods.append(rotate_stress(reordered_stress, -angle))
-        all_turns = np.concatenate(stress_of_periods, axis=2)
-        return all_turns.reshape(-1, solved.shape[-1])
+            stress_of_periods.append(rotate_stress(renumbered_stress, -angle))
+
+        turn_axis = 2
+        stress_of_all_turns = np.concatenate(stress_of_periods, axis=turn_axis)
+        return stress_of_all_turns.reshape(-1, n_value)
 
 
 def node_counts(film: Film) -> tuple[NodeCount, ...]:
@@ -397,12 +406,14 @@ def family_mesh(film: Film, probe: Probe, domain: Domain, settings: SolveSetting
     """
     min_force, max_force = domain.force_range
     middle_force = math.sqrt(min_force * max_force)
-    layer = layer_for(film, middle_force) if settings.layer == "auto" else settings.layer
-    # The smallest force needs the finest mesh if the pretension is uneven, or if the footprint is smallest then.
+    ring_width = layer_for(film, middle_force) if settings.layer == "auto" else settings.layer
+
+    # The press that is nearest to the clamp needs the finest mesh. If the pretension is uneven, or if the footprint
+    # grows with the force, the smallest force needs the finest mesh.
     force = middle_force if film.is_axisymmetric and not probe.grows else min_force
     outermost = nearest_to_clamp(film, domain.radius)
-    resolution = needed_resolution(film, probe, outermost, force, replace(settings, layer=layer))
-    return resolution, layer
+    resolution = needed_resolution(film, probe, outermost, force, replace(settings, layer=ring_width))
+    return resolution, ring_width
 
 
 def direct_charges(

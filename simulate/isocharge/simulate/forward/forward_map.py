@@ -37,8 +37,8 @@ from isocharge.simulate.forward.family import (
 )
 from isocharge.simulate.forward.readout import (
     STRESS_WEIGHTS,
+    ChargeDensity,
     ElectrodePieces,
-    PressedFilm,
     contact_charges,
 )
 from isocharge.simulate.mechanics.theory import Theory, amplitude_squared, rotate_stress
@@ -137,34 +137,35 @@ class ForwardMap:
             SolveError: If a press has no equilibrium, or the interpolation error exceeds `INTERPOLATION_ERROR`.
         """
         domain = Domain(radius, force_range)
-        # Increase the number of nodes until the interpolated charges are sufficiently accurate. They are compared with
-        # the charges of the check presses, which are solved directly. If the error is very large, the next number of
-        # nodes would not suffice either and is skipped.
-        check_charges: list[Array] = []  # solved in the first pass of the loop
-        remaining_counts = list(node_counts(sensor.film))
-        while remaining_counts:
-            count = remaining_counts.pop(0)
-            forward_map = cls.build_unchecked(
-                sensor, probe, domain, count, settings, orientation=orientation, executor=executor
-            )
-            # With the mesh of this map, the charges of the next map can be compared with the same check presses.
-            settings = replace(forward_map.settings, layer=forward_map.layer)
-            if not check_charges:
-                contact, rotation = spread_check_presses(domain, CHECK_COUNT)
-                if forward_map.family.is_oriented:
-                    rotation = np.zeros(CHECK_COUNT)
-                checks = np.column_stack([contact, rotation]).tolist()
-                solve_directly = partial(direct_charges, sensor, probe, forward_map.settings)
-                check_charges = list(in_order(executor, solve_directly, checks))
-            error = relative_error(forward_map.charges(contact, rotation), np.array(check_charges))
-            if error <= INTERPOLATION_ERROR:
-                return replace(forward_map, error=error)
-            if error > SKIP_RATIO * INTERPOLATION_ERROR and len(remaining_counts) > 1:
-                remaining_counts.pop(0)
-        raise SolveError(
-            f"the forward map of {sensor.name} up to {radius:g} mm and {force_range[1]:g} N interpolates to "
-            f"{error:.2g} only, expected {INTERPOLATION_ERROR:g}; ask for a smaller radius or range of forces"
-        )
+        counts = node_counts(sensor.film)
+        build_map = partial(cls.build_unchecked, sensor, probe, domain, orientation=orientation, executor=executor)
+        forward_map = build_map(counts[0], settings)
+
+        # Solve a few check presses directly. The interpolated charges of all maps are compared with their charges, so
+        # all maps have the mesh of the first map.
+        contact, rotation = spread_check_presses(domain, CHECK_COUNT)
+        if forward_map.family.is_oriented:
+            rotation = np.zeros(CHECK_COUNT)
+        checks = np.column_stack([contact, rotation]).tolist()
+        solve_directly = partial(direct_charges, sensor, probe, forward_map.settings)
+        check_charges = np.array(list(in_order(executor, solve_directly, checks)))
+        same_mesh = replace(forward_map.settings, layer=forward_map.layer)
+
+        # Increase the number of nodes until the interpolated charges are sufficiently accurate. If the error is very
+        # large, the next number of nodes would not suffice either and is skipped, unless it is the last.
+        error = relative_error(forward_map.charges(contact, rotation), check_charges)
+        index = 0  # of the number of nodes
+        while not error <= INTERPOLATION_ERROR:
+            may_next_suffice = error <= SKIP_RATIO * INTERPOLATION_ERROR
+            index += 1 if may_next_suffice or index + 2 == len(counts) else 2
+            if index >= len(counts):
+                raise SolveError(
+                    f"the forward map of {sensor.name} up to {radius:g} mm and {force_range[1]:g} N interpolates to "
+                    f"{error:.2g} only, expected {INTERPOLATION_ERROR:g}; ask for a smaller radius or range of forces"
+                )
+            forward_map = build_map(counts[index], same_mesh)
+            error = relative_error(forward_map.charges(contact, rotation), check_charges)
+        return replace(forward_map, error=error)
 
     @classmethod
     def build_unchecked(
@@ -200,8 +201,9 @@ class ForwardMap:
         resolution, layer = family_mesh(sensor.film, probe, domain, settings)
         same_mesh = SolveSettings(theory=settings.theory, resolution=resolution, layer=layer)
         family = Family.spread(domain, sensor.film, probe, count, orientation)
+        solved_values = family.solve(sensor, probe, same_mesh, executor, read)
         template = template_for(resolution, probe.topology, not sensor.film.is_axisymmetric)
-        table = family.unfold(family.solve(sensor, probe, same_mesh, executor, read), template)
+        table = family.unfold(solved_values, template)
         return cls(sensor, probe, family, settings.theory, resolution, layer, table, error=np.inf)
 
     @property
@@ -301,10 +303,10 @@ class ForwardMap:
     def charges_by_force(self, position: Array, is_odd: Booleans = EVEN_FIELD) -> Array:
         """Compute the charges of each stress field at given positions, for all forces at which presses were solved.
 
-        If the footprint of the probe grows with the force, each force has a map of its own with its own mesh.
-        Otherwise, one map contains the fields of all forces, so that the integration points are located only once. Its
-        table has single precision. The result includes neither the crosstalk nor the charges that the contact pressure
-        causes. The probe keeps its own orientation.
+        If the footprint of the probe grows with the force, each force has its own mesh. Otherwise, all forces have the
+        same mesh, and the integration points are located only once. The stress fields then have single precision. The
+        result includes neither the crosstalk nor the charges that the contact pressure causes. The probe keeps its own
+        orientation.
 
         Args:
             position: Positions (x, y) in the domain, shape (n, 2), mm.
@@ -314,33 +316,46 @@ class ForwardMap:
         Returns:
             Charges, shape (n_force, n, n_electrode, n_field), pC.
         """
-        # Divide the forces of the family into groups, of which each has one map.
+        n_force = self.family.force.size
+        if not self.probe.grows:
+            return self._same_mesh_charges(position, is_odd, slice(n_force), np.float32)
+        single_forces = [slice(index, index + 1) for index in range(n_force)]
+        return np.concatenate([self._same_mesh_charges(position, is_odd, one, np.float64) for one in single_forces])
+
+    def _same_mesh_charges(self, position: Array, is_odd: Booleans, forces: slice, precision: type) -> Array:
+        """Compute the charges of each stress field for some forces of the family, whose presses have the same mesh.
+
+        Args:
+            position: Positions (x, y) in the domain, shape (n, 2), mm.
+            is_odd: Whether each field is odd with respect to a reflection in the direction of the press, shape
+                (n_field,).
+            forces: Which forces of the family are used.
+            precision: Number type to which the stress fields are converted.
+
+        Returns:
+            Charges, shape (n_selected_force, n, n_electrode, n_field), pC.
+        """
+        # Create a map with a single force. At each node, its fields are those of the first force, followed by those of
+        # the other forces.
         family = self.family
-        n_map = family.force.size if self.probe.grows else 1
-        precision = np.float64 if self.probe.grows else np.float32
-        shape = (family.distance.size, family.force.size, family.turns.rotation.size, -1, is_odd.size * 3)
-        map_tables = np.split(self.table.reshape(shape), n_map, axis=1)
-        map_forces = np.split(family.force, n_map)
+        force = family.force[forces]
+        n_field = is_odd.size
+        press_shape = (family.distance.size, family.force.size, family.turns.rotation.size)
+        table = self.table.reshape(*press_shape, -1, n_field * 3)[:, forces]
+        fields = np.moveaxis(table, 1, 3)  # shape (n_distance, n_turn, n_node, n_selected_force, n_field * 3)
+        single_force_map = replace(
+            self,
+            probe=self.probe.under(force[0]),
+            family=replace(family, force=force[:1]),
+            table=fields.reshape(-1, fields[0, 0].size).astype(precision),
+        )
+        charge = single_force_map.field_charges(contacts_at(position, force[0]), np.tile(is_odd, force.size))
+        charge_by_force = charge.reshape(*charge.shape[:2], force.size, n_field)
 
-        charges = []
-        for table, force in zip(map_tables, map_forces, strict=True):
-            # Create a map with a single force, in which the fields of all forces are further fields at each node.
-            fields = np.moveaxis(table, 1, 3)
-            first_force = force[0]
-            one_map = replace(
-                self,
-                probe=self.probe.under(first_force),
-                family=replace(family, force=force[:1]),
-                table=fields.reshape(-1, fields[0, 0].size).astype(precision),
-            )
-            charge = one_map.field_charges(contacts_at(position, first_force), np.tile(is_odd, force.size))
-            charge_by_force = charge.reshape(*charge.shape[:2], force.size, is_odd.size)
-
-            # The map multiplies all fields by the squared amplitude of its single force. Correct the other fields.
-            squared_amplitude = amplitude_squared(self.sensor.film, force)
-            charge_by_force *= (squared_amplitude / squared_amplitude[0])[:, None]
-            charges.append(np.moveaxis(charge_by_force, 2, 0))
-        return np.concatenate(charges)
+        # The map multiplies all fields by the squared amplitude of its single force. Correct the other fields.
+        squared_amplitude = amplitude_squared(self.sensor.film, force)
+        charge_by_force *= (squared_amplitude / squared_amplitude[0])[:, None]
+        return np.moveaxis(charge_by_force, 2, 0)  # from (n, n_electrode, n_force, n_field)
 
     def _unchecked_charges(self, contact: Array, orientation: Array | float = 0.0) -> Array:
         """Compute the charges of presses that lie in the domain or slightly outside the domain.
@@ -377,15 +392,7 @@ class ForwardMap:
             Charges, shape (n, n_electrode, n_field), pC.
         """
         if self.probe.grows:
-            # The mesh depends on the footprint. Therefore, the charges are computed at each force of the family,
-            # divided by the squared amplitude, and interpolated between the forces.
-            film = self.sensor.film
-            force = self.family.force
-            weights = lagrange_values(np.log(force), np.log(contact[:, 2]))
-            weights *= amplitude_squared(film, contact[:, 2])[:, None] / amplitude_squared(film, force)
-            family_charges = self.charges_by_force(contact[:, :2], is_odd)
-            # Sum over the forces of the family (index k), for each press (n), electrode (e) and field (f).
-            return np.asarray(np.einsum("nk,knef->nef", weights, family_charges))
+            return self._growing_probe_charges(contact, is_odd)
 
         position = to_complex(contact[:, :2])
         orientation = np.broadcast_to(orientation, len(contact))
@@ -396,15 +403,38 @@ class ForwardMap:
             chunk_size = max(1, CHUNK_SIZE // is_odd.size)
             for start in range(0, len(contact), chunk_size):
                 chunk = slice(start, start + chunk_size)
-                pressed = self.pressed(
+                density = self.charge_density(
                     position[chunk], contact[chunk, 2], orientation[chunk], is_odd, charge_per_stress
                 )
-                charges[chunk] = pressed.charges(pieces)
+                charges[chunk] = density.integrate(pieces)
         return self.sensor.gains[:, None] * charges
 
-    def pressed(
+    def _growing_probe_charges(self, contact: Array, is_odd: Booleans) -> Array:
+        """Compute the charges of each stress field for a probe whose footprint grows with the force.
+
+        The mesh depends on the footprint, so the stress fields cannot be interpolated between forces. Instead, the
+        charges at the forces of the family are divided by the squared amplitude, and interpolated.
+
+        Args:
+            contact: Presses (x, y, F), shape (n, 3), mm and N.
+            is_odd: Whether each field is odd with respect to a reflection in the direction of the press, shape
+                (n_field,).
+
+        Returns:
+            Charges without crosstalk, shape (n, n_electrode, n_field), pC.
+        """
+        film = self.sensor.film
+        family_force = self.family.force
+        force = contact[:, 2]
+        weights = lagrange_values(np.log(family_force), np.log(force))
+        weights *= amplitude_squared(film, force)[:, None] / amplitude_squared(film, family_force)
+        family_charges = self.charges_by_force(contact[:, :2], is_odd)
+        # Sum over the forces of the family (index k), for each press (n), electrode (e) and field (f).
+        return np.asarray(np.einsum("nk,knef->nef", weights, family_charges))
+
+    def charge_density(
         self, position: Complexes, force: Array, orientation: Array, is_odd: Booleans, charge_per_stress: Array
-    ) -> PressedFilm:
+    ) -> ChargeDensity:
         """Interpolate the stress fields under several presses, and convert them into charge per area.
 
         If only half of the film is meshed, the charge per area is also computed for the reflection of the mesh. The
@@ -418,8 +448,12 @@ class ForwardMap:
                 shape (n_field,).
             charge_per_stress: Charge per area and stress (s11, s22, s12) of each kind of piece, shape (n_kind, 3),
                 pC/N.
+
+        Returns:
+            Charge per area at the nodes of the mesh under each press.
         """
         film = self.sensor.film
+        n_field = is_odd.size
         direction = np.angle(position)  # from the centre of the film to the press, rad
         # The stress refers to the probe or, if the probe is axisymmetric, to the direction of the press.
         rotation = np.zeros_like(direction) if self.probe.is_axisymmetric else orientation - direction
@@ -430,25 +464,27 @@ class ForwardMap:
         # Interpolate the stress in the precision of the table, and multiply by the unit of the scaled stress.
         stress_unit = film.young * amplitude_squared(film, force)
         weights = self.family.weights(position, force, rotation) * stress_unit[:, None]
-        fields = weights.astype(self.table.dtype) @ self.table
-        stress = fields.reshape(position.size, -1, is_odd.size, 3).swapaxes(1, 2)  # shape (n, n_field, n_node, 3)
+        interpolated = weights.astype(self.table.dtype) @ self.table  # one row for each press
+        stress = interpolated.reshape(position.size, -1, n_field, 3).swapaxes(1, 2)  # shape (n, n_field, n_node, 3)
 
-        # Compute the charge per area and stress in the frame of the stress, for each press (index n), field (f), stress
-        # component (c), reflection of the mesh (m) and kind of piece (k).
-        signs = _reflection_signs(is_odd) if template.half else np.ones((1, is_odd.size, 3))
+        # Convert the components of the stress, which refer to the frame of the mesh, into charge per area. A reflection
+        # changes the signs of some components.
         frame_angle = direction + rotation + self.probe.angle
         charge_per_frame_stress = rotate_stress(np.eye(3), frame_angle[:, None]) @ charge_per_stress.T
-        coefficients = np.einsum("mfc,nck->nfcmk", signs, charge_per_frame_stress).astype(fields.dtype)
+        signs = _reflection_signs(is_odd) if template.half else np.ones((n_field, 3, 1))
+        # Axes: press, field, stress component, sign (of the mesh or of its reflection), kind of piece
+        coefficients = signs[..., None] * charge_per_frame_stress[:, None, :, None]
+        density = stress @ coefficients.reshape(*stress.shape[:2], 3, -1).astype(stress.dtype)
 
-        # Convert the stress into charge per area, and order the axes as in `PressedFilm.density`.
-        density = stress @ coefficients.reshape(*stress.shape[:2], 3, -1)  # shape (n, n_field, n_node, n_sign * n_kind)
-        shape = (len(signs), len(charge_per_stress), position.size, template.n_element, -1, is_odd.size)
+        # Order the axes as in `ChargeDensity.values`: from (press, field, node, sign and kind) to (sign, kind, press,
+        # element, node of the element, field).
+        shape = (*coefficients.shape[3:], position.size, template.n_element, -1, n_field)
         ordered_density = density.transpose(3, 0, 2, 1).reshape(shape)
-        return PressedFilm(position, self.probe, film.radius, template, placement, ordered_density)
+        return ChargeDensity(position, self.probe, film.radius, template, placement, ordered_density)
 
 
 def _reflection_signs(is_odd: Booleans) -> Array:
-    """Return the signs of the stress at a point of the half mesh and at its reflection.
+    """Return the signs of the stress components at a point of the half mesh and at its reflection.
 
     At the reflection, s12 of an even field changes its sign, and s11 and s22 of an odd field change theirs.
 
@@ -456,7 +492,8 @@ def _reflection_signs(is_odd: Booleans) -> Array:
         is_odd: Whether each field is odd with respect to the reflection, shape (n_field,).
 
     Returns:
-        Signs 1 and -1, shape (2, n_field, 3). The first index is 0 for the point and 1 for its reflection.
+        Signs 1 and -1 of (s11, s22, s12), shape (n_field, 3, 2). The last index is 0 for the point and 1 for its
+        reflection.
     """
     reflected_signs = np.where(is_odd[:, None], [-1.0, -1.0, 1.0], [1.0, 1.0, -1.0])
-    return np.stack([np.ones_like(reflected_signs), reflected_signs])
+    return np.stack([np.ones_like(reflected_signs), reflected_signs], axis=2)

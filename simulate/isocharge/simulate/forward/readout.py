@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Complexes, Integers
+from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.common.errors import SensorError
 from isocharge.simulate.mechanics.warming import tension_change
 from isocharge.simulate.mesh.placement import Placement
@@ -79,6 +79,61 @@ class PieceRule(NamedTuple):
     area: Array
 
 
+class Piece(NamedTuple):
+    """Quadrilateral that is a part of an electrode, or line of the edge readout.
+
+    Attributes:
+        corners: Nominal corners (x, y), anticlockwise, shape (4, 2), mm; see `ElectrodePieces.corners`.
+        line_area: Area that a line represents, mm^2. Zero for a quadrilateral.
+        kind: Index of the weights of the piece in the rows of `STRESS_WEIGHTS`.
+    """
+
+    corners: Array
+    line_area: float
+    kind: int
+
+
+class _Pairs(NamedTuple):
+    """Pairs of a press and a piece of an electrode.
+
+    Attributes:
+        press: Index of the press of each pair, shape (n_pair,).
+        piece: Index of the piece of each pair, shape (n_pair,).
+        corners: Corners x + iy of the piece, or of a part of it, shape (n_pair, 4), mm.
+        line_area: Area that a line represents, shape (n_pair,), mm^2. Zero for a quadrilateral.
+    """
+
+    press: Integers
+    piece: Integers
+    corners: Complexes
+    line_area: Array
+
+    def select(self, selected: Booleans | slice) -> "_Pairs":
+        """Return the pairs that a mask or a slice selects."""
+        return _Pairs(self.press[selected], self.piece[selected], self.corners[selected], self.line_area[selected])
+
+    def halved(self) -> "_Pairs":
+        """Replace each pair by two pairs with the halves of its piece, which is divided along its longest side."""
+        return _Pairs(
+            press=np.tile(self.press, 2),
+            piece=np.tile(self.piece, 2),
+            corners=halve_quadrilaterals(self.corners),
+            line_area=np.tile(0.5 * self.line_area, 2),
+        )
+
+    def rules(self, count: int) -> Iterator[PieceRule]:
+        """Yield the integration points of all pairs, chunk by chunk.
+
+        Args:
+            count: Number of Gauss points along a side of a piece.
+        """
+        chunk_size = 50_000 // count**2  # with more points, the working arrays would exceed 100 MB
+        for start in range(0, self.press.size, chunk_size):
+            chunk = self.select(slice(start, start + chunk_size))
+            points, area = gauss_quadrilaterals(chunk.corners, chunk.line_area, count)
+            yield PieceRule(chunk.press, chunk.piece, points, area)
+
+
 @dataclass(frozen=True)
 class ElectrodePieces:
     """Quadrilaterals that together cover the electrodes of a sensor, or the lines of the edge readout.
@@ -108,9 +163,13 @@ class ElectrodePieces:
             rotation: Angle by which the electrodes are turned later, rad. It decides which edges are the left ones.
         """
         pieces_of = partial(_edge_lines, rotation=rotation) if readout == "edge" else _area_pieces
-        pieces = [(index, *piece) for index, electrode in enumerate(electrodes) for piece in pieces_of(electrode)]
-        electrode_of_piece, corners, line_area, kind = (np.array(column) for column in zip(*pieces, strict=True))
-        return cls(to_complex(corners), line_area, electrode_of_piece, kind)
+        pieces = [(index, piece) for index, electrode in enumerate(electrodes) for piece in pieces_of(electrode)]
+        return cls(
+            corners=to_complex(np.array([piece.corners for _, piece in pieces])),
+            line_area=np.array([piece.line_area for _, piece in pieces]),
+            electrode=np.array([index for index, _ in pieces]),
+            kind=np.array([piece.kind for _, piece in pieces]),
+        )
 
     @classmethod
     def of(cls, sensor: Sensor) -> "ElectrodePieces":
@@ -141,27 +200,17 @@ class ElectrodePieces:
         """
         near_count, distant_count = counts
         press, piece = np.indices((position.size, len(self.corners))).reshape(2, -1)  # all pairs
-        corners = self.corners[piece]
-        line_area = self.line_area[piece]
-        while press.size:
+        pairs = _Pairs(press, piece, self.corners[piece], self.line_area[piece])
+        while pairs.press.size:
+            corners = pairs.corners
             centre = corners.mean(axis=1)
             radius = np.abs(corners - centre[:, None]).max(axis=1)
-            is_near = np.abs(position[press] - centre) < NEAR_DISTANCE * (radius + probe.reach)
+            is_near = np.abs(position[pairs.press] - centre) < NEAR_DISTANCE * (radius + probe.reach)
             sides = np.abs(np.roll(corners, -1, axis=1) - corners)
-            is_halved = is_near & (sides.max(axis=1) > NEAR_SIDE * probe.half_width)
-            for count, selected in ((near_count, is_near & ~is_halved), (distant_count, ~is_near)):
-                pairs = np.flatnonzero(selected)
-                chunk_size = 50_000 // count**2  # with more points, the working arrays would exceed 100 MB
-                for start in range(0, pairs.size, chunk_size):
-                    chunk = pairs[start : start + chunk_size]
-                    points, area = gauss_quadrilaterals(corners[chunk], line_area[chunk], count)
-                    yield PieceRule(press[chunk], piece[chunk], points, area)
-
-            # Continue with both halves of each halved piece.
-            press = np.tile(press[is_halved], 2)
-            piece = np.tile(piece[is_halved], 2)
-            line_area = np.tile(0.5 * line_area[is_halved], 2)
-            corners = halve_quadrilaterals(corners[is_halved])
+            is_large = sides.max(axis=1) > NEAR_SIDE * probe.half_width
+            yield from pairs.select(is_near & ~is_large).rules(near_count)
+            yield from pairs.select(~is_near).rules(distant_count)
+            pairs = pairs.select(is_near & is_large).halved()
 
 
 def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
@@ -209,9 +258,10 @@ def stress_charge(sensor: Sensor, equilibrium: Equilibrium, counts: tuple[int, i
     for rule in pieces.rules(equilibrium.probe, np.array([complex(*equilibrium.at)]), counts):
         # `touch_stress` expects one list of points.
         stress_of_points = touch_stress(equilibrium, to_corners(rule.points.ravel()), sensor.surface)
-        stress = stress_of_points.reshape(*rule.points.shape, 3)
+        stress = stress_of_points.reshape(*rule.points.shape, 3)  # shape (n_pair, n_point, 3)
+        pair_charge_per_stress = charge_per_stress[pieces.kind[rule.piece]]  # shape (n_pair, 3)
         # Sum over the points (index p) and the stress components (c) of each pair of press and piece (k).
-        pair_charge = np.einsum("kpc,kp,kc->k", stress, rule.area, charge_per_stress[pieces.kind[rule.piece]])
+        pair_charge = np.einsum("kpc,kp,kc->k", stress, rule.area, pair_charge_per_stress)
         np.add.at(charge, pieces.electrode[rule.piece], pair_charge)
     return sensor.gains * charge
 
@@ -272,25 +322,23 @@ def thermal_charge(sensor: Sensor, step: float) -> Array:
     return sensor.calibration.read(sensor.gains * areas * (sensor.piezo.pyro * step + tension_charge))
 
 
-def _area_pieces(electrode: Electrode) -> Iterator[tuple[Array, float, int]]:
-    """Divide the area of an electrode into quadrilaterals.
+def _area_pieces(electrode: Electrode) -> Iterator[Piece]:
+    """Divide the area of an electrode into quadrilaterals, and yield them one after the other.
 
     Args:
         electrode: Electrode over whose area the stress is averaged.
-
-    Yields:
-        Nominal corners (x, y) of a quadrilateral, shape (4, 2), mm. The area that a line represents, which is zero for
-        a quadrilateral. The kind of the piece, which is the row of its weights in `STRESS_WEIGHTS`.
     """
     for polygon in electrode.collecting_polygons:
-        # The quadrilaterals share the first corner. If a corner is missing, the last one is repeated.
+        # Divide the convex polygon into quadrilaterals that share its first corner. If the number of its corners is
+        # odd, the last quadrilateral is a triangle, whose last corner is repeated.
         last = len(polygon) - 1
         for second in range(1, last, 2):
+            third = second + 1
             fourth = min(second + 2, last)
-            yield polygon[[0, second, second + 1, fourth]], 0.0, 0
+            yield Piece(polygon[[0, second, third, fourth]], line_area=0.0, kind=0)
 
 
-def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[tuple[Array, float, int]]:
+def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[Piece]:
     """Yield the lines of the edge readout (Mirbagheri et al., 2007, equation 3).
 
     The stress s11 is averaged over the left and right edges of the rotated electrode, and the stress s22 over its lower
@@ -302,22 +350,22 @@ def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[tuple[Array, 
         rotation: Angle by which the electrode is rotated, rad.
 
     Yields:
-        Ends of a line as the corners of a quadrilateral without width: the first end, twice the last end, and the first
-        end again, shape (4, 2), mm. The area that the line represents, mm^2. The kind of the piece, which is the row of
-        its weights in `STRESS_WEIGHTS`.
+        A line as a quadrilateral without width. Its corners are the first end, twice the last end, and the first end
+        again.
     """
-    line_area = 0.25 * electrode.area  # each mean is over the halves of two edges
+    line_area = 0.25 * electrode.area  # each mean is over two edges, which are four lines
     corners = np.array(electrode.corners)
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         middle = 0.5 * (start + end)
         rotated_edge = complex(*(end - start)) * cmath.rect(1.0, rotation)
-        kind = int(abs(rotated_edge.real) > abs(rotated_edge.imag))  # 1 for the lower and upper edges
+        is_horizontal = abs(rotated_edge.real) > abs(rotated_edge.imag)
+        kind = 1 if is_horizontal else 0  # row of `STRESS_WEIGHTS`: s22 for the lower and upper edges, otherwise s11
         for first, last in ((start, middle), (middle, end)):
-            yield np.array([first, last, last, first]), line_area, kind
+            yield Piece(np.array([first, last, last, first]), line_area, kind)
 
 
 @dataclass(frozen=True)
-class PressedFilm:
+class ChargeDensity:
     """Charge per area that several presses cause, at the nodes of the mesh under each press.
 
     Attributes:
@@ -326,7 +374,7 @@ class PressedFilm:
         film_radius: Radius of the film, mm.
         template: Template of the meshes.
         placement: Position of the template under each press, after the press has been rotated onto the x axis.
-        density: Charge per area that each stress field causes, shape (n_sign, n_kind, n, n_element, n_local, n_field),
+        values: Charge per area that each stress field causes, shape (n_sign, n_kind, n, n_element, n_local, n_field),
             pC/mm^2. The first axis has one entry for points of the meshed part of the film and, if only half of the
             film is meshed, a second entry for points that are reflected into it. The second axis is the kind of a
             piece; see `STRESS_WEIGHTS`.
@@ -337,9 +385,9 @@ class PressedFilm:
     film_radius: float
     template: Template
     placement: Placement
-    density: np.ndarray
+    values: np.ndarray
 
-    def charges(self, pieces: ElectrodePieces) -> Array:
+    def integrate(self, pieces: ElectrodePieces) -> Array:
         """Integrate the charge per area, which is known at the nodes of the mesh, over electrodes.
 
         If only half of the film is meshed, points in the other half are reflected into the meshed half.
@@ -350,21 +398,27 @@ class PressedFilm:
         Returns:
             Charges without gains and crosstalk, shape (n, n_electrode, n_field), pC.
         """
-        n_field = self.density.shape[-1]
+        n_field = self.values.shape[-1]
         charge = np.zeros((self.position.size, pieces.electrode.max() + 1, n_field))
         # After the rotation, the press is on the x axis. The unit is the radius of the film.
         rotation_and_scale = np.exp(-1j * np.angle(self.position)) / self.film_radius
         for rule in pieces.rules(self.probe, self.position):
-            # For each point, select the charge per area at the nodes of its element.
+            # For each point, find its element, and select the charge per area at the nodes of the element, shape
+            # (n_pair, n_point, n_local, n_field).
             points = rule.points * rotation_and_scale[rule.press, None]
             element, xi, eta, is_reflected = locate_points(self.placement[rule.press], self.template, points)
+            sign = is_reflected.astype(np.intp)  # index of the sign: 0 or 1
             kind = pieces.kind[rule.piece, None]
-            density = self.density[is_reflected.astype(np.intp), kind, rule.press[:, None], element]
+            nodal_density = self.values[sign, kind, rule.press[:, None], element]
 
-            # For each pair of press and piece, sum over its points and over the nodes of their elements.
-            n_pair = len(rule.press)
+            # The weight of a node in the integral is the area of the point times the basis function of the node.
             basis_values = tensor_values(self.template.resolution.order, xi.ravel(), eta.ravel())
-            node_weights = (rule.area.reshape(-1, 1) * basis_values).reshape(n_pair, 1, -1)
-            pair_charge = node_weights.astype(density.dtype) @ density.reshape(n_pair, -1, n_field)
+            node_weights = rule.area.reshape(-1, 1) * basis_values  # shape (n_pair * n_point, n_local)
+
+            # For each pair of press and piece, sum over its points and over the nodes of their elements. Then add the
+            # charges of all pieces of an electrode.
+            n_pair = len(rule.press)
+            pair_weights = node_weights.reshape(n_pair, 1, -1).astype(nodal_density.dtype)
+            pair_charge = pair_weights @ nodal_density.reshape(n_pair, -1, n_field)  # shape (n_pair, 1, n_field)
             np.add.at(charge, (rule.press, pieces.electrode[rule.piece]), pair_charge[:, 0])
         return charge

@@ -28,7 +28,7 @@ from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.working_area import working_area
 from isocharge.simulate.layout.case import GAP, NO_NUISANCES, RIM_DISTANCE, DesignCase
-from isocharge.simulate.layout.stress_fields import electrode_rows, pressed_film, rows_of, solve_fields
+from isocharge.simulate.layout.stress_fields import charge_density, electrode_rows, rows_of, solve_fields
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.sensor.sensor import Electrode, Sensor
 
@@ -197,7 +197,7 @@ class Search:
         Returns:
             Layout with its power mean.
         """
-        pressed = pressed_film(self.fields, presses)
+        pressed = charge_density(self.fields, presses)
         kept_rows = electrode_rows(pressed, self.case.kept_electrodes)
         side = self.case.square_side
 

@@ -16,7 +16,7 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.common.contact_domain import Domain
 from isocharge.simulate.forward.family import NodeCount
 from isocharge.simulate.forward.forward_map import ForwardMap
-from isocharge.simulate.forward.readout import ElectrodePieces, PressedFilm
+from isocharge.simulate.forward.readout import ChargeDensity, ElectrodePieces
 from isocharge.simulate.mechanics.theory import rotate_stress
 from isocharge.simulate.numerics.polygon import to_complex, to_corners
 from isocharge.simulate.sensor.film import Surface
@@ -92,39 +92,43 @@ def rows_of(fields: ForwardMap, presses: Array, electrodes: Sequence[Electrode])
         One row with the columns `COLUMNS` for each press and electrode, shape (n, n_electrode, 6).
     """
     chunks = np.array_split(presses, math.ceil(len(presses) / PRESS_CHUNK))
-    return np.concatenate([electrode_rows(pressed_film(fields, chunk), electrodes) for chunk in chunks])
+    return np.concatenate([electrode_rows(charge_density(fields, chunk), electrodes) for chunk in chunks])
 
 
-def pressed_film(fields: ForwardMap, presses: Array) -> PressedFilm:
+def charge_density(fields: ForwardMap, presses: Array) -> ChargeDensity:
     """Interpolate the stress fields at the positions of presses, and convert the stress to charge per area.
 
     Args:
         fields: Stress fields that `solve_fields` returns, in a domain that contains the presses.
         presses: Positions (x, y) of the presses, shape (n, 2), mm.
+
+    Returns:
+        Charge per area and its derivatives, with one field for each of the `COLUMNS`.
     """
     position = to_complex(presses)
-    force = np.full(len(presses), fields.family.force[0])
-    charge_per_stress = fields.sensor.piezo.charge_per_stress[None]
-    return fields.pressed(position, force, np.zeros(len(presses)), COLUMN_IS_ODD, charge_per_stress)
+    force = np.full(len(presses), fields.family.force[0])  # all presses have the same force
+    orientation = np.zeros(len(presses))
+    charge_per_stress = fields.sensor.piezo.charge_per_stress[None]  # one kind of piece, shape (1, 3)
+    return fields.charge_density(position, force, orientation, COLUMN_IS_ODD, charge_per_stress)
 
 
-def electrode_rows(pressed: PressedFilm, electrodes: Sequence[Electrode]) -> Array:
+def electrode_rows(density: ChargeDensity, electrodes: Sequence[Electrode]) -> Array:
     """Compute the charges of electrodes, and their derivatives with respect to the parameters of the presses.
 
     Args:
-        pressed: Charge per area under the presses, with one field for each of the `COLUMNS`.
+        density: Charge per area under the presses, with one field for each of the `COLUMNS`.
         electrodes: Electrodes of any shape at their nominal positions.
 
     Returns:
         One row with the columns `COLUMNS` for each press and electrode, shape (n_press, n_electrode, 6).
     """
     if not electrodes:
-        return np.empty((pressed.position.size, 0, len(COLUMNS)))
-    rows = pressed.charges(ElectrodePieces.covering(electrodes))  # shape (n_press, n_electrode, 6)
+        return np.empty((density.position.size, 0, len(COLUMNS)))
+    rows = density.integrate(ElectrodePieces.covering(electrodes))  # shape (n_press, n_electrode, 6)
     # Rotate the derivatives along and across the direction of each press into derivatives with respect to x and y.
     x_column = COLUMNS.index("x")
     y_column = COLUMNS.index("y")
-    rotation = np.exp(1j * np.angle(pressed.position))[:, None]
+    rotation = np.exp(1j * np.angle(density.position))[:, None]
     derivative = (rows[..., x_column] + 1j * rows[..., y_column]) * rotation
     rows[..., x_column] = derivative.real
     rows[..., y_column] = derivative.imag
