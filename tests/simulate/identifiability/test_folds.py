@@ -138,8 +138,8 @@ def test_ambiguous_pairs_are_mirror_images_in_the_fold_line(forces):
     pairs = find_ambiguous_pairs(folded_map(forces=forces), REFERENCE, [0.5], places=400)
     assert pairs.first[:, 0] + pairs.second[:, 0] == pytest.approx(2.0 * FOLD_X, abs=0.5)
     assert pairs.first[:, 1] == pytest.approx(pairs.second[:, 1], abs=0.5)
-    assert (pairs.distance < 3.0).all()
-    assert np.median(pairs.distance) < 0.01
+    assert (pairs.charge_difference < 3.0).all()
+    assert np.median(pairs.charge_difference) < 0.01
     assert len(set(pairs.first[:, 0])) == len(pairs) > 20  # several searches find the same mirror image
     assert (np.diff(pairs.outer_radius) >= 0.0).all()
 

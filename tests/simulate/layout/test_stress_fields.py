@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from isocharge.simulate import Circle, SolveSettings, load_sensor, press
-from isocharge.simulate.layout.stress_fields import COLUMNS, _stress_and_derivatives, rows_of
+from isocharge.simulate.layout.stress_fields import COLUMNS, _stress_and_derivatives, charges_and_derivatives
 from isocharge.simulate.mesh.blocks import Resolution
 from solved_charges import relative_error
 
@@ -15,7 +15,7 @@ def test_charges_and_derivatives_of_a_uniaxial_film_are_those_of_the_forward_map
     uniaxial = load_sensor("four-25um-uniaxial")
     forward_map = replace(three_map, sensor=uniaxial)
     contact = np.array([[3.0, 1.0, 1.0], [-1.0, 2.5, 1.0], [0.3, -0.4, 1.0], [-2.0, -3.0, 1.0]])
-    rows = rows_of(fields[uniaxial.name], contact[:, :2], uniaxial.electrodes)
+    rows = charges_and_derivatives(fields[uniaxial.name], contact[:, :2], uniaxial.electrodes)
     charge = forward_map.charges(contact)
     np.testing.assert_allclose(rows[..., 0], charge, rtol=1e-3)
     assert relative_error(rows[..., 1:4], forward_map.derivatives(contact)) <= 4e-4

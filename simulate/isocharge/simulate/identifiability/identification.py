@@ -1,6 +1,7 @@
 """Analysis of how well the charges of a sensor determine contacts: error limits, folds and working area."""
 
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Any
@@ -83,10 +84,10 @@ class LimitMap:
         """
         # The area that a position represents is proportional to its distance from the centre, and therefore to the
         # number of its ring. The outermost ring represents half as much, because it is the edge of the disk. In the
-        # median, an error is repeated according to its area.
+        # median, an error is repeated according to its area, so the areas are integers in an arbitrary unit.
         n_ring, n_angle = self.position.shape
         ring_area = np.append(2 * np.arange(1, n_ring), n_ring)
-        area = np.repeat(ring_area, n_angle)
+        area = np.repeat(ring_area, n_angle)  # of each position, shape (n_ring * n_angle,)
         statistics = {"force_N": self.force}
         for key, errors in (
             ("position_{}_mm", self.position.ravel()),
@@ -189,14 +190,14 @@ class Identification:
     def _listed_pairs(self) -> list[dict[str, Any]]:
         """Return the first `MAX_LISTED_PAIRS` ambiguous pairs as dictionaries for JSON."""
         pairs = self.area.pairs
-        contacts_and_distances = zip(pairs.first, pairs.second, pairs.distance, strict=True)
+        pair_values = zip(pairs.first, pairs.second, pairs.charge_difference, strict=True)
         return [
             {
                 "first": dict(zip(CONTACT_KEYS, first, strict=True)),
                 "second": dict(zip(CONTACT_KEYS, second, strict=True)),
-                "sigmas_apart": distance,
+                "sigmas_apart": charge_difference,
             }
-            for first, second, distance in islice(contacts_and_distances, MAX_LISTED_PAIRS)
+            for first, second, charge_difference in islice(pair_values, MAX_LISTED_PAIRS)
         ]
 
 
@@ -297,11 +298,11 @@ def map_to_search(
         SceneError: If a press in the domain cannot exist.
         SolveError: If the map with the smallest of these radii cannot be built.
     """
-    largest_probe = probe.under(force_range[1])
-    radii = search_radius(sensor, largest_probe) * RADIUS_REDUCTION ** np.arange(MAX_REDUCTIONS + 1.0)
-    for radius in radii.tolist():
-        try:
+    _, max_force = force_range
+    first_radius = search_radius(sensor, probe.under(max_force))
+    radii = first_radius * RADIUS_REDUCTION ** np.arange(MAX_REDUCTIONS + 1.0)
+    *larger_radii, smallest_radius = radii.tolist()
+    for radius in larger_radii:
+        with suppress(SolveError):
             return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
-        except SolveError as error:
-            last_error = error
-    raise last_error
+    return ForwardMap.build(sensor, probe, smallest_radius, force_range, executor=executor)

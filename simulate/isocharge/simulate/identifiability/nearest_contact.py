@@ -64,7 +64,8 @@ def minimise(
     residual, slopes = evaluate(active, point)  # r and dr/du
     squared_norm = (residual**2).sum(axis=1)  # |r|^2, shape (n,)
     damping = np.full(len(point), 1e-4)  # relative to the mean of the diagonal of J'J
-    for _ in range(60):
+    max_steps = 60  # twice as many as problems with large residuals usually need
+    for _ in range(max_steps):
         if not active.size:
             break
         trial_point = bounded_step(point[active], residual[active], slopes[active], damping[active])
@@ -100,8 +101,10 @@ def bounded_step(point: Array, residual: Array, slopes: Array, damping: Array) -
     trace = np.trace(matrix, axis1=1, axis2=2)[:, None, None] + 1e-12
     matrix = matrix + damping[:, None, None] * trace * np.eye(3) / 3.0
 
-    # The equations change only for points on the circle or at an end of the interval, which are the edges of D.
-    edge_coordinates = np.column_stack([np.hypot(point[:, 0], point[:, 1]), np.abs(point[:, 2])])  # 1 on an edge
+    # The equations change only for points on an edge of D: on the circle that bounds x and y, or at an end of the
+    # interval that bounds z.
+    x, y, z = point.T
+    edge_coordinates = np.column_stack([np.hypot(x, y), np.abs(z)])  # 1 on the edge, shape (n, 2)
     is_on_edge = edge_coordinates > 1.0 - ROUNDING
     rows = np.flatnonzero(is_on_edge.any(axis=1))
     if rows.size:
@@ -135,13 +138,17 @@ def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -
 
     # A step along the tangent (-y, x, 0) of the circle must also turn with the circle. The turn adds the outward
     # component to the second derivative along the tangent.
-    tangent = active_normals[:, 0, [1, 0, 2]] * np.array([-1.0, 1.0, 0.0])
-    matrix = matrix + outward[:, :1] * tangent[:, :, None] * tangent[:, None, :]
+    x, y, _ = active_normals[:, 0].T  # zeros if the circle is not active
+    tangent = np.column_stack([-y, x, np.zeros_like(x)])
+    circle_outward = outward[:, :1]  # shape (n, 1, 1)
+    matrix = matrix + circle_outward * tangent[:, :, None] * tangent[:, None, :]
 
     # Remove the components across the active edges. The trace makes the matrix regular in these directions.
     across = active_normals.swapaxes(1, 2) @ active_normals  # projection onto the active normals, shape (n, 3, 3)
     along = np.eye(3) - across
-    return along @ matrix @ along + trace * across, (along @ gradient[..., None])[..., 0]
+    matrix_along = along @ matrix @ along
+    gradient_along = along @ gradient[..., None]
+    return matrix_along + trace * across, gradient_along[..., 0]
 
 
 CANDIDATES = 4096
@@ -181,8 +188,10 @@ def explain(
     """
     domain = charge_map.domain.within(INNER_RADIUS * charge_map.domain.radius)
     min_force, max_force = domain.force_range
-    # With a single force, the charges do not depend on the third unit coordinate.
-    half_width = domain.scale * [1.0, 1.0, max_force > min_force]
+    x_scale, y_scale, log_force_scale = domain.scale
+    if min_force == max_force:  # the charges do not depend on the third unit coordinate
+        log_force_scale = 0.0
+    scale = np.array([x_scale, y_scale, log_force_scale])  # derivative of (x, y, ln F) by the unit coordinates
 
     def residuals(rows: Integers, unit_coordinates: Array) -> tuple[Array, Array]:
         """Compute the residuals (Q - Q(c)) / sigma for selected rows of charges, and the derivatives of the residuals.
@@ -196,7 +205,7 @@ def explain(
             n_electrode).
         """
         predicted, slopes = charge_map.linearised(_to_contact(domain, unit_coordinates))
-        derivatives = -slopes * half_width / sigma[rows][..., None]
+        derivatives = -slopes * scale / sigma[rows][..., None]  # shape (k, n_electrode, 3)
         return (charge[rows] - predicted) / sigma[rows], derivatives.swapaxes(1, 2)
 
     unit_solution, residual = minimise(residuals, domain.to_unit(start), min_change=min_change)
@@ -332,8 +341,9 @@ def _unit_candidates(count: int) -> tuple[Array, Booleans]:
     radius[: count // 4] = 1.0  # on the edge
     angle = math.tau * angle_sample
     position = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+    log_force = 2.0 * force_sample - 1.0  # from the interval [0, 1] to [-1, 1]
     distance = scipy.spatial.distance.cdist(position, position)
-    return np.column_stack([position, 2.0 * force_sample - 1.0]), distance < START_SEPARATION
+    return np.column_stack([position, log_force]), distance < START_SEPARATION
 
 
 def _nearest_rows(

@@ -98,16 +98,16 @@ class Triangulation:
         # For each press, search from several starting points that do not lie close together.
         largest_charge = np.abs(charge).max(axis=1, keepdims=True, initial=1.0)  # at least 1 pC
         equal_sigma = np.broadcast_to(largest_charge, charge.shape)  # all charges of a press have the same weight
-        starts = starting_contacts(self.charge_map, charge, equal_sigma, starts=STARTS)
-        contacts, spreads = self._descend(np.repeat(charge, STARTS, axis=0), starts.reshape(-1, 3))
-        contacts = contacts.reshape(starts.shape)
-        spreads = spreads.reshape(starts.shape[:2])
+        starts = starting_contacts(self.charge_map, charge, equal_sigma, starts=STARTS)  # shape (n, STARTS, 3)
+        contact_list, spread_list = self._descend(np.repeat(charge, STARTS, axis=0), starts.reshape(-1, 3))
+        contacts = contact_list.reshape(starts.shape)
+        spreads = spread_list.reshape(starts.shape[:2])  # shape (n, STARTS)
 
         # Choose the best contact of each press, unless another contact is as good and lies elsewhere.
-        row = np.arange(len(charge))
-        best = spreads.argmin(axis=1)
-        best_contact = contacts[row, best]
-        best_spread = spreads[row, best]
+        press = np.arange(len(charge))
+        best_search = spreads.argmin(axis=1)
+        best_contact = contacts[press, best_search]
+        best_spread = spreads[press, best_search]
         distance = np.linalg.norm((contacts - best_contact[:, None])[..., :2], axis=2)
         other_spread = spreads.min(axis=1, where=distance > TOLERANCE, initial=np.inf)
         is_ambiguous = other_spread <= np.maximum(AMBIGUOUS_RATIO * best_spread, AMBIGUOUS_SPREAD)

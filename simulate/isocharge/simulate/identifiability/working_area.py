@@ -22,6 +22,7 @@ the map.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -34,6 +35,7 @@ from isocharge.simulate.identifiability.nearest_contact import local_minima
 from isocharge.simulate.noise import NoiseModel
 from isocharge.simulate.numerics.disk import INNER_RADIUS, Rings, contacts_at, onto_disk, sunflower
 from isocharge.simulate.numerics.polygon import to_corners
+from isocharge.simulate.sensor.film import tidy
 
 FOLD_WIDTH = 0.02
 """Distance between two contacts on both sides of a fold, mm.
@@ -71,7 +73,8 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
     # points: itself and the 24 points that are up to two steps away along x and y.
     error_on_rings = position_error(onto_disk(rings.position, radius))
     position, step = _starting_points(rings, 1.0 / error_on_rings)
-    neighbours = np.stack(np.meshgrid(range(-2, 3), range(-2, 3)), axis=-1).reshape(-1, 2)
+    grid_y, grid_x = np.indices((5, 5)) - 2  # from -2 to 2
+    neighbours = np.column_stack([grid_x.ravel(), grid_y.ravel()])  # in steps, shape (25, 2)
     while step.max() > 0.05 * FOLD_WIDTH:
         step *= 0.5
         trial = onto_disk(position[:, None] + step[:, None, None] * neighbours, radius)  # shape (n, 25, 2)
@@ -79,12 +82,12 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
         position = trial[np.arange(len(trial)), best_trial]
 
     # A position is on a fold if the charge map reverses its orientation between two opposite points of a small circle
-    # around the position. Four pairs of points are tried.
+    # around the position. Four pairs of opposite points are tried.
     angle = np.pi * np.arange(4) / 4.0
-    half_width = 0.5 * FOLD_WIDTH * to_corners(np.exp(1j * angle))  # shape (4, 2)
-    pairs = np.stack([position[:, None] + half_width, position[:, None] - half_width])  # shape (2, n, 4, 2)
-    is_fold = _reverses_orientation(charge_map, onto_disk(pairs, radius), force, noise).any(axis=1)
-    folds = position[is_fold]
+    offset = 0.5 * FOLD_WIDTH * to_corners(np.exp(1j * angle))  # from the position to a point, shape (4, 2)
+    opposite_points = np.stack([position[:, None] + offset, position[:, None] - offset])  # shape (2, n, 4, 2)
+    is_reversed = _reverses_orientation(charge_map, onto_disk(opposite_points, radius), force, noise)  # shape (n, 4)
+    folds = position[is_reversed.any(axis=1)]
     distance = np.hypot(*folds.T)
     return folds[np.argsort(distance, kind="stable")], error_on_rings
 
@@ -117,7 +120,7 @@ def _starting_points(rings: Rings, precision: Array) -> tuple[Array, Array]:
     At a fold, contacts on both sides have the same charges, and the position error is infinite.
 
     Args:
-        rings: Positions on concentric rings. Each ring is closed.
+        rings: Positions on concentric rings, whose distances are equal. Each ring is closed.
         precision: Inverse of the position error at each position, shape (n_ring, n_angle). It is zero at a fold.
 
     Returns:
@@ -126,17 +129,19 @@ def _starting_points(rings: Rings, precision: Array) -> tuple[Array, Array]:
     # A position is chosen if none of its eight neighbours has a smaller precision.
     is_chosen = precision == scipy.ndimage.minimum_filter(precision, 3, mode=("nearest", "wrap"))
 
-    # A position is also chosen if the precision has a kink, as at a fold line: along the ring or from ring to ring, the
-    # precision decreases to zero and increases again.
+    # Along a fold line, the precision has a kink: it decreases to zero and increases again. A position is therefore
+    # also chosen if its precision is at most a third of the sum of both neighbours along the ring, or of both
+    # neighbours on the adjacent rings. Where the precision is smooth, it is about half of these sums.
     sum_along_ring = np.roll(precision, 1, axis=1) + np.roll(precision, -1, axis=1)
     is_chosen |= 3.0 * precision <= sum_along_ring
     sum_across_rings = precision[:-2] + precision[2:]
     is_chosen[1:-1] |= 3.0 * precision[1:-1] <= sum_across_rings
-    ring, _ = np.nonzero(is_chosen)
+
+    ring_of_chosen, _ = np.nonzero(is_chosen)
     spacing_between_rings = rings.distance[0]
     spacing_on_ring = rings.distance * math.tau / precision.shape[1]
     neighbour_distance = np.maximum(spacing_between_rings, spacing_on_ring)  # shape (n_ring,)
-    return rings.position[is_chosen], neighbour_distance[ring]
+    return rings.position[is_chosen], neighbour_distance[ring_of_chosen]
 
 
 INDISTINGUISHABLE_SIGMAS = 3.0
@@ -168,13 +173,13 @@ class AmbiguousPairs:
     Attributes:
         first: First contact (x, y, F) of each pair, shape (n, 3), mm and N.
         second: Second contact (x, y, F) of each pair, shape (n, 3), mm and N.
-        distance: Distance between the charges of the two contacts of each pair, shape (n,), in standard deviations of
-            the noise.
+        charge_difference: Norm of the difference between the charges of the two contacts of each pair, shape (n,), in
+            standard deviations of the noise.
     """
 
     first: Array
     second: Array
-    distance: Array
+    charge_difference: Array
 
     def __len__(self) -> int:
         return len(self.first)
@@ -205,8 +210,8 @@ class AmbiguousPairs:
         other_x, other_y, other_force = self.second[0]
         return (
             f"Contacts far apart can have the same charges: the charges of {force:.3g} N at ({x:.1f}, {y:.1f}) mm and "
-            f"of {other_force:.3g} N at ({other_x:.1f}, {other_y:.1f}) mm differ by {self.distance[0]:.1f} standard "
-            "deviations."
+            f"of {other_force:.3g} N at ({other_x:.1f}, {other_y:.1f}) mm differ by {self.charge_difference[0]:.1f} "
+            "standard deviations."
         )
 
 
@@ -231,31 +236,47 @@ def find_ambiguous_pairs(
     Returns:
         The pairs, ordered by the distance of the outer contact from the centre.
     """
-    # Choose the first contacts, and compute the distance above which a second contact counts as distant.
-    position = INNER_RADIUS * charge_map.domain.radius * sunflower(places)
-    contact = np.concatenate([contacts_at(position, force) for force in forces])
+    # Choose the first contacts. For each of them, several searches find a second contact with similar charges. Their
+    # tolerance is coarse, because one digit of the difference of the charges is sufficient.
+    domain_radius = charge_map.domain.radius
+    first_position = INNER_RADIUS * domain_radius * sunflower(places)
+    contact = np.concatenate([contacts_at(first_position, force) for force in forces])
     charge = charge_map.charges(contact)
-    position_std = limits_at(charge_map, contact, noise).position
-    smallest_distance = min(MIN_DISTANCE, MIN_RELATIVE_DISTANCE * charge_map.domain.radius)
-    min_distance = np.maximum(smallest_distance, MIN_DISTANCE_SIGMAS * position_std)
-    sigma = noise.sigma(charge)
-
-    # Search for the second contacts. Then select the pairs whose contacts are distant, and whose charges agree within
-    # the noise. A search that has found the first contact again is thus discarded. The tolerance is coarse, because one
-    # digit of the difference of the charges is sufficient.
-    second, residual = local_minima(charge_map, charge, sigma, starts=STARTS, min_change=1e-4)
+    second, residual = local_minima(charge_map, charge, noise.sigma(charge), starts=STARTS, min_change=1e-4)
     first = np.broadcast_to(contact[:, None], second.shape)  # shape (n, STARTS, 3)
+
+    # Select the pairs whose positions are distant, and whose charges agree within the noise. A search that has found
+    # the first contact again is thus discarded.
+    position_std = limits_at(charge_map, contact, noise).position  # shape (n,)
+    min_distance = min(MIN_DISTANCE, MIN_RELATIVE_DISTANCE * domain_radius)
+    min_distances = np.maximum(min_distance, MIN_DISTANCE_SIGMAS * position_std)
+    distance = np.linalg.norm((second - first)[..., :2], axis=2)  # shape (n, STARTS), mm
     charge_difference = np.linalg.norm(residual, axis=2)
-    is_distant = np.linalg.norm((second - first)[..., :2], axis=2) > min_distance[:, None]
-    is_ambiguous = is_distant & (charge_difference < INDISTINGUISHABLE_SIGMAS)
+    is_ambiguous = (distance > min_distances[:, None]) & (charge_difference < INDISTINGUISHABLE_SIGMAS)
 
     # Several searches of a first contact often find the same second contact, which counts once.
-    separation = np.linalg.norm((second[:, :, None] - second[:, None])[..., :2], axis=3)  # shape (n, STARTS, STARTS)
-    is_same = (separation < position_std[:, None, None]) & is_ambiguous[:, None]
-    is_ambiguous &= ~np.tril(is_same, -1).any(axis=2)
+    is_ambiguous &= ~_is_repeated(second[..., :2], is_ambiguous, position_std)
     pairs = AmbiguousPairs(first[is_ambiguous], second[is_ambiguous], charge_difference[is_ambiguous])
     order = np.argsort(pairs.outer_radius, kind="stable")
-    return AmbiguousPairs(pairs.first[order], pairs.second[order], pairs.distance[order])
+    return AmbiguousPairs(pairs.first[order], pairs.second[order], pairs.charge_difference[order])
+
+
+def _is_repeated(position: Array, is_selected: Booleans, tolerance: Array) -> Booleans:
+    """Return whether each of several positions in a row is the same as an earlier selected position of the row.
+
+    Args:
+        position: Positions (x, y), shape (n_row, n, 2), mm.
+        is_selected: Whether each position is selected, shape (n_row, n).
+        tolerance: Distance below which two positions of a row are the same, shape (n_row,), mm.
+
+    Returns:
+        Whether each position is repeated, shape (n_row, n).
+    """
+    is_repeated = np.zeros_like(is_selected)
+    for earlier, later in combinations(range(position.shape[1]), 2):
+        distance = np.linalg.norm(position[:, later] - position[:, earlier], axis=1)
+        is_repeated[:, later] |= (distance < tolerance) & is_selected[:, earlier]
+    return is_repeated
 
 
 DEFAULT_ERROR = 1.0
@@ -369,31 +390,28 @@ def working_area(
     noise.check_white()
     search_radius = charge_map.domain.radius
     min_force, max_force = charge_map.domain.force_range
-    n_force = 1 + math.ceil(2.0 * math.log(max_force / min_force))
+    n_force = 1 + math.ceil(2.0 * math.log(max_force / min_force))  # two for each factor of e
     forces = np.geomspace(min_force, max_force, n_force).tolist()
 
     # The distances of the rings are multiples of the step to which the radius of the working area is rounded.
     step = RADIUS_STEP * np.ceil(search_radius / (MAX_RINGS * RADIUS_STEP))
-    n_rings = max(1, int(_round_down(search_radius, step) / step + 0.5))
+    n_rings = max(1, round(_round_down(search_radius, step) / step))
     rings = Rings.spread(min(n_rings * step, search_radius), n_rings)
 
     # Find the folds, the largest error on each ring for each force, and the ambiguous pairs.
-    folds_of_forces = []
-    ring_errors = np.empty((n_force, n_rings))
-    for index, force in enumerate(forces):
-        folds_of_force, error_on_rings = find_folds(charge_map, rings, force, noise)
-        folds_of_forces.append(folds_of_force)
-        ring_errors[index] = error_on_rings.max(axis=1)
-    folds = np.concatenate(folds_of_forces)
+    results = [find_folds(charge_map, rings, force, noise) for force in forces]
+    folds = np.concatenate([folds_of_force for folds_of_force, _ in results])
+    ring_errors = np.array([error_on_rings.max(axis=1) for _, error_on_rings in results])  # shape (n_force, n_rings)
     fold_radius = float(np.hypot(*folds.T).min(initial=np.inf))
     pairs = find_ambiguous_pairs(charge_map, noise, forces) if search_pairs else NO_PAIRS
 
     # Find the last ring before the error first exceeds its limit. An error that is NaN exceeds it.
     is_within_limit = (ring_errors <= error).all(axis=0)
-    first_exceeding = is_within_limit.argmin()
+    first_exceeding = is_within_limit.argmin()  # index of the ring; 0 if there is none
     error_radius = search_radius
     if not is_within_limit.all():
-        error_radius = float(np.append(0.0, rings.distance)[first_exceeding])
+        radius_before_ring = np.append(0.0, rings.distance)
+        error_radius = float(radius_before_ring[first_exceeding])
 
     # The smallest of the following radii bounds the working area. The first of several equal radii is the bound: if the
     # error never exceeds its limit, `error_radius` is the radius of the search.
@@ -421,7 +439,6 @@ def working_area(
 
 def _round_down(radius: float, step: float = RADIUS_STEP) -> float:
     """Round a radius down to a multiple of a step, mm."""
-    # The factor compensates the rounding error of the quotient. The conversion into decimal digits removes the rounding
-    # error of the product.
-    steps = np.floor(radius / step * (1.0 + 1e-9))
-    return float(f"{steps * step:.12g}")
+    # The factor compensates the rounding error of the quotient. The function `tidy` removes that of the product.
+    n_step = np.floor(radius / step * (1.0 + 1e-9))
+    return tidy(n_step * step)

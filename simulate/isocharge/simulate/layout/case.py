@@ -212,10 +212,10 @@ class DesignCase:
             Smallest margin of each square, which is an actual distance minus a required distance, shape (n,), mm. It is
             negative if the square violates a rule.
         """
-        # The corner that is farthest from the centre of the film determines the distance from the rim.
+        # The outermost corner of a square determines its distance from the rim of the film.
         half_side = 0.5 * self.square_side
-        corner_x, corner_y = (np.abs(positions) + half_side).T
-        corner_distance = np.hypot(corner_x, corner_y)
+        corner_x, corner_y = (np.abs(positions) + half_side).T  # mirrored into the first quadrant
+        corner_distance = np.hypot(corner_x, corner_y)  # from the centre of the film
         clearances = [self.sensor.film.inner_radius - RIM_DISTANCE - corner_distance]
 
         for electrode in self.kept_electrodes:
@@ -251,26 +251,30 @@ class DesignCase:
             The margin of each square, followed by the margin of each pair of squares, shape (n + n (n - 1) / 2,), mm.
             A margin is negative if a rule is violated.
         """
-        pairs = np.triu_indices(len(positions), 1)
-        return np.concatenate([self.clearance(positions), self.pair_clearance(positions, positions)[pairs]])
+        each_pair_once = np.triu_indices(len(positions), 1)
+        pair_clearances = self.pair_clearance(positions, positions)[each_pair_once]
+        return np.concatenate([self.clearance(positions), pair_clearances])
 
-    def position_errors(self, rows: Array, nuisances: Nuisances) -> Array:
+    def position_errors(self, charges: Array, nuisances: Nuisances) -> Array:
         """Compute the Cramer-Rao limit of the position of each press with uncertain nuisance parameters.
 
         The parameters of a press are x, y, ln F, the probe radius and the pretension. The uncertainty of the gains is
         added to the noise.
 
         Args:
-            rows: Charges and their derivatives, with the columns `stress_fields.COLUMNS`, shape (n_press, n_electrode,
-                6).
+            charges: Charges and their derivatives, with the columns `stress_fields.COLUMNS`, shape (n_press,
+                n_electrode, 6).
             nuisances: Standard deviations of the parameters that are not known exactly.
 
         Returns:
             Root mean square errors, shape (n_press,), mm.
         """
+        charge = charges[..., 0]
+        contact_derivatives = charges[..., 1:4]  # with respect to x, y and ln F
+        nuisance_derivatives = charges[..., 4:]  # with respect to the probe radius and the pretension
+        nuisance_changes = nuisance_derivatives * [nuisances.probe_radius, nuisances.pretension]  # by one deviation
         noise = replace(self.noise, gain=float(np.hypot(self.noise.gain, nuisances.gain)))
-        nuisance_changes = rows[..., 4:] * [nuisances.probe_radius, nuisances.pretension]
-        return cramer_rao(rows[..., 0], rows[..., 1:4], noise, nuisance_changes).position
+        return cramer_rao(charge, contact_derivatives, noise, nuisance_changes).position
 
     def layout(self, positions: Array) -> Sensor:
         """Create the sensor that has the kept electrodes and new squares at given positions.

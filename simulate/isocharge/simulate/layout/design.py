@@ -28,7 +28,12 @@ from isocharge.simulate.forward.charge_spline import ChargeSpline
 from isocharge.simulate.forward.forward_map import ForwardMap
 from isocharge.simulate.identifiability.working_area import working_area
 from isocharge.simulate.layout.case import GAP, NO_NUISANCES, RIM_DISTANCE, DesignCase
-from isocharge.simulate.layout.stress_fields import charge_density, electrode_rows, rows_of, solve_fields
+from isocharge.simulate.layout.stress_fields import (
+    charge_density,
+    charges_and_derivatives,
+    electrode_charges,
+    solve_fields,
+)
 from isocharge.simulate.numerics.disk import sunflower
 from isocharge.simulate.sensor.sensor import Electrode, Sensor
 
@@ -97,10 +102,18 @@ def random_layouts(case: DesignCase) -> list[Array]:
 
 
 def _layouts_within(radius: float, case: DesignCase) -> list[Array]:
-    """Choose random layouts of new squares, whose centres all lie within a radius, mm.
+    """Choose random layouts of new squares, whose centres all lie within a radius.
 
     Candidates are points that are distributed evenly over the disk. For each layout, they are tried in random order,
-    and added if the squares keep the smallest allowed distances. The result is empty if a layout remains incomplete.
+    and added if the squares keep the smallest allowed distances.
+
+    Args:
+        radius: Largest distance of a centre from the centre of the film, mm.
+        case: Design case with the number of new squares and the distance rules.
+
+    Returns:
+        Centres (x, y) of the squares of each layout, shape (n_new, 2), mm. The list is empty if a layout remains
+        incomplete.
     """
     points = radius * sunflower(1000)
     allowed_points = points[case.clearance(points) >= 0.0]
@@ -130,25 +143,31 @@ class Search:
     fields: ForwardMap
 
     def error_map(self, sensor: Sensor) -> "ErrorMap":
-        """Compute the position errors of a sensor for the many presses, with its electrodes at their nominal positions.
+        """Compute the position errors of a sensor for the presses `DesignCase.fine_presses`.
+
+        The errors are lower limits (Cramer-Rao). The electrodes are at their nominal positions.
 
         Args:
             sensor: Sensor whose layout is evaluated.
 
         Returns:
-            Position errors for the noise alone, and for the noise together with the nuisances.
+            Position errors that the noise causes alone, and those that the noise and the uncertain nuisance parameters
+            of the design case cause together.
         """
-        case = self.case
-        charge_rows = rows_of(self.fields, case.fine_presses, sensor.electrodes)
-        error_by_noise = case.position_errors(charge_rows, NO_NUISANCES)
-        error_with_nuisances = case.position_errors(charge_rows, case.nuisances)
-        return ErrorMap(case.fine_presses, error_by_noise, error_with_nuisances)
+        presses = self.case.fine_presses
+        charges = charges_and_derivatives(self.fields, presses, sensor.electrodes)
+        error_by_noise = self.case.position_errors(charges, NO_NUISANCES)
+        error_with_nuisances = self.case.position_errors(charges, self.case.nuisances)
+        return ErrorMap(presses, error_by_noise, error_with_nuisances)
 
     def errors(self, positions: Array) -> Array:
-        """Compute the position error of each of the many presses with uncertain nuisances, shape (n_press,), mm.
+        """Compute the position errors of a layout for the presses `DesignCase.fine_presses`.
 
         Args:
             positions: Centres (x, y) of the new squares, shape (n_new, 2), mm.
+
+        Returns:
+            Position errors with uncertain nuisance parameters, shape (n_press,), mm.
         """
         return self.error_map(self.case.layout(positions)).with_nuisances
 
@@ -177,8 +196,9 @@ class Search:
         if self.case.goal != "worst":
             return Layout(best_positions, math.sqrt(np.mean(best_errors**2)))
         for round_number in range(1, ROUNDS + 1):
-            largest = np.argsort(-best_errors)[: len(self.case.search_presses)]
-            presses = np.concatenate([self.case.search_presses, self.case.fine_presses[largest]])
+            # Minimise the errors of the search presses, and of as many presses with the largest errors.
+            worst = np.argsort(-best_errors)[: len(self.case.search_presses)]
+            presses = np.concatenate([self.case.search_presses, self.case.fine_presses[worst]])
             positions = self.minimise(presses, best_positions, POWER * 2.0**round_number).positions
             errors = self.errors(positions)
             if errors.max() < best_errors.max():
@@ -195,39 +215,57 @@ class Search:
             power: Exponent of the power mean.
 
         Returns:
-            Layout with its power mean.
+            Layout with its power mean. If the new positions violate a distance rule, it is the layout of the start.
         """
-        pressed = charge_density(self.fields, presses)
-        kept_rows = electrode_rows(pressed, self.case.kept_electrodes)
+        density = charge_density(self.fields, presses)
+        kept_charges = electrode_charges(density, self.case.kept_electrodes)
         side = self.case.square_side
 
-        def square_rows(positions: Array) -> Array:
-            """Return the rows of squares at positions of shape (n, 2), shape (n_press, n, 6)."""
-            squares = [Electrode.of_square("A", (x, y), side) for x, y in positions.tolist()]
-            return electrode_rows(pressed, squares)
+        def square_charges(positions: Array) -> Array:
+            """Compute the charges of squares and their derivatives, with the columns `stress_fields.COLUMNS`.
 
-        def log_mean(new_rows: Array) -> float:
-            """Return the logarithm of the power mean for rows of the new squares, shape (n_press, n_new, 6)."""
-            rows = np.concatenate([new_rows, kept_rows], axis=1)
-            error = self.case.position_errors(rows, self.case.nuisances)
+            Args:
+                positions: Centres (x, y) of the squares, shape (n, 2), mm.
+
+            Returns:
+                Charges and their derivatives, shape (n_press, n, 6).
+            """
+            squares = [Electrode.of_square("A", (x, y), side) for x, y in positions.tolist()]
+            return electrode_charges(density, squares)
+
+        def log_power_mean(new_charges: Array) -> float:
+            """Compute the logarithm of the power mean of the position errors of the presses.
+
+            Args:
+                new_charges: Charges of the new squares and their derivatives, shape (n_press, n_new, 6).
+            """
+            charges = np.concatenate([new_charges, kept_charges], axis=1)
+            error = self.case.position_errors(charges, self.case.nuisances)
             largest = error.max()  # the powers of the ratios neither overflow nor all underflow
             return float(np.log(largest) + np.log(np.mean((error / largest) ** power)) / power)
 
         def objective(coordinates: Array) -> tuple[float, Array]:
-            """Return the logarithm of the power mean, and its derivatives with respect to x1, y1, x2, y2, ..."""
-            positions = coordinates.reshape(-1, 2)
-            rows = square_rows(positions)
-            value = log_mean(rows)
+            """Compute the logarithm of the power mean of the position errors, and its derivatives.
 
-            # Move each square along x and along y. Only the rows of this square change.
-            moved_positions = (positions[:, None] + DIFFERENCE_STEP * np.eye(2)).reshape(-1, 2)
-            moved_rows = square_rows(moved_positions)
-            gradient = np.empty(coordinates.size)
-            for index in range(coordinates.size):
-                changed_rows = rows.copy()
-                changed_rows[:, index // 2] = moved_rows[:, index]
-                gradient[index] = (log_mean(changed_rows) - value) / DIFFERENCE_STEP
-            return value, gradient
+            Args:
+                coordinates: Coordinates x1, y1, x2, y2, ... of the new squares, shape (2 n_new,), mm.
+
+            Returns:
+                The logarithm, and its derivatives with respect to the coordinates, shape (2 n_new,), 1/mm.
+            """
+            positions = coordinates.reshape(-1, 2)
+            charges = square_charges(positions)
+            value = log_power_mean(charges)
+
+            # Move one square along one axis at a time. Only the charges of this square change.
+            gradient = np.empty(positions.shape)
+            for axis, step in enumerate(DIFFERENCE_STEP * np.eye(2)):
+                moved_charges = square_charges(positions + step)
+                for square in range(len(positions)):
+                    changed_charges = charges.copy()
+                    changed_charges[:, square] = moved_charges[:, square]
+                    gradient[square, axis] = (log_power_mean(changed_charges) - value) / DIFFERENCE_STEP
+            return value, gradient.ravel()
 
         solution = scipy.optimize.minimize(
             objective,
@@ -239,7 +277,7 @@ class Search:
         )
         positions = solution.x.reshape(-1, 2)
         if self.case.all_clearances(positions).min() < -CLEARANCE_TOLERANCE:
-            return Layout(start, math.exp(objective(start.ravel())[0]))
+            return Layout(start, math.exp(log_power_mean(square_charges(start))))
         return Layout(positions, math.exp(solution.fun))
 
 

@@ -29,7 +29,7 @@ from isocharge.simulate.solver.press import press
 from isocharge.simulate.solver.sensitivity import change_by_node_shift
 
 COLUMNS = ("charge", "x", "y", "ln force", "probe radius", "pretension")
-"""Columns of a row, which contains the results for one press and one electrode.
+"""Results for one press and one electrode, in the order of the last axis of arrays.
 
 The columns are the charge (pC) and its derivatives with respect to x and y (pC/mm), ln F (pC), the probe radius (pC/mm)
 and the pretension (pC/MPa).
@@ -77,11 +77,10 @@ def solve_fields(
     return replace(fields, table=fields.table.astype(np.float32))
 
 
-def rows_of(fields: ForwardMap, presses: Array, electrodes: Sequence[Electrode]) -> Array:
+def charges_and_derivatives(fields: ForwardMap, presses: Array, electrodes: Sequence[Electrode]) -> Array:
     """Compute the charges of electrodes under presses, and the derivatives of these charges.
 
-    A row contains the charge of one electrode under one press, followed by the derivatives of this charge. The charge
-    per area is averaged over the area of an electrode, even if the sensor has the edge readout.
+    The charge per area is averaged over the area of an electrode, even if the sensor has the edge readout.
 
     Args:
         fields: Stress fields that `solve_fields` returns.
@@ -89,10 +88,11 @@ def rows_of(fields: ForwardMap, presses: Array, electrodes: Sequence[Electrode])
         electrodes: Electrodes of any shape at their nominal positions.
 
     Returns:
-        One row with the columns `COLUMNS` for each press and electrode, shape (n, n_electrode, 6).
+        Charge of each electrode under each press, followed by its derivatives, shape (n, n_electrode, 6). The last axis
+        has the order of `COLUMNS`.
     """
     chunks = np.array_split(presses, math.ceil(len(presses) / PRESS_CHUNK))
-    return np.concatenate([electrode_rows(charge_density(fields, chunk), electrodes) for chunk in chunks])
+    return np.concatenate([electrode_charges(charge_density(fields, chunk), electrodes) for chunk in chunks])
 
 
 def charge_density(fields: ForwardMap, presses: Array) -> ChargeDensity:
@@ -112,7 +112,7 @@ def charge_density(fields: ForwardMap, presses: Array) -> ChargeDensity:
     return fields.charge_density(position, force, orientation, COLUMN_IS_ODD, charge_per_stress)
 
 
-def electrode_rows(density: ChargeDensity, electrodes: Sequence[Electrode]) -> Array:
+def electrode_charges(density: ChargeDensity, electrodes: Sequence[Electrode]) -> Array:
     """Compute the charges of electrodes, and their derivatives with respect to the parameters of the presses.
 
     Args:
@@ -120,26 +120,27 @@ def electrode_rows(density: ChargeDensity, electrodes: Sequence[Electrode]) -> A
         electrodes: Electrodes of any shape at their nominal positions.
 
     Returns:
-        One row with the columns `COLUMNS` for each press and electrode, shape (n_press, n_electrode, 6).
+        Charge of each electrode under each press, followed by its derivatives, shape (n_press, n_electrode, 6). The
+        last axis has the order of `COLUMNS`.
     """
     if not electrodes:
         return np.empty((density.position.size, 0, len(COLUMNS)))
-    rows = density.integrate(ElectrodePieces.covering(electrodes))  # shape (n_press, n_electrode, 6)
+    charges = density.integrate(ElectrodePieces.covering(electrodes))
     # Rotate the derivatives along and across the direction of each press into derivatives with respect to x and y.
     x_column = COLUMNS.index("x")
     y_column = COLUMNS.index("y")
-    rotation = np.exp(1j * np.angle(density.position))[:, None]
-    derivative = (rows[..., x_column] + 1j * rows[..., y_column]) * rotation
-    rows[..., x_column] = derivative.real
-    rows[..., y_column] = derivative.imag
-    return rows
+    along_and_across = charges[..., x_column] + 1j * charges[..., y_column]
+    direction = np.exp(1j * np.angle(density.position))[:, None]
+    gradient = along_and_across * direction
+    charges[..., x_column] = gradient.real
+    charges[..., y_column] = gradient.imag
+    return charges
 
 
 def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
     """Compute the stress under a press and its derivatives at the nodes of the mesh, in the frame of the press.
 
-    The derivatives refer to fixed points of the film. The derivatives are computed by finite differences between solved
-    presses.
+    The derivatives refer to fixed points of the film. They are computed by finite differences between solved presses.
 
     Args:
         solved: Equilibrium of the film under a press on the positive x axis.
@@ -160,11 +161,11 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
             columns.append((_stress_in_film_axes(increased, surface) - stress) / step)
             continue
 
+        # A step in x or y near the centre changes the direction of the press by a large angle, and the mesh turns with
+        # it. Therefore both stresses are read at the nodes of the original mesh.
         decreased = _changed_press(solved, -changes)
-        smallest_distance = {"x": 1.0, "y": 10.0}.get(column, 0.0) * step
+        smallest_distance = {"x": 1.0, "y": 10.0}.get(column, 0.0) * step  # in x, only a step across the centre turns
         if distance < smallest_distance:
-            # A step in x or y near the centre changes the direction of the press by a large angle, and the mesh turns
-            # with it. Therefore both stresses are read at the nodes of the original mesh.
             change = _change_at_fixed_points(solved, decreased, increased, surface)
         else:
             # The nodes move with the press. Subtract the change of the stress that their movement causes.
@@ -172,7 +173,8 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
             change_at_nodes = _stress_in_film_axes(increased, surface) - _stress_in_film_axes(decreased, surface)
             change = change_at_nodes - change_by_node_shift(solved.mesh, stress, node_shift)
         columns.append(change / (2.0 * step))
-    return np.stack(columns, axis=2) / (solved.film.young * solved.groups.squared_amplitude)
+    stress_unit = solved.film.young * solved.groups.squared_amplitude
+    return np.stack(columns, axis=2) / stress_unit
 
 
 def _changed_press(solved: Equilibrium, changes: Array) -> Equilibrium:
@@ -207,12 +209,12 @@ def _nodes_in_film_axes(solved: Equilibrium) -> Complexes:
 
 
 def _change_at_fixed_points(solved: Equilibrium, first: Equilibrium, second: Equilibrium, surface: Surface) -> Array:
-    """Return the stress of the second press minus the stress of the first press at the nodes of a third press.
+    """Compute the difference of the stress between two presses at the nodes of a third press.
 
     Args:
-        solved: Press whose nodes are the points at which both stresses are read.
-        first: Press whose stress is subtracted.
-        second: Press from whose stress it is subtracted.
+        solved: Third press, at whose nodes both stresses are read.
+        first: First press, whose stress is subtracted from that of the second press.
+        second: Second press.
         surface: Surface at which the stress is read.
 
     Returns:
