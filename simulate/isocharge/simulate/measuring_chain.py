@@ -167,11 +167,11 @@ class Measurement:
         # standard deviation of the film is smaller than that of the air. The ratio of both standard deviations is also
         # the correlation of both temperatures. The film must have the standard deviation `temperature_rms`, so the air
         # has the standard deviation `temperature_rms / correlation`.
-        common_draw, independent_draw = amplifier.temperature_rms * rng.standard_normal(2)
+        common_part, independent_part = amplifier.temperature_rms * rng.standard_normal(2)
         variance_ratio = self._variance_ratio  # variance of the film divided by the variance of the air
         correlation = math.sqrt(variance_ratio)
-        self._air_temperature = common_draw / correlation
-        self._film_temperature = correlation * common_draw + math.sqrt(1.0 - variance_ratio) * independent_draw
+        self._air_temperature = common_part / correlation
+        self._film_temperature = correlation * common_part + math.sqrt(1.0 - variance_ratio) * independent_part
 
         # There is no touch before the measurement, so the film has only its pyroelectric charge.
         self._film_charge = self.pyro_charge_per_K * self._film_temperature
@@ -238,10 +238,11 @@ class Measurement:
         innovations = innovation_std * self.rng.standard_normal(time.size)
         drift = _decaying_sum(air_decay, innovations, self._air_temperature)
 
-        # The temperature step of the air has the shape of a trapezium: it rises, remains constant, and falls again.
-        time_since_step = time - amplifier.step_at
-        time_until_end = amplifier.step_for - time_since_step
-        relative_step = np.clip(np.minimum(time_since_step, time_until_end) / amplifier.step_time, 0.0, 1.0)
+        # The temperature step of the air has the shape of a trapezium: it rises, remains constant, and falls again. The
+        # rise ends `step_time` after the start of the step, and the fall begins `step_time` before its end.
+        time_since_start = time - amplifier.step_at
+        time_until_end = amplifier.step_for - time_since_start
+        relative_step = np.clip(np.minimum(time_since_start, time_until_end) / amplifier.step_time, 0.0, 1.0)
         air_temperature = drift + amplifier.step * relative_step
 
         # The film is a low-pass filter: film[n] = film_decay * film[n - 1] + (1 - film_decay) * air[n]
@@ -269,11 +270,12 @@ class Measurement:
         inputs = self.gain * changes + bias_charge
 
         # Each channel has its own time constant. The filter of a channel is output[n] = decay * output[n - 1] +
-        # inputs[n]. A charge that arrives between two readings has decayed by (1 + decay) / 2 on average.
+        # inputs[n]. A charge that arrives between two readings has decayed by the factor (1 + decay) / 2 on average.
         decays = np.exp(-1.0 / (self.rate * self.leak_time))
         inputs *= 0.5 * (1.0 + decays)
         channels = zip(decays.tolist(), inputs.T, self._output.tolist(), strict=True)
-        output = np.stack([_decaying_sum(*channel) for channel in channels], axis=1)
+        channel_outputs = [_decaying_sum(decay, channel_inputs, last) for decay, channel_inputs, last in channels]
+        output = np.stack(channel_outputs, axis=1)
         self._output = output[-1]
         return output
 
@@ -406,11 +408,9 @@ def load_amplifier(level: StrPath) -> Amplifier:
 
     # Remove the level and the parameters of the noise, because the remaining keys must be attributes of the amplifier.
     similar_amplifier = AMPLIFIER_LEVELS[changes.pop("like")]
-    noise = NoiseModel(
-        Path(level).stem,
-        changes.pop("white_pC", similar_amplifier.noise.white),
-        changes.pop("proportional", similar_amplifier.noise.gain),
-    )
+    white = changes.pop("white_pC", similar_amplifier.noise.white)
+    gain = changes.pop("proportional", similar_amplifier.noise.gain)
+    noise = NoiseModel(Path(level).stem, white, gain)
     with error_prefix(f"{level}: ", InputError):
         return replace(similar_amplifier, noise=noise, **changes)
 

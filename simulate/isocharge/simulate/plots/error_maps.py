@@ -38,9 +38,9 @@ def identification_picture(identification: Identification) -> Figure:
     area = identification.area
     figure = new_figure(16.0, 5.2)
     *map_axes, distance_axes = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
-    limit_maps = (identification.maps[0], identification.maps[-1])
+    limit_maps = (identification.maps[0], identification.maps[-1])  # for the smallest and the largest force
     smallest = min(float(limit_map.position.min()) for limit_map in limit_maps)
-    norm = LogNorm(smallest, max(area.error, 2.0 * smallest))
+    norm = LogNorm(smallest, max(area.error, 2.0 * smallest))  # the scale must not be empty
     for axes, limit_map in zip(map_axes, limit_maps, strict=True):
         positions = limit_map.rings.position.reshape(-1, 2)
         coloured_area = _draw_errors(axes, identification.sensor, positions, limit_map.position.ravel(), norm)
@@ -68,7 +68,8 @@ def _draw_distance(axes: Any, identification: Identification) -> None:
     axes.set_prop_cycle(color=COLOURS)
     for limit_map in identification.maps:
         distance = limit_map.rings.distance
-        (curve,) = axes.semilogy(distance, np.median(limit_map.position, axis=1), label=f"{limit_map.force:g} N")
+        median_error = np.median(limit_map.position, axis=1)  # of each ring
+        (curve,) = axes.semilogy(distance, median_error, label=f"{limit_map.force:g} N")
         axes.semilogy(distance, limit_map.position.max(axis=1), ":", color=curve.get_color())
     axes.plot([], [], ":", color=INK, label="worst of the ring")  # an entry of the legend for all dotted curves
 
@@ -164,7 +165,8 @@ def mirror_picture(sensor: Sensor, mirror: MirrorRegion) -> Figure:
     figure = new_figure(7.4, 6.4)
     axes = figure.subplots()
 
-    # Compute the corners of the cells, shape (n_ring + 1, n_sector + 1). A cell is the part of a ring in one sector.
+    # Compute the corners x + iy of the cells, shape (n_ring + 1, n_sector + 1). A cell is the part of a ring in one
+    # sector.
     n_sector = mirror.share.shape[1]
     edge_angle = np.linspace(0.0, 2.0 * np.pi, n_sector + 1)
     corners = np.outer(mirror.edges, np.exp(1j * edge_angle))

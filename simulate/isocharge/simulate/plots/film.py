@@ -116,10 +116,13 @@ def draw_charge_map(axes: Any, charge_map: ChargeMap, electrode: int) -> None:
         charge_map: Map that computes the charges of contacts.
         electrode: Index of the electrode in the order of the charges.
     """
-    edge = charge_map.domain.radius * np.exp(2j * np.pi * np.linspace(0.0, 1.0, 81))
-    points = _polar_grid(edge, rings=40)
-    contact = contacts_at(to_corners(points.ravel()), 1.0)
-    charge = charge_map.charges(contact)[:, electrode].reshape(points.shape)
+    # Compute the charge at the points x + iy of a polar grid, which covers the disk of the charge map.
+    angle = 2.0 * np.pi * np.linspace(0.0, 1.0, 81)
+    points = _polar_grid(charge_map.domain.radius * np.exp(1j * angle), rings=40)
+    positions = to_corners(points.ravel())  # (x, y)
+    charges = charge_map.charges(contacts_at(positions, force=1.0))
+    charge = charges[:, electrode].reshape(points.shape)
+
     axes.contourf(points.real, points.imag, charge, levels=30, cmap="YlGnBu")
     contour_lines = axes.contour(points.real, points.imag, charge, levels=12, colors=INK, linewidths=0.8)
     axes.clabel(contour_lines, fmt="%.0f", fontsize=7)
@@ -132,8 +135,9 @@ def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
         axes: Axes of matplotlib.
         equilibrium: Equilibrium of the film under a press.
     """
-    points = _polar_grid(equilibrium.film.rim, rings=240)
-    depth = deflection(equilibrium, to_corners(points.ravel())).reshape(points.shape)
+    points = _polar_grid(equilibrium.film.rim, rings=240)  # x + iy
+    positions = to_corners(points.ravel())  # (x, y)
+    depth = deflection(equilibrium, positions).reshape(points.shape)
     shades = axes.contourf(points.real, points.imag, depth, levels=24, cmap="viridis_r")
     axes.figure.colorbar(shades, ax=axes, shrink=0.8, label="deflection, mm")
     draw_rim(axes, equilibrium.film, color=INK)
@@ -150,10 +154,10 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
         equilibrium: Equilibrium of the film under a press.
     """
     # Draw the deflection downwards. The horizontal axis is the signed distance from the centre along the line.
-    distance, angle = cmath.polar(complex(*equilibrium.at))
+    distance, angle = cmath.polar(complex(*equilibrium.at))  # of the probe from the centre
     rim_distance = equilibrium.film.rim_distance(np.array(angle))
     distance_along_section = np.linspace(-1.0, 1.0, 801) * rim_distance
-    section_points = np.outer(distance_along_section, [np.cos(angle), np.sin(angle)])
+    section_points = np.outer(distance_along_section, [np.cos(angle), np.sin(angle)])  # (x, y)
     depth = deflection(equilibrium, section_points)
     axes.plot(distance_along_section, -depth, color=INK, lw=1.5)
 

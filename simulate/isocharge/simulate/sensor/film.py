@@ -170,7 +170,8 @@ class Film:
             if value is None:  # an optional property
                 continue
             limits = (number.smallest, number.largest)
-            for value_in_file in np.atleast_1d(np.multiply(value, number.factor)).tolist():
+            values_in_file = np.atleast_1d(np.multiply(value, number.factor))  # some properties have two components
+            for value_in_file in values_in_file.tolist():
                 check_range(f"film.{number.key}", value_in_file, limits, number.unit, SensorError)
         if self.thickness > 0.1 * self.radius:
             raise SensorError(
@@ -236,7 +237,10 @@ class Piezo:
 
 
 OTHER_UNITS = {"mm": ("m", 1e3), "um": ("mm", 1e3), "MPa": ("Pa", 1e-6), "GPa": ("MPa", 1e-3)}
-"""For some units, another unit in which a value is easily given by mistake, and the factor that converts the value."""
+"""For some units, another unit in which a value is easily given by mistake, and the factor that converts the value.
+
+A value in the other unit is multiplied by the factor.
+"""
 
 
 def tidy(value: float) -> float:
@@ -247,7 +251,8 @@ def tidy(value: float) -> float:
 def check_range(what: str, value: float, allowed: tuple[float, float], unit: str, error: type[InputError]) -> None:
     """Raise an error if a quantity is infinite or outside its accepted range.
 
-    If the value was probably given in a unit of `OTHER_UNITS`, the message converts it.
+    The value was probably given in another unit (`OTHER_UNITS`) by mistake if it would then be in the range. In this
+    case, the message converts the value.
 
     Args:
         what: Name of the quantity in the error message.
@@ -264,7 +269,7 @@ def check_range(what: str, value: float, allowed: tuple[float, float], unit: str
         return
     hint = ""
     other_unit, factor = OTHER_UNITS.get(unit, ("", math.nan))
-    converted_value = factor * value
+    converted_value = factor * value  # NaN, which is outside the range, if there is no other unit
     if low <= converted_value <= high:
         hint = f"; {value:.6g} {other_unit} are {converted_value:.6g} {unit}"
     expected = f"at least {low:g}" if high == math.inf else f"{low:g} to {high:g}"
@@ -273,15 +278,18 @@ def check_range(what: str, value: float, allowed: tuple[float, float], unit: str
 
 
 def add_axial(size: float, axis: float, addition: complex) -> tuple[float, float]:
-    """Add to a property that has a size and an axis, such as an oval clamp, and return the new size and axis.
+    """Add to a property of a film that has a size and an axis, such as an oval clamp.
 
-    The property is the complex number size * exp(2 i axis), because it is the same after half a turn. The axis does not
-    change if the addition is zero, or if the new size is zero within the rounding errors.
+    The property is the complex number size * exp(2 i axis), because it is the same after half a turn.
 
     Args:
-        size: Size of the property. The new size is not negative.
+        size: Size of the property.
         axis: Angle of the axis from the x axis, rad.
         addition: Complex number that is added to the property.
+
+    Returns:
+        New size and new axis (rad). The axis does not change if the addition is zero, or if the new size is zero within
+        the rounding errors. Unless the addition is zero, the new size is not negative.
     """
     if addition == 0.0:
         return size, axis

@@ -74,7 +74,15 @@ class FilmProperty:
 
 
 def _imperfection(name: str, meaning: str, unit: str, std: float, largest: float | None = None) -> FilmProperty:
-    """Declare an imperfection with a small drift. If no largest magnitude is given, the bounds follow from `std`."""
+    """Declare an imperfection of a film, which drifts by a tenth of its standard deviation.
+
+    Args:
+        name: Name of the property.
+        meaning: Description of the property, for tables.
+        unit: Unit of the value.
+        std: Standard deviation of the prior distribution.
+        largest: Largest magnitude of the value; None for `MAX_DEVIATION` standard deviations.
+    """
     bounds = None if largest is None else (-largest, largest)
     return FilmProperty(name, meaning, unit, std, drift=0.1 * std, bounds=bounds, is_imperfection=True)
 
@@ -115,11 +123,11 @@ FILM_PROPERTIES = (
 
 
 def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> tuple[Sensor, Probe]:
-    """Return a sensor and a probe whose film has other properties.
+    """Change properties of a film, of its electrodes, and the radius of a probe.
 
     Args:
         sensor: Sensor that is changed.
-        probe: Probe, which must be circular if its radius is changed.
+        probe: Probe that is changed. The radius of a probe that is not circular does not change.
         values: Value of each property by its name. The value of the pretension is the new pretension. Any other value
             is a change: a number that is added, or the logarithm of a factor. Properties without a value remain
             unchanged.
@@ -231,7 +239,7 @@ class FilmPrior:
         # sum is larger by a factor of sqrt(2).
         largest_shift = 0.5 * self._rim_gap / math.sqrt(2.0)
         largest_oval = largest_shift / self.sensor.film.radius
-        largest_of = {
+        largest_values = {
             "shift_x": largest_shift,
             "shift_y": largest_shift,
             "oval_x": largest_oval,
@@ -239,13 +247,14 @@ class FilmPrior:
         }
         properties = []
         for film_property in FILM_PROPERTIES:
-            largest = largest_of.get(film_property.name, math.inf)
-            if largest < film_property.limits[1]:
+            largest = largest_values.get(film_property.name, math.inf)
+            _, upper_limit = film_property.limits
+            if largest < upper_limit:
                 properties.append(replace(film_property, bounds=(-largest, largest)))
             else:
                 properties.append(film_property)
 
-        # The radius of the probe and the gains of the electrodes follow.
+        # Append the radius of the probe and the gains of the electrodes.
         if isinstance(self.probe, Circle):
             radius = self.probe.radius
             bounds = (-MAX_RADIUS_DEVIATION * radius, MAX_RADIUS_DEVIATION * radius)
@@ -259,7 +268,7 @@ class FilmPrior:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the properties, in the order of the vector."""
-        return tuple(one.name for one in self.properties)
+        return tuple(film_property.name for film_property in self.properties)
 
     def index(self, name: str) -> int:
         """Return the index of the property with the given name in the vector."""
@@ -268,23 +277,23 @@ class FilmPrior:
     @cached_property
     def mean(self) -> Array:
         """Means of the properties, shape (n_property,)."""
-        return np.array([one.mean for one in self.properties])
+        return np.array([film_property.mean for film_property in self.properties])
 
     @cached_property
     def std(self) -> Array:
         """Standard deviations of the properties, shape (n_property,)."""
-        return np.array([one.std for one in self.properties])
+        return np.array([film_property.std for film_property in self.properties])
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
         """Smallest and largest values of the properties, each of shape (n_property,)."""
-        low, high = np.array([one.limits for one in self.properties]).T
+        low, high = np.array([film_property.limits for film_property in self.properties]).T
         return low, high
 
     @cached_property
     def is_imperfection(self) -> Booleans:
         """Whether each property is an imperfection, shape (n_property,)."""
-        return np.array([one.is_imperfection for one in self.properties])
+        return np.array([film_property.is_imperfection for film_property in self.properties])
 
     @cached_property
     def changes_stress(self) -> Booleans:
@@ -292,7 +301,8 @@ class FilmPrior:
 
         Properties of the electrodes and of the piezoelectric coefficients do not change the stress.
         """
-        # In each row, one property differs from its mean.
+        # In each row, one property differs from its mean by one standard deviation. The stress can only change if the
+        # film or the probe changes.
         changed_values = np.clip(self.mean + np.diag(self.std), *self.bounds)
         mean_sensor, mean_probe = self.film(self.mean)
         changes = []
@@ -302,15 +312,19 @@ class FilmPrior:
         return np.array(changes)
 
     def even(self, values: Array) -> Array:
-        """Return the values of the film with the same mean properties and no imperfections, shape (n_property,).
+        """Return the values of a film with the same properties, but without imperfections.
 
         A value of an imperfection is its deviation from the sensor file. The returned values therefore cancel the
         imperfections that the sensor file describes. A described shear modulus remains.
 
         Args:
-            values: Values, shape (n_property,).
+            values: Values of the properties, shape (n_property,).
+
+        Returns:
+            Values of the properties of the film without imperfections, shape (n_property,).
         """
-        # Collect the imperfections of the described film, in the units of the properties.
+        # Collect the imperfections of the described film, in the units of the properties. The components of a property
+        # with an axis are its size times the cosine and the sine of twice the angle of the axis.
         film = self.sensor.film
         stiffness = cmath.rect(math.log(film.young_ratio), 2.0 * film.axis)
         oval = cmath.rect(film.oval, 2.0 * film.oval_axis)
@@ -321,7 +335,7 @@ class FilmPrior:
             "oval_xy": oval.imag,
         }
         pretension = values[self.index(PRETENSION.name)]
-        if pretension > 0.0:
+        if pretension > 0.0:  # uneven tensions are shares of the mean pretension
             described |= dict(zip(UNEVEN_TENSIONS, np.divide(film.deviator, pretension), strict=True))
 
         # A deviation of the opposite size cancels an imperfection.

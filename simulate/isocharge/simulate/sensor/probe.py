@@ -248,7 +248,8 @@ class Polygon(Probe):
             SceneError: If the corners do not form such a polygon, or if the polygon is too small.
         """
         corners = np.array(self.corners, dtype=float)
-        if corners.shape[1:] != (2,) or not (3 <= len(corners) <= MAX_CORNERS and np.isfinite(corners).all()):
+        are_points = corners.shape[1:] == (2,) and np.isfinite(corners).all()
+        if not (are_points and 3 <= len(corners) <= MAX_CORNERS):
             raise SceneError(f"probe: expected 3 to {MAX_CORNERS} corners (x, y), got {cut(str(self.corners))}")
         check_angle(self.angle)
         if not is_convex(corners):
@@ -289,7 +290,8 @@ class Polygon(Probe):
         check_length("probe height", height)
         x = 0.5 * width
         y = 0.5 * height
-        return cls(((x, y), (-x, y), (-x, -y), (x, -y)), angle, f"rectangle:{tidy(width)}x{tidy(height)}")
+        corners = ((x, y), (-x, y), (-x, -y), (x, -y))
+        return cls(corners, angle, f"rectangle:{tidy(width)}x{tidy(height)}")
 
     @classmethod
     def triangle(cls, side: float, angle: float = 0.0) -> "Polygon":
@@ -302,7 +304,8 @@ class Polygon(Probe):
         check_length("probe side", side)
         circumradius = side / np.sqrt(3.0)
         corner_angles = 0.5 * math.pi + math.tau / 3.0 * np.arange(3)
-        return cls.of(to_corners(np.exp(1j * corner_angles) * circumradius), angle, f"triangle:{tidy(side)}")
+        corners = to_corners(np.exp(1j * corner_angles) * circumradius)
+        return cls.of(corners, angle, f"triangle:{tidy(side)}")
 
     @property
     def notation(self) -> str:
@@ -323,8 +326,8 @@ class Polygon(Probe):
     @property
     def period(self) -> float:
         """Smallest rotation that maps the polygon onto itself, rad."""
-        # If a rotation by an n-th part of a turn maps the polygon onto itself, it maps each corner to another corner,
-        # which is an n-th part of all corners ahead.
+        # Find the largest order n for which a rotation by an n-th part of a turn maps the polygon onto itself. The
+        # rotation maps each corner to the corner that is an n-th part of all corners ahead.
         corners = to_complex(np.array(self.corners))
         for order in range(corners.size, 1, -1):
             if corners.size % order != 0:
@@ -391,14 +394,16 @@ def parse_probe(text: str) -> Probe:
         SceneError: If the text is not the notation of a probe, or no such footprint can exist.
     """
     for notation, create in PROBE_SHAPES.items():
-        # A polygon may have more corners. Each word of capital letters stands for a number.
+        # Convert the notation into a regular expression. A polygon may have more corners. Each word of capital letters
+        # stands for a number.
         with_more_corners = notation.replace(";X,Y;X,Y", "(?:;X,Y)+")
         shape_pattern = re.sub("[A-Z]+", lambda _: NUMBER_PATTERN, with_more_corners)
         match = re.fullmatch(f"({shape_pattern})(?:@({NUMBER_PATTERN}))?", text.strip())
         if match is not None:
             shape, degrees = match.groups()
             lengths = map(float, re.findall(NUMBER_PATTERN, shape))
-            return create(*lengths).rotated(math.radians(float(degrees or 0.0)))
+            probe = create(*lengths)
+            return probe.rotated(math.radians(float(degrees or 0.0)))
     forms = [f"'{notation}'" for notation in PROBE_SHAPES]
     raise SceneError(
         f"probe {cut(text)!r}: expected {_join_with_or(forms)} in mm, each optionally rotated as in 'triangle:4.0@30' "

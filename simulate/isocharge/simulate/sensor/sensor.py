@@ -159,8 +159,10 @@ class Electrode:
         """
         if self.more or self.back or len(self.corners) != 4:
             return None
-        (lower_left, lower_right, *_) = self.corners
-        side = lower_right[0] - lower_left[0]
+
+        # Compare the corners with those of a square of the same width.
+        (left_x, _), (right_x, _), *_ = self.corners  # the lower corners of a square
+        side = right_x - left_x
         square = Electrode.of_square(self.name, self.centre, side)
         is_square = side > 0.0 and np.allclose(self.corners, square.corners, rtol=0.0, atol=1e-9 * side)
         return side if is_square else None
@@ -306,7 +308,7 @@ class Sensor:
         """
         object.__setattr__(self, "electrodes", _as_tuples(self.electrodes))  # the dataclass is frozen
 
-        # Check the readout, the names of the electrodes, and the calibration.
+        # Check the readout and the surface, the names of the electrodes, and the calibration.
         for value, options in ((self.readout, get_args(Readout)), (self.surface, get_args(Surface))):
             if value not in options:
                 raise SensorError(f"expected one of {options}, got {value!r}")
@@ -388,11 +390,12 @@ def _check_name(name: str) -> None:
         name: Name of the electrode.
 
     Raises:
-        SensorError: If the name is empty, too long or reserved, or contains a comma or characters that are not
-            printable.
+        SensorError: If the name is empty, too long or reserved, contains a comma or characters that are not printable,
+            or begins or ends with a blank.
     """
     has_valid_length = 0 < len(name) <= MAX_NAME_LENGTH
-    if not (has_valid_length and is_printable(name) and name == name.strip() and "," not in name):
+    has_valid_characters = is_printable(name) and "," not in name and name == name.strip()
+    if not (has_valid_length and has_valid_characters):
         raise SensorError(
             f"electrode {shown(name)}: expected a name of 1 to {MAX_NAME_LENGTH} printable characters, without commas "
             "and without blanks at its ends, because it is the header of a column in CSV files"
@@ -423,7 +426,8 @@ def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
         corners = np.array(electrode.corners)
         check_range(name, float(np.ptp(corners, axis=0).max()), (MIN_EXTENT, np.inf), "mm", SensorError)
     for first, second in combinations(electrodes, 2):
-        # Electrodes that touch share an area because of rounding errors.
+        # Because of rounding errors, electrodes that only touch share a strip along their outline, whose length is at
+        # most the shorter perimeter.
         touching_area = MERGE_DISTANCE * min(first.region.length, second.region.length)
         if shapely.intersection(first.region, second.region).area > touching_area:
             raise SensorError(f"electrodes {first.name!r} and {second.name!r} overlap; move one of them")
@@ -441,7 +445,7 @@ def _check_on_film(electrode: Electrode, film: Film, calibration: Calibration) -
         SensorError: If a part of the electrode lies on or beyond the rim.
     """
     placed_corners = calibration.place(np.concatenate(electrode.collecting_polygons))  # shape (n, 2), mm
-    relative_distance = film.relative_distance(to_complex(placed_corners))
+    relative_distance = film.relative_distance(to_complex(placed_corners))  # 1 on the rim
     if not (relative_distance < 1.0).all():
         x, y = placed_corners[np.argmax(relative_distance)]
         hint = "; end its traces before the rim" if electrode.more else ""

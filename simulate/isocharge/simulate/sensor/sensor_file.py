@@ -140,12 +140,13 @@ class SensorTable(Settings, frozen=True):
                     missing = "width_mm" if has_trace else "trace_mm"
                     raise WrongKey(f"electrodes.{name}.{missing}", "trace_mm and a width_mm above 0 together")
 
+        # The side must be a positive number. Only squares, whose value is their centre (x, y), need it.
         side = self.electrodes.get(SIDE)
-        if side is not None and not (isinstance(side, float) and 0.0 < side <= MAX_COORDINATE_mm):
-            raise WrongKey(f"electrodes.{SIDE}", f"a number above 0 and at most {MAX_COORDINATE_mm:g}", side)
         has_squares = any(isinstance(value, tuple) for value in self.electrodes.values())
         if side is None and has_squares:
             raise WrongKey(f"electrodes.{SIDE}")
+        if side is not None and not (isinstance(side, float) and 0.0 < side <= MAX_COORDINATE_mm):
+            raise WrongKey(f"electrodes.{SIDE}", f"a number above 0 and at most {MAX_COORDINATE_mm:g}", side)
 
 
 def built_in_sensors() -> tuple[str, ...]:
@@ -242,7 +243,7 @@ def sensor_to_dict(sensor: Sensor) -> dict[str, Any]:
         "piezo": {
             key: tidy(coefficient)
             for key, coefficient in zip(PiezoTable.__struct_fields__, vars(sensor.piezo).values(), strict=True)
-            if key != "d12" or coefficient
+            if key != "d12" or coefficient  # without a d12 of zero
         },
         "electrodes": _electrode_tables(sensor),
         "calibration": {
@@ -272,12 +273,14 @@ def film_to_dict(film: Film) -> dict[str, Any]:
         root_of_ratio = math.sqrt(film.young_ratio)
         values["young"] = (film.young * root_of_ratio, film.young / root_of_ratio)
 
-    # Convert all values into the units of the file, and omit those that are equal to their default.
+    # Convert all values into the units of the file.
     table = {
         number.key: _tidy_all(np.multiply(values[attribute], number.factor).tolist())
         for attribute, number in FILM_NUMBERS.items()
         if values[attribute] is not None
     }
+
+    # Return the keys in the order of `FilmTable`, without those whose value is the default.
     defaults = {field.name: field.default for field in msgspec.structs.fields(FilmTable)}
     defaults["pretension_MPa"] = None  # the pretension is always written
     return {key: table[key] for key in defaults if key in table and table[key] != defaults[key]}
@@ -341,25 +344,26 @@ def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
         raise SensorError(
             f"readout 'edge' needs squares, and in a sensor file all squares have one side: got {sides} mm"
         )
-    shared_side = next(iter(sides.values()), None)  # side of the first square; None if there are no squares
     tables: dict[str, Any] = {}
-    if shared_side is not None:
-        tables[SIDE] = shared_side
+    if sides:
+        tables[SIDE] = next(iter(sides.values()))  # side of the first square
     for electrode in sensor.electrodes:
-        if electrode.name in sides and sides[electrode.name] == shared_side:
+        if electrode.name in sides and sides[electrode.name] == tables[SIDE]:
             tables[electrode.name] = _tidy_all(electrode.centre)
         else:
-            polygons = {"more_mm": electrode.more, "back_mm": electrode.back}
+            further_polygons = {"more_mm": electrode.more, "back_mm": electrode.back}
             tables[electrode.name] = {
                 "polygon_mm": _tidy_all(electrode.corners),
-                **{key: _tidy_all(value) for key, value in polygons.items() if value},
+                **{key: _tidy_all(polygons) for key, polygons in further_polygons.items() if polygons},
             }
     return tables
 
 
 def _tidy_all(values: Any) -> Any:
-    """Round all numbers of nested tuples or lists, and return them as nested lists."""
-    return [_tidy_all(value) for value in values] if isinstance(values, tuple | list) else tidy(values)
+    """Round a number, or all numbers of nested tuples or lists, which are returned as nested lists."""
+    if isinstance(values, tuple | list):
+        return [_tidy_all(value) for value in values]
+    return tidy(values)
 
 
 def _film(table: FilmTable) -> Film:
@@ -374,18 +378,18 @@ def _film(table: FilmTable) -> Film:
     Raises:
         SensorError: If a property is outside its accepted range.
     """
-    # Young's moduli along both axes, and their geometric mean. The mean of equal values has no rounding error.
+    # Replace Young's moduli along both axes by their geometric mean. The mean of equal values has no rounding error.
     values = msgspec.structs.asdict(table)
     young_1, young_2 = _along_axes(table.young_GPa)
     values["young_GPa"] = math.sqrt(young_1 * young_2)
 
-    # Components of the pretension, and the mean of the components along x and y
+    # Replace the components of the pretension by the mean of the components along x and y.
     tension = table.pretension_MPa
     tension_11, tension_22, tension_12 = tension if isinstance(tension, list) else (tension, tension, 0.0)
     values["pretension_MPa"] = 0.5 * (tension_11 + tension_22)
     deviator = (0.5 * (tension_11 - tension_22), tension_12)
 
-    # Convert all numbers into the units of `Film`.
+    # Convert all numbers into the units of `Film`, without optional properties that the file omits.
     numbers = {
         attribute: values[number.key] / number.factor
         for attribute, number in FILM_NUMBERS.items()
@@ -398,7 +402,11 @@ def _film(table: FilmTable) -> Film:
 
 
 def _along_axes(value: float | list[float]) -> list[float]:
-    """Return the components of a property along both axes, which are equal if the file contains one number."""
+    """Return the components of a property along both axes of the film. They are equal if the file contains one number.
+
+    Args:
+        value: Value in the file, which is a number or a list of both components.
+    """
     return value if isinstance(value, list) else [value, value]
 
 
