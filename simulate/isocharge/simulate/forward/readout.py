@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans, Complexes, Integers
+from isocharge.common.arrays import Array, Complexes, Integers
 from isocharge.common.errors import SensorError
 from isocharge.simulate.mechanics.warming import tension_change
 from isocharge.simulate.mesh.placement import Placement
@@ -93,47 +93,6 @@ class Piece(NamedTuple):
     kind: int
 
 
-class _Pairs(NamedTuple):
-    """Pairs of a press and a piece of an electrode.
-
-    Attributes:
-        press: Index of the press of each pair, shape (n_pair,).
-        piece: Index of the piece of each pair, shape (n_pair,).
-        corners: Corners x + iy of the piece, or of a part of it, shape (n_pair, 4), mm.
-        line_area: Area that a line represents, shape (n_pair,), mm^2. Zero for a quadrilateral.
-    """
-
-    press: Integers
-    piece: Integers
-    corners: Complexes
-    line_area: Array
-
-    def select(self, selected: Booleans | slice) -> "_Pairs":
-        """Return the pairs that a mask or a slice selects."""
-        return _Pairs(self.press[selected], self.piece[selected], self.corners[selected], self.line_area[selected])
-
-    def halved(self) -> "_Pairs":
-        """Replace each pair by two pairs with the halves of its piece, which is divided along its longest side."""
-        return _Pairs(
-            press=np.tile(self.press, 2),
-            piece=np.tile(self.piece, 2),
-            corners=halve_quadrilaterals(self.corners),
-            line_area=np.tile(0.5 * self.line_area, 2),
-        )
-
-    def rules(self, count: int) -> Iterator[PieceRule]:
-        """Yield the integration points of all pairs, chunk by chunk.
-
-        Args:
-            count: Number of Gauss points along a side of a piece.
-        """
-        chunk_size = 50_000 // count**2  # with more points, the working arrays would exceed 100 MB
-        for start in range(0, self.press.size, chunk_size):
-            chunk = self.select(slice(start, start + chunk_size))
-            points, area = gauss_quadrilaterals(chunk.corners, chunk.line_area, count)
-            yield PieceRule(chunk.press, chunk.piece, points, area)
-
-
 @dataclass(frozen=True)
 class ElectrodePieces:
     """Quadrilaterals that together cover the electrodes of a sensor, or the lines of the edge readout.
@@ -198,19 +157,34 @@ class ElectrodePieces:
         Yields:
             The integration points of some of the pairs of a press and a piece.
         """
+        # The pairs of a press and a piece are described by four arrays. In the first round, they are all pairs.
         near_count, distant_count = counts
-        press, piece = np.indices((position.size, len(self.corners))).reshape(2, -1)  # all pairs
-        pairs = _Pairs(press, piece, self.corners[piece], self.line_area[piece])
-        while pairs.press.size:
-            corners = pairs.corners
+        press, piece = np.indices((position.size, len(self.corners))).reshape(2, -1)
+        corners = self.corners[piece]
+        line_area = self.line_area[piece]
+        while press.size:
             centre = corners.mean(axis=1)
             radius = np.abs(corners - centre[:, None]).max(axis=1)
-            is_near = np.abs(position[pairs.press] - centre) < NEAR_DISTANCE * (radius + probe.reach)
+            is_near = np.abs(position[press] - centre) < NEAR_DISTANCE * (radius + probe.reach)
             sides = np.abs(np.roll(corners, -1, axis=1) - corners)
-            is_large = sides.max(axis=1) > NEAR_SIDE * probe.half_width
-            yield from pairs.select(is_near & ~is_large).rules(near_count)
-            yield from pairs.select(~is_near).rules(distant_count)
-            pairs = pairs.select(is_near & is_large).halved()
+            is_halved = is_near & (sides.max(axis=1) > NEAR_SIDE * probe.half_width)
+            for count, is_selected in ((near_count, is_near & ~is_halved), (distant_count, ~is_near)):
+                # With longer chunks, the working arrays would exceed 100 MB.
+                for chunk in _chunks(np.flatnonzero(is_selected), 50_000 // count**2):
+                    points, area = gauss_quadrilaterals(corners[chunk], line_area[chunk], count)
+                    yield PieceRule(press[chunk], piece[chunk], points, area)
+
+            # Continue with both halves of the pieces that are halved.
+            press = np.tile(press[is_halved], 2)
+            piece = np.tile(piece[is_halved], 2)
+            line_area = np.tile(0.5 * line_area[is_halved], 2)
+            corners = halve_quadrilaterals(corners[is_halved])
+
+
+def _chunks(indices: Integers, size: int) -> Iterator[Integers]:
+    """Divide indices into chunks of a given size. The last chunk may be smaller."""
+    for start in range(0, indices.size, size):
+        yield indices[start : start + size]
 
 
 def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:

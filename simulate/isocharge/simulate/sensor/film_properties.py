@@ -247,12 +247,9 @@ class FilmPrior:
         }
         properties = []
         for film_property in FILM_PROPERTIES:
+            low, high = film_property.limits
             largest = largest_values.get(film_property.name, math.inf)
-            _, upper_limit = film_property.limits
-            if largest < upper_limit:
-                properties.append(replace(film_property, bounds=(-largest, largest)))
-            else:
-                properties.append(film_property)
+            properties.append(replace(film_property, bounds=(max(low, -largest), min(high, largest))))
 
         # Append the radius of the probe and the gains of the electrodes.
         if isinstance(self.probe, Circle):
