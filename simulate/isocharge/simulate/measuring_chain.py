@@ -274,8 +274,7 @@ class Measurement:
         decays = np.exp(-1.0 / (self.rate * self.leak_time))
         inputs *= 0.5 * (1.0 + decays)
         channels = zip(decays.tolist(), inputs.T, self._output.tolist(), strict=True)
-        channel_outputs = [_decaying_sum(decay, channel_inputs, last) for decay, channel_inputs, last in channels]
-        output = np.stack(channel_outputs, axis=1)
+        output = np.stack([_decaying_sum(*channel) for channel in channels], axis=1)
         self._output = output[-1]
         return output
 

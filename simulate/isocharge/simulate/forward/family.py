@@ -297,9 +297,8 @@ class Family:
             # The stress itself does not change, but its components refer to a frame that was rotated by `angle`.
             stress_of_periods.append(rotate_stress(renumbered_stress, -angle))
 
-        turn_axis = 2
-        stress_of_all_turns = np.concatenate(stress_of_periods, axis=turn_axis)
-        return stress_of_all_turns.reshape(-1, n_value)
+        all_turns = np.concatenate(stress_of_periods, axis=2)
+        return all_turns.reshape(-1, n_value)
 
 
 def node_counts(film: Film) -> tuple[NodeCount, ...]:

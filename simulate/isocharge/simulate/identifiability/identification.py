@@ -89,15 +89,15 @@ class LimitMap:
         ring_area = np.append(2 * np.arange(1, n_ring), n_ring)
         area = np.repeat(ring_area, n_angle)  # of each position, shape (n_ring * n_angle,)
         statistics = {"force_N": self.force}
-        for key, errors in (
-            ("position_{}_mm", self.position.ravel()),
-            ("force_{}_percent", 100.0 * self.relative_force.ravel()),
+        for quantity, unit, errors in (
+            ("position", "mm", self.position.ravel()),
+            ("force", "percent", 100.0 * self.relative_force.ravel()),
         ):
             median = np.quantile(np.repeat(errors, area), 0.5, method="inverted_cdf")
             root_mean_square = np.sqrt(np.average(errors**2, weights=area))
-            statistics[key.format("median")] = float(median)
-            statistics[key.format("rms")] = float(root_mean_square)
-            statistics[key.format("worst")] = float(errors.max())
+            statistics[f"{quantity}_median_{unit}"] = float(median)
+            statistics[f"{quantity}_rms_{unit}"] = float(root_mean_square)
+            statistics[f"{quantity}_worst_{unit}"] = float(errors.max())
         return statistics
 
 

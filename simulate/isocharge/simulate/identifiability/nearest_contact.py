@@ -64,8 +64,7 @@ def minimise(
     residual, slopes = evaluate(active, point)  # r and dr/du
     squared_norm = (residual**2).sum(axis=1)  # |r|^2, shape (n,)
     damping = np.full(len(point), 1e-4)  # relative to the mean of the diagonal of J'J
-    max_steps = 60  # twice as many as problems with large residuals usually need
-    for _ in range(max_steps):
+    for _ in range(60):  # few problems need more than half of these steps
         if not active.size:
             break
         trial_point = bounded_step(point[active], residual[active], slopes[active], damping[active])
@@ -188,10 +187,9 @@ def explain(
     """
     domain = charge_map.domain.within(INNER_RADIUS * charge_map.domain.radius)
     min_force, max_force = domain.force_range
-    x_scale, y_scale, log_force_scale = domain.scale
+    scale = domain.scale  # derivatives of (x, y, ln F) with respect to the unit coordinates
     if min_force == max_force:  # the charges do not depend on the third unit coordinate
-        log_force_scale = 0.0
-    scale = np.array([x_scale, y_scale, log_force_scale])  # derivative of (x, y, ln F) by the unit coordinates
+        scale[2] = 0.0
 
     def residuals(rows: Integers, unit_coordinates: Array) -> tuple[Array, Array]:
         """Compute the residuals (Q - Q(c)) / sigma for selected rows of charges, and the derivatives of the residuals.

@@ -135,9 +135,8 @@ def draw_deflection(axes: Any, equilibrium: Equilibrium) -> None:
         axes: Axes of matplotlib.
         equilibrium: Equilibrium of the film under a press.
     """
-    points = _polar_grid(equilibrium.film.rim, rings=240)  # x + iy
-    positions = to_corners(points.ravel())  # (x, y)
-    depth = deflection(equilibrium, positions).reshape(points.shape)
+    points = _polar_grid(equilibrium.film.rim, rings=240)  # x + iy, shape (240, n_angle)
+    depth = deflection(equilibrium, to_corners(points.ravel())).reshape(points.shape)
     shades = axes.contourf(points.real, points.imag, depth, levels=24, cmap="viridis_r")
     axes.figure.colorbar(shades, ax=axes, shrink=0.8, label="deflection, mm")
     draw_rim(axes, equilibrium.film, color=INK)

@@ -290,8 +290,7 @@ class Polygon(Probe):
         check_length("probe height", height)
         x = 0.5 * width
         y = 0.5 * height
-        corners = ((x, y), (-x, y), (-x, -y), (x, -y))
-        return cls(corners, angle, f"rectangle:{tidy(width)}x{tidy(height)}")
+        return cls(((x, y), (-x, y), (-x, -y), (x, -y)), angle, f"rectangle:{tidy(width)}x{tidy(height)}")
 
     @classmethod
     def triangle(cls, side: float, angle: float = 0.0) -> "Polygon":
@@ -304,8 +303,7 @@ class Polygon(Probe):
         check_length("probe side", side)
         circumradius = side / np.sqrt(3.0)
         corner_angles = 0.5 * math.pi + math.tau / 3.0 * np.arange(3)
-        corners = to_corners(np.exp(1j * corner_angles) * circumradius)
-        return cls.of(corners, angle, f"triangle:{tidy(side)}")
+        return cls.of(to_corners(np.exp(1j * corner_angles) * circumradius), angle, f"triangle:{tidy(side)}")
 
     @property
     def notation(self) -> str:
