@@ -89,6 +89,8 @@ def doctor_command(
     if port is None:
         show_result({"ports": [*port_lines()]}, json=json)
         return
+
+    # Check the options before the port is opened.
     if write:
         check_new_output(write)
     electrodes = _electrodes_of(model, models)
@@ -101,6 +103,8 @@ def doctor_command(
         )
     if gain:
         device_from_table({"gain": gain}, "--pc-per-unit")  # raises an error for 0 or a number that is not finite
+
+    # Listen on the port, and report what it sends.
     say(f"listening for {seconds:g} s; leave the film alone")
     examination = examine(
         port,
@@ -121,6 +125,7 @@ def doctor_command(
     elif write is not None and device is None and examination.unit != "pC":
         obstacle = "the charge of one unit is missing: add the option that is named above"
 
+    # Find out which channel belongs to each electrode, if the user has requested this.
     found_channels = None
     if check_wiring and examination.good and not obstacle:
         wiring = _check_wiring(examination)

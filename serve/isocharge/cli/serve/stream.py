@@ -233,7 +233,7 @@ def stream_command(
     if record:
         check_new_output(record)
 
-    # The options take precedence over the settings of the device file.
+    # Load the model, and set up the stream. The options take precedence over the settings of the device file.
     load_latest = partial(Predictor, model, models=models)
     predictor = load_latest()
     board = load_device(device)
@@ -246,6 +246,7 @@ def stream_command(
     stream = RecordedStream(touch, recorder)
     has_expired = Event()
 
+    # Write the records of the port to all outputs, until the stream ends or is stopped.
     outputs: Outputs | None = None  # until the port is open
     with (
         until_stopped(),
@@ -286,6 +287,8 @@ def stream_command(
             if not is_repeatable:
                 outputs.close()  # otherwise, their incomplete files are removed
             say(summary(touch))
+
+    # Report how the stream has ended.
     if outputs is None:
         say(f"{port}: the command was stopped before the port was open")
         raise typer.Exit(int(has_expired.is_set()))

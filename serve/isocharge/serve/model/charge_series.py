@@ -247,20 +247,24 @@ class ChargeSeries:
         n_electrode = len(self.electrodes)
         nearest, excess = self._nearest_in_domain(contact)
         states = np.broadcast_to(state, (n_contact, 1 + self.direction_count))
-        pretension, directions = states[:, 0], states[:, 1:]
+        pretension = states[:, 0]  # t of each contact, shape (n,)
+        directions = states[:, 1:]  # z of each contact, shape (n, K)
 
         # Evaluate v at the nodes, and d and d' of each direction. The axis of length 4 contains the value and its
         # derivatives with respect to the three coordinates of the contact.
         node_values = self._node_series.values_and_derivatives(nearest, excess).reshape(n_contact, 4, -1, n_electrode)
         direction_values = self._direction_series.values_and_derivatives(nearest, excess)
         direction_values = direction_values.reshape(n_contact, 4, 2, self.direction_count, n_electrode)
-        change, change_per_MPa = direction_values[:, :, 0], direction_values[:, :, 1]  # d and d'
+        change = direction_values[:, :, 0]  # d, shape (n, 4, K, n_electrode)
+        change_per_MPa = direction_values[:, :, 1]  # d', of the same shape
         total_change = change + pretension[:, None, None, None] * change_per_MPa  # d + t d'
 
         # Interpolate between the nodes (index k), and add the changes by the directions (index d). The other indices
         # are the press (n), the value or one of its derivatives (s) and the electrode (e).
-        weights, weight_slopes = interpolation_weights(self.node_MPa, pretension)  # shape (n, n_node)
+        weights, weight_slopes = interpolation_weights(self.node_MPa, pretension)  # each of shape (n, n_node)
         value = np.einsum("nk,nske->nse", weights, node_values) + np.einsum("nd,nsde->nse", directions, total_change)
+
+        # Derivatives of v with respect to t, and to z of each direction
         value_per_MPa = np.einsum("nk,nke->ne", weight_slopes, node_values[:, 0])
         value_per_MPa += np.einsum("nd,nde->ne", directions, change_per_MPa[:, 0])
         value_per_direction = total_change[:, 0].swapaxes(0, 1)  # shape (K, n, n_electrode)

@@ -98,9 +98,9 @@ class Predictor:
             structs.replace(self.metadata, noise=noise)  # runs the checks of the metadata
         except WrongKey as error:
             raise ChargeError(f"{error.key}: {error}") from error
-        # The new predictor uses the same session. A touch must also exceed the stated noise.
+        # The new predictor is made without `__init__`, which would load the model again, and uses the same session.
         new_predictor = object.__new__(type(self))
-        validity = replace(self.validity, white_pC=noise.white_pC)
+        validity = replace(self.validity, white_pC=noise.white_pC)  # a touch must also exceed the stated noise
         new_predictor.__dict__.update(self.__dict__, noise=noise, validity=validity)
         return new_predictor
 

@@ -196,7 +196,10 @@ def _exclusion_reasons(validity: Validity, presses: MeasuredPresses) -> NDArray[
 
 
 TEST_SIGNIFICANCE = 0.01 / 3.0
-"""Probability that one test rejects a model that fits. The three tests together reject it with a probability of 1 %."""
+"""Probability that one test rejects a model that fits.
+
+The three tests, of the scatter, of the common errors and of the misfits, reject it together with a probability of 1 %.
+"""
 
 MAX_ACCEPTED_CHI_SQUARED = 1.1
 """Chi-squared per degree of freedom up to which the scatter is always accepted, dimensionless.

@@ -76,13 +76,15 @@ class StdFactor(NamedTuple):
 def binomial_distribution(count: int, probability: float) -> Array:
     """Compute the probabilities that at most 0, 1, ... `count` of `count` trials succeed, shape (count + 1,).
 
-    The terms are computed from their logarithms, because the binomial coefficients would overflow.
+    The logarithms of the probabilities are added up, because the binomial coefficients would overflow.
 
     Args:
         count: Number of trials.
         probability: Probability that a trial succeeds.
     """
     successes = np.arange(1, count + 1)
-    log_ratios = np.log((count + 1 - successes) / successes * (probability / (1.0 - probability)))
-    log_terms = count * math.log1p(-probability) + np.append(0.0, np.cumsum(log_ratios))
-    return np.cumsum(np.exp(log_terms))
+    # Ratio of the probability of k successes to the probability of k - 1 successes, for k = 1, ..., count
+    ratios = (count + 1 - successes) / successes * (probability / (1.0 - probability))
+    log_no_success = count * math.log1p(-probability)
+    log_probabilities = log_no_success + np.append(0.0, np.cumsum(np.log(ratios)))
+    return np.cumsum(np.exp(log_probabilities))

@@ -155,7 +155,8 @@ class CsvTable:
         missing_name_of_spelling: dict[str, str] = {}
         for name in names:
             if name not in self.header:
-                spellings = _spellings(name) | _spellings(f"{name}_pC")  # the latter also match the column `ApC`
+                # Without the second set, the column `ApC` would not be similar to the electrode `A`.
+                spellings = _spellings(name) | _spellings(f"{name}_pC")
                 missing_name_of_spelling |= dict.fromkeys(spellings, name)
         name_of_column = {
             column: missing_name_of_spelling[spelling]

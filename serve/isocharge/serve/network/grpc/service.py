@@ -157,7 +157,7 @@ class Service:
                 await self._answer(name, context)
                 call.status = "OK"
             except grpc.aio.InternalError as error:  # the client ended the call while a message was read or sent
-                raise asyncio.CancelledError from error
+                raise asyncio.CancelledError from error  # the status remains "CANCELLED", and nothing is sent
             except Exception as error:  # every error is sent to the client
                 is_late = isinstance(error, TimeoutError)
                 status, message = refusal(RequestError(TIMEOUT_MESSAGE, 408) if is_late else error)

@@ -141,14 +141,16 @@ class Connection(HttpToolsProtocol):
         Args:
             now: Present time on the clock of the event loop, s.
         """
-        if self.is_idle and self.deadline == math.inf:
+        if self.is_idle and self.deadline == math.inf:  # all requests are answered since the previous call
             self._allow(self._limits.idle_seconds)
         if not self.flow.write_paused:  # uvicorn pauses if the client does not read its responses
             self._write_deadline = now + self._limits.body_seconds
         if min(self.deadline, self._write_deadline) > now:
             return
         if self._is_reading:
-            self._is_reading = False
+            self._is_reading = (
+                False  # if the client does not read the refusal in time either, the connection is aborted
+            )
             self.refuse(408, "waited too long for the rest of the request")
         else:
             self.transport.abort()
