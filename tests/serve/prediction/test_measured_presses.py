@@ -179,12 +179,10 @@ ROW = "1,2,3,4,5,6\n"
         ("x_mm,y_mm,force_N,Ladung A [pC],B,C", r"got the header \[.*'Ladung A \[pC\]'.*; missing: \['A'\]"),
         ("x_mm,y_mm,force_N,a,B,C", "rename 'a' to 'A' and check the units, or remove these columns; missing"),
         ("x_mm,y_mm,force_N,A [pC],B [pC],C [pC]", r"rename 'A \[pC\]' to 'A'"),
-        ("x [mm],y_mm,force_N,A,B,C", r"rename 'x \[mm\]' to 'x_mm'"),
         ("x_mm,y_mm,Force_STD,A,B,C", "rename 'Force_STD' to 'force_std'"),
         ("x,y,force,A,B,C", "rename 'x' to 'x_mm', 'y' to 'y_mm', 'force' to 'force_N' and check"),
         ("x_um,y_um,force_N,A,B,C", "rename 'x_um' to 'x_mm', 'y_um' to 'y_mm' and check"),
         ("x_mm,y_mm,Force (lbf),A,B,C", r"rename 'Force \(lbf\)' to 'force_N' and check"),
-        ("x_mm,y_mm,force_N,A [nC],B,C", r"rename 'A \[nC\]' to 'A' and check"),
     ],
 )
 def test_similar_header_names_the_column_to_rename(write, header, message):

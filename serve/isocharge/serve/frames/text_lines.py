@@ -107,10 +107,11 @@ _UNIT_BEHIND = r"(?P<number>[0t])(?:[\])}]*,?k)?[\]\[(){}:=]*(?P<word>[quw])"
 A key may stand between the number and the unit, as in `"value": 3.5, "unit": "nC"`, and the unit may have brackets.
 """
 
-_UNIT_BEFORE = r"[kquw]\W*(?P<word>[kquw])(?:\W*k)?\W*(?P<number>[0t])"
+_UNIT_BEFORE = r"[kquw,]\W*(?P<word>[kquw])(?:\W*k)?\W*(?P<number>[0t])"
 """Regular expression, for the shape of a line, of a word between the name and the number, which may be its unit.
 
-A key may stand between the unit and the number, as in `"unit": "nC", "value": 3.5`.
+A comma may take the place of the name, as in `"A": {"raw": 512, "nC": 3.5}`, and a key may stand between the unit and
+the number, as in `"unit": "nC", "value": 3.5`.
 """
 
 _IGNORED_AT_END = ",; \t"
@@ -216,8 +217,9 @@ def parse_line(text: str, *, has_header: bool = False, meanings: Mapping[str, st
         number_pattern = _NUMBER.replace(r"\.[0-9]*", r"(?:\.[0-9]*|,[0-9]+)")
         text_with_points = re.sub(_DECIMAL_COMMA, lambda match: match[1] or ".", text)
     parts = _parts(text_with_points)
-    names = _alternating_names(parts, has_header=has_header) or _preceding_names(parts, {SEQ, *meanings})
-    names_with_units = _with_units(parts, names)
+    counters = {SEQ, *TIMES_US, *meanings}
+    names = _alternating_names(parts, has_header=has_header) or _preceding_names(parts, counters)
+    names_with_units = _with_units(names, _units(parts, names), counters)
     return Line(
         text,
         _skeleton(parts, names, number_pattern),
@@ -423,12 +425,11 @@ def _preceding_names(parts: list[_Part], counters: Container[str]) -> list[str]:
     return names
 
 
-def _with_units(parts: list[_Part], names: list[str]) -> list[str]:
-    """Add the unit of charge or voltage of each number to its name, as in `A_nC` for `A = 3.5 nC`.
+def _units(parts: list[_Part], names: list[str]) -> list[str]:
+    """Return the unit of charge or voltage of each number; empty for a number without such a unit.
 
     The unit stands behind the number, or between the name and the number. A unit before the first name, as in
-    `nC: A=3.5 B=4.1`, is the unit of all numbers. The unit pC is not added, and counters and clocks have no unit of
-    charge.
+    `nC: A=3.5 B=4.1`, is the unit of all numbers.
 
     Args:
         parts: Parts of the line.
@@ -438,16 +439,43 @@ def _with_units(parts: list[_Part], names: list[str]) -> list[str]:
     words_before = _words(parts, _UNIT_BEFORE)
     # The word `C` may be the name of an electrode or a degree, but behind several other numbers it is a unit of charge.
     is_coulomb = words_behind.count("C") > 1 + names.count("C")
-    units = {*OTHER_CHARGE_UNITS} if is_coulomb else _CHARGE_UNITS - {"pC"}
+    units = {*_CHARGE_UNITS, "C"} if is_coulomb else _CHARGE_UNITS
     shape_before_numbers, _, _ = _shape(parts).partition("0")
     first_words = [part.name.strip("[]") for part in parts[: len(shape_before_numbers)]]
     words_before_names = takewhile(lambda word: word not in names, first_words)
     common_unit = next((word for word in words_before_names if word in units), "")
+    return [
+        next((word.strip("[]") for word in words if word.strip("[]") in units), common_unit)
+        for words in zip(words_behind, words_before, strict=True)
+    ]
+
+
+def _with_units(names: list[str], units: list[str], counters: Container[str]) -> list[str]:
+    """Add the unit of charge or voltage of each number to its name, as in `A_nC` for `A = 3.5 nC`.
+
+    The unit pC is not added, and counters and clocks have no unit of charge. If two numbers follow each of several
+    names, and only the second number has a unit, it has the name, as in `A: 512 (3.5 nC), B: 498 (4.1 nC)`.
+
+    Args:
+        names: Name of each number; empty for a number without a name.
+        units: Unit of each number; empty for a number without a unit.
+        counters: Names of counters and clocks.
+    """
+    # Indices of names whose number has no unit, before a number that has a unit and no name
+    movable = [
+        index
+        for index, name in enumerate(names[:-1])
+        if name not in counters and not (names[index + 1] or units[index]) and units[index + 1]
+    ]
+    moved_names = names.copy()
+    for index in movable if len(movable) > 1 else []:
+        moved_names[index] = ""
+        moved_names[index + 1] = names[index]
+
     names_with_units = []
-    for number, (name, *words) in enumerate(zip(names, words_behind, words_before, strict=True), 1):
-        unit = next((word.strip("[]") for word in words if word.strip("[]") in units), common_unit)
+    for number, (name, unit) in enumerate(zip(moved_names, units, strict=True), 1):
         ending = "coulomb" if unit == "C" else unit  # `A_C` would be an electrode with the name C
-        is_added = unit and ending not in names and name not in {SEQ, *TIMES_US}
+        is_added = unit not in ("", "pC") and ending not in names and name not in counters
         names_with_units.append(f"{name or f'ch{number}'}_{ending}" if is_added else name)
     return names_with_units
 
