@@ -204,7 +204,7 @@ class Leak(Stage):
 
         # After a gap, check whether the touch has ended, or its charge is wrong.
         has_gap = dt_s > 1.5 * previous.dt_s  # frames are missing or were invalid
-        if has_gap and previous.is_contact and self._has_ended_in_gap(frame, output_pC, surplus_pC):
+        if has_gap and previous.is_contact and self._has_ended_in_gap(frame, surplus_pC):
             self._is_falsified = False
             surplus_pC = -self._charge_pC  # so that no touch charge remains
             has_gap = False
@@ -228,18 +228,16 @@ class Leak(Stage):
         """
         return np.exp(np.minimum(frame.dt_s / self._tau_s, 60.0))
 
-    def _has_ended_in_gap(self, frame: Frame, output_pC: Array, surplus_pC: Array) -> bool:
+    def _has_ended_in_gap(self, frame: Frame, surplus_pC: Array) -> bool:
         """Return whether a touch has ended in a gap, during which frames were missing.
 
         When a touch ends, a charge arrives that cancels the charge of the touch. It is not known when it arrived. If
         it arrived early, most of it has leaked since, so the output shows only a small part of it. The touch may have
-        ended if both are true: the outputs are almost zero, and the touch charges would be almost zero if the new
-        charge had arrived at the beginning of the gap. Up to 5 % of a charge may remain, because the time constant and
-        the inflow have errors.
+        ended if the touch charges would be almost zero if the new charge had arrived at the beginning of the gap. Up to
+        5 % of a charge may remain, because the time constant and the inflow have errors.
 
         Args:
             frame: The frame after the gap.
-            output_pC: Output of the amplifiers above the tare, shape (n_electrode,), pC.
             surplus_pC: New touch charge, if it arrived evenly in the gap, shape (n_electrode,), pC.
         """
         growth = self._growth(frame)
@@ -247,7 +245,7 @@ class Leak(Stage):
         margin_pC = np.maximum(4.0 * frame.noise_pC, 0.05 * np.abs(self._charge_pC))
         # An even arrival needs on average half of the correction for the leak that an arrival at the beginning needs.
         smallest_pC = self._charge_pC + surplus_pC * (1.0 + growth) / 2.0
-        return bool(((sign * output_pC <= margin_pC) & (sign * smallest_pC <= growth * margin_pC)).all())
+        return bool((sign * smallest_pC <= growth * margin_pC).all())
 
     def _is_large(self, error_pC: Array, frame: Frame) -> bool:
         """Return whether an error of the touch charge exceeds both the noise and 1 % of the touch charge.

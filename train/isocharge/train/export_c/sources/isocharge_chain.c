@@ -214,7 +214,7 @@ static void learn_inflow(isocharge_chain *chain, const real surplus_pC[N], real 
 }
 
 /* Set the charges to 0 if the touch ended in a gap; otherwise state whether the gap may have falsified them. */
-static void examine_gap(isocharge_chain *chain, const real output_pC[N], real surplus_pC[N], const real tau_s[N])
+static void examine_gap(isocharge_chain *chain, real surplus_pC[N], const real tau_s[N])
 {
     int left = chain->contact, falsified = chain->falsified;
 
@@ -227,7 +227,7 @@ static void examine_gap(isocharge_chain *chain, const real output_pC[N], real su
         const real smallest_pC = charge_pC + surplus_pC[k] * (1 + growth) / 2;
         const real error_pC = ABS(surplus_pC[k]) * (growth - 1) / 2;
 
-        left = left && sign * output_pC[k] <= margin_pC && sign * smallest_pC <= growth * margin_pC;
+        left = left && sign * smallest_pC <= growth * margin_pC;
         falsified = falsified || error_pC > larger(noise_pC, (real)0.01 * ABS(charge_pC + surplus_pC[k]));
     }
     chain->falsified = falsified && !left;
@@ -258,7 +258,7 @@ static void undo_leak(isocharge_chain *chain, const real output_pC[N], real dt_s
         real new_pC[N];
 
         EACH(k) new_pC[k] = surplus_pC[k];
-        examine_gap(chain, output_pC, new_pC, tau_s);
+        examine_gap(chain, new_pC, tau_s);
         EACH(k) chain->charge_pC[k] += new_pC[k];
     } else {
         EACH(k) chain->charge_pC[k] += surplus_pC[k];
