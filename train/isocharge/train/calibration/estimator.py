@@ -13,7 +13,6 @@ over the hypotheses, weighted by their evidence.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import compress, groupby, product
 
 import numpy as np
@@ -24,9 +23,8 @@ from isocharge.common.arrays import Array, Booleans
 from isocharge.common.contact_domain import with_log_force
 from isocharge.serve.model.robust_estimate import ModelValues, RobustPoint, RobustProblem
 from isocharge.simulate import NoiseModel
-from isocharge.simulate.sensor.film_properties import UNEVEN_TENSIONS
 from isocharge.train.calibration.film_charges import FilmCharges
-from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, Layout, unit_covariance
+from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, Prior
 from isocharge.train.calibration.press_data import (
     Linearised,
     PressData,
@@ -52,9 +50,6 @@ The sizes are relative to the prior standard deviations. An uneven tension may b
 
 DISCREPANCY_SIZES = ((0.001, 0.7), (0.005, 0.2), (0.02, 0.1))
 """Sizes of the discrepancy, relative to the charge, with their prior probabilities."""
-
-REMAINING_DISCREPANCY = 0.3
-"""Size of the discrepancy that an earlier calibration could not show, relative to the size of the hypothesis."""
 
 FORCE_SCATTERS = ((0.0, 0.8), (0.01, 0.1), (0.03, 0.1))
 """Random errors of the forces beyond the stated ones, relative to the force, with their prior probabilities."""
@@ -124,80 +119,6 @@ TYPICAL = np.array([1.0, 1.0, 1.0, 0.01, *(one.stds[-1][0] for one in SESSION)])
 
 No size is zero, so that all unknowns can differ from their means.
 """
-
-PLANNED = np.array([1.0, 0.5, 0.5, 0.01, *(one.stds[0][0] for one in SESSION)])
-"""Sizes of the parts of the prior covariance with which presses are planned before the first press."""
-
-
-@dataclass(frozen=True)
-class Prior:
-    """Gaussian prior distribution of all unknowns.
-
-    Attributes:
-        layout: Order of the unknowns.
-        earlier: Estimate of an earlier calibration with its drift; None for the prior distribution of the sensor.
-    """
-
-    layout: Layout
-    earlier: FilmEstimate | None = None
-
-    @property
-    def mean(self) -> Array:
-        """Means of the unknowns, shape (n_unknown,)."""
-        if self.earlier is not None:
-            return self.earlier.values
-        mean = np.zeros(self.layout.coefficients.stop)
-        mean[self.layout.film] = self.layout.prior.mean
-        return mean
-
-    @property
-    def bounds(self) -> tuple[Array, Array]:
-        """Smallest and largest unknowns, each of shape (n_unknown,); infinite except for the properties of the film."""
-        high = np.full(self.layout.coefficients.stop, np.inf)
-        low = -high
-        low[self.layout.film], high[self.layout.film] = self.layout.prior.bounds
-        return low, high
-
-    @cached_property
-    def parts(self) -> Array:
-        """Terms whose sum is the covariance of the unknowns, shape (4 + n_session, n_unknown, n_unknown).
-
-        The first part is the covariance that is the same under all hypotheses. The other parts are the covariances of
-        the uneven tension, of the other imperfections, of the discrepancy, and of each unknown of the session. A
-        hypothesis multiplies each of them by the square of its size; see `Hypothesis.sizes`. After an earlier
-        calibration, the first part is the covariance that it has found, which contains the imperfections. The part of
-        the discrepancy then describes only what the earlier calibration could not show.
-        """
-        layout = self.layout
-        n_unknown = layout.coefficients.stop
-        parts = np.zeros((4 + len(SESSION), n_unknown, n_unknown))
-        fixed, uneven_tension, others, discrepancy, *session = parts
-        discrepancy[layout.coefficients, layout.coefficients] = unit_covariance(
-            len(layout.prior.sensor.electrode_names)
-        )
-        for index, matrix in enumerate(session, layout.session.start):
-            matrix[index, index] = 1.0
-        if self.earlier is not None:
-            fixed += self.earlier.covariance
-            discrepancy *= REMAINING_DISCREPANCY**2
-            return parts
-        is_imperfection = layout.prior.is_imperfection
-        is_tension = np.isin(layout.prior.names, UNEVEN_TENSIONS)
-        for part, is_part in (
-            (fixed, ~is_imperfection),
-            (uneven_tension, is_tension),
-            (others, is_imperfection & ~is_tension),
-        ):
-            part[layout.film, layout.film] = np.diag(is_part * layout.prior.std**2)
-        return parts
-
-    def covariance(self, sizes: Array) -> Array:
-        """Return the covariance of the unknowns, shape (n_unknown, n_unknown).
-
-        Args:
-            sizes: Size of each part, by whose square the part is multiplied, shape (4 + n_session,).
-        """
-        return np.tensordot(sizes**2, self.parts, 1)
 
 
 @dataclass(frozen=True)

@@ -243,3 +243,81 @@ class FilmEstimate:
             for one in SESSION
             if abs(self.value(one.name)) > 3.0 * self.std(one.name)
         ]
+
+
+REMAINING_DISCREPANCY = 0.3
+"""Size of the discrepancy that an earlier calibration could not show, relative to the size of the hypothesis."""
+
+PLANNED = np.array([1.0, 0.5, 0.5, 0.01, *(one.stds[0][0] for one in SESSION)])
+"""Sizes of the parts of the prior covariance with which presses are planned before the first press."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Gaussian prior distribution of all unknowns.
+
+    Attributes:
+        layout: Order of the unknowns.
+        earlier: Estimate of an earlier calibration with its drift; None for the prior distribution of the sensor.
+    """
+
+    layout: Layout
+    earlier: FilmEstimate | None = None
+
+    @property
+    def mean(self) -> Array:
+        """Means of the unknowns, shape (n_unknown,)."""
+        if self.earlier is not None:
+            return self.earlier.values
+        mean = np.zeros(self.layout.coefficients.stop)
+        mean[self.layout.film] = self.layout.prior.mean
+        return mean
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Smallest and largest unknowns, each of shape (n_unknown,); infinite except for the properties of the film."""
+        high = np.full(self.layout.coefficients.stop, np.inf)
+        low = -high
+        low[self.layout.film], high[self.layout.film] = self.layout.prior.bounds
+        return low, high
+
+    @cached_property
+    def parts(self) -> Array:
+        """Terms whose sum is the covariance of the unknowns, shape (4 + n_session, n_unknown, n_unknown).
+
+        The first part is the covariance that is the same under all hypotheses. The other parts are the covariances of
+        the uneven tension, of the other imperfections, of the discrepancy, and of each unknown of the session. A
+        hypothesis multiplies each of them by the square of its size; see `Hypothesis.sizes`. After an earlier
+        calibration, the first part is the covariance that it has found, which contains the imperfections. The part of
+        the discrepancy then describes only what the earlier calibration could not show.
+        """
+        layout = self.layout
+        n_unknown = layout.coefficients.stop
+        parts = np.zeros((4 + len(SESSION), n_unknown, n_unknown))
+        fixed, uneven_tension, others, discrepancy, *session = parts
+        discrepancy[layout.coefficients, layout.coefficients] = unit_covariance(
+            len(layout.prior.sensor.electrode_names)
+        )
+        for index, matrix in enumerate(session, layout.session.start):
+            matrix[index, index] = 1.0
+        if self.earlier is not None:
+            fixed += self.earlier.covariance
+            discrepancy *= REMAINING_DISCREPANCY**2
+            return parts
+        is_imperfection = layout.prior.is_imperfection
+        is_tension = np.isin(layout.prior.names, UNEVEN_TENSIONS)
+        for part, is_part in (
+            (fixed, ~is_imperfection),
+            (uneven_tension, is_tension),
+            (others, is_imperfection & ~is_tension),
+        ):
+            part[layout.film, layout.film] = np.diag(is_part * layout.prior.std**2)
+        return parts
+
+    def covariance(self, sizes: Array) -> Array:
+        """Return the covariance of the unknowns, shape (n_unknown, n_unknown).
+
+        Args:
+            sizes: Size of each part, by whose square the part is multiplied, shape (4 + n_session,).
+        """
+        return np.tensordot(sizes**2, self.parts, 1)

@@ -10,9 +10,8 @@ from isocharge.simulate.forward.charge_map import check_electrode_count
 from isocharge.simulate.forward.family import check_family
 from isocharge.simulate.noise import NOISE_LEVELS
 from isocharge.simulate.sensor.film_properties import PRETENSION
-from isocharge.train.calibration.estimator import PLANNED, Prior
 from isocharge.train.calibration.film_charges import round_probe
-from isocharge.train.calibration.film_estimate import FilmEstimate, Layout
+from isocharge.train.calibration.film_estimate import PLANNED, FilmEstimate, Layout, Prior
 
 POSITION_MARGIN_MM = 0.5
 """Distance by which the solved presses extend beyond the working area, mm, because the places have errors."""
