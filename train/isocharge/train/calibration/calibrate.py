@@ -88,7 +88,7 @@ def calibrate(
             "force, so they say nothing about the film; give the position or the force of a press (four electrodes "
             "would have one redundant charge)"
         )
-    # Presses at the edge may lie outside the working area by their errors.
+    # The solved domain is larger than the working area, because errors may move presses at its edge to the outside.
     is_outside = problem.solved_domain.is_outside(ordered_presses.contact)
     used_presses = ordered_presses[~is_outside]
     cautions = []
@@ -104,28 +104,9 @@ def calibrate(
         charges = start or solve_even(problem, executor)
         if is_outside.mean() > 0.5:
             raise unexplained_error(ordered_presses, charges, outside_words)
-        check_channels(used_presses, charges)
-        if misfit(used_presses, charges) > SUSPICIOUS_MISFIT and find_mistakes(used_presses, charges):
-            raise unexplained_error(used_presses, charges, "their charges are very different from those of its films")
-        data = PressData.of(used_presses, problem.noise, problem.solved_domain)
-        estimation = _fit_even_film(problem, data, charges, executor)
-        is_at_end = np.equal(estimation.film.film_values, problem.prior.layout.prior.bounds)
-        is_doubtful = estimation.hypothesis.errors.position_ratio > 1.0 or is_at_end.any()
-        if is_doubtful and find_mistakes(used_presses, charges):
-            raise unexplained_error(
-                used_presses, charges, "only larger errors of the positions or an improbable film would explain them"
-            )
-        if accurate:
-            estimation = _fit_uneven_film(problem, data, estimation, executor)
-            if not _is_exact(estimation.charges, estimation.film.film_values, estimation.contact):
-                cautions.append(NOT_CONVERGED)
-        if estimation.is_unexplained:
-            residual = np.sqrt(estimation.chi2 / estimation.redundancy)
-            raise unexplained_error(
-                used_presses,
-                estimation.charges,
-                f"the charges of the best film differ from theirs by {residual:.2g} times the noise",
-            )
+        estimation = _fit_film(problem, used_presses, charges, accurate, executor)
+        if accurate and not _is_exact(estimation.charges, estimation.film.film_values, estimation.contact):
+            cautions.append(NOT_CONVERGED)
         _check_placement(estimation.film)
         sensitivity = ContactSensitivity.of(estimation.film, estimation.charges, problem.domain)
     return CalibrationResult(
@@ -153,13 +134,64 @@ def solve_even(
     return FilmCharges.of_even_film(layout.prior, film_values, problem.solved_domain, executor)
 
 
+def _fit_film(
+    problem: CalibrationProblem,
+    presses: MeasuredPresses,
+    charges: FilmCharges,
+    accurate: bool,
+    executor: Executor | None,
+) -> Estimation:
+    """Estimate a film from presses, of which most are in the solved domain.
+
+    Args:
+        problem: The calibration problem.
+        presses: The presses, with the electrodes in the order of the sensor.
+        charges: Charges of the film that is used first, and of similar films.
+        accurate: Whether an uneven film is solved.
+        executor: Executor that runs the solves; None for this process.
+
+    Raises:
+        PressError: If the presses probably contain a mistake, or no film explains them.
+    """
+    check_channels(presses, charges)
+    if misfit(presses, charges) > SUSPICIOUS_MISFIT and find_mistakes(presses, charges):
+        raise unexplained_error(presses, charges, "their charges are very different from those of its films")
+
+    data = PressData.of(presses, problem.noise, problem.solved_domain)
+    estimation = _fit_even_film(problem, data, charges, executor)
+    is_at_bound = np.equal(estimation.film.film_values, problem.prior.layout.prior.bounds)
+    is_doubtful = estimation.hypothesis.errors.position_ratio > 1.0 or is_at_bound.any()
+    if is_doubtful and find_mistakes(presses, charges):
+        raise unexplained_error(
+            presses, charges, "only larger errors of the positions or an improbable film would explain them"
+        )
+
+    if accurate:
+        estimation = _fit_uneven_film(problem, data, estimation, executor)
+    if estimation.is_unexplained:
+        residual = np.sqrt(estimation.chi2 / estimation.redundancy)
+        raise unexplained_error(
+            presses,
+            estimation.charges,
+            f"the charges of the best film differ from theirs by {residual:.2g} times the noise",
+        )
+    return estimation
+
+
 def _fit_even_film(
     problem: CalibrationProblem, data: PressData, charges: FilmCharges, executor: Executor | None
 ) -> Estimation:
-    """Solve axisymmetric films and estimate the properties in turn, until the estimate hardly changes."""
+    """Solve axisymmetric films and estimate the properties in turn, until the estimate hardly changes.
+
+    Args:
+        problem: The calibration problem.
+        data: The presses.
+        charges: Charges of the first solved film.
+        executor: Executor that runs the solves; None for this process.
+    """
     estimation = estimate(charges, data, problem.prior)
     for _ in range(MAX_SOLVED_FILMS - 1):
-        if _solved_distance(estimation) < SAME_FILM_STD:
+        if _largest_deviation(estimation) < SAME_FILM_STD:
             break
         charges = solve_even(problem, executor, estimation.film.film_values)
         estimation = estimate(charges, data, problem.prior, estimation)
@@ -173,17 +205,29 @@ def _fit_uneven_film(
 
     This step is repeated once if the estimate changes the film much. A nearly even film under an axisymmetric probe
     needs no step.
+
+    Args:
+        problem: The calibration problem.
+        data: The presses.
+        estimation: The estimate with an axisymmetric film, with which the first step begins.
+        executor: Executor that runs the solves; None for this process.
     """
     for _ in range(2):
-        charges, values = estimation.charges, estimation.film.film_values
+        charges = estimation.charges
+        values = estimation.film.film_values
         if _is_exact(charges, values, estimation.contact):
             break
-        estimation = estimate(charges.solved(values, executor), data, problem.prior, estimation)
+        solved_charges = charges.solved(values, executor)
+        estimation = estimate(solved_charges, data, problem.prior, estimation)
     return estimation
 
 
-def _solved_distance(estimation: Estimation) -> float:
-    """Return the largest difference of an even property from that of the solved film, in standard deviations."""
+def _largest_deviation(estimation: Estimation) -> float:
+    """Return the largest difference between a property of the estimate and of the solved film, in standard deviations.
+
+    Only properties that change the stress of an axisymmetric film are compared. The charges follow changes of the other
+    properties exactly, or these properties are imperfections.
+    """
     film, charges = estimation.film, estimation.charges
     is_even = charges.prior.changes_stress & ~charges.prior.is_imperfection
     std = np.sqrt(np.diagonal(film.covariance)[film.layout.film])
@@ -191,38 +235,43 @@ def _solved_distance(estimation: Estimation) -> float:
 
 
 def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
-    """Return whether the charges of the solved film hardly differ from those of the film with the given properties.
+    """Return whether first-order changes of a solved film give the charges of a film with given properties accurately.
 
-    The solved film may lack imperfections, and its probe may be round although the real probe is not. The lack of
-    imperfections may be neglected if their second-order effect on the charges is small. The second-order effect is
-    about the square of the first-order effect. An uneven tension has a further second-order effect, although its
-    first-order effect is small: if u is its ratio to the mean tension, the film behaves as if the mean tension were
-    smaller by up to u^2 / 2 of itself.
+    The solved film may lack imperfections, and its probe may be round although the real probe is not. First-order
+    changes are accurate enough if the second-order effects of the missing imperfections on the charges are small. The
+    second-order effect is about the square of the first-order effect. An uneven tension has a further second-order
+    effect, although its first-order effect is small: if u is its ratio to the mean tension, the film behaves as if the
+    mean tension were smaller by up to u^2 / 2 of itself.
 
     Args:
         charges: The solved film, with its charges and their derivatives.
         values: The given properties, shape (n_property,).
         contact: Contacts at which the effects are computed, shape (n, 3).
     """
-    solved, wanted = charges.film, charges.prior
-    if solved.probe.is_axisymmetric != wanted.probe.is_axisymmetric:
+    solved, prior = charges.film, charges.prior
+    if solved.probe.is_axisymmetric != prior.probe.is_axisymmetric:
         return False
-    if solved.sensor.film.shear != wanted.sensor.film.shear:
+    if solved.sensor.film.shear != prior.sensor.film.shear:
         return False
     charge, _, jacobian = charges.linearised(values, contact)
-    # Imperfections that change the stress may be missing in the solved film. The effects of all others are exact.
-    is_missing = wanted.is_imperfection & wanted.changes_stress
-    missing = np.where(is_missing, values - charges.values, 0.0)
     charge_size = np.linalg.norm(charge)
-    squared_effect = (np.linalg.norm(jacobian @ missing) / charge_size) ** 2
-    tension_index = wanted.index(PRETENSION.name)
-    lost_tension = 0.5 * values[tension_index] * (missing[np.isin(wanted.names, UNEVEN_TENSIONS)] ** 2).sum()
-    tension_effect = lost_tension * np.linalg.norm(jacobian[:, :, tension_index]) / charge_size
-    return bool(squared_effect + tension_effect < MAX_NEGLECTED_EFFECT)
+    # Imperfections that change the stress may be missing in the solved film. The effects of all others are exact.
+    may_be_missing = prior.is_imperfection & prior.changes_stress
+    missing = np.where(may_be_missing, values - charges.values, 0.0)  # by how much each property is missing
+    first_order_effect = np.linalg.norm(jacobian @ missing) / charge_size
+    tension_index = prior.index(PRETENSION.name)
+    missing_tensions = missing[np.isin(prior.names, UNEVEN_TENSIONS)]  # relative to the mean tension
+    lost_tension_MPa = 0.5 * values[tension_index] * (missing_tensions**2).sum()
+    tension_effect = lost_tension_MPa * np.linalg.norm(jacobian[:, :, tension_index]) / charge_size
+    return bool(first_order_effect**2 + tension_effect < MAX_NEGLECTED_EFFECT)
 
 
 def _is_uninformative(presses: MeasuredPresses) -> bool:
-    """Return whether there are presses, but all contacts are unknown and three charges only determine the contact."""
+    """Return whether presses cannot contain any information about the film, because they only determine their contacts.
+
+    This is the case if all contacts are unknown, and each press has at most three charges for its x, y and force.
+    Without presses, the result is False.
+    """
     return len(presses) > 0 and len(presses.electrodes) <= 3 and bool(np.isnan(presses.contact).all())
 
 

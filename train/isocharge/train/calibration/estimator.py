@@ -13,13 +13,15 @@ over the hypotheses, weighted by their evidence.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import compress, groupby, product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_solve
 from scipy.special import chdtrc, chdtri, softmax
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.contact_domain import with_log_force
 from isocharge.serve.model.robust_estimate import ModelValues, RobustPoint, RobustProblem
 from isocharge.simulate import NoiseModel
@@ -196,9 +198,6 @@ def _estimate_with_errors(
 ) -> Estimation:
     """Search for the film and for bad presses with assumed errors, and estimate the film under all hypotheses.
 
-    The result is a weighted average over the hypotheses. The weight of a hypothesis is proportional to its evidence.
-    Hypotheses with a weight below `MIN_WEIGHT` are left out.
-
     Args:
         charges: Charges of a solved film and of similar films.
         stated: The presses with their stated errors.
@@ -209,70 +208,49 @@ def _estimate_with_errors(
     """
     data = stated.with_errors(assumed)
     point = _most_probable_point(charges, data, prior, previous)
-    redundancy = np.maximum(np.isfinite(data.measured_std).sum(axis=1) - 3, 0)  # a contact has three unknowns
-    is_bad = (redundancy > 0) & (chdtrc(redundancy, point.chi2) < BAD_PROBABILITY)
-    # If most presses seem to be bad, the assumed film is wrong, and not the presses. Among a few presses, a bad press
-    # cannot be recognised. In both cases, all presses are used.
-    if is_bad.mean() > 0.5 or len(data) <= FEW_PRESSES:
-        is_bad[:] = False
+    is_bad = _find_bad_presses(data.redundancy, point.chi2)
     is_used = ~is_bad
 
-    # The estimate of each hypothesis follows from the linearised problem at the most probable unknowns so far.
-    # The second round considers only the hypotheses that are possible after the first. If the evidence is smaller at
-    # the estimate of the first round, the charges are too nonlinear there, and the second round is discarded.
-    used_data, used_contact = data[is_used], point.contacts[is_used]
-    unknowns = point.state
-    probable = all_hypotheses
-    largest_evidence = -np.inf
-    for _ in range(2):
-        # Compare the hypotheses. Those with the same errors of the presses share one linearised problem.
-        model = model_values(charges, prior.layout, used_data, unknowns, used_contact)
-        evidences = [
-            _Evidence.of(model, stated[is_used].with_errors(errors), used_contact, unknowns, prior, list(group))
-            for errors, group in groupby(probable, lambda one: one.errors)
-        ]
-        all_chi2, log_evidence = np.concatenate([one.chi2_and_log_evidence() for one in evidences], axis=1)
-        if log_evidence.max() < largest_evidence:
-            break
-        largest_evidence = log_evidence.max()
-        all_weights = softmax(log_evidence)
-        all_weights[all_weights < MIN_WEIGHT] = 0.0
-        all_weights /= all_weights.sum()
+    # The second average is linearised at the first average, and considers only its hypotheses. If the evidence is
+    # smaller there, the charges are too nonlinear, and the second average is discarded.
+    average_estimates = partial(_average_estimates, charges, stated[is_used], data[is_used], prior)
+    average = average_estimates(all_hypotheses, point.state, point.contacts[is_used])
+    second_average = average_estimates(average.hypotheses, average.unknowns, average.log_contact)
+    if second_average.largest_log_evidence >= average.largest_log_evidence:
+        average = second_average
 
-        # Compute the estimates under the probable hypotheses, and average them.
-        weights_of_evidences = np.split(all_weights, np.cumsum([len(one.hypotheses) for one in evidences])[:-1])
-        posteriors = [one.posterior(weight) for one, weight in zip(evidences, weights_of_evidences, strict=True)]
-        means = np.concatenate([mean for mean, _ in posteriors])
-        is_probable = all_weights > 0.0
-        weight, chi2 = all_weights[is_probable], all_chi2[is_probable]
-        probable = list(compress(probable, is_probable))
-        mean = weight @ means
-        covariance = prior.covariance(np.sqrt(weight @ np.array([one.sizes**2 for one in probable])))
-        covariance -= sum(reduction for _, reduction in posteriors)
-        # The means of the hypotheses differ, which adds to the covariance of the average.
-        covariance += np.cov(means, rowvar=False, ddof=0, aweights=weight)
-        used_contact = used_contact + Linearised.of(model, used_data, used_contact).contact_change(mean - unknowns)
-        unknowns = np.clip(mean, *prior.bounds)
-
-    best = weight.argmax()
     log_contact = point.contacts.copy()
-    log_contact[is_used] = used_contact
-    final_model = model_values(charges, prior.layout, data, unknowns, log_contact)
-    final_residual, _ = Linearised.of(final_model, data, log_contact).eliminated()
-    final_chi2 = (final_residual**2).sum(axis=1)
-    # The noise of a frame is at least the stated one, although averages of frames have less noise.
-    gains = np.maximum([one.errors.noise.gain for one in probable], stated.noise.gain)
-    noise = NoiseModel("presses", stated.noise.white, float(np.sqrt(weight @ gains**2)))
+    log_contact[is_used] = average.log_contact
+    model = model_values(charges, prior.layout, data, average.unknowns, log_contact)
+    residual, _ = Linearised.of(model, data, log_contact).eliminated()
+    press_chi2 = (residual**2).sum(axis=1)
+    best = average.weight.argmax()
     return Estimation(
         charges=charges,
-        film=FilmEstimate(prior.layout, unknowns, covariance, noise),
+        film=FilmEstimate(prior.layout, average.unknowns, average.covariance, average.noise(stated.noise)),
         contact=in_domain(log_contact, charges.domain),
         is_bad=is_bad,
-        press_chi2=np.where(redundancy > 0, final_chi2 / np.maximum(redundancy, 1), np.nan),
-        chi2=float(chi2[best]),
-        redundancy=float(redundancy[is_used].sum()),
-        hypothesis=probable[best],
+        press_chi2=np.where(data.redundancy > 0, press_chi2 / np.maximum(data.redundancy, 1), np.nan),
+        chi2=float(average.chi2[best]),
+        redundancy=float(data.redundancy[is_used].sum()),
+        hypothesis=average.hypotheses[best],
     )
+
+
+def _find_bad_presses(redundancy: Integers, chi2: Array) -> Booleans:
+    """Return whether each press is to be left out, because its residuals are improbably large, shape (n,).
+
+    If most presses seem to be bad, the assumed film is wrong, and not the presses. Among a few presses, a bad press
+    cannot be recognised. In both cases, no press is bad.
+
+    Args:
+        redundancy: Number of redundant measurements of each press, shape (n,).
+        chi2: Sum of the squared residuals of each press, shape (n,).
+    """
+    is_improbable = (redundancy > 0) & (chdtrc(redundancy, chi2) < BAD_PROBABILITY)
+    if is_improbable.mean() > 0.5 or len(chi2) <= FEW_PRESSES:
+        return np.zeros(len(chi2), dtype=bool)
+    return np.asarray(is_improbable)
 
 
 def _most_probable_point(
@@ -302,16 +280,106 @@ def _most_probable_point(
     return problem.estimate(unknowns, log_contact, state_bounds=prior.bounds)
 
 
+class _Average(NamedTuple):
+    """Average of the estimates under several hypotheses.
+
+    Attributes:
+        hypotheses: Hypotheses whose weight is not negligible.
+        weight: Weight of each of these hypotheses, which is proportional to its evidence, shape (n_hypothesis,).
+        chi2: Smallest sum of the squared residuals under each of these hypotheses, shape (n_hypothesis,).
+        largest_log_evidence: Logarithm of the largest evidence of a hypothesis.
+        unknowns: Weighted mean of the unknowns, shape (n_unknown,), within their bounds.
+        covariance: Covariance of the unknowns, shape (n_unknown, n_unknown).
+        log_contact: Contacts (x, y, ln F) that fit best to the mean unknowns, shape (n, 3).
+    """
+
+    hypotheses: list[Hypothesis]
+    weight: Array
+    chi2: Array
+    largest_log_evidence: float
+    unknowns: Array
+    covariance: Array
+    log_contact: Array
+
+    def noise(self, stated: NoiseModel) -> NoiseModel:
+        """Return the root mean square of the noise over the hypotheses.
+
+        Args:
+            stated: Noise of a frame. Averages of frames have less noise, but a later frame has at least this noise.
+        """
+        gains = np.maximum([one.errors.noise.gain for one in self.hypotheses], stated.gain)
+        return NoiseModel("presses", stated.white, float(np.sqrt(self.weight @ gains**2)))
+
+
+def _average_estimates(
+    charges: FilmCharges,
+    stated: PressData,
+    data: PressData,
+    prior: Prior,
+    hypotheses: list[Hypothesis],
+    unknowns: Array,
+    log_contact: Array,
+) -> _Average:
+    """Estimate the unknowns under each hypothesis, and average the estimates by the evidence of the hypotheses.
+
+    The charges are linearised at given unknowns and contacts. Hypotheses with a weight below `MIN_WEIGHT` are left out.
+
+    Args:
+        charges: Charges of a solved film and of similar films.
+        stated: The presses with their stated errors, which a hypothesis replaces by its own.
+        data: The presses with assumed errors, with which the contacts follow the mean unknowns.
+        prior: Prior distribution of the unknowns.
+        hypotheses: The hypotheses. Those with the same errors of the presses follow one another.
+        unknowns: Unknowns at which the charges are linearised, shape (n_unknown,).
+        log_contact: Contacts (x, y, ln F) at which the charges are linearised, shape (n, 3).
+    """
+    # Compare the hypotheses. Those with the same errors of the presses share one linearised problem.
+    model = model_values(charges, prior.layout, data, unknowns, log_contact)
+    groups = [
+        _HypothesisGroup.of(model, stated.with_errors(errors), log_contact, unknowns, prior, list(group))
+        for errors, group in groupby(hypotheses, lambda one: one.errors)
+    ]
+    all_chi2, log_evidence = np.concatenate([group.chi2_and_log_evidence() for group in groups], axis=1)
+    all_weights = softmax(log_evidence)
+    all_weights[all_weights < MIN_WEIGHT] = 0.0
+    all_weights /= all_weights.sum()
+    is_probable = all_weights > 0.0
+    weight = all_weights[is_probable]
+    probable = list(compress(hypotheses, is_probable))
+
+    # Compute the means and the covariances of the unknowns under the probable hypotheses, and average them.
+    first_indices = np.cumsum([len(group.hypotheses) for group in groups])[:-1]  # of all groups but the first
+    weights_of_groups = np.split(all_weights, first_indices)
+    posteriors = [group.posterior(weights) for group, weights in zip(groups, weights_of_groups, strict=True)]
+    means = np.concatenate([mean for mean, _ in posteriors])
+    mean = weight @ means
+    mean_squared_sizes = weight @ np.array([one.sizes**2 for one in probable])
+    covariance = prior.covariance(np.sqrt(mean_squared_sizes))
+    covariance -= sum(reduction for _, reduction in posteriors)
+    # The means of the hypotheses differ, which adds to the covariance of the average.
+    covariance += np.cov(means, rowvar=False, ddof=0, aweights=weight)
+    contact_change = Linearised.of(model, data, log_contact).contact_change(mean - unknowns)
+    return _Average(
+        hypotheses=probable,
+        weight=weight,
+        chi2=all_chi2[is_probable],
+        largest_log_evidence=log_evidence.max(),
+        unknowns=np.clip(mean, *prior.bounds),
+        covariance=covariance,
+        log_contact=log_contact + contact_change,
+    )
+
+
 @dataclass(frozen=True)
-class _Evidence:
-    """What presses with given errors state about the unknowns, in the linearised problem.
+class _HypothesisGroup:
+    """Hypotheses with the same errors of the presses, and the linearised residuals of the presses with these errors.
 
     The residuals r at the prior means, without the effect of the contacts, have the covariance S = 1 + J P J', where
     J contains their derivatives, and P is the prior covariance of the unknowns. The prior covariance, and therefore S,
     depends on the hypothesis.
 
     Attributes:
-        hypotheses: Hypotheses with these errors of the presses.
+        hypotheses: The hypotheses.
         prior: Prior distribution of the unknowns.
         residual: Residuals r, shape (m,), in a basis of all residuals that the unknowns change.
         jacobian: Derivatives J, shape (m, n_unknown).
@@ -338,7 +406,7 @@ class _Evidence:
         unknowns: Array,
         prior: Prior,
         hypotheses: list[Hypothesis],
-    ) -> "_Evidence":
+    ) -> "_HypothesisGroup":
         """Linearise the residuals, and eliminate the contacts from them, so that they only depend on the unknowns.
 
         The residuals are then projected onto the column space of their Jacobian (QR factorisation), which has fewer
@@ -358,19 +426,16 @@ class _Evidence:
         is_changed = eliminated_jacobian.any(axis=2)  # False for a coordinate that was not measured
         basis, jacobian = np.linalg.qr(eliminated_jacobian[is_changed])
         residual = basis.T @ eliminated[is_changed]
-        by_contact = linearised.contact_jacobian
-        contact_precision = by_contact.swapaxes(1, 2) @ by_contact
-        contact_precision += 1e-6 * np.eye(3)  # without it, the volume of fewer than three measurements is infinite
-        log_contact_volume = -0.5 * np.linalg.slogdet(contact_precision)[1].sum()
+        prior_change = unknowns - prior.mean
         log_density = -np.log(data.measured_std[np.isfinite(data.measured_std)]).sum()
         return cls(
             hypotheses=hypotheses,
             prior=prior,
-            residual=residual - jacobian @ (unknowns - prior.mean),
+            residual=residual - jacobian @ prior_change,
             jacobian=jacobian,
             parts=jacobian @ prior.parts @ jacobian.T,
             other_chi2=float((eliminated**2).sum() - residual @ residual),
-            log_volume=float(log_contact_volume + log_density),
+            log_volume=float(linearised.log_contact_volume + log_density),
         )
 
     def chi2_and_log_evidence(self) -> tuple[Array, Array]:
@@ -383,7 +448,7 @@ class _Evidence:
             Smallest sum of the squared residuals of the presses and of the prior distribution that any unknowns give,
             and logarithm of the evidence, each of shape (n_hypothesis,).
         """
-        factors = np.linalg.cholesky(self._covariance(self._squared_sizes))
+        factors = np.linalg.cholesky(self._covariance(self._squared_sizes))  # shape (n_hypothesis, m, m)
         weighted = [cho_solve((factor, True), self.residual, check_finite=False) for factor in factors]  # S^-1 r
         chi2 = self.other_chi2 + np.array(weighted) @ self.residual
         log_determinant = 2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)

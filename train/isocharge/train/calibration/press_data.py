@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans
+from isocharge.common.arrays import Array, Booleans, Integers
 from isocharge.common.contact_domain import into_unit_domain, with_log_force
 from isocharge.serve.model.robust_estimate import ModelValues
 from isocharge.serve.presses.measured_presses import MeasuredPresses
@@ -83,6 +83,11 @@ class PressData:
         """Standard deviations of the charges and of the contacts, shape (n, n_electrode + 3); infinite if unknown."""
         return np.column_stack([self.charge_std, self.contact_std])
 
+    @property
+    def redundancy(self) -> Integers:
+        """Number of redundant measurements of each press, shape (n,). The contact of a press has three unknowns."""
+        return np.asarray(np.maximum(np.isfinite(self.measured_std).sum(axis=1) - 3, 0))
+
     def __getitem__(self, rows: Booleans) -> "PressData":
         """Return some of the presses. Their times keep their reference."""
         names = ("charge", "charge_std", "contact", "contact_std", "time")
@@ -130,6 +135,14 @@ class Linearised:
             weight[:, :, None] * np.pad(model.by_state, ((0, 0), (0, 3), (0, 0))),
             weight[:, :, None] * np.concatenate([model.by_contact, contact_rows], axis=1),
         )
+
+    @property
+    def log_contact_volume(self) -> float:
+        """Logarithm of the volume of the contacts of all presses that agree with the measurements, up to a constant."""
+        precision = self.contact_jacobian.swapaxes(1, 2) @ self.contact_jacobian
+        precision += 1e-6 * np.eye(3)  # without it, the volume of fewer than three measurements is infinite
+        _, log_determinants = np.linalg.slogdet(precision)
+        return float(-0.5 * log_determinants.sum())
 
     def eliminated(self) -> tuple[Array, Array]:
         """Return the residuals and their derivatives after the best change of each contact.
