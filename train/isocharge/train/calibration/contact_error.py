@@ -86,14 +86,15 @@ class ContactSensitivity:
             charges: Charges of a film and of similar films.
             domain: The working area.
         """
+        # The equations are those of the module, with J and A in standard deviations of the noise, so that W = 1.
         linearised = _linearise_at(film, charges, spread_contacts(domain))
-        slopes = linearised.contact_jacobian
-        # The error of a contact is (S' S + P)^-1 S' (noise + R e), where e is the error of the unknowns, and P is the
-        # precision of the prior. S and R are the derivatives of the charges with respect to the contact and to the
-        # unknowns. A uniform distribution from -1 to 1 has the variance 1/3.
-        domain_precision = np.diag(3.0 / domain.scale**2)
-        noise_covariance = np.linalg.inv(slopes.swapaxes(1, 2) @ slopes + domain_precision)
-        film_gain = noise_covariance @ slopes.swapaxes(1, 2) @ linearised.jacobian
+        slopes = linearised.contact_jacobian  # J for each contact, shape (n, n_row, 3)
+        transposed_slopes = slopes.swapaxes(1, 2)
+        # A contact that may lie anywhere in the domain has unit coordinates that are uniformly distributed from -1 to
+        # 1, with the variance 1/3.
+        domain_precision = np.diag(3.0 / domain.scale**2)  # P
+        noise_covariance = np.linalg.inv(transposed_slopes @ slopes + domain_precision)
+        film_gain = noise_covariance @ transposed_slopes @ linearised.jacobian  # G
         # The charges of a later contact do not depend on the offset of the forces that the load cell stated.
         film_gain[:, :, film.layout.index("force_offset")] = 0.0
         return cls(film_gain, np.asarray(noise_covariance))
@@ -169,23 +170,27 @@ def next_presses(
     covariance = film.covariance
     candidates = _candidates(problem)
     contact_std = (position_std_mm, position_std_mm, force_std)
-    _, candidate_rows = _linearise_at(film, charges, candidates, contact_std).eliminated()
+    # Derivatives H of the residuals of each candidate with respect to the unknowns, shape (n, n_electrode, n_unknown)
+    _, jacobian = _linearise_at(film, charges, candidates, contact_std).eliminated()
     sensitivity = ContactSensitivity.of(film, charges, problem.domain)
 
-    # Divide the errors of x, y and ln F by those that the noise causes, so that they can be added.
-    scale = np.sqrt(np.diagonal(sensitivity.noise_covariance, axis1=1, axis2=2).mean(axis=0))  # shape (3,)
-    gain = sensitivity.film_gain / scale[:, None]
+    # Divide the errors of x, y and ln F by those that the noise causes, so that their squares can be added. If the
+    # unknowns have the covariance C, the sum of the squared errors of all contacts is the trace of G C G'. In the
+    # following sum over the contacts n and their coordinates i, j and k are unknowns.
+    noise_std = np.sqrt(np.diagonal(sensitivity.noise_covariance, axis1=1, axis2=2).mean(axis=0))  # shape (3,)
+    gain = sensitivity.film_gain / noise_std[:, None]
     squared_gain = np.einsum("nij,nik->jk", gain, gain)  # G' G, shape (n_unknown, n_unknown)
     proposed = []
     for _ in range(count):
-        # A candidate with the rows H reduces the covariance C by C H' (1 + H C H')^-1 H C.
-        spread_rows = np.tensordot(candidate_rows, covariance, 1)  # H C, shape (n, n_row, n_unknown)
-        innovation = np.eye(candidate_rows.shape[1]) + spread_rows @ candidate_rows.swapaxes(1, 2)  # 1 + H C H'
-        effect = np.tensordot(spread_rows, squared_gain, 1) @ spread_rows.swapaxes(1, 2)
-        reduction = np.trace(np.linalg.solve(innovation, effect), axis1=1, axis2=2)  # of the sum of the squared errors
+        # A press reduces the covariance by C H' (1 + H C H')^-1 H C (Kalman), and therefore the sum of the squared
+        # errors by the trace of (1 + H C H')^-1 H C G' G C H'.
+        cross_covariance = np.tensordot(jacobian, covariance, 1)  # H C, shape (n, n_electrode, n_unknown)
+        residual_covariance = np.eye(jacobian.shape[1]) + cross_covariance @ jacobian.swapaxes(1, 2)
+        effect = np.tensordot(cross_covariance, squared_gain, 1) @ cross_covariance.swapaxes(1, 2)
+        reduction = np.trace(np.linalg.solve(residual_covariance, effect), axis1=1, axis2=2)  # shape (n,)
         best = int(reduction.argmax())
-        rows = spread_rows[best]
-        covariance = covariance - rows.T @ np.linalg.solve(innovation[best], rows)
+        best_rows = cross_covariance[best]
+        covariance = covariance - best_rows.T @ np.linalg.solve(residual_covariance[best], best_rows)
         error = sensitivity.film_error(covariance)
         x, y, force = candidates[best].tolist()
         proposed.append(ProposedPress(x, y, force, error.position_mm, error.force_percent))
@@ -198,24 +203,30 @@ def spread_contacts(domain: Domain) -> Array:
 
 
 def _candidates(problem: CalibrationProblem) -> Array:
-    """Return the presses that are compared, (x, y, F), shape (n, 3)."""
+    """Return the contacts (x, y, F) of the presses that are compared, shape (n, 3), mm and N.
+
+    Positions and forces are rounded to grids, so that a person can set them. No force causes too large a stress.
+    """
     domain = problem.domain
     grid_position = np.unique(np.round(sunflower(N_CONTACTS) * domain.radius / GRID_MM), axis=0)
-    position = GRID_MM * grid_position + 0.0  # not -0.0
-    position = position[np.hypot(*position.T) <= domain.radius]
+    rounded_position = GRID_MM * grid_position + 0.0  # not -0.0
+    position = rounded_position[np.hypot(*rounded_position.T) <= domain.radius]
+
     low, high = domain.force_range
-    strongest = force_within_stress(problem.sensor.film, problem.probe, problem.stress_limit, domain.force_range)
-    high = min(high, strongest)
-    forces = log_spaced_forces(np.array(CANDIDATE_FORCES), (low, high))
-    grid = min(GRID_N, low)
-    forces = np.clip(np.round(forces / grid) * grid, low, high)
-    return np.array([(x, y, force) for x, y in position for force in forces])
+    film_limit = force_within_stress(problem.sensor.film, problem.probe, problem.stress_limit, domain.force_range)
+    high_within_stress = min(high, film_limit)
+    force = log_spaced_forces(np.array(CANDIDATE_FORCES), (low, high_within_stress))
+    grid_N = min(GRID_N, low)
+    rounded_force = np.clip(np.round(force / grid_N) * grid_N, low, high_within_stress)
+    return np.array([(x, y, force_N) for x, y in position for force_N in rounded_force])
 
 
 def _linearise_at(
     film: FilmEstimate, charges: FilmCharges, contact: Array, contact_std: Sequence[float] = (UNKNOWN_STD,) * 3
 ) -> Linearised:
-    """Compute the derivatives of the residuals of presses without noise on a film.
+    """Compute the derivatives of the residuals of planned presses on a film.
+
+    The measured charges are assumed to be those of the film, so that all residuals are zero.
 
     Args:
         film: The film and the noise of the charges.
@@ -225,7 +236,7 @@ def _linearise_at(
     """
     log_contact = with_log_force(contact)
     unknown_charge = np.zeros((len(contact), len(charges.prior.sensor.electrodes)))
-    planned = PressData(
+    without_charges = PressData(
         charge=unknown_charge,
         charge_std=unknown_charge,
         noise=film.noise,
@@ -233,6 +244,6 @@ def _linearise_at(
         contact_std=np.broadcast_to(contact_std, contact.shape),
         time=np.linspace(-0.5, 0.5, len(contact)),
     )
-    model = model_values(charges, film.layout, planned, film.values, log_contact)
-    data = replace(planned, charge=model.charge_pC, charge_std=film.noise.sigma(model.charge_pC))
+    model = model_values(charges, film.layout, without_charges, film.values, log_contact)
+    data = replace(without_charges, charge=model.charge_pC, charge_std=film.noise.sigma(model.charge_pC))
     return Linearised.of(model, data, log_contact)

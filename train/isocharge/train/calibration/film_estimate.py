@@ -49,9 +49,9 @@ def terms(contact: Array, domain: Domain) -> Array:
     degrees = _degrees()
     largest_degrees = (DEGREE, DEGREE, FORCE_DEGREE)
     x, y, log_force = domain.to_unit(contact).T
-    products = chebyshev.chebvander3d(x, y, log_force, largest_degrees)
-    columns = np.ravel_multi_index(degrees.T, np.add(largest_degrees, 1))  # columns of `products` with these degrees
-    return np.asarray(FADING ** degrees.sum(axis=1) * products[:, columns])
+    all_products = chebyshev.chebvander3d(x, y, log_force, largest_degrees)  # one column for each (i, j, m)
+    columns = np.ravel_multi_index(degrees.T, np.add(largest_degrees, 1))  # the columns with the degrees of the terms
+    return np.asarray(FADING ** degrees.sum(axis=1) * all_products[:, columns])
 
 
 def discrepancy_jacobian(charge: Array, contact: Array, domain: Domain) -> Array:
@@ -65,9 +65,11 @@ def discrepancy_jacobian(charge: Array, contact: Array, domain: Domain) -> Array
         domain: Range of positions and forces to which the variables of the polynomials are scaled.
 
     Returns:
-        Derivatives, shape (n, n_electrode, n_coefficient), pC. The index of the electrode changes fastest.
+        Derivatives, shape (n, n_electrode, n_coefficient), pC. The coefficients of a term follow one another.
     """
-    own_charge = charge[:, :, None] * np.eye(charge.shape[1])
+    # A coefficient belongs to one term and one electrode, and only changes the charge of its own electrode. The axes of
+    # the jacobian are the press, the electrode of the charge, the term, and the electrode of the coefficient.
+    own_charge = charge[:, :, None] * np.eye(charge.shape[1])  # zero between different electrodes
     jacobian = own_charge[:, :, None, :] * terms(contact, domain)[:, None, :, None]
     return jacobian.reshape(*charge.shape, -1)
 
@@ -85,8 +87,9 @@ def unit_covariance(n_electrode: int) -> Array:
     The factors FADING^(i + j + m) belong to `terms`. The coefficients of a term are correlated between electrodes.
 
     Returns:
-        Covariance, shape (n_term * n_electrode, n_term * n_electrode). The index of the electrode changes fastest.
+        Covariance, shape (n_term * n_electrode, n_term * n_electrode). The coefficients of a term follow one another.
     """
+    # A coefficient is the sum of a part of its own and a part that is the same for all electrodes, both of variance 1.
     between_electrodes = np.eye(n_electrode) + np.ones((n_electrode, n_electrode))
     return np.asarray(np.kron(np.eye(len(_degrees())), between_electrodes), dtype=float)
 
@@ -294,24 +297,24 @@ class Prior:
         layout = self.layout
         n_unknown = layout.coefficients.stop
         parts = np.zeros((4 + len(SESSION), n_unknown, n_unknown))
-        fixed, uneven_tension, others, discrepancy, *session = parts
+        fixed, uneven_tension, other_imperfections, discrepancy, *session = parts  # views, which are filled below
         discrepancy[layout.coefficients, layout.coefficients] = unit_covariance(
             len(layout.prior.sensor.electrode_names)
         )
-        for index, matrix in enumerate(session, layout.session.start):
-            matrix[index, index] = 1.0
+        for index, part in enumerate(session, layout.session.start):
+            part[index, index] = 1.0
         if self.earlier is not None:
             fixed += self.earlier.covariance
             discrepancy *= REMAINING_DISCREPANCY**2
             return parts
         is_imperfection = layout.prior.is_imperfection
         is_tension = np.isin(layout.prior.names, UNEVEN_TENSIONS)
-        for part, is_part in (
+        for part, is_in_part in (
             (fixed, ~is_imperfection),
             (uneven_tension, is_tension),
-            (others, is_imperfection & ~is_tension),
+            (other_imperfections, is_imperfection & ~is_tension),
         ):
-            part[layout.film, layout.film] = np.diag(is_part * layout.prior.std**2)
+            part[layout.film, layout.film] = np.diag(is_in_part * layout.prior.std**2)
         return parts
 
     def covariance(self, sizes: Array) -> Array:

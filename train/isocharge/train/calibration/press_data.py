@@ -97,7 +97,7 @@ class PressData:
         """Return a copy of these presses whose stated errors are replaced by errors of the given sizes."""
         noise, position_ratio, force_scatter = errors
         charge_std = np.where(np.isfinite(self.charge_std), noise.sigma(self.charge), UNKNOWN_STD)
-        force_std = np.hypot(self.contact_std[:, 2], force_scatter)
+        force_std = np.hypot(self.contact_std[:, 2], force_scatter)  # the sum of two independent errors
         contact_std = np.column_stack([position_ratio * self.contact_std[:, :2], force_std])
         return replace(self, charge_std=charge_std, noise=noise, contact_std=contact_std)
 
@@ -129,12 +129,11 @@ class Linearised:
         """
         weight = 1.0 / data.measured_std
         residual = np.column_stack([model.charge_pC - data.charge, contact - data.contact])
+        # The unknowns do not change the contact, and each coordinate of the contact only changes itself.
+        jacobian = np.pad(model.by_state, ((0, 0), (0, 3), (0, 0)))
         contact_rows = np.tile(np.eye(3), (len(data), 1, 1))
-        return cls(
-            weight * residual,
-            weight[:, :, None] * np.pad(model.by_state, ((0, 0), (0, 3), (0, 0))),
-            weight[:, :, None] * np.concatenate([model.by_contact, contact_rows], axis=1),
-        )
+        contact_jacobian = np.concatenate([model.by_contact, contact_rows], axis=1)
+        return cls(weight * residual, weight[:, :, None] * jacobian, weight[:, :, None] * contact_jacobian)
 
     @property
     def log_contact_volume(self) -> float:
@@ -145,18 +144,24 @@ class Linearised:
         return float(-0.5 * log_determinants.sum())
 
     def eliminated(self) -> tuple[Array, Array]:
-        """Return the residuals and their derivatives after the best change of each contact.
+        """Return the part of the residuals that no change of the contacts can reduce, and its derivatives.
+
+        The residuals of a press are a vector. A change of the three coordinates of its contact only changes this vector
+        within a subspace of three dimensions. The results are components in an orthonormal basis of the other
+        n_electrode dimensions.
 
         Returns:
-            Residuals, shape (n, n_electrode), and derivatives, shape (n, n_electrode, n_unknown), in an orthonormal
-            basis of the space in which the contacts have no effect.
+            Residuals, shape (n, n_electrode), and derivatives with respect to the unknowns, shape (n, n_electrode,
+            n_unknown).
         """
+        # The first three columns of the complete basis span the subspace of the contact, and the others the rest.
         basis, _ = np.linalg.qr(self.contact_jacobian, mode="complete")
-        transposed = basis[:, :, 3:].swapaxes(1, 2)
-        return (transposed @ self.residual[:, :, None])[:, :, 0], transposed @ self.jacobian
+        projection = basis[:, :, 3:].swapaxes(1, 2)  # shape (n, n_electrode, n_electrode + 3)
+        residual = (projection @ self.residual[:, :, None])[:, :, 0]
+        return residual, projection @ self.jacobian
 
     def contact_change(self, change: Array) -> Array:
-        """Return the changes of the contacts that fit best after a change of the unknowns.
+        """Return the changes of the contacts that minimise the squared residuals after a change of the unknowns.
 
         Args:
             change: Change of the unknowns, shape (n_unknown,).
@@ -171,22 +176,31 @@ class Linearised:
 def model_values(charges: FilmCharges, layout: Layout, data: PressData, unknowns: Array, contact: Array) -> ModelValues:
     """Compute the charges of presses for given unknowns, and their derivatives.
 
+    The unknowns are properties of the film, unknowns of the session of presses such as an offset of all charges, and
+    coefficients of the discrepancy between the real film and its description.
+
     Args:
-        charges: Charges of a solved film and of similar films.
+        charges: Charges of a solved film, from which those of films with slightly other properties follow.
         layout: Order of the unknowns.
-        data: The presses, from which the effects of the unknowns of the session follow.
+        data: The presses, of which only the times are used.
         unknowns: Values of the unknowns, shape (n_unknown,).
-        contact: Contacts (x, y, ln F), shape (n, 3).
+        contact: Contacts (x, y, ln F), shape (n, 3). Contacts outside the domain are moved to its nearest contact.
+
+    Returns:
+        Charges, pC, and their derivatives with respect to x, y and ln F and to the unknowns.
     """
     metric_contact = in_domain(contact, charges.domain)  # (x, y, F), mm and N
-    charge, contact_slopes, film_jacobian = charges.linearised(unknowns[layout.film], metric_contact)
+    film_charge, contact_slopes, film_jacobian = charges.linearised(unknowns[layout.film], metric_contact)
     force_slope = contact_slopes[:, :, 2] / metric_contact[:, 2:]  # with respect to F instead of ln F, pC/N
-    session_jacobian = np.stack([one.effect(data.time, charge, force_slope) for one in SESSION], axis=2)
-
-    coefficient_jacobian = discrepancy_jacobian(charge, metric_contact, charges.domain)
+    session_effects = [session_unknown.effect(data.time, film_charge, force_slope) for session_unknown in SESSION]
+    session_jacobian = np.stack(session_effects, axis=2)
+    coefficient_jacobian = discrepancy_jacobian(film_charge, metric_contact, charges.domain)
     jacobian = np.concatenate([film_jacobian, session_jacobian, coefficient_jacobian], axis=2)
+
+    # The charges are linear in the unknowns of the session and in the coefficients of the discrepancy.
     beyond_film = slice(layout.film.stop, None)
-    return ModelValues(charge + jacobian[:, :, beyond_film] @ unknowns[beyond_film], contact_slopes, jacobian)
+    addition = jacobian[:, :, beyond_film] @ unknowns[beyond_film]
+    return ModelValues(film_charge + addition, contact_slopes, jacobian)
 
 
 def in_domain(contact: Array, domain: Domain) -> Array:
