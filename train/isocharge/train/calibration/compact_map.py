@@ -74,22 +74,28 @@ def compact_charges(
         film: The estimate, with the noise of the charges, which decides how many directions are needed.
         executor: Executor that solves the films at the nodes; None for this process.
     """
-    contact = draw_contacts(np.random.default_rng(SEED), domain, SERIES_CONTACTS)
-    names = charges.prior.sensor.electrode_names
+    # Solve the films at the nodes. With three electrodes, the charges only determine the contact, so that a change of
+    # the pretension cannot be followed, and the calibrated film is the only node.
+    electrodes = charges.prior.sensor.electrode_names
     calibrated = _ChangedFilm(0.0, charges, film.film_values, np.eye(film.film_values.size))
     films = [calibrated]
-    if len(names) > len(CONTACT):  # three charges only determine the contact
+    if len(electrodes) > len(CONTACT):
         films = [calibrated.changed(change_MPa, executor) for change_MPa in _nodes(film)]
+    node_MPa = np.array([node_film.change_MPa for node_film in films])
+
+    # Compute the charges of all contacts on the calibrated film, and of the first contacts on the other films.
+    contact = draw_contacts(np.random.default_rng(SEED), domain, SERIES_CONTACTS)
     first_contacts = contact[:CHANGE_CONTACTS]
-    jobs = [partial(calibrated.charge, contact), *(partial(one.charge, first_contacts) for one in films)]
-    film_charge, *changed_charges = in_order(executor, call, jobs)
+    node_jobs = [partial(node_film.charge, first_contacts) for node_film in films]
+    film_charge, *changed_charges = in_order(executor, call, [partial(calibrated.charge, contact), *node_jobs])
     discrepancy = discrepancy_jacobian(film_charge, contact, charges.domain) @ film.values[film.layout.coefficients]
     charge = film_charge + discrepancy  # most probable charges without offset, shape (n, n_electrode)
-    node_MPa = np.array([one.change_MPa for one in films])
+
+    # Fit series to the charges at the nodes, and to the effects of the directions.
     node_charge = _node_charges(domain.to_unit(contact), charge[:, None], np.stack(changed_charges, axis=1), node_MPa)
-    series = _fit_followable_nodes(domain, names, contact, node_charge, node_MPa)
+    series = _fit_followable_nodes(domain, electrodes, contact, node_charge, node_MPa)
     few_contacts, few_charges = contact[:DIRECTION_CONTACTS], charge[:DIRECTION_CONTACTS]
-    followed_films = [one for one in films if one.change_MPa in series.node_MPa]
+    followed_films = [node_film for node_film in films if node_film.change_MPa in series.node_MPa]
     return replace(
         series,
         directions=_directions(series, film, calibrated, followed_films, few_contacts, few_charges, executor),
@@ -134,14 +140,19 @@ class _ChangedFilm:
         uneven_indices = [prior.index(name) for name in UNEVEN_TENSIONS]
         values = self.values.copy()
         values[tension_index] += change_MPa
+
         # The values contain the uneven parts of the tension as shares of the mean tension. In MPa, they do not change.
-        # A film without tension has no shares. The smallest tension then avoids a division by zero.
-        tension_MPa = max(float(values[tension_index]), 1e-9)
+        # If T is the mean tension before the change D, a share s becomes s T / (T + D). A film without tension has no
+        # shares. The smallest tension then avoids a division by zero.
+        tension_MPa = max(float(values[tension_index]), 1e-9)  # T + D
         share_ratio = self.values[tension_index] / tension_MPa
         values[uneven_indices] *= share_ratio
+
+        # The derivatives of s T / (T + D) are T / (T + D) with respect to s, and s D / (T + D)^2 with respect to T.
         by_calibrated = np.eye(values.size)
         by_calibrated[uneven_indices, uneven_indices] = share_ratio
         by_calibrated[uneven_indices, tension_index] = self.values[uneven_indices] * change_MPa / tension_MPa**2
+
         even_charges = self.charges.even
         if change_MPa != 0.0:
             even_charges = FilmCharges.of_even_film(prior, values, self.charges.domain, executor)
@@ -227,17 +238,18 @@ def _node_charges(unit_contact: Array, charge: Array, changed_charge: Array, nod
     """
     has_one_sign = np.ptp(np.sign(changed_charge)) == 0.0
 
-    def size(charge: Array) -> Array:
-        """Return the values to which the changes of the charges of a film are relative."""
-        return charge if has_one_sign else np.linalg.norm(charge, axis=2, keepdims=True)
+    def change_unit(film_charge: Array) -> Array:
+        """Return the charges to which the changes of given charges are relative."""
+        return film_charge if has_one_sign else np.linalg.norm(film_charge, axis=2, keepdims=True)
 
     charge_before = changed_charge[:, node_MPa == 0.0]
-    changes = (changed_charge - charge_before) / size(charge_before)
-    first_contact, other_contact = np.split(unit_contact, [len(changes)])
-    series = Series(fit_series(first_contact, changes.reshape(len(changes), -1), *CHANGE_DEGREES))
+    changes = (changed_charge - charge_before) / change_unit(charge_before)  # shape (n_first, n_node, n_electrode)
+    n_first, n_node, n_electrode = changes.shape
+    first_contact, other_contact = np.split(unit_contact, [n_first])
+    series = Series(fit_series(first_contact, changes.reshape(n_first, n_node * n_electrode), *CHANGE_DEGREES))
     other_changes = series.values_and_derivatives(other_contact, np.zeros_like(other_contact))[:, 0]
-    all_changes = np.concatenate([changes, other_changes.reshape(-1, *changes.shape[1:])])
-    return charge + all_changes * size(charge)
+    all_changes = np.concatenate([changes, other_changes.reshape(-1, n_node, n_electrode)])
+    return charge + all_changes * change_unit(charge)
 
 
 def _directions(
@@ -272,35 +284,61 @@ def _directions(
     Returns:
         Coefficients, as in `ChargeSeries.directions`.
     """
-    unknowns = np.r_[film.layout.film, film.layout.index("offset"), film.layout.coefficients]
-    eigenvalues, vectors = np.linalg.eigh(film.covariance[np.ix_(unknowns, unknowns)])
-    covariance_root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
     unit_contact = series.domain.to_unit(contact)
     size = None if series.log_size is None else series_size(series.log_size, unit_contact[:, 2])[0]
-
-    node = [one.change_MPa for one in films].index(0.0)
+    node = [node_film.change_MPa for node_film in films].index(0.0)
     lower, upper = films[max(node - 1, 0)], films[min(node + 1, len(films) - 1)]
-    neighbours = [] if lower is upper else [lower, upper]
-    changes_of_films = []  # changes of v by one standard deviation of each unknown, shape (n, n_electrode, n_unknown)
-    halves = np.array_split(contact, 2)  # two workers share each film
-    jobs = [partial(one.linearised, half) for one in (calibrated, *neighbours) for half in halves]
-    results = in_order(executor, call, jobs)
-    for first, second in zip(results, results, strict=True):  # both halves of one film
-        film_charge, jacobian = map(np.concatenate, zip(first, second, strict=True))
-        charge_per_value = np.maximum(film_charge, LOWEST_CHARGE) if size is None else size
-        changes_of_films.append((jacobian / charge_per_value[:, :, None]) @ covariance_root)
-    changes, *neighbour_changes = changes_of_films
+    examined_films = [calibrated] if lower is upper else [calibrated, lower, upper]
+    changes, *neighbour_changes = _value_changes(examined_films, film, contact, size, executor)
     slopes = np.zeros_like(changes)  # derivatives of the changes with respect to the pretension, 1/MPa
     if neighbour_changes:
         lower_changes, upper_changes = neighbour_changes
         slopes = (upper_changes - lower_changes) / (upper.change_MPa - lower.change_MPa)
 
     # Rotate the directions so that their effects are uncorrelated in units of the noise, and keep the large ones.
-    weight = ((charge if size is None else size) / film.noise.sigma(charge))[:, :, None]
-    weighted = np.stack([weight * (changes + one.change_MPa * slopes) for one in (lower, calibrated, upper)])
-    weighted = weighted.reshape(-1, unknowns.size)
-    _, singular_values, rotation = np.linalg.svd(weighted, full_matrices=False)
-    kept = rotation[singular_values > MIN_DIRECTION * np.sqrt(len(weighted))]
-    effects = np.stack([changes @ kept.T, slopes @ kept.T], axis=1).swapaxes(2, 3)  # (n, 2, n_direction, n_electrode)
-    coefficients = fit_series(unit_contact, effects.reshape(len(contact), -1), *DIRECTION_DEGREES)
-    return coefficients.reshape(*coefficients.shape[:3], *effects.shape[1:])
+    noise_stds_per_value = ((charge if size is None else size) / film.noise.sigma(charge))[:, :, None]
+    effects_at_films = [noise_stds_per_value * (changes + one.change_MPa * slopes) for one in (lower, calibrated, upper)]
+    n, n_electrode, n_unknown = changes.shape
+    all_effects = np.stack(effects_at_films).reshape(-1, n_unknown)
+    _, singular_values, rotation = np.linalg.svd(all_effects, full_matrices=False)
+    kept = rotation[singular_values > MIN_DIRECTION * np.sqrt(len(all_effects))]  # shape (n_direction, n_unknown)
+
+    # Fit a series to the change and the slope of each direction, with the axes (n, 2, n_direction, n_electrode).
+    effects = np.stack([changes @ kept.T, slopes @ kept.T], axis=1).swapaxes(2, 3)
+    coefficients = fit_series(unit_contact, effects.reshape(n, -1), *DIRECTION_DEGREES)
+    *degrees, _ = coefficients.shape
+    return coefficients.reshape(*degrees, 2, len(kept), n_electrode)
+
+
+def _value_changes(
+    films: list[_ChangedFilm], film: FilmEstimate, contact: Array, size: Array | None, executor: Executor | None
+) -> list[Array]:
+    """Compute the changes of the values v of a charge map that the uncertainty of the unknowns causes.
+
+    The unknowns are replaced by uncorrelated linear combinations of them, with the standard deviation 1. The changes
+    are those by one standard deviation of each combination.
+
+    Args:
+        films: Films whose charges are changed.
+        film: The estimate of the calibrated film, with the covariance of the unknowns.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+        size: Charges by which the values are multiplied to get charges, shape (n, 1), pC; None if the values are
+            logarithms.
+        executor: Executor that computes the charges of the films; None for this process.
+
+    Returns:
+        Changes for each film, shape (n, n_electrode, n_unknown).
+    """
+    unknowns = np.r_[film.layout.film, film.layout.index("offset"), film.layout.coefficients]
+    eigenvalues, vectors = np.linalg.eigh(film.covariance[np.ix_(unknowns, unknowns)])
+    covariance_root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
+
+    halves = np.array_split(contact, 2)  # two workers share each film
+    jobs = [partial(one.linearised, half) for one in films for half in halves]
+    results = in_order(executor, call, jobs)
+    changes = []
+    for first, second in zip(results, results, strict=True):  # the two halves of one film follow one another
+        film_charge, jacobian = map(np.concatenate, zip(first, second, strict=True))
+        charge_per_value = np.maximum(film_charge, LOWEST_CHARGE) if size is None else size
+        changes.append((jacobian / charge_per_value[:, :, None]) @ covariance_root)
+    return changes
