@@ -297,7 +297,9 @@ def _directions(
 
     # Rotate the directions so that their effects are uncorrelated in units of the noise, and keep the large ones.
     noise_stds_per_value = ((charge if size is None else size) / film.noise.sigma(charge))[:, :, None]
-    effects_at_films = [noise_stds_per_value * (changes + one.change_MPa * slopes) for one in (lower, calibrated, upper)]
+    effects_at_films = [
+        noise_stds_per_value * (changes + one.change_MPa * slopes) for one in (lower, calibrated, upper)
+    ]
     n, n_electrode, n_unknown = changes.shape
     all_effects = np.stack(effects_at_films).reshape(-1, n_unknown)
     _, singular_values, rotation = np.linalg.svd(all_effects, full_matrices=False)

@@ -122,11 +122,14 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
     placed = presses[presses.placed]
     film_charges = expected_charges(charges, placed.contact)
-    film_ratios = [_charge_ratios(film_charge) for film_charge in film_charges if len(placed)]
-    largest_ratio = 1.0 if len(placed) else UNPLACED_RATIO
-    smallest_film_ratio = np.min(film_ratios, axis=0, initial=largest_ratio)
+    # The typical charge of a channel may be smaller than that of the others: on some film at the known places of the
+    # presses, or because the presses of unknown places are all far from the electrode.
+    smallest_usual_ratio = np.full(len(presses.electrodes), UNPLACED_RATIO)
+    if len(placed):
+        film_ratios = [_charge_ratios(film_charge) for film_charge in film_charges]
+        smallest_usual_ratio = np.min(film_ratios, axis=0, initial=1.0)
     ratio = _charge_ratios(presses.charge_pC)
-    for channel in np.flatnonzero(ratio < MAX_DEAD_RATIO * smallest_film_ratio):
+    for channel in np.flatnonzero(ratio < MAX_DEAD_RATIO * smallest_usual_ratio):
         typical_charge = np.nanmedian(np.abs(presses.charge_pC[:, channel]))
         raise PressError(
             f"electrode {presses.electrodes[channel]!r} is dead: half of its charges are below "
@@ -208,14 +211,18 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     placed_presses = presses[presses.placed]
     if not len(placed_presses):
         return []
-    misfits = {
+    corrected_misfits = {  # by the sentence about the mistake
         sentence: misfit(replace(placed_presses, contact=contact, charge_pC=charge), charges)
         for sentence, contact, charge in _possible_corrections(placed_presses, charges)
     }
-    limit = min(BETTER_MISFIT_RATIO * misfit(placed_presses, charges), SUSPICIOUS_MISFIT)
-    smallest = min(misfits.values())
-    probable = [name for name, value in misfits.items() if value < limit and BETTER_MISFIT_RATIO * value <= smallest]
-    return sorted(probable, key=misfits.__getitem__)
+    largest_accepted = min(BETTER_MISFIT_RATIO * misfit(placed_presses, charges), SUSPICIOUS_MISFIT)
+    smallest = min(corrected_misfits.values())
+    probable = [
+        sentence
+        for sentence, value in corrected_misfits.items()
+        if value < largest_accepted and BETTER_MISFIT_RATIO * value <= smallest
+    ]
+    return sorted(probable, key=corrected_misfits.__getitem__)
 
 
 def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
@@ -247,15 +254,19 @@ def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
 
 
 def _log_ratio(measured: Array, expected: Array) -> Array:
-    """Return the logarithms of measured divided by expected charges. NaN remains NaN.
+    """Return the logarithms of the ratios of measured to expected charges.
 
-    The logarithm of a charge with the opposite sign, or of one whose expected charge is zero, is very small.
+    The logarithm is very small if the two charges have opposite signs or the expected charge is zero, and NaN if the
+    measured charge is NaN.
 
     Args:
         measured: Measured charges, pC.
         expected: Charges of films, pC, of a shape that can be broadcast with that of the measured charges.
+
+    Returns:
+        Logarithms, of the broadcast shape.
     """
-    tiny = np.finfo(float).tiny
+    tiny = np.finfo(float).tiny  # avoids a division by zero and the logarithm of zero
     ratio = measured * expected / np.maximum(expected**2, tiny)
     return np.log(np.maximum(ratio, tiny))
 
@@ -286,9 +297,11 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
     for electrode_of_column in _plausible_electrode_orders(presses, charges):
         held_names = ", ".join(electrodes[electrode] for electrode in electrode_of_column)
         sentence = f"the charge columns are swapped: those named {', '.join(electrodes)} hold {held_names}"
-        yield sentence, contact, charge[:, np.argsort(electrode_of_column)]
+        column_of_electrode = np.argsort(electrode_of_column)  # the inverse permutation
+        yield sentence, contact, charge[:, column_of_electrode]
 
     # A gain is the typical ratio of measured to expected charges of a channel, relative to that of the other channels.
+    # The median is that over the films and the presses, shape (n_electrode,).
     log_ratios = np.nanmedian(_log_ratio(charge, expected_charges(charges, contact)), axis=(0, 1))
     # A channel with the wrong sign has no gain, so the gains are limited.
     gains = np.exp(np.clip(log_ratios - np.median(log_ratios), -3.0, 3.0))
@@ -361,7 +374,10 @@ def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: st
 
 
 def is_one_place(presses: MeasuredPresses) -> bool:
-    """Return whether the presses have known positions, which are the same within their errors."""
-    position = presses.contact[np.isfinite(presses.contact[:, 0]), :2]
+    """Return whether some presses have known positions, and all these positions are the same within their errors."""
+    is_known = np.isfinite(presses.contact[:, 0])
+    if not is_known.any():
+        return False
+    largest_range_mm = np.ptp(presses.contact[is_known, :2], axis=0).max()
     # One press may be much less accurate than the others, so the median of the standard deviations counts.
-    return position.size > 0 and bool(np.ptp(position, 0).max() <= 6.0 * np.median(presses.position_std_mm))
+    return bool(largest_range_mm <= 6.0 * np.median(presses.position_std_mm))

@@ -102,19 +102,26 @@ class FilmCharges:
         return self.film.domain
 
     def charges(self, values: Array, contact: Array) -> Array:
-        """Compute the charges of presses on a film with given properties, shape (n, n_electrode), pC."""
-        sensor = self._electrodes(values)
+        """Compute the charges of presses on a film with given properties.
+
+        Args:
+            values: Properties of the film, shape (n_property,).
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Charges, shape (n, n_electrode), pC.
+        """
+        sensor = self._sensor_with_readout(values)
         film = _read(self.film, sensor)
         solved_charge = film.charges(contact)
-        # Only the derivatives with respect to Young's modulus and to the thickness follow from those with respect to
-        # the force.
+        # The derivatives with respect to the force take time. Only the effects of Young's modulus and of the thickness
+        # follow from these derivatives.
         changes = self._property_changes(values)
-        needs_force_slope = changes["young"] or changes["thickness"]
-        force_slope = (
-            film.derivatives(contact, LOG_FORCE)[:, :, 0] if needs_force_slope else np.zeros_like(solved_charge)
-        )
+        force_slope = np.zeros_like(solved_charge)
+        if changes["young"] or changes["thickness"]:
+            force_slope = film.derivatives(contact, LOG_FORCE)[:, :, 0]
         derivatives = self._stress_derivatives(sensor, contact, solved_charge, force_slope)
-        charge, _ = _with_other_stress(solved_charge, changes, derivatives)
+        charge, _ = _add_stress_changes(solved_charge, changes, derivatives)
         return charge
 
     def linearised(self, values: Array, contact: Array) -> ModelValues:
@@ -128,28 +135,33 @@ class FilmCharges:
             Charges and their derivatives. The derivatives with respect to the contact are those of the solved film. The
             properties of the film take the place of the state.
         """
-        sensor = self._electrodes(values)
+        sensor = self._sensor_with_readout(values)
         solved_charge, contact_slopes = _read(self.film, sensor).linearised(contact)
         stress_derivatives = self._stress_derivatives(sensor, contact, solved_charge, contact_slopes[:, :, 2])
-        charge, factor = _with_other_stress(solved_charge, self._property_changes(values), stress_derivatives)
+        charge, factor = _add_stress_changes(solved_charge, self._property_changes(values), stress_derivatives)
 
-        derivatives = {**stress_derivatives, "crosstalk": solved_charge.sum(axis=1, keepdims=True) - solved_charge}
         # Each uneven part of the pretension is the product of a share and the pretension. The derivatives with respect
         # to the parts become derivatives with respect to the shares, and the pretension also changes the parts.
+        derivatives = dict(stress_derivatives)
         for name in UNEVEN_TENSIONS:
             share = values[self.prior.index(name)]
             derivatives[PRETENSION.name] = derivatives[PRETENSION.name] + share * derivatives[name]
             derivatives[name] = values[self.prior.index(PRETENSION.name)] * derivatives[name]
+
+        # Properties of the readout: crosstalk adds a share of the charges of all other electrodes, and a gain
+        # multiplies the charge of its own electrode. The other derivatives are difference quotients.
+        derivatives["crosstalk"] = solved_charge.sum(axis=1, keepdims=True) - solved_charge
         for name, is_own in zip(sensor.electrode_names, np.eye(len(sensor.electrodes)), strict=True):
             derivatives[f"gain {name}"] = is_own * solved_charge
-        columns = [
-            derivatives[one.name] if one.name in derivatives else self._read_difference(sensor, one, contact)
-            for one in self.prior.properties
-        ]
-        return ModelValues(charge, contact_slopes, factor[:, :, None] * np.stack(columns, axis=2))
+        for one in self.prior.properties:
+            if one.name not in derivatives:
+                derivatives[one.name] = self._readout_derivative(sensor, one, contact)
 
-    def _electrodes(self, values: Array) -> Sensor:
-        """Return a sensor with the electrodes and the piezoelectric coefficients of given properties.
+        columns = np.stack([derivatives[name] for name in self.prior.names], axis=2)
+        return ModelValues(charge, contact_slopes, factor[:, :, None] * columns)
+
+    def _sensor_with_readout(self, values: Array) -> Sensor:
+        """Return the solved sensor with the electrodes and the piezoelectric coefficients of given properties.
 
         Args:
             values: Properties, shape (n_property,). The properties that change the stress are not used.
@@ -158,15 +170,15 @@ class FilmCharges:
         return sensor
 
     def _mechanics(self, values: Array) -> dict[str, float]:
-        """Return properties by their names, with the uneven parts of the pretension in MPa instead of relative to it.
+        """Return the properties by name, with the uneven parts of the pretension in MPa instead of relative to it.
 
         Args:
             values: Properties of a film, shape (n_property,).
         """
-        value = dict(zip(self.prior.names, values.tolist(), strict=True))
+        value_of = dict(zip(self.prior.names, values.tolist(), strict=True))
         for name, described_MPa in zip(UNEVEN_TENSIONS, self.prior.sensor.film.deviator, strict=True):
-            value[name] = described_MPa + value[name] * value[PRETENSION.name]
-        return value
+            value_of[name] = described_MPa + value_of[name] * value_of[PRETENSION.name]
+        return value_of
 
     def _property_changes(self, values: Array) -> dict[str, float]:
         """Return the differences from the properties of the solved film, by name; see `_mechanics`."""
@@ -197,26 +209,38 @@ class FilmCharges:
         slopes = replace(self.slopes, film=film, fields=fields).jacobian(contact)
         # The radius of the probe is only a property if the probe is a circle.
         derivatives = {name: slope for name, slope in slopes.items() if name in self.prior.names}
+        # Let q be a function of F / (E h) and of the tensions T / E. Then Q = E q, ln h changes Q like -ln F, and ln E
+        # changes Q by Q - dQ/d(ln F) - sum of T dQ/dT.
         derivatives["thickness"] = -force_slope
         mechanics = self._mechanics(self.values)
         tension_terms = (mechanics[name] * derivatives[name] for name in (PRETENSION.name, *UNEVEN_TENSIONS))
         derivatives["young"] = solved_charge - force_slope - sum(tension_terms)
         return derivatives
 
-    def _read_difference(self, sensor: Sensor, one: FilmProperty, contact: Array) -> Array:
-        """Compute the derivative with respect to a property that does not change the stress, by central differences."""
-        step = STEP * one.std
-        sensors = [changed_film(sensor, self.film.probe, {one.name: change})[0] for change in (step, -step)]
+    def _readout_derivative(self, sensor: Sensor, film_property: FilmProperty, contact: Array) -> Array:
+        """Compute the derivatives of charges with respect to a property that does not change the stress.
+
+        Args:
+            sensor: Sensor with the electrodes and the coefficients.
+            film_property: The property.
+            contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Central difference quotients, shape (n, n_electrode), pC per unit.
+        """
+        step = STEP * film_property.std
+        sensors = [changed_film(sensor, self.film.probe, {film_property.name: change})[0] for change in (step, -step)]
         forward, backward = (_read(self.film, changed).charges(contact) for changed in sensors)
         return (forward - backward) / (2.0 * step)
 
 
-def _with_other_stress(
+def _add_stress_changes(
     solved_charge: Array, changes: dict[str, float], derivatives: dict[str, Array]
 ) -> tuple[Array, Array]:
-    """Change charges to first order, as the properties that change the stress require.
+    """Add the first-order effects of changed properties, which change the stress, to the charges of a solved film.
 
-    The change is applied to the logarithm of the magnitude of a charge, unless the change is larger than the charge.
+    An effect is added to the logarithm of the magnitude of a charge. If it is larger than the charge, it is added to
+    the charge itself.
 
     Args:
         solved_charge: Charges of the solved film, shape (n, n_electrode), pC.
@@ -230,9 +254,10 @@ def _with_other_stress(
     addition = np.zeros_like(solved_charge)
     for name, derivative in derivatives.items():
         addition += changes[name] * derivative
+    # The relative addition to a charge of zero is infinite.
     relative = np.divide(addition, solved_charge, out=np.full_like(addition, np.inf), where=solved_charge != 0.0)
     is_logarithmic = np.abs(relative) < MAX_LOG_CHANGE
-    factor = np.exp(relative, out=np.ones_like(relative), where=is_logarithmic)
+    factor = np.exp(relative, out=np.ones_like(relative), where=is_logarithmic)  # 1 elsewhere
     charge = np.where(is_logarithmic, solved_charge * factor, solved_charge + addition)
     return charge, factor
 

@@ -226,17 +226,21 @@ class FilmEstimate:
         drift_std = np.zeros(len(self.values))
         drift_std[layout.film] = [one.drift for one in layout.prior.properties]
         drift_std[layout.coefficients] = COEFFICIENT_DRIFT
-        drift_effects = np.diag(drift_std)  # each column contains the effects of the drift of one unknown
+        # Each column contains the changes of all unknowns by one standard deviation of the drift of one unknown.
+        drift_effects = np.diag(drift_std)
         tension_index = layout.index(PRETENSION.name)
         for name in UNEVEN_TENSIONS:
             # The limit avoids a very large change for a film that is nearly slack.
             share_change_per_MPa = -self.value(name) / max(self.values[tension_index], PRETENSION.drift)
             drift_effects[layout.index(name), tension_index] = share_change_per_MPa * PRETENSION.drift
-        values = self.values.copy()
         covariance = self.covariance + drift_effects @ drift_effects.T
+
+        # Remove the unknowns of this session: their values, and their rows and columns of the covariance.
         session = layout.session
+        values = self.values.copy()
         values[session] = 0.0
-        covariance[session] = covariance[:, session] = 0.0
+        covariance[session] = 0.0
+        covariance[:, session] = 0.0
         return replace(self, values=values, covariance=covariance)
 
     def session_cautions(self) -> Sequence[str]:

@@ -42,8 +42,9 @@ def training_data(
     # The film is estimated for the middle of the session. After the session, the gain differs by half of the drift, and
     # may change further or return. The root mean square of the drift follows from its estimate and its standard
     # deviation.
-    gain_std = 0.5 * np.hypot(film.value("drift"), film.std("drift"))
-    charge *= 1.0 + gain_std * rng.standard_normal((PRESSES, 1))
+    drift_rms = np.hypot(film.value("drift"), film.std("drift"))
+    gain_error = 0.5 * drift_rms * rng.standard_normal((PRESSES, 1))
+    charge *= 1.0 + gain_error
     sensor, probe = charges.prior.film(film.film_values)
     return TrainingData(
         sensor=sensor,
@@ -58,9 +59,20 @@ def training_data(
 
 
 def _drawn_charges(series: ChargeSeries, rng: np.random.Generator, contact: Array) -> Array:
-    """Draw the charges of contacts, each on another film of the posterior distribution, shape (n, n_electrode), pC."""
+    """Draw the charges of contacts, each on another film of the posterior distribution.
+
+    Args:
+        series: The compact charge map of the film, which can be evaluated for similar films.
+        rng: Random number generator.
+        contact: Contacts (x, y, F), shape (n, 3), mm and N.
+
+    Returns:
+        Charges, shape (n, n_electrode), pC.
+    """
     drawn = []
-    for chunk in np.array_split(contact, len(contact) // CHUNK_SIZE + 1):
+    for chunk in np.array_split(contact, len(contact) // CHUNK_SIZE + 1):  # chunks limit the memory
+        # The state of a film is the change of its pretension and its deviations along the directions, which have the
+        # standard deviation 1.
         state = rng.standard_normal((len(chunk), 1 + series.direction_count))
         state[:, 0] = 0.0  # the pretension does not change
         drawn.append(series.in_state(chunk, state).charge_pC)

@@ -131,22 +131,24 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
 
     layout = problem.prior.layout
     unknowns = content.unknowns.values()
-    values = np.array([one.value for one in unknowns])
-    std = np.array([one.std for one in unknowns])
-    for one in layout.prior.properties:
-        low, high = one.limits
-        value = content.unknowns[one.name].value
+    values = np.array([unknown.value for unknown in unknowns])
+    std = np.array([unknown.std for unknown in unknowns])
+    for film_property in layout.prior.properties:
+        low, high = film_property.limits
+        value = content.unknowns[film_property.name].value
         if not low <= value <= high:
             raise PressError(
-                f"{path}: unknowns.{one.name}.value: expected {low:.6g} to {high:.6g}, got {value:g}; calibrate again"
+                f"{path}: unknowns.{film_property.name}.value: expected {low:.6g} to {high:.6g}, got {value:g}; "
+                "calibrate again"
             )
-    covariance = _correlations(path, content.correlations, len(values)) * np.outer(std, std)
+    covariance = _correlation_matrix(path, content.correlations, len(values)) * np.outer(std, std)
     return FilmEstimate(layout, values, covariance, content.noise)
 
 
 def _check_same_problem(path: Path, content: _CalibrationFile, problem: CalibrationProblem) -> None:
     """Raise PressError if a file belongs to another calibration problem."""
-    # The properties are deviations from the sensor file, so that they would be wrong with another one.
+    # The estimated properties are changes from the values of the sensor file. Added to the values of another sensor
+    # file, they would describe another film.
     described = plain_values(sensor_to_dict(problem.sensor))
     differences = [key for key in described if described[key] != content.described_sensor.get(key)]
     if differences:
@@ -169,8 +171,16 @@ def _check_same_problem(path: Path, content: _CalibrationFile, problem: Calibrat
             )
 
 
-def _correlations(path: Path, rows: list[list[float]], count: int) -> Array:
-    """Return the correlation matrix of a lower triangle, shape (count, count), and check that it is possible.
+def _correlation_matrix(path: Path, rows: list[list[float]], count: int) -> Array:
+    """Return the symmetric matrix with a given lower triangle, and check that it can be a correlation matrix.
+
+    Args:
+        path: File that contains the triangle, for messages.
+        rows: Rows of the triangle without the diagonal. The row i has i numbers.
+        count: Number of unknowns.
+
+    Returns:
+        Matrix, shape (count, count).
 
     Raises:
         PressError: If the triangle has the wrong shape, or the matrix is not positive semidefinite.
@@ -180,9 +190,9 @@ def _correlations(path: Path, rows: list[list[float]], count: int) -> Array:
             f"{path}: correlations: expected {count} rows of 0 to {count - 1} numbers, the lower triangle of a matrix, "
             f"got {len(rows)} rows of other lengths; calibrate again"
         )
-    matrix = np.eye(count)
-    lower = np.tril_indices(count, -1)
-    matrix[lower] = matrix.T[lower] = [number for row in rows for number in row]
+    below_diagonal = np.zeros((count, count))
+    below_diagonal[np.tril_indices(count, -1)] = [number for row in rows for number in row]
+    matrix = np.eye(count) + below_diagonal + below_diagonal.T
     eigenvalues, vectors = np.linalg.eigh(matrix)
     largest_rounding_error = count * 10.0**-DIGITS  # of an eigenvalue, if each correlation was rounded
     if eigenvalues[0] < -largest_rounding_error:
@@ -190,6 +200,7 @@ def _correlations(path: Path, rows: list[list[float]], count: int) -> Array:
             f"{path}: correlations: expected a positive semidefinite matrix, got one with the eigenvalue "
             f"{eigenvalues[0]:.3g}: no unknowns have these correlations together; calibrate again"
         )
+    # Rounding may have made an eigenvalue of zero slightly negative.
     return np.asarray((vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T)
 
 
@@ -275,8 +286,8 @@ def write_calibration(
         held_out = usable_held_out(held_out, result.presses, problem)
     with single_threaded_blas():
         series = compact_charges(problem.domain, result.charges, film, executor)
-    settings = config or FitConfig()
-    settings = FitConfig(settings.network, replace_setting(settings.training, noise=film.noise))
+    requested = config or FitConfig()
+    settings = FitConfig(requested.network, replace_setting(requested.training, noise=film.noise))
     fitted = fit(training_data(result.charges, film, series, executor), settings)
     if held_out is not None:
         fitted = with_guarantee(fitted, held_out)

@@ -89,12 +89,14 @@ class CalibrationResult:
         """Properties of the film by name, with their standard deviations before and after the presses."""
         before = self.problem.film_before
         estimates = {}
-        for one in self.film.layout.prior.properties:
+        for declared in self.film.layout.prior.properties:
+            name = declared.name
             # `film_before`, with which presses are planned, has only half of the declared std of imperfections.
-            before_std = one.std if self.problem.earlier is None else before.std(one.name)
-            value, std = self.film.value(one.name), self.film.std(one.name)
+            before_std = declared.std if self.problem.earlier is None else before.std(name)
+            value = self.film.value(name)
+            std = self.film.std(name)
             is_identified = std <= IDENTIFIED_RATIO * before_std
-            estimates[one.name] = PropertyEstimate(one.meaning, one.unit, value, std, before_std, is_identified)
+            estimates[name] = PropertyEstimate(declared.meaning, declared.unit, value, std, before_std, is_identified)
         return estimates
 
     @property

@@ -71,14 +71,15 @@ def read_answer(text: str) -> Answer:
     normalised_text = text.strip().lower()
     if normalised_text in REPLIES:
         return Answer(REPLIES[normalised_text])
-    # A question mark alone stands for an unknown place and an unknown force.
+    if normalised_text == "?":  # unknown place and force
+        return Answer("take", np.full(3, np.nan))
     separator = "," if "," in normalised_text else None  # None: any blanks
-    values = "? ? ?" if normalised_text == "?" else normalised_text
-    cells = [cell.strip() for cell in values.split(separator)]
+    cells = [cell.strip() for cell in normalised_text.split(separator)]
     if len(cells) != len(CONTACT) or not all(map(_CELL.fullmatch, cells)):
         # The message repeats at most 60 characters of the text.
         raise PressError(f"expected {EXPECTED_ANSWER}; got {text.strip()!r:.60}")
-    return Answer("take", np.array([float(cell.strip("?") or "nan") for cell in cells]))
+    values = [float(cell) if cell.strip("?") else np.nan for cell in cells]  # unknown: empty or a question mark
+    return Answer("take", np.array(values))
 
 
 class PressSession:
@@ -154,10 +155,13 @@ class PressSession:
             return self._proposed
 
         # If there are no presses, or no film explains them, all presses are planned from the beginning. The presses so
-        # far count as the first presses of this plan, and the next one is proposed.
-        film = None if self.result is None else self.result.film
-        count = 1 if self.result is not None else len(self) + 1
-        plan = next_presses(self.problem, self._charges, count, film, **self._stds)
+        # far count as the first presses of this plan, and the press after them is proposed.
+        planned_count = len(self) + 1
+        film = None
+        if self.result is not None:
+            planned_count = 1
+            film = self.result.film
+        plan = next_presses(self.problem, self._charges, planned_count, film, **self._stds)
         self._proposed = plan[-1]
         return self._proposed
 
