@@ -38,9 +38,10 @@ def mean_loss(posterior: Posterior, target: Tensor) -> Tensor:
         posterior: Estimated unit coordinates with their standard deviations.
         target: Unit coordinates that the mean should have, shape (n, 3).
     """
-    std = torch.exp(posterior.log_std.detach())
-    squares = (posterior.mean - target) ** 2 / (std * std.mean(dim=0))
-    return 0.5 * squares.sum(dim=1)
+    std = torch.exp(posterior.log_std.detach())  # a constant in this loss
+    # The square over the variance, times the factor std / (mean of std)
+    weighted_squares = (posterior.mean - target) ** 2 / (std * std.mean(dim=0))
+    return 0.5 * weighted_squares.sum(dim=1)
 
 
 def covariance_loss(posterior: Posterior, error: Tensor) -> Tensor:
@@ -57,16 +58,21 @@ def covariance_loss(posterior: Posterior, error: Tensor) -> Tensor:
     """
     x_deviation, y_deviation, force_deviation = (error.detach() * torch.exp(-posterior.log_std)).unbind(dim=1)
 
-    # The Cholesky factor of the correlations has the rows (1, 0, 0), (cos a, sin a, 0) and (cos b, sin b cos c,
-    # sin b sin c), where the angles a, b and c are pi / 2 + turn. The factor is inverted row by row, which gives errors
-    # with unit covariance.
+    # The angles a, b and c of the correlations are pi / 2 + turn, so that their sines are the cosines of the turns, and
+    # their cosines are the sines of the negative turns.
     sin_a, sin_b, sin_c = torch.cos(posterior.turn).clamp(min=MIN_SINE).unbind(dim=1)
     cos_a, cos_b, cos_c = torch.sin(-posterior.turn).unbind(dim=1)
-    white_y = (y_deviation - cos_a * x_deviation) / sin_a
-    white_force = (force_deviation - cos_b * x_deviation - sin_b * cos_c * white_y) / (sin_b * sin_c)
+
+    # The Cholesky factor of the correlations has the rows (1, 0, 0), (cos a, sin a, 0) and (cos b, sin b cos c,
+    # sin b sin c). Its product with the independent errors (x_deviation, independent_y, independent_force) gives the
+    # deviations. These equations are solved one after the other.
+    independent_y = (y_deviation - cos_a * x_deviation) / sin_a
+    independent_force = (force_deviation - cos_b * x_deviation - sin_b * cos_c * independent_y) / (sin_b * sin_c)
     log_determinant = posterior.log_std.sum(dim=1) + torch.log(sin_a * sin_b * sin_c)
 
-    squares = torch.stack([x_deviation, white_y, white_force]) ** 2
+    # The logarithm of the t distribution replaces half of the square of a normal distribution. `TAIL_FACTOR` makes the
+    # loss smallest at the true standard deviation if the errors are normally distributed.
+    squares = torch.stack([x_deviation, independent_y, independent_force]) ** 2
     return log_determinant + TAIL_FACTOR * torch.log1p(squares / DEGREES_OF_FREEDOM).sum(dim=0)
 
 
@@ -97,7 +103,8 @@ def contact_stage(
         """
         rows = torch.randint(len(charge), (config.batch,), generator=random)
         target = unit_contact[rows]
-        posterior = network.posterior(torch.normal(charge[rows], noise_std[rows], generator=random))
+        noisy_charge = torch.normal(charge[rows], noise_std[rows], generator=random)
+        posterior = network.posterior(noisy_charge)
         # The two losses have separate gradients. The first loss does not change the outputs for the covariance, and the
         # second loss does not change the mean.
         return (mean_loss(posterior, target) + covariance_loss(posterior, target - posterior.mean)).mean()

@@ -154,6 +154,7 @@ class TrainingStage:
         smallest_mean_loss = math.inf
         checkpoints: deque[list[Tensor]] = deque(maxlen=2)  # weights at the latest two reports
         for step in range(self.steps):
+            # Change the weights by one step of the optimisers.
             loss = self.loss(random)
             losses.append(loss.item())
             if not math.isfinite(losses[-1]):
@@ -166,7 +167,8 @@ class TrainingStage:
             rate = largest_rate * relative_rate(step / self.steps)
             for optimiser in optimisers:
                 optimiser.step(rate)
-            if len(losses) < REPORT_EVERY and step + 1 < self.steps:
+            is_last_step = step + 1 == self.steps
+            if len(losses) < REPORT_EVERY and not is_last_step:
                 continue
 
             # Report the mean loss, and return to earlier weights if it has increased too much.

@@ -25,12 +25,12 @@ LOG_DISTANCES = (-1.0, 3.0)
 
 
 def draw_charges(rng: np.random.Generator, charge: Array, noise: ChannelNoise, count: int) -> Array:
-    """Draw charges whose distances from the charges of presses vary from less than the noise to very large values.
+    """Draw charges that differ from those of presses by errors of very different sizes.
 
     Presses are chosen at random, and normally distributed errors are added to the levels of their charges. The level of
     a charge is its value on a scale on which the noise has the standard deviation 1. In each press, a random share of
-    the electrodes has errors whose standard deviation is log-uniform within `LOG_DISTANCES`. The other electrodes have
-    noise.
+    the electrodes has errors with one random standard deviation, from less than the noise to a thousand times the
+    noise. It is log-uniform within `LOG_DISTANCES`. The errors of the other electrodes are those of the noise.
 
     Args:
         rng: Random number generator.
@@ -43,10 +43,11 @@ def draw_charges(rng: np.random.Generator, charge: Array, noise: ChannelNoise, c
     """
     rows = rng.integers(len(charge), size=count)
     level = noise.level(charge[rows])
-    is_moved = rng.random(level.shape) < rng.random((count, 1))  # each press has its own share of such electrodes
-    distance = 10.0 ** rng.uniform(*LOG_DISTANCES, (count, 1))
-    std = np.where(is_moved, distance, 1.0)
-    error = std * rng.standard_normal(level.shape)
+    # Whether an electrode has a special error. Each press has its own probability of special errors.
+    is_special = rng.random(level.shape) < rng.random((count, 1))
+    special_std = 10.0 ** rng.uniform(*LOG_DISTANCES, (count, 1))
+    error_std = np.where(is_special, special_std, 1.0)  # the noise has the standard deviation 1
+    error = error_std * rng.standard_normal(level.shape)
     return noise.charge(level + error)
 
 

@@ -27,7 +27,7 @@ from isocharge.train.training.config import NetworkConfig
 from isocharge.train.training.folded_network import (
     LARGEST_INT8,
     LOG_FORCE,
-    LOG_STD,
+    LOG_FORCE_STD,
     TURN,
     ChargeFeatures,
     FoldedNetwork,
@@ -71,7 +71,7 @@ def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
     asinh_charge = np.arcsinh(charge / typical)
     lowest = asinh_charge.min(axis=0)
     highest = asinh_charge.max(axis=0)
-    margin = highest - lowest
+    margin = highest - lowest  # the width of the range, by which the limits lie outside the range
     return ChargeFeatures(
         typical_pC=typical,
         low_pC=np.sinh(lowest - margin) * typical,
@@ -86,7 +86,7 @@ FIRST_LAYER_SLOPES = (0.5, 3.5)
 The inputs of the layer have unit variance.
 """
 
-FORCE_OUTPUTS = [LOG_FORCE.start, LOG_STD.stop - 1, TURN.start + 1, TURN.start + 2]
+FORCE_OUTPUTS = [LOG_FORCE.start, LOG_FORCE_STD.start, TURN.start + 1, TURN.start + 2]
 """Columns of the contact perceptron's outputs for ln F, for its log standard deviation and for its correlations."""
 
 
@@ -225,20 +225,23 @@ class InverseNetwork(nn.Module):
         self.contact = TrainablePerceptron(n_electrode, widths, TURN.stop)
         self.contact.sharpen_first_layer()
         self.misfit_vector = TrainablePerceptron(n_electrode, misfit_widths, n_electrode)
+
+        # Without a force to learn, constants replace the outputs for the force: the middle of the range of forces (0),
+        # its given standard deviation in unit coordinates, and no correlations (0).
         self.output_factor = nn.Buffer(torch.ones(TURN.stop))
         self.output_offset = nn.Buffer(torch.zeros(TURN.stop))
         if force_std is not None:
             self.output_factor[FORCE_OUTPUTS] = 0.0
-            self.output_offset[LOG_STD.stop - 1] = np.log(force_std / domain.scale[2])
+            self.output_offset[LOG_FORCE_STD] = np.log(force_std / domain.scale[2])
 
-        # The rows of `axes` are the principal axes. The standard deviation of the values along an axis is its singular
-        # value divided by the square root of the number of values.
+        # Whitening. The rows of `principal_axes` are orthonormal. The standard deviation of the features along an axis
+        # is the singular value divided by the square root of the number of presses.
         values = feature_values(features, torch.tensor(charge, dtype=torch.float64))
         mean = values.mean(dim=0)
-        _, singular_values, axes = torch.linalg.svd(values - mean, full_matrices=False)
+        _, singular_values, principal_axes = torch.linalg.svd(values - mean, full_matrices=False)
         inverse_std = len(values) ** 0.5 / singular_values.clamp(min=torch.finfo(values.dtype).eps)
         self.features_mean = nn.Buffer(mean.float())
-        self.whitening = nn.Buffer((axes.T * inverse_std).float())
+        self.whitening = nn.Buffer((principal_axes.T * inverse_std).float())
 
     def inputs(self, charge: Tensor) -> Tensor:
         """Compute whitened features, which are the inputs of both perceptrons. Finite charges give finite inputs.

@@ -111,7 +111,7 @@ SMALLEST_SHARE = 0.2
 def invertible_domain(
     field: ChargeSeries, presses: LabelledPresses, noise: NoiseModel
 ) -> tuple[Domain, tuple[str, ...]]:
-    """Return the disk on which a network is trained, and sentences for the user about ambiguous contacts.
+    """Find the disk on which a network can be trained, and write sentences for the user about ambiguous contacts.
 
     At a fold, the map from contacts to charges turns back, so that contacts on both sides of the fold have the same
     charges. If an accurate fit shows a fold, the disk is reduced to the radius of the fold, and a sentence states this.
@@ -131,8 +131,9 @@ def invertible_domain(
     """
     requested_radius = field.domain.radius
     area = working_area(within(field, SEARCHED_RADIUS_RATIO * requested_radius), noise, search_pairs=False)
-    fold_radius = float(f"{area.unambiguous_radius:.6g}")
-    if not np.isfinite(area.fold_radius) or fold_radius >= requested_radius:
+    fold_radius = float(f"{area.unambiguous_radius:.6g}")  # rounded to the digits that the sentences state
+    has_fold = np.isfinite(area.fold_radius) and fold_radius < requested_radius
+    if not has_fold:
         return field.domain, ()
     if field.charge_std > MAX_ERROR_OF_CERTAIN_FOLD:
         probable_fold = (
@@ -192,7 +193,7 @@ class Split:
             data: Presses of the sensor.
             training: Fractions of the presses, noise and seed.
         """
-        # Fit the field, and determine the domain without folds.
+        # Fit the field to presses of the whole requested domain, and determine the domain without folds.
         presses = data.presses
         train, test = split_by_position(presses, training.hold_out)
         noise = misfit_noise(training.noise_model)
