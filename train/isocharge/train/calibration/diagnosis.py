@@ -124,7 +124,7 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
     film_charges = expected_charges(charges, placed.contact)
     # The typical charge of a channel may be smaller than that of the others: on some film at the known places of the
     # presses, or because the presses of unknown places are all far from the electrode.
-    smallest_usual_ratio = np.full(len(presses.electrodes), UNPLACED_RATIO)
+    smallest_usual_ratio = np.array(UNPLACED_RATIO)
     if len(placed):
         film_ratios = [_charge_ratios(film_charge) for film_charge in film_charges]
         smallest_usual_ratio = np.min(film_ratios, axis=0, initial=1.0)

@@ -46,12 +46,11 @@ def terms(contact: Array, domain: Domain) -> Array:
     Returns:
         Values of the terms, shape (n, n_term), dimensionless.
     """
-    degrees = _degrees()
-    largest_degrees = (DEGREE, DEGREE, FORCE_DEGREE)
+    i, j, m = _degrees().T
     x, y, log_force = domain.to_unit(contact).T
-    all_products = chebyshev.chebvander3d(x, y, log_force, largest_degrees)  # one column for each (i, j, m)
-    columns = np.ravel_multi_index(degrees.T, np.add(largest_degrees, 1))  # the columns with the degrees of the terms
-    return np.asarray(FADING ** degrees.sum(axis=1) * all_products[:, columns])
+    all_products = chebyshev.chebvander3d(x, y, log_force, (DEGREE, DEGREE, FORCE_DEGREE))
+    product_of_degrees = all_products.reshape(-1, DEGREE + 1, DEGREE + 1, FORCE_DEGREE + 1)
+    return np.asarray(FADING ** (i + j + m) * product_of_degrees[:, i, j, m])
 
 
 def discrepancy_jacobian(charge: Array, contact: Array, domain: Domain) -> Array:

@@ -156,11 +156,8 @@ class PressSession:
 
         # If there are no presses, or no film explains them, all presses are planned from the beginning. The presses so
         # far count as the first presses of this plan, and the press after them is proposed.
-        planned_count = len(self) + 1
-        film = None
-        if self.result is not None:
-            planned_count = 1
-            film = self.result.film
+        film = None if self.result is None else self.result.film
+        planned_count = len(self) + 1 if film is None else 1
         plan = next_presses(self.problem, self._charges, planned_count, film, **self._stds)
         self._proposed = plan[-1]
         return self._proposed

@@ -97,19 +97,23 @@ class ChannelNoise(GaussianNoise):
         Returns:
             Noise model with the white noise and the noise of the gain of each channel.
         """
-        # Leave out copies, and compute charges without noise and the residuals, each of shape (m, n_electrode).
+        # Leave out copies of presses.
         different_rows = np.unique(np.column_stack([unit_contact, charge]), axis=0)
         contact = different_rows[:, :3]
         noisy_charge = different_rows[:, 3:]
+
+        # Compute the charges without noise and the residuals, each of shape (m, n_electrode). A channel that is silent
+        # at repeated contacts does not show its noise there, so only contacts with a charge count.
         exact_charge, residual = _repeated_residuals(contact, noisy_charge)
-        # A channel that is silent at repeated contacts does not show its noise there.
-        if np.count_nonzero(np.unique(exact_charge, axis=0), axis=0).min() < MIN_REPEATED_CONTACTS:
+        repeated_charges = np.unique(exact_charge, axis=0)  # one row for each repeated contact
+        if np.count_nonzero(repeated_charges, axis=0).min() < MIN_REPEATED_CONTACTS:
             planes = LocalPlanes.fit(contact, noisy_charge)
             exact_charge = planes.value
             residual = planes.residual
 
         # Fit the noise of each channel.
-        white_std, gain_std = np.transpose(list(map(_fit_noise, exact_charge.T, residual.T)))
+        stds_of_channels = list(map(_fit_noise, exact_charge.T, residual.T))  # (white, gain) of each channel
+        white_std, gain_std = np.transpose(stds_of_channels)
         gain = np.maximum(gain_std, LEAST_GAIN)
         # The presses do not determine the white noise if all charges are large. The lower limit of the white noise is a
         # small fraction of the noise of the gain at the usual charge.
@@ -327,8 +331,8 @@ def _fit_noise(charge: Array, residual: Array) -> Array:
     Returns:
         The standard deviation of the white noise, pC, and the relative standard deviation of the gain.
     """
-    # The unknowns are the logarithms of white and gain. Each of them is divided by the value with which it alone
-    # explains the residuals, because charges may be very large or small.
+    # The unknowns are the logarithms of white and gain, in units of the values with which each of them alone explains
+    # the residuals. The units are needed because charges may be very large or small.
     is_silent = (charge == 0.0) & (residual == 0.0)
     smallest_number = np.finfo(float).tiny
     units = smallest_number + rms(residual) / np.array([1.0, rms(charge)])
@@ -337,7 +341,8 @@ def _fit_noise(charge: Array, residual: Array) -> Array:
         """Return the mean negative logarithm of the likelihood, without a constant."""
         white, gain = units * np.exp(log_std)
         variance = np.maximum(white**2 + (gain * charge) ** 2, smallest_number)
-        square = residual**2 / variance  # in squared standard deviations
+        # The squared deviation counts up to `OUTLIER` squared, and only its logarithm beyond.
+        square = residual**2 / variance
         tail = OUTLIER**2 * np.log(np.maximum(square / OUTLIER**2, 1.0))
         terms = np.log(variance) + np.minimum(square, OUTLIER**2) + tail
         return float(np.mean(np.where(is_silent, 0.0, terms)))

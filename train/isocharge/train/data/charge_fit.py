@@ -111,7 +111,7 @@ def fit_charge_series(
         target = np.log(presses.charge)
         error_unit = validation.charge
 
-    # Try the degrees until the error is small enough, or the presses are too few.
+    # Try the degrees until the error is small enough, or the presses are too few for the next degrees.
     best_series: ChargeSeries | None = None
     for degree, largest_force_degree in candidate_degrees:
         force_degree = determined_degree(unit_contact[:, 2], largest_force_degree)
@@ -125,7 +125,7 @@ def fit_charge_series(
             best_series = replace(series, charge_std=error)
         if error < GOOD_ENOUGH:
             break
-    if best_series is None:
+    if best_series is None:  # the presses are too few for the first degrees
         raise TrainingError(f"expected at least {fewest} presses to fit the charges by, got {len(presses)}")
     return best_series
 
@@ -152,9 +152,13 @@ def fit_film_series(
     names = electrodes * node_MPa.size
     is_validation = np.arange(len(contact)) % 10 == 0
     all_nodes = fit_charge_series(domain, names, presses[~is_validation], presses[is_validation])
-    joined = all_nodes.coefficients[0]
-    by_node = joined.reshape(*joined.shape[:3], node_MPa.size, len(electrodes))
-    return replace(all_nodes, electrodes=electrodes, coefficients=np.moveaxis(by_node, 3, 0), node_MPa=node_MPa)
+
+    # The coefficients have an axis for each of the three degrees, and one for the electrodes of all nodes. Divide the
+    # last axis into nodes and electrodes, and make the nodes the first axis.
+    (joined,) = all_nodes.coefficients
+    *degrees, _ = joined.shape
+    by_degree = joined.reshape(*degrees, node_MPa.size, len(electrodes))
+    return replace(all_nodes, electrodes=electrodes, coefficients=np.moveaxis(by_degree, 3, 0), node_MPa=node_MPa)
 
 
 def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
@@ -185,14 +189,14 @@ def determined_degree(coordinate: Array, largest: int) -> int:
         coordinate: Coordinates, scaled to [-1, 1], shape (n,).
         largest: Upper bound of the result.
     """
-    # Smallest singular value of the matrix of the Chebyshev polynomials, divided by the root of n, with which a degree
-    # counts as determined. For evenly distributed coordinates, it is above 0.3.
-    smallest_singular_value = 0.1
-    terms = chebyshev.chebvander(coordinate, largest)  # shape (n, largest + 1)
-    moments = terms.T @ terms / len(coordinate)
+    # A degree counts as determined if the smallest singular value of the matrix of the Chebyshev polynomials up to this
+    # degree, divided by the root of n, is at least this number. For evenly distributed coordinates, it is above 0.3.
+    min_singular_value = 0.1
+    terms = chebyshev.chebvander(coordinate, largest)  # one column for each degree, shape (n, largest + 1)
+    moments = terms.T @ terms / len(coordinate)  # its eigenvalues are the squared singular values divided by n
     for degree in range(largest, 0, -1):
         smallest_eigenvalue = np.linalg.eigvalsh(moments[: degree + 1, : degree + 1])[0]
-        if smallest_eigenvalue >= smallest_singular_value**2:
+        if smallest_eigenvalue >= min_singular_value**2:
             return degree
     return 0
 

@@ -119,7 +119,9 @@ def outline(places: Array) -> Array:
     spacing = float(np.median(distances[:, 1]))
     exterior = shapely.concave_hull(shapely.MultiPoint(places), HULL_RATIO).simplify(0.0)
     enlarged = exterior.buffer(0.5 * spacing, join_style="mitre", mitre_limit=2.0)
-    return np.asarray(shapely.get_coordinates(enlarged.normalize().exterior)[:0:-1])
+    # The corners are clockwise, and the last corner repeats the first. Reverse them, and leave out the repeated corner.
+    closed_outline = shapely.get_coordinates(enlarged.normalize().exterior)
+    return np.asarray(closed_outline[:0:-1])
 
 
 USUAL_SHARE = 0.9

@@ -60,19 +60,22 @@ class OutsidePresses:
         Returns:
             The presses; None if fewer than `N_NEIGHBOURS` presses for measuring have a large enough force.
         """
+        # Collect all presses outside, and divide them into two random halves.
         pool = presses[presses.distance > domain.radius]
         if outside is not None:
             contact = np.concatenate([pool.contact, outside.contact])
             pool = LabelledPresses(contact, np.concatenate([pool.charge, outside.charge]))
-        pool = pool[np.random.default_rng(seed).permutation(len(pool))]
-        half_count = len(pool) // 2
-        train = pool[:half_count]
-        test = pool[half_count:]
+        shuffled = pool[np.random.default_rng(seed).permutation(len(pool))]
+        half_count = len(shuffled) // 2
+        train = shuffled[:half_count]
+        second_half = shuffled[half_count:]
+
+        # Very weak presses do not count as wrong answers without a flag.
         _, max_force = domain.force_range
-        test = test[test.contact[:, 2] >= max_force / FORCE_RATIO]
+        test = second_half[second_half.contact[:, 2] >= max_force / FORCE_RATIO]
         if len(test) < N_NEIGHBOURS:
             return None
-        return cls(domain, train, test, float(pool.distance.max()))
+        return cls(domain, train, test, float(shuffled.distance.max()))
 
     def unnoticed_shares(self, is_unnoticed: Booleans) -> UnnoticedPresses:
         """For each sector of each ring, compute the share of presses with a wrong answer that carries no flag.
@@ -80,9 +83,10 @@ class OutsidePresses:
         Args:
             is_unnoticed: Whether the answer to each press of `test` is wrong and carries no flag, shape (n,).
         """
-        middles = Rings.between(self.domain.radius, self.outer, N_SECTORS, N_SECTORS)
-        _, nearest = cKDTree(self.test.contact[:, :2]).query(middles.position, N_NEIGHBOURS)
-        shares = is_unnoticed[nearest].mean(axis=-1).round(2)
+        # The share of a sector is that of the presses nearest to its middle.
+        sector_middles = Rings.between(self.domain.radius, self.outer, N_SECTORS, N_SECTORS)
+        _, nearest_presses = cKDTree(self.test.contact[:, :2]).query(sector_middles.position, N_NEIGHBOURS)
+        shares = is_unnoticed[nearest_presses].mean(axis=-1).round(2)  # shape (ring, sector)
 
         min_force, max_force = self.domain.force_range
         smallest_force = max(min_force, max_force / FORCE_RATIO)

@@ -186,20 +186,22 @@ def merged_places(contact: Array, step_mm: float = PLACE_STEP_mm) -> Array:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         step_mm: Largest step, mm.
     """
-    # Connect positions whose distance is at most a step. The connected positions form a place. A coarse grid of cells
-    # limits the number of pairs if many presses are at one place.
+    # Round the positions to a grid that is finer than a step. This limits the number of pairs below if many presses are
+    # at one place.
     position = contact[:, :2]
     grid_mm = 0.25 * step_mm
     cells, cell_of_press = np.unique(np.round(position / grid_mm), axis=0, return_inverse=True)
+
+    # Connect cells whose distance is at most a step. The connected cells form a place.
     pairs = cKDTree(cells * grid_mm).query_pairs(step_mm, output_type="ndarray")
     steps = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(cells), len(cells)))
     _, place_of_cell = connected_components(steps, directed=False)
-    place_of_press = place_of_cell[cell_of_press.ravel()]
+    place_of_press = place_of_cell[cell_of_press.ravel()]  # some versions of NumPy return two axes
 
     def mean_of_place(values: Array) -> Array:
         """Return for each press the mean of the values, shape (n,), over all presses at its place."""
-        mean = np.bincount(place_of_press, values) / np.bincount(place_of_press)
-        return np.asarray(mean[place_of_press])
+        means = np.bincount(place_of_press, values) / np.bincount(place_of_press)  # one for each place
+        return np.asarray(means[place_of_press])
 
     # Keep the original positions of places that are too large.
     mean_position = np.column_stack([mean_of_place(coordinate) for coordinate in position.T])
