@@ -227,7 +227,7 @@ def _estimate_with_errors(
     best = average.weight.argmax()
     return Estimation(
         charges=charges,
-        film=FilmEstimate(prior.layout, average.unknowns, average.covariance, average.noise(stated.noise)),
+        film=FilmEstimate(prior.layout, average.unknowns, average.covariance, average.noise),
         contact=in_domain(log_contact, charges.domain),
         is_bad=is_bad,
         press_chi2=np.where(data.redundancy > 0, press_chi2 / np.maximum(data.redundancy, 1), np.nan),
@@ -291,6 +291,8 @@ class _Average(NamedTuple):
         unknowns: Weighted mean of the unknowns, shape (n_unknown,), within their bounds.
         covariance: Covariance of the unknowns, shape (n_unknown, n_unknown).
         log_contact: Contacts (x, y, ln F) that fit best to the mean unknowns, shape (n, 3).
+        noise: Root mean square of the noise. Averages of frames may have less noise than a frame, but this noise is at
+            least the stated noise of a frame.
     """
 
     hypotheses: list[Hypothesis]
@@ -300,15 +302,7 @@ class _Average(NamedTuple):
     unknowns: Array
     covariance: Array
     log_contact: Array
-
-    def noise(self, stated: NoiseModel) -> NoiseModel:
-        """Return the root mean square of the noise over the hypotheses.
-
-        Args:
-            stated: Noise of a frame. Averages of frames have less noise, but a later frame has at least this noise.
-        """
-        gains = np.maximum([one.errors.noise.gain for one in self.hypotheses], stated.gain)
-        return NoiseModel("presses", stated.white, float(np.sqrt(self.weight @ gains**2)))
+    noise: NoiseModel
 
 
 def _average_estimates(
@@ -348,8 +342,8 @@ def _average_estimates(
     probable = list(compress(hypotheses, is_probable))
 
     # Compute the means and the covariances of the unknowns under the probable hypotheses, and average them.
-    first_indices = np.cumsum([len(group.hypotheses) for group in groups])[:-1]  # of all groups but the first
-    weights_of_groups = np.split(all_weights, first_indices)
+    group_ends = np.cumsum([len(group.hypotheses) for group in groups])
+    weights_of_groups = np.split(all_weights, group_ends[:-1])
     posteriors = [group.posterior(weights) for group, weights in zip(groups, weights_of_groups, strict=True)]
     means = np.concatenate([mean for mean, _ in posteriors])
     mean = weight @ means
@@ -359,6 +353,7 @@ def _average_estimates(
     # The means of the hypotheses differ, which adds to the covariance of the average.
     covariance += np.cov(means, rowvar=False, ddof=0, aweights=weight)
     contact_change = Linearised.of(model, data, log_contact).contact_change(mean - unknowns)
+    gains = np.maximum([one.errors.noise.gain for one in probable], stated.noise.gain)
     return _Average(
         hypotheses=probable,
         weight=weight,
@@ -367,6 +362,7 @@ def _average_estimates(
         unknowns=np.clip(mean, *prior.bounds),
         covariance=covariance,
         log_contact=log_contact + contact_change,
+        noise=NoiseModel("presses", stated.noise.white, float(np.sqrt(weight @ gains**2))),
     )
 
 

@@ -5,7 +5,6 @@ would be too small. Measured presses are always split in the same way, because t
 which fifth of the presses is held out. Every command therefore measures errors on the same presses of a file.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -347,5 +346,5 @@ def check_enough(count: int, total_count: int, sensor: str) -> None:
 
 def presses_sha256(presses: MeasuredPresses) -> str:
     """Return the checksum of the contacts, the charges and the standard deviations of measured presses."""
-    columns: Sequence[Array] = (presses.contact, presses.charge_pC, presses.position_std_mm, presses.force_std)
-    return sha256_of(np.column_stack(columns).tobytes())
+    table = np.column_stack([presses.contact, presses.charge_pC, presses.position_std_mm, presses.force_std])
+    return sha256_of(table.tobytes())

@@ -22,11 +22,12 @@ log = logging.getLogger(__name__)
 
 
 def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: bool = False) -> str:
-    """Return the text of `isocharge_device.h`.
+    """Return the text of `isocharge_device.h`, which defines the settings of the signal chain as macros.
 
-    Each stage of the signal chain whose section the C sources contain states its settings for C. The macro
-    `ISOCHARGE_<SECTION>_ON` is 1 if the stage is switched on. All other macros of a stage have the names of its
-    settings in capital letters.
+    A stage of the signal chain belongs to a section of a device file. The C sources implement only some of the stages.
+    The macro `ISOCHARGE_<SECTION>_ON` of such a stage is 1 if the stage is switched on. Its other macros have the names
+    of its settings in capital letters. A stage that the C sources lack is left out with a warning if it only processes
+    contacts, which a host can do as well. Any other such stage is an error, because the charges would be wrong.
 
     Args:
         device: The board.
@@ -46,10 +47,11 @@ def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: 
     for stage in STAGES:
         is_on = stage.rule_class in device.rules
         prefix = f"ISOCHARGE_{stage.section.upper()}_"
-        if prefix in chain_source:
+        is_in_c = prefix in chain_source  # the C source of a stage uses its macros
+        if is_in_c:
             settings = {"on": is_on, **stage.c_settings(setup)}
             macros |= {prefix + name.upper(): _c_literal(value) for name, value in settings.items()}
-        elif stage.section and is_on:
+        elif stage.section and is_on:  # the device file switches the stage on
             if not stage.needs_contact:
                 raise DeviceError(f"{device.where}: {stage.section}: {NOT_IN_C}")
             host_sections.append(stage.section)

@@ -73,12 +73,16 @@ def simulated_errors(predict: Predict, presses: LabelledPresses, noise: Noise) -
     Returns:
         Errors by name, as `evaluate` returns them.
     """
+    # Errors with and without noise
     contact, std, _ = predict(presses.noisy(noise, seed=1))
     clean_contact, _, _ = predict(presses.charge)
     clean_median_mm, clean_p95_mm = np.percentile(position_error(clean_contact, presses.contact), [50, 95])
 
+    # Misfits of good presses, whose noise has the standard deviation 1 in units of the misfit
     unit_noise = misfit_noise(noise)
     _, _, misfits = predict(presses.repeated(N_GOOD_PRESSES).noisy(unit_noise, seed=1))
+
+    # Presses for the simulation of faults
     min_force, max_force = FORCES_NEAR_1_N
     force = presses.contact[:, 2]
     presses_near_1_N = presses[(force >= min_force) & (force <= max_force)]

@@ -93,6 +93,7 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     n_hidden = operators.count("Tanh")  # one after each hidden layer
     is_signed = operators[0] == "Max"  # the first node of a graph for charges of both signs
 
+    # Take the constants one after the other from an iterator, in their order in the graph.
     constants = (np.asarray_chkfinite(numpy_helper.to_array(tensor), dtype=float) for tensor in graph.initializer)
     low_pC = next(constants)
     high_pC = next(constants)
@@ -111,10 +112,13 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     # Each matrix contains the weights of the contact perceptron in its first rows and columns, and those of the misfit
     # perceptron in the others. Find the first column of the misfit perceptron in each layer, from the last layer to the
     # first. In a hidden layer, it is the first row of the next layer with a weight for the misfit perceptron.
-    misfit_starts = [ANGLES.stop]
-    for weight, _ in (last, *hidden[:0:-1]):
-        has_misfit_weight = weight[:, misfit_starts[0] :].any(axis=1)
-        misfit_starts.insert(0, int(has_misfit_weight.argmax()))
+    misfit_starts = [ANGLES.stop]  # of the last layer, whose first columns are the answers about the contact
+    for weight, _ in (last, *hidden[:0:-1]):  # the last layer, and the hidden layers backwards without the first
+        has_misfit_weight = weight[:, misfit_starts[0] :].any(
+            axis=1
+        )  # for each row, which is a unit of the layer before
+        first_misfit_row = int(has_misfit_weight.argmax())
+        misfit_starts.insert(0, first_misfit_row)
 
     joined = Perceptron(tuple(hidden), last, skip)
     contact = _select_units(joined, [slice(start) for start in misfit_starts])
@@ -130,12 +134,13 @@ def _select_units(joined: Perceptron, units: list[slice]) -> Perceptron:
         units: Units of each layer that belong to the perceptron, from the first layer to the last. They are columns of
             the weights of the layer, and rows of the weights of the next layer.
     """
-    rows = [slice(None), *units[:-1]]  # all inputs in the first layer
-    layers = [
-        Layer(weight[layer_rows, columns], bias[columns])
-        for (weight, bias), layer_rows, columns in zip((*joined.hidden, joined.last), rows, units, strict=True)
-    ]
-    return Perceptron(tuple(layers[:-1]), layers[-1], joined.skip[:, units[-1]])
+    joined_layers = (*joined.hidden, joined.last)
+    units_before = [slice(None), *units[:-1]]  # all inputs before the first layer
+    *hidden, last = (
+        Layer(weight[rows, columns], bias[columns])
+        for (weight, bias), rows, columns in zip(joined_layers, units_before, units, strict=True)
+    )
+    return Perceptron(tuple(hidden), last, joined.skip[:, units[-1]])
 
 
 OutputFunction = Callable[[Array], tuple[Array, ...]]
@@ -190,7 +195,8 @@ def check_graph(
     session = open_session(graph, "the exported graph")
     golden_charge = _choose_golden_charges(compute_exact, presses, noise)
     _check_finite_outputs(session, n_electrode=presses.charge.shape[1])
-    # The difference must be less than a quarter of the tolerance, because another runtime rounds differently.
+    # Find the presses for which every difference is less than a quarter of the tolerance, because another runtime
+    # rounds differently.
     all_floors = FLOORS | {"contact": tuple(floors), "contact_std": tuple(floors)}
     is_reproducible: Booleans = np.full(len(golden_charge), True)
     exact_outputs = compute_exact(golden_charge.astype(float))

@@ -108,49 +108,50 @@ def fit_presses(
         ConfigError: If a setting is out of its range.
         TrainingError: If the loss is not finite.
     """
-    settings = (config or FitConfig()).checked()
     # Measured presses are few and noisy. Therefore, the misfit network is trained like that of many electrodes.
+    settings = (config or FitConfig()).checked()
     training = structs.replace(
         settings.training,
         steps=settings.training.steps or DEFAULT_STEPS,
         misfit_steps=settings.training.misfit_steps or MANY_ELECTRODE_SIZES.misfit_steps,
         misfit_charges=settings.training.misfit_charges or MANY_ELECTRODE_SIZES.misfit_charges,
     )
+    # Select the presses, and estimate the noise of their charges.
     usable = usable_presses(presses)
     force_std = constant_force_std(usable)  # None if the forces vary
     labelled = LabelledPresses(usable.contact, usable.charge_pC)
     domain = PressedArea.of_contacts(labelled.contact)
     unit_contact = domain.to_unit(labelled.contact)
-    if force_std is not None and force_std >= 1.0:  # the forces are unknown and may vary
-        unit_contact[:, 2] = _unit_sizes(labelled.charge)
+    has_unknown_forces = force_std is not None and force_std >= 1.0  # they may vary, although one force is assumed
+    if has_unknown_forces:
+        unit_contact[:, 2] = _unit_log_sizes(labelled.charge)
     noise = ChannelNoise.estimate(labelled.charge, unit_contact)
-    level = noise.level(labelled.charge)  # charges on a scale on which the noise has the standard deviation 1
     with threads_and_seed(training.threads, training.seed):
         features = signed_features(labelled.charge, noise.transition_charge(labelled.charge))
-        # The first network is returned. It learns from the networks of the cross-validation.
+        # Cross-validation: train a network for each fold, and compute the answers to the presses of the fold.
         create_network = partial(InverseNetwork, domain, features, labelled.charge, settings.network, force_std)
-        network = create_network()
+        network = create_network()  # the network that is returned, which learns from the networks of the folds
         fold_networks = [create_network() for _ in range(HELD_PARTS)]
         fold_of_press = (HELD_PARTS * position_ranks(uncertain_places(usable))).astype(int)
-        _train_fold_networks(fold_networks, labelled, fold_of_press, noise, training)
-        contact, std, misfit = _cross_validated_answers(
-            fold_networks, labelled.charge, unit_contact, level, fold_of_press
-        )
+        contact, std, misfit = _cross_validate(fold_networks, labelled, unit_contact, fold_of_press, noise, training)
         position_factor, force_factor = std_factors(contact, std, labelled.contact)
         if force_std is not None:
             force_factor = 1.0
 
-        # Train the returned network: its contacts on the mean outputs of the other networks, then its misfits.
+        # Train the returned network: its contacts on the mean outputs of the networks of the folds, then its misfits.
         distillation = _distillation_stage(network, fold_networks, labelled, noise, training)
         train_perceptron(distillation, settings)
         examples = _misfit_examples(labelled.charge, unit_contact, noise, training)
         train_perceptron(misfit_stage(network, examples, training), settings)
 
+    # The returned network adds its own error to the misfit. Three charges fit a contact exactly, so that this error is
+    # then the whole misfit.
     folded_network = fold_network(network)
-    # The network adds an error to the misfit. Three charges fit a contact exactly, so this error is then the misfit.
     *_, network_misfit = folded_network.outputs(labelled.charge)
     misfit = np.maximum(misfit, network_misfit)
     cross_validated = Answers(contact, std * [position_factor, position_factor, force_factor], misfit)
+
+    # Describe the training in the metadata of the model.
     made_with: dict[str, object] = {
         "config": settings.to_dict(),
         "measured": {
@@ -176,7 +177,7 @@ def fit_presses(
         test=labelled,
         sha256=presses_sha256(usable),
         made_with=made_with,
-        # As they were measured: without merged places, and without assumed forces.
+        # The file contains the presses as they were measured: without merged places, and without assumed forces.
         files={PRESSES_FILE: csv_text(presses[np.isin(presses.lines, usable.lines)].columns).encode()},
         cross_validated=cross_validated,
     )
@@ -268,16 +269,16 @@ def constant_force_std(presses: MeasuredPresses) -> float | None:
     return float(np.hypot(np.std(np.log(force)), rms(presses.force_std)))
 
 
-def _unit_sizes(charge: Array) -> Array:
+def _unit_log_sizes(charge: Array) -> Array:
     """Return the logarithm of the common size of the charges of each press, scaled to -1 to 1, shape (n,).
 
-    If the force at a place changes, all charges change by about the same factor, which their common size shows. The
+    If the force at a place changes, all charges change by about the same factor, and so does their common size. The
     size therefore replaces an unknown force, whose effect on the charges would otherwise be taken for noise.
 
     Args:
         charge: Charges, shape (n, n_channel), pC.
     """
-    size = np.linalg.norm(charge / usual_size(charge), axis=1)
+    size = np.linalg.norm(charge / usual_size(charge), axis=1)  # each channel has the same weight
     log_size = np.log(np.maximum(size, np.finfo(float).tiny))
     return np.asarray(np.interp(log_size, [log_size.min(), log_size.max()], [-1.0, 1.0]))
 
@@ -304,28 +305,6 @@ def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]
     return float(position_factor), float(force_factor)
 
 
-def _train_fold_networks(
-    fold_networks: list[InverseNetwork],
-    presses: LabelledPresses,
-    fold_of_press: Integers,
-    noise: ChannelNoise,
-    config: TrainingConfig,
-) -> None:
-    """Train the contact perceptron of one network for each fold on the presses of all other folds.
-
-    Args:
-        fold_networks: Networks, one for each fold.
-        presses: All presses.
-        fold_of_press: Index of the fold of each press, shape (n,).
-        noise: Noise of the charges.
-        config: Settings, whose seed is that of the first fold.
-    """
-    added_noise = noise.scaled(TRAINING_NOISE_FACTOR)
-    for fold_index, network in enumerate(fold_networks):
-        fold_config = structs.replace(config, seed=config.seed + fold_index)
-        contact_stage(network, presses[fold_of_press != fold_index], added_noise, fold_config).run()
-
-
 def _misfit_examples(charge: Array, unit_contact: Array, noise: ChannelNoise, config: TrainingConfig) -> Array:
     """Draw charges, and compute how much they differ from the charges of the most similar contacts.
 
@@ -349,27 +328,42 @@ def _misfit_examples(charge: Array, unit_contact: Array, noise: ChannelNoise, co
     return np.stack([drawn_charge, planes.residuals(noise.level(drawn_charge))])
 
 
-def _cross_validated_answers(
-    fold_networks: list[InverseNetwork], charge: Array, unit_contact: Array, level: Array, fold_of_press: Integers
+def _cross_validate(
+    fold_networks: list[InverseNetwork],
+    presses: LabelledPresses,
+    unit_contact: Array,
+    fold_of_press: Integers,
+    noise: ChannelNoise,
+    config: TrainingConfig,
 ) -> Answers:
-    """Estimate the contact and the misfit of each press without using the presses of its fold.
+    """Train one network for each fold on the presses of all other folds, and estimate the presses of the fold.
 
-    The folds are the parts into which a cross-validation divides the presses. The contact is the answer of a network
-    that was not trained on the press. The misfit is the length of the difference between the level of the press and the
-    level of the most similar contact. This contact is searched on planes: near each press of the other folds, the level
-    is approximated by a linear function of the contact.
+    The folds are the parts into which a cross-validation divides the presses. The contact of a press is the answer of
+    the network that was not trained on the press. The misfit is the length of the difference between the level of the
+    press and the level of the most similar contact. A level is a charge on a scale on which the noise has the standard
+    deviation 1. The most similar contact is searched on planes: near each press of the other folds, the level is
+    approximated by a linear function of the contact.
 
     Args:
-        fold_networks: Networks, one for each fold, which were trained on the presses of all other folds.
-        charge: Charges of all presses, shape (n, n_electrode), pC.
+        fold_networks: Networks, one for each fold, of which the contact perceptrons are trained.
+        presses: All presses.
         unit_contact: Contacts of the presses in unit coordinates, shape (n, 3).
-        level: Charges on a scale on which the noise has the standard deviation 1, shape (n, n_electrode).
         fold_of_press: Index of the fold of each press, shape (n,).
+        noise: Noise of the charges.
+        config: Settings, whose seed is that of the first fold.
+
+    Returns:
+        Contacts, standard deviations and misfits of all presses.
     """
-    answers = Answers(np.empty_like(unit_contact), np.empty_like(unit_contact), np.empty((len(charge), 1)))
+    level = noise.level(presses.charge)
+    added_noise = noise.scaled(TRAINING_NOISE_FACTOR)
+    answers = Answers(np.empty_like(unit_contact), np.empty_like(unit_contact), np.empty((len(presses), 1)))
     for fold_index, network in enumerate(fold_networks):
         is_in_fold = fold_of_press == fold_index
-        contact, std, *_ = fold_network(network).outputs(charge[is_in_fold])
+        fold_config = structs.replace(config, seed=config.seed + fold_index)
+        contact_stage(network, presses[~is_in_fold], added_noise, fold_config).run()
+
+        contact, std, *_ = fold_network(network).outputs(presses.charge[is_in_fold])
         answers.contact[is_in_fold] = contact
         answers.std[is_in_fold] = std
         planes = LocalPlanes.fit(unit_contact[~is_in_fold], level[~is_in_fold])
@@ -399,11 +393,12 @@ def _distillation_stage(
     rng = np.random.default_rng(config.seed)
     copies = [noise.scaled(factor).add(presses.charge, rng) for factor in DISTILLATION_NOISE_FACTORS]
     charge = as_tensor(np.concatenate(copies))
-    # The targets are the means of the outputs over the fold networks.
+    # The targets are the outputs (means, logarithms of standard deviations, turns), averaged over the fold networks.
     with torch.no_grad():
         outputs = [torch.cat(fold_network.posterior(charge), dim=1) for fold_network in fold_networks]
-    target = torch.stack(outputs).mean(dim=0)
-    # The differences of the means are divided by the standard deviations, and their squares are halved.
+    target = torch.stack(outputs).mean(dim=0)  # shape (number of copies, n_output)
+    # The differences of the means are divided by the standard deviations, and their squares are halved, as in the
+    # likelihood of a normal distribution.
     weight = torch.ones_like(target)
     weight[:, MEAN] = 0.5 * torch.exp(-2.0 * target[:, LOG_STD])
 

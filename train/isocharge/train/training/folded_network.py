@@ -218,8 +218,8 @@ class FoldedNetwork:
             Contacts (x, y, F), shape (n, 3), mm and N. Standard deviations of the contacts, shape (n, 3). Correlations,
             shape (n, 3). Misfits, shape (n, 1), in standard deviations of the noise.
         """
-        outputs: Any = ReferenceEvaluator(self.onnx_model(np.float64)).run(None, {INPUT: charge.astype(float)})
-        contact, std, correlation, misfit = outputs
+        evaluator: Any = ReferenceEvaluator(self.onnx_model(np.float64))
+        contact, std, correlation, misfit = evaluator.run(None, {INPUT: charge.astype(float)})
         return contact, std, correlation, misfit
 
     def onnx_model(self, number_type: type = np.float32) -> onnx.ModelProto:
