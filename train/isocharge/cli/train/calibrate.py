@@ -1,6 +1,7 @@
 """`isocharge train calibrate`: calibrate a film with measured presses, and write a model of this film."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -89,6 +90,7 @@ def calibrate_command(
 
     Example: isocharge train calibrate presses.csv --sensor four-25um-biaxial -o my-film
     """
+    # Check the combination of the options.
     if held_out is not None and output is None:
         raise InputError("--held-out: expected --output FOLDER for the model whose standard deviations it changes")
     if file is None and not next_count:
@@ -101,6 +103,7 @@ def calibrate_command(
     problem = CalibrationProblem(load_sensor(sensor), parse_probe(probe), radius, force, stress_limit=stress_limit)
     if output is not None:
         check_calibration_folder(output, problem.electrodes)
+
     fields: dict[str, Any] = {}  # of the JSON object
     sentences: list[str] = []
     rows: list[dict[str, Any]] = []  # proposed presses, each with the errors that would remain after it
@@ -108,18 +111,19 @@ def calibrate_command(
         shown_progress(),
         executor_for() as executor,
     ):
-        presses, held_out_presses = (
-            None
-            if path is None
-            else read_presses(path, problem.electrodes, position_std_mm=position_std_mm, force_std=force_std)
-            for path in (file, held_out)
+        # Read all files before anything is solved.
+        read = partial(
+            read_presses, electrodes=problem.electrodes, position_std_mm=position_std_mm, force_std=force_std
         )
+        presses = read(file) if file else None
+        held_out_presses = read(held_out) if held_out else None
         if earlier is not None:
             problem = replace(problem, earlier=read_earlier(earlier, problem, presses, held_out_presses))
         if presses is not None and held_out_presses is not None:
-            held_out_presses = usable_held_out(held_out_presses, presses, problem)  # before anything is solved
+            held_out_presses = usable_held_out(held_out_presses, presses, problem)
+
+        # Calibrate the film. Without presses, the next presses are chosen for the mean film.
         if presses is None:
-            # The presses are chosen for the mean film.
             charges = solve_even(problem, executor)
             film = problem.film_before
         else:
@@ -142,10 +146,10 @@ def calibrate_command(
                     fields["std_factor"] = std_factor.factor
                     sentences.append(f"Held-out presses: {std_factor.statement}.")
         if next_count:
-            rows += map(
-                vars,
-                next_presses(problem, charges, next_count, film, position_std_mm=position_std_mm, force_std=force_std),
+            proposed = next_presses(
+                problem, charges, next_count, film, position_std_mm=position_std_mm, force_std=force_std
             )
+            rows += map(vars, proposed)
 
     if json:
         show_json(fields | {"next": rows})

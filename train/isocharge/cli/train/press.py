@@ -100,22 +100,11 @@ def press_command(
         say(f"{device}: [common_mode] is not used for these presses, because it needs a model of the film")
 
     stds = {"position_std_mm": position_std_mm, "force_std": force_std}
-    presses = None
-    if output.is_file():  # the file of an earlier session
-        presses = read_presses(output, problem.electrodes, **stds)
-        if presses.ignored:
-            raise PressError(
-                f"{output}: expected a file of `isocharge train press`, got further columns: "
-                f"{', '.join(presses.ignored)}; they would be lost, so choose another output"
-            )
-        say(f"{output} has {len(presses)} presses; the session continues with them. Delete the file to begin again")
-    elif output.exists() or not output.parent.is_dir():
-        raise OutputError(f"{output}: expected a file in an existing folder; choose another output")
-    else:
-        check_new_output(output)
+    presses = _read_earlier_session(output, problem.electrodes, stds)
     if earlier:
         problem = replace(problem, earlier=read_earlier(earlier, problem, presses))
     with executor_for() as executor:
+        # Begin or continue the session, and check the list of the machine.
         say("solving the film of the sensor file")
         session = PressSession(
             problem, save=partial(_save, output), presses=presses, until=until, executor=executor, **stds
@@ -123,6 +112,8 @@ def press_command(
         for number, contact in enumerate([] if contacts is None else contacts, 1):
             with error_prefix(f"{press_list}, press {number}: ", PressError):
                 session.check(contact)
+
+        # Record the presses.
         piezo = problem.sensor.piezo
         stream = ReadingStream(
             problem.electrodes,
@@ -153,6 +144,8 @@ def press_command(
         raise PressError(f"no press was taken, so {output} is not written")
     if session.refusal:  # the reason why the presses cannot be used for a calibration
         raise PressError(f"{output}: {session.refusal}")
+
+    # State the command that calibrates with the presses.
     options = ["--sensor", sensor, "--probe", probe, "--radius", f"{radius:g}"]
     if force != DEFAULT_FORCE_RANGE:
         options += ["--force", *map(str, force)]
@@ -161,6 +154,36 @@ def press_command(
     if stress_limit != DEFAULT_STRESS_LIMIT:
         options += ["--stress-limit", f"{stress_limit:g}"]
     say(f"To make a model: isocharge train calibrate {shlex.join([str(output), *options])} -o my-film")
+
+
+def _read_earlier_session(path: Path, electrodes: tuple[str, ...], stds: dict[str, float]) -> MeasuredPresses | None:
+    """Read the file of an earlier session, or check that a new file can be written.
+
+    Args:
+        path: The file.
+        electrodes: Names of the electrodes.
+        stds: Standard deviations of positions and forces that the file does not state, by the names of the options.
+
+    Returns:
+        The presses of the earlier session; None if there is no file.
+
+    Raises:
+        PressError: If the file is not that of a session.
+        OutputError: If a file cannot be written.
+    """
+    if path.is_file():
+        presses = read_presses(path, electrodes, **stds)
+        if presses.ignored:
+            raise PressError(
+                f"{path}: expected a file of `isocharge train press`, got further columns: "
+                f"{', '.join(presses.ignored)}; they would be lost, so choose another output"
+            )
+        say(f"{path} has {len(presses)} presses; the session continues with them. Delete the file to begin again")
+        return presses
+    if path.exists() or not path.parent.is_dir():
+        raise OutputError(f"{path}: expected a file in an existing folder; choose another output")
+    check_new_output(path)
+    return None
 
 
 def _save(path: Path, presses: MeasuredPresses) -> None:

@@ -235,9 +235,10 @@ def evaluate_dataset(dataset: Dataset, model_folder: Path, settings: Settings) -
     measured = is_measured(dataset)
     noise = noise_of(model)  # it also weights the charges of measured presses
     if not measured:
-        test = test.repeated(settings.presses)
-        test = replace(test, charge=test.noisy(noise, SEED))
+        repeated_test = test.repeated(settings.presses)
+        test = replace(repeated_test, charge=repeated_test.noisy(noise, SEED))
 
+    # Fit the other methods, which is impossible with too few presses.
     methods = [model_method(predictor)]
     limits: dict[str, float] = {}
     failure_reasons = []
@@ -246,19 +247,21 @@ def evaluate_dataset(dataset: Dataset, model_folder: Path, settings: Settings) -
         charge_map = fit_charge_series(domain, dataset.sensor.electrode_names, train, validation, noise.white)
         task = FittingTask(presses, charge_map, noise)
         methods += [build_method(task) for build_method in METHOD_BUILDERS]
-        # The limit follows from the derivatives of the series, and the noise of measured presses is unknown.
+
+        # Compute the Cramér-Rao limit from the derivatives of the series. The noise of measured presses is unknown.
         series_error_pC = charge_map.charges(validation.contact) - validation.charge
-        if not measured and rms(series_error_pC / noise.sigma(validation.charge)) >= 1.0:
-            failure_reasons.append(
-                f"Cramér-Rao limit: a series that is fitted to {len(train)} presses has an error of "
-                f"{100.0 * charge_map.charge_std:.2g} % of a charge, more than the noise; simulate more presses"
-            )
-        elif not measured:
+        is_series_accurate = rms(series_error_pC / noise.sigma(validation.charge)) < 1.0
+        if is_series_accurate and not measured:
             cramer_rao = limits_at(charge_map, test.contact, noise)
             limits = {
                 "position_rms_mm": rounded(rms(cramer_rao.position)),
                 "force_rms_percent": rounded(100.0 * rms(cramer_rao.force)),
             }
+        elif not measured:
+            failure_reasons.append(
+                f"Cramér-Rao limit: a series that is fitted to {len(train)} presses has an error of "
+                f"{100.0 * charge_map.charge_std:.2g} % of a charge, more than the noise; simulate more presses"
+            )
     except TrainingError as error:
         failure_reasons.append(str(error))
     return Section(
@@ -352,9 +355,10 @@ def _calibration_charges(model_folder: Path, model: ModelMetadata) -> Array:
     A calibration may continue an earlier one, so the presses of all versions of the model are returned. A model that
     was not calibrated has no such presses.
     """
-    files = model_folder.parent.glob(f"*/{PRESSES}")
+    files = model_folder.parent.glob(f"*/{PRESSES}")  # of all versions
     charges = [read_presses(file, model.electrodes).charge_pC for file in files]
-    return np.concatenate([np.empty((0, len(model.electrodes))), *charges])
+    no_charges = np.empty((0, len(model.electrodes)))  # `concatenate` needs at least one array
+    return np.concatenate([no_charges, *charges])
 
 
 def check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
@@ -373,7 +377,9 @@ def check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
             differ.
     """
     names = dataset.sensor.electrode_names
-    differences = [] if model.electrodes == names else [f"electrodes ({', '.join(model.electrodes)})"]
+    differences = []
+    if model.electrodes != names:
+        differences.append(f"electrodes ({', '.join(model.electrodes)})")
     if not is_measured(dataset):
         expected = sensor_to_dict(dataset.sensor)
         keys = (expected.keys() | model.sensor.keys()) - {"name"}

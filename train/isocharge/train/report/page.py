@@ -150,11 +150,12 @@ def draw_speed(sections: Sequence[Section]) -> Figure:
     for axes, section in zip(panels[0], sections, strict=True):
         answered = [record for record in section.methods if record.errors]
         for record in answered:
-            is_evaluated = record is section.methods[0]
-            colour, marker, size = (FELT, "*", 14) if is_evaluated else (None, "o", 7)
+            style: dict[str, Any] = {"marker": "o", "ms": 7}
+            if record is section.methods[0]:  # the evaluated model
+                style = {"marker": "*", "ms": 14, "color": FELT}
             error_mm = _position_error(record)
             label = f"{record.name.replace('`', '')}, {error_mm:.3g} mm"
-            axes.plot(record.single_press_us, error_mm, ls="", label=label, color=colour, marker=marker, ms=size)
+            axes.plot(record.single_press_us, error_mm, ls="", label=label, **style)
         if section.limits:
             limit_mm = section.limits["position_rms_mm"]
             axes.axhline(limit_mm, color=INK, ls=":", label=f"Cramér-Rao limit, unbiased, {limit_mm:.3g} mm")
