@@ -84,12 +84,12 @@ class PressEvents:
                 raise event
             if isinstance(event, str):
                 return event
-            if event is None:
+            if event is None:  # a call of `arm`
                 self._watch.arm()
                 self._waiting_arms -= 1
                 continue
             watched = self._watch.feed(event)
-            if not self._waiting_arms:
+            if not self._waiting_arms:  # otherwise, the reading is older than the last call of `arm`
                 return watched
 
     def _start_reading(self, items: Iterable[Frame | str]) -> threading.Thread:

@@ -217,8 +217,7 @@ def _fit_uneven_film(
         values = estimation.film.film_values
         if _is_exact(charges, values, estimation.contact):
             break
-        solved_charges = charges.solved(values, executor)
-        estimation = estimate(solved_charges, data, problem.prior, estimation)
+        estimation = estimate(charges.solved(values, executor), data, problem.prior, estimation)
     return estimation
 
 

@@ -211,8 +211,10 @@ def _fit_followable_nodes(
 def _nodes(film: FilmEstimate) -> Array:
     """Return the changes of the pretension at the nodes, of which none makes the film slack, shape (n_node,), MPa."""
     sensor, _ = film.layout.prior.film(film.film_values)
-    # An interpolation between several nodes near zero would amplify the errors of their charges.
-    lowest_MPa = min(0.0, -0.95 * (sensor.film.pretension - np.hypot(*sensor.film.deviator)))
+    smallest_tension_MPa = sensor.film.pretension - np.hypot(*sensor.film.deviator)  # over all directions
+    lowest_MPa = min(0.0, -0.95 * smallest_tension_MPa)
+    # Nodes below the lowest change become one node. An interpolation between several nodes close to each other would
+    # amplify the errors of their charges.
     return np.unique(np.maximum(NODES_MPa, lowest_MPa))
 
 
@@ -300,16 +302,17 @@ def _directions(
     effects_at_films = [
         noise_stds_per_value * (changes + one.change_MPa * slopes) for one in (lower, calibrated, upper)
     ]
-    n, n_electrode, n_unknown = changes.shape
+    *_, n_unknown = changes.shape
     all_effects = np.stack(effects_at_films).reshape(-1, n_unknown)
     _, singular_values, rotation = np.linalg.svd(all_effects, full_matrices=False)
     kept = rotation[singular_values > MIN_DIRECTION * np.sqrt(len(all_effects))]  # shape (n_direction, n_unknown)
 
-    # Fit a series to the change and the slope of each direction, with the axes (n, 2, n_direction, n_electrode).
+    # Fit a series to the change and the slope of each direction. The axes of the effects are the contact, change or
+    # slope, direction and electrode. The series has three axes for the degrees in place of the first one.
     effects = np.stack([changes @ kept.T, slopes @ kept.T], axis=1).swapaxes(2, 3)
-    coefficients = fit_series(unit_contact, effects.reshape(n, -1), *DIRECTION_DEGREES)
-    *degrees, _ = coefficients.shape
-    return coefficients.reshape(*degrees, 2, len(kept), n_electrode)
+    coefficients = fit_series(unit_contact, effects.reshape(len(contact), -1), *DIRECTION_DEGREES)
+    *degree_axes, _ = coefficients.shape
+    return coefficients.reshape(*degree_axes, *effects.shape[1:])
 
 
 def _value_changes(

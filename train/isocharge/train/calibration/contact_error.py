@@ -175,8 +175,8 @@ def next_presses(
     sensitivity = ContactSensitivity.of(film, charges, problem.domain)
 
     # Divide the errors of x, y and ln F by those that the noise causes, so that their squares can be added. If the
-    # unknowns have the covariance C, the sum of the squared errors of all contacts is the trace of G C G'. In the
-    # following sum over the contacts n and their coordinates i, j and k are unknowns.
+    # unknowns have the covariance C, the sum of the squared errors of all contacts is the trace of G C G'. The product
+    # G' G is a sum over the contacts (n) and their coordinates (i), and has two axes of unknowns (j and k).
     noise_std = np.sqrt(np.diagonal(sensitivity.noise_covariance, axis1=1, axis2=2).mean(axis=0))  # shape (3,)
     gain = sensitivity.film_gain / noise_std[:, None]
     squared_gain = np.einsum("nij,nik->jk", gain, gain)  # G' G, shape (n_unknown, n_unknown)

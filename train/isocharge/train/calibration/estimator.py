@@ -99,7 +99,10 @@ class Hypothesis:
 
 
 def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
-    """Yield all hypotheses about presses.
+    """Yield all hypotheses about presses: all combinations of the sizes that are not known beforehand.
+
+    The sizes are independent, so the probability of a hypothesis is the product of the probabilities of its sizes.
+    Hypotheses with the same errors of the presses follow one another.
 
     Args:
         noise: Noise of a frame from a good amplifier.
@@ -108,11 +111,13 @@ def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
         (replace(noise, white=min(ratio, 1.0) * noise.white, gain=ratio * noise.gain), probability)
         for ratio, probability in NOISE_RATIOS
     ]
-    session = [one.stds for one in SESSION]
-    for cases in product(noises, POSITION_RATIOS, FORCE_SCATTERS, IMPERFECTION_SCALES, DISCREPANCY_SIZES, *session):
-        sizes, probabilities = zip(*cases, strict=True)
-        level, position_ratio, force_scatter, imperfections, discrepancy, *session_std = sizes
-        errors = PressErrors(level, position_ratio, force_scatter)
+    session = [session_property.stds for session_property in SESSION]
+    # Each factor of the product is a list of sizes with their probabilities.
+    factors = (noises, POSITION_RATIOS, FORCE_SCATTERS, IMPERFECTION_SCALES, DISCREPANCY_SIZES, *session)
+    for combination in product(*factors):
+        sizes, probabilities = zip(*combination, strict=True)
+        press_noise, position_ratio, force_scatter, imperfections, discrepancy, *session_std = sizes
+        errors = PressErrors(press_noise, position_ratio, force_scatter)
         yield Hypothesis(imperfections, discrepancy, tuple(session_std), errors, float(np.prod(probabilities)))
 
 
@@ -248,9 +253,8 @@ def _find_bad_presses(redundancy: Integers, chi2: Array) -> Booleans:
         chi2: Sum of the squared residuals of each press, shape (n,).
     """
     is_improbable = (redundancy > 0) & (chdtrc(redundancy, chi2) < BAD_PROBABILITY)
-    if is_improbable.mean() > 0.5 or len(chi2) <= FEW_PRESSES:
-        return np.zeros(len(chi2), dtype=bool)
-    return np.asarray(is_improbable)
+    can_be_bad = is_improbable.mean() <= 0.5 and len(chi2) > FEW_PRESSES
+    return np.asarray(is_improbable & can_be_bad)
 
 
 def _most_probable_point(
@@ -310,7 +314,7 @@ def _average_estimates(
     stated: PressData,
     data: PressData,
     prior: Prior,
-    hypotheses: list[Hypothesis],
+    all_hypotheses: list[Hypothesis],
     unknowns: Array,
     log_contact: Array,
 ) -> _Average:
@@ -323,7 +327,7 @@ def _average_estimates(
         stated: The presses with their stated errors, which a hypothesis replaces by its own.
         data: The presses with assumed errors, with which the contacts follow the mean unknowns.
         prior: Prior distribution of the unknowns.
-        hypotheses: The hypotheses. Those with the same errors of the presses follow one another.
+        all_hypotheses: The hypotheses. Those with the same errors of the presses follow one another.
         unknowns: Unknowns at which the charges are linearised, shape (n_unknown,).
         log_contact: Contacts (x, y, ln F) at which the charges are linearised, shape (n, 3).
     """
@@ -331,7 +335,7 @@ def _average_estimates(
     model = model_values(charges, prior.layout, data, unknowns, log_contact)
     groups = [
         _HypothesisGroup.of(model, stated.with_errors(errors), log_contact, unknowns, prior, list(group))
-        for errors, group in groupby(hypotheses, lambda one: one.errors)
+        for errors, group in groupby(all_hypotheses, lambda one: one.errors)
     ]
     all_chi2, log_evidence = np.concatenate([group.chi2_and_log_evidence() for group in groups], axis=1)
     all_weights = softmax(log_evidence)
@@ -339,7 +343,7 @@ def _average_estimates(
     all_weights /= all_weights.sum()
     is_probable = all_weights > 0.0
     weight = all_weights[is_probable]
-    probable = list(compress(hypotheses, is_probable))
+    probable = list(compress(all_hypotheses, is_probable))
 
     # Compute the means and the covariances of the unknowns under the probable hypotheses, and average them.
     group_ends = np.cumsum([len(group.hypotheses) for group in groups])
@@ -422,7 +426,8 @@ class _HypothesisGroup:
         is_changed = eliminated_jacobian.any(axis=2)  # False for a coordinate that was not measured
         basis, jacobian = np.linalg.qr(eliminated_jacobian[is_changed])
         residual = basis.T @ eliminated[is_changed]
-        prior_change = unknowns - prior.mean
+        prior_change = unknowns - prior.mean  # the residuals at the prior means follow from those at the unknowns
+        # The density of an error at zero is proportional to the inverse of its standard deviation.
         log_density = -np.log(data.measured_std[np.isfinite(data.measured_std)]).sum()
         return cls(
             hypotheses=hypotheses,
@@ -447,7 +452,7 @@ class _HypothesisGroup:
         factors = np.linalg.cholesky(self._covariance(self._squared_sizes))  # shape (n_hypothesis, m, m)
         weighted = [cho_solve((factor, True), self.residual, check_finite=False) for factor in factors]  # S^-1 r
         chi2 = self.other_chi2 + np.array(weighted) @ self.residual
-        log_determinant = 2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)
+        log_determinant = 2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)  # of S
         log_probability = np.log([one.probability for one in self.hypotheses])
         return chi2, self.log_volume - 0.5 * (chi2 + log_determinant) + log_probability
 
@@ -466,8 +471,9 @@ class _HypothesisGroup:
         is_used = weight > 0.0
         squared_sizes = self._squared_sizes[is_used]
         gain = np.tensordot(squared_sizes, self.jacobian @ self.prior.parts, 1)  # J P, shape (n, m, n_unknown)
-        gain_by_covariance = np.linalg.solve(self._covariance(squared_sizes), gain)  # S^-1 J P
+        gain_by_covariance = np.linalg.solve(self._covariance(squared_sizes), gain)  # S^-1 J P, same shape
         means = self.prior.mean - self.residual @ gain_by_covariance
+        # Sum the products P J' S^-1 J P of all hypotheses, with their weights.
         weighted_gain = weight[is_used, None, None] * gain_by_covariance
         return means, np.tensordot(gain, weighted_gain, ((0, 1), (0, 1)))
 

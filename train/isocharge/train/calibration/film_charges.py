@@ -66,6 +66,7 @@ class FilmCharges:
         """
         even_values = prior.even(values)
         sensor, probe = prior.film(even_values)
+        # The sensor file itself may describe a film without axial symmetry.
         film = replace(sensor.film, deviator=(0.0, 0.0), young_ratio=1.0, shear=None, oval=0.0)
         slopes = FilmSlopes.build(replace(sensor, film=film), round_probe(probe), domain, executor=executor)
         return cls(prior, even_values, slopes.film, slopes, even_values)

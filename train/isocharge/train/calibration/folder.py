@@ -190,17 +190,16 @@ def _correlation_matrix(path: Path, rows: list[list[float]], count: int) -> Arra
             f"{path}: correlations: expected {count} rows of 0 to {count - 1} numbers, the lower triangle of a matrix, "
             f"got {len(rows)} rows of other lengths; calibrate again"
         )
-    below_diagonal = np.zeros((count, count))
-    below_diagonal[np.tril_indices(count, -1)] = [number for row in rows for number in row]
-    matrix = np.eye(count) + below_diagonal + below_diagonal.T
-    eigenvalues, vectors = np.linalg.eigh(matrix)
+    lower_triangle = np.eye(count)
+    lower_triangle[np.tril_indices(count, -1)] = [number for row in rows for number in row]
+    eigenvalues, vectors = np.linalg.eigh(lower_triangle, UPLO="L")  # of the symmetric matrix with this triangle
     largest_rounding_error = count * 10.0**-DIGITS  # of an eigenvalue, if each correlation was rounded
     if eigenvalues[0] < -largest_rounding_error:
         raise PressError(
             f"{path}: correlations: expected a positive semidefinite matrix, got one with the eigenvalue "
             f"{eigenvalues[0]:.3g}: no unknowns have these correlations together; calibrate again"
         )
-    # Rounding may have made an eigenvalue of zero slightly negative.
+    # Compute the matrix from its eigenvalues. Rounding may have made an eigenvalue of zero slightly negative.
     return np.asarray((vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T)
 
 
@@ -279,11 +278,14 @@ def write_calibration(
     from isocharge.simulate.plots.figure import picture_bytes
     from isocharge.train.calibration.picture import calibration_picture
 
+    # Check the folder and the presses before the training, which takes long.
     folder = Path(folder)
     problem, film = result.problem, result.film
     check_calibration_folder(folder, problem.electrodes)
     if held_out is not None:
         held_out = usable_held_out(held_out, result.presses, problem)
+
+    # Train the network.
     with single_threaded_blas():
         series = compact_charges(problem.domain, result.charges, film, executor)
     requested = config or FitConfig()
@@ -292,6 +294,7 @@ def write_calibration(
     if held_out is not None:
         fitted = with_guarantee(fitted, held_out)
 
+    # Write the version folder, and copy the readable files.
     sensor, _ = result.sensor_and_probe
     is_folded = CHARGES in fitted.files  # a training writes this file only if the charges fold
     files = {

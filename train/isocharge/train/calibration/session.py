@@ -71,10 +71,10 @@ def read_answer(text: str) -> Answer:
     normalised_text = text.strip().lower()
     if normalised_text in REPLIES:
         return Answer(REPLIES[normalised_text])
-    if normalised_text == "?":  # unknown place and force
-        return Answer("take", np.full(3, np.nan))
-    separator = "," if "," in normalised_text else None  # None: any blanks
-    cells = [cell.strip() for cell in normalised_text.split(separator)]
+    # A question mark alone stands for an unknown place and an unknown force.
+    value_text = "? ? ?" if normalised_text == "?" else normalised_text
+    separator = "," if "," in value_text else None  # None: any blanks
+    cells = [cell.strip() for cell in value_text.split(separator)]
     if len(cells) != len(CONTACT) or not all(map(_CELL.fullmatch, cells)):
         # The message repeats at most 60 characters of the text.
         raise PressError(f"expected {EXPECTED_ANSWER}; got {text.strip()!r:.60}")

@@ -112,8 +112,7 @@ class ChannelNoise(GaussianNoise):
             residual = planes.residual
 
         # Fit the noise of each channel.
-        stds_of_channels = list(map(_fit_noise, exact_charge.T, residual.T))  # (white, gain) of each channel
-        white_std, gain_std = np.transpose(stds_of_channels)
+        white_std, gain_std = np.transpose(list(map(_fit_noise, exact_charge.T, residual.T)))
         gain = np.maximum(gain_std, LEAST_GAIN)
         # The presses do not determine the white noise if all charges are large. The lower limit of the white noise is a
         # small fraction of the noise of the gain at the usual charge.
@@ -217,12 +216,13 @@ class LocalPlanes:
 
         # The pseudoinverse contains the weights of the neighbours in the least-squares solution. The first coefficient
         # is the value at the contact, and the next three are the slopes.
-        weights = np.linalg.pinv(terms)
+        weights = np.linalg.pinv(terms)  # shape (n, 10, number of neighbours)
         coefficients = weights @ mean_value[neighbours]  # shape (n, 10, k)
         value = coefficients[:, 0]
         slope = coefficients[:, 1:4].swapaxes(1, 2)  # shape (n, k, 3)
 
-        # A residual contains the noise of the mean value and the noise of the plane.
+        # A residual contains the noise of the mean value and the noise of the plane. The value of the plane is the sum
+        # of the mean values of the neighbours with the weights in the first row.
         plane_variance = (weights[:, 0] ** 2 / press_count[neighbours]).sum(axis=1)
         relative_std = np.sqrt(1.0 / press_count + plane_variance)
         return cls(value, slope, (mean_value - value) / relative_std[:, None], distance[:, -1])

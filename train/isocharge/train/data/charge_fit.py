@@ -234,7 +234,8 @@ def fit_series(unit_contact: Array, target: Array, degree: int, force_degree: in
         normal_matrix += chunk_of_a.T @ chunk_of_a
         right_side += chunk_of_a.T @ target[rows]
 
-    # The series also has entries for terms above the total degree, whose coefficients remain zero.
+    # The series also has entries for terms above the total degree, whose coefficients remain zero. The axes of the
+    # solution become the term in the position, the degree in the force, and the value.
     solution = cho_solve(cho_factor(normal_matrix), right_side)
     series = np.zeros((degree + 1, degree + 1, force_degree + 1, target.shape[1]))
     series[position_degrees(degree)] = solution.reshape(n_term // (force_degree + 1), force_degree + 1, -1)

@@ -236,7 +236,7 @@ def self_test(golden: Golden, metadata: ModelMetadata) -> str:
         metadata: Metadata of the model.
     """
     answers = np.concatenate([golden.outputs[name] for name in COLUMNS], axis=1).astype(np.float32)
-    contacts = Contacts(*answers.T)
+    contacts = Contacts(*answers.T)  # one array for each column
     flags = [sum(FLAG_BITS[flag] for flag in words) for words in Validity.of(metadata).batch_flags(contacts)]
     floors = np.concatenate([golden.tolerance.floor[name] for name in COLUMNS])
     return source_text(

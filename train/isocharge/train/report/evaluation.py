@@ -91,7 +91,7 @@ class Method:
         else:
             calls = [partial(self.estimate, press_charge[None]) for press_charge in charge]
         calls_in_turn = cycle(calls)
-        return lambda: next(calls_in_turn)()
+        return lambda: next(calls_in_turn)()  # take the next function, and call it
 
 
 def triangulation(task: FittingTask) -> Method:
@@ -357,8 +357,8 @@ def _calibration_charges(model_folder: Path, model: ModelMetadata) -> Array:
     """
     files = model_folder.parent.glob(f"*/{PRESSES}")  # of all versions
     charges = [read_presses(file, model.electrodes).charge_pC for file in files]
-    no_charges = np.empty((0, len(model.electrodes)))  # `concatenate` needs at least one array
-    return np.concatenate([no_charges, *charges])
+    # The empty array is the result for a model that was not calibrated.
+    return np.concatenate([np.empty((0, len(model.electrodes))), *charges])
 
 
 def check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
@@ -377,9 +377,7 @@ def check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
             differ.
     """
     names = dataset.sensor.electrode_names
-    differences = []
-    if model.electrodes != names:
-        differences.append(f"electrodes ({', '.join(model.electrodes)})")
+    differences = [] if model.electrodes == names else [f"electrodes ({', '.join(model.electrodes)})"]
     if not is_measured(dataset):
         expected = sensor_to_dict(dataset.sensor)
         keys = (expected.keys() | model.sensor.keys()) - {"name"}

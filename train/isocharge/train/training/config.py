@@ -86,15 +86,15 @@ class NetworkConfig(Settings, frozen=True):
     def widths(self, n_electrode: int) -> tuple[Widths, Widths]:
         """Return the widths of the hidden layers of the contact network and of the misfit network.
 
-        Widths that are not given are defaults. If the widths of only one network are given, the other network has as
-        many layers.
+        Widths that are not given are defaults, which are equal for all layers of a network. If the widths of only one
+        network are given, the other network has as many layers.
 
         Args:
             n_electrode: Number of electrodes, which determines the defaults.
         """
         default = Sizes.for_electrodes(n_electrode)
         layer_count = len(self.hidden or self.misfit_hidden or default.hidden)
-        hidden = self.hidden or default.hidden[:1] * layer_count
+        hidden = self.hidden or default.hidden[:1] * layer_count  # the first width, once for each layer
         misfit_hidden = self.misfit_hidden or default.misfit_hidden[:1] * layer_count
         return hidden, misfit_hidden
 

@@ -122,8 +122,7 @@ def fit_presses(
     labelled = LabelledPresses(usable.contact, usable.charge_pC)
     domain = PressedArea.of_contacts(labelled.contact)
     unit_contact = domain.to_unit(labelled.contact)
-    has_unknown_forces = force_std is not None and force_std >= 1.0  # they may vary, although one force is assumed
-    if has_unknown_forces:
+    if force_std is not None and force_std >= 1.0:  # the forces are unknown and may vary
         unit_contact[:, 2] = _unit_log_sizes(labelled.charge)
     noise = ChannelNoise.estimate(labelled.charge, unit_contact)
     with threads_and_seed(training.threads, training.seed):
@@ -212,8 +211,7 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
         assumed_contact[:, 2] = UNKNOWN_FORCE_N
         presses = replace(presses, contact=assumed_contact, force_std=np.ones(len(presses)))
     check_known_columns(presses)
-    is_complete = complete(presses)  # whether the place, the force and all charges of each press are known
-    usable = presses[is_complete]
+    usable = presses[complete(presses)]  # the place, the force and all charges of each press are known
     usable = replace(usable, contact=merged_places(usable.contact))
     usable_places = place_count(uncertain_places(usable))
     if len(usable) < FEWEST or usable_places < FEWEST_PLACES:

@@ -167,8 +167,7 @@ class TrainingStage:
             rate = largest_rate * relative_rate(step / self.steps)
             for optimiser in optimisers:
                 optimiser.step(rate)
-            is_last_step = step + 1 == self.steps
-            if len(losses) < REPORT_EVERY and not is_last_step:
+            if len(losses) < REPORT_EVERY and step + 1 < self.steps:
                 continue
 
             # Report the mean loss, and return to earlier weights if it has increased too much.

@@ -132,8 +132,7 @@ def invertible_domain(
     requested_radius = field.domain.radius
     area = working_area(within(field, SEARCHED_RADIUS_RATIO * requested_radius), noise, search_pairs=False)
     fold_radius = float(f"{area.unambiguous_radius:.6g}")  # rounded to the digits that the sentences state
-    has_fold = np.isfinite(area.fold_radius) and fold_radius < requested_radius
-    if not has_fold:
+    if not np.isfinite(area.fold_radius) or fold_radius >= requested_radius:  # no fold in the domain
         return field.domain, ()
     if field.charge_std > MAX_ERROR_OF_CERTAIN_FOLD:
         probable_fold = (
