@@ -121,7 +121,7 @@ class Sweep:
 
     def contacts(self) -> Array:
         """Return the contacts (x, y, F) of a sweep with one probe, shape (n, 3), mm and N."""
-        first_stream = (0,)  # of random numbers
+        first_stream = (0,)  # selects the random numbers of the first probe
         contact, _ = self._draw(self.samples, first_stream, 0.0, self.radius)
         return contact
 
@@ -131,7 +131,7 @@ class Sweep:
         Args:
             outer_radius: Radius of the larger circle, mm.
         """
-        outside_stream = (0, 1)  # of random numbers, which no probe uses
+        outside_stream = (0, 1)  # selects random numbers that no probe uses
         contact, _ = self._draw(self.outside, outside_stream, self.radius, outer_radius)
         return SweepPresses(np.full(self.outside, OUTSIDE_PROBE), contact, np.zeros(self.outside))
 

@@ -59,6 +59,8 @@ class ElasticFilm:
         self.bending = Bending(mesh, groups.bending) if groups.bending > 0.0 else None
         has_back_pressure = groups.static_pressure != 0.0 or groups.compression != 0.0
         self.back_pressure = BackPressure(mesh, groups) if has_back_pressure else None
+
+        # The load of the mesh contains the share of each node in the force of the probe.
         self.probe_force = np.outer(mesh.load, [*groups.side_load, groups.load])
 
     @property
@@ -115,7 +117,7 @@ class ElasticFilm:
         residual = np.stack([self.mesh.gather(element_forces[..., i]) for i in range(3)], axis=1)
         residual -= self.probe_force
 
-        # The derivative of the energy is minus the force of the pressure on the film. Therefore it is added.
+        # These forces are derivatives of the energy, like the internal forces. Therefore they are added.
         if self.back_pressure is not None:
             residual[:, 2] += self.back_pressure.forces(field[:, 2])
         return residual

@@ -257,9 +257,12 @@ def rim_angles(angle: Array, map_parameter: Array, template_radius: Array) -> Ar
     Returns:
         Angles in the template plane, shape (..., n_sector + 1), rad.
     """
-    # The sectors compensate a share of 0.65 of the stretching of the conformal map along the rim.
+    # The shift compensates a part of the stretch of the conformal map along the rim (empirical exponent). The angles on
+    # the innermost circle already compensate the stretch on the circle.
     rim_stretch = map_stretch(map_parameter, 1.0) ** 0.65
-    remaining_stretch = rim_stretch / map_stretch(map_parameter, template_radius)
+    circle_stretch = map_stretch(map_parameter, template_radius)
+    remaining_stretch = rim_stretch / circle_stretch
+
     # A factor above 1 shifts angles towards pi. A factor below 1 would shift them back, so the factor is at least 1.
     return stretch_angles(angle, np.maximum(remaining_stretch, 1.0))
 

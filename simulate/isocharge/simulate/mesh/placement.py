@@ -93,10 +93,10 @@ class Placement:
             oval: Shape of the clamp in the frame of the press, a number or of the shape of `distance`.
         """
         # Corners of the core polygon on the circular film, followed by the centroid of the footprint. The centroid is a
-        # real number, because the press lies on the x axis.
-        real_centroid = distance / film_radius
+        # real number, because the press lies on the x axis. On a film with an oval clamp, the footprint is displaced.
+        displaced_centroid = distance / film_radius
         reach = probe.reach / film_radius
-        centroid = circular_distance(real_centroid, np.asarray(oval), reach)
+        centroid = circular_distance(displaced_centroid, np.asarray(oval), reach)
         rotation_factor: Complexes = np.exp(1j * np.broadcast_to(rotation, centroid.shape))
         rotation_and_scale = rotation_factor / film_radius
         core_corners = _on_film(probe.core(), centroid, rotation_and_scale)
@@ -134,7 +134,7 @@ class Placement:
             rotation_and_scale=rotation_and_scale,
             probe=probe,
             oval=np.asarray(oval),
-            footprint_displacement=real_centroid - centroid,
+            footprint_displacement=displaced_centroid - centroid,
         )
 
     def __getitem__(self, indices: Integers | None) -> "Placement":

@@ -34,7 +34,8 @@ def area_of(corners: Array) -> float:
     Args:
         corners: Corners (x, y), shape (n, 2).
     """
-    x, y = (corners - corners[0]).T  # large coordinates would cause large rounding errors
+    # Coordinates relative to the first corner, because large coordinates would cause large rounding errors
+    x, y = (corners - corners[0]).T
     return float(0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
 
 

@@ -132,7 +132,7 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
     # The squared amplitude is of the order of the strains.
     with np.errstate(over="ignore"):  # the amplitude of a huge force is infinite, and is refused
         squared_amplitude = amplitude_squared(film, force)
-    if not squared_amplitude <= MAX_AMPLITUDE2:
+    if not squared_amplitude <= MAX_AMPLITUDE2:  # the condition is negated, so that NaN raises the error
         raise SceneError(
             f"force {force:.4g} N stretches a film of {film.thickness:.4g} mm beyond small strains: expected "
             f"(F / (E h a))^(2/3) up to {MAX_AMPLITUDE2:g}, got {squared_amplitude:.3g}"
@@ -140,7 +140,7 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
 
 
 def _check_position(film: Film, probe: Probe, at: tuple[float, float]) -> None:
-    """Raise an error if a footprint is not completely on the film, or so close to the rim that no mesh fits.
+    """Raise an error if a footprint is not completely on the film, or if it is too close to the rim for a mesh.
 
     Args:
         film: The film.
@@ -148,10 +148,10 @@ def _check_position(film: Film, probe: Probe, at: tuple[float, float]) -> None:
         at: Centroid (x, y) of the footprint, mm.
 
     Raises:
-        SceneError: If the footprint is at this position not on the film, or is too close to the rim.
+        SceneError: If the footprint is not completely on the film, or if it is too close to the rim.
     """
-    # On an oval film, `farthest_distance` is less than the radius exactly if the footprint lies on the film. A NaN in
-    # the position makes both comparisons false.
+    # The function `farthest_distance` refers to the circular film that is deformed into an oval film. The outline is
+    # also compared with the oval rim itself. A NaN in the position makes both comparisons false.
     farthest = farthest_distance(film, probe, at)
     outline = complex(*at) + probe.outline
     relative_distance = film.relative_distance(outline)
@@ -287,7 +287,9 @@ def choose_mesh(case: LoadCase) -> PlacedMesh:
 def needs_second_mesh(case: LoadCase) -> bool:
     """Return whether a press must be solved on two meshes in order to estimate the error of the charges.
 
-    The docstring of the module `error_estimate` states the reasons.
+    The shapes of the elements of a single mesh do not predict the error reliably in four cases: for a large footprint
+    that is not circular, for a press near the rim, for a pressure on the whole film, and if the required accuracy is
+    better than the default accuracy.
 
     Args:
         case: The press and the required accuracy.
@@ -295,7 +297,8 @@ def needs_second_mesh(case: LoadCase) -> bool:
     radius = case.film.radius
     is_large = not case.probe.topology.fills_circle and case.probe.reach > RELIABLE_REACH * radius
     is_near_rim = farthest_distance(case.film, case.probe, case.at) > RELIABLE_RADIUS * radius
-    return is_large or is_near_rim or case.film.has_back_pressure or case.settings.accuracy < ACCURACY
+    must_be_accurate = case.settings.accuracy < ACCURACY
+    return is_large or is_near_rim or case.film.has_back_pressure or must_be_accurate
 
 
 def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:
@@ -315,8 +318,8 @@ def too_near_the_rim(case: LoadCase, resolution: Resolution) -> SceneError:
 def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
     """Generate the resolutions that are tried for a press, from coarse to fine.
 
-    For presses in the inner half of the film, the first resolution is sufficient. The other resolutions have a higher
-    order and several times as many elements around the innermost circle.
+    For presses in the inner half of the film, the first resolution is sufficient. The other resolutions have elements
+    of a higher order, or more elements around the innermost circle, or both.
 
     Args:
         case: The press and the required accuracy.

@@ -256,7 +256,7 @@ def _chord_steps(iterate: _Iterate, solve: SolveTangent, previous_residual: floa
     Returns:
         The last iterate whose step reduced the residual sufficiently.
     """
-    if iterate.relative_residual > 0.5 * previous_residual:
+    if iterate.relative_residual > 0.5 * previous_residual:  # the Newton step reduced the residual too little
         return iterate
     while iterate.relative_residual > tolerance:
         step = solve(-iterate.residual)

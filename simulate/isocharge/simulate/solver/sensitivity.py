@@ -198,9 +198,11 @@ def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
         Change of the stress per unit of each property, shape (n_element, n_local, n_field, 3). The last axis is the
         stress component (S11, S22, S12).
     """
-    if solved.rest is not None:  # the touch stress is the difference from the stress before the contact
+    # The touch stress is the stress under the press minus the stress before the contact, and so are its changes.
+    if solved.rest is not None:
         before_contact = stress_changes(solved.rest, surface)
-        return stress_changes(replace(solved, rest=None), surface) - before_contact
+        under_press = stress_changes(replace(solved, rest=None), surface)
+        return under_press - before_contact
 
     # Even and odd fields have different fixed displacements on the line of symmetry. Therefore the tangent is
     # factorised once for all even fields, and once for all odd fields.
@@ -323,10 +325,11 @@ def holding_force(solved: Equilibrium) -> tuple[float, float]:
 
 
 def friction_force(solved: Equilibrium, coefficient: float) -> tuple[float, float]:
-    """Compute the side force of a probe on a stage that moves vertically.
+    """Compute the side force that friction exerts on the film under a probe on a stage that moves vertically.
 
-    The side force is the holding force, but not larger than the coefficient of friction times the force of the press.
-    The docstring of the module describes the model.
+    The holding force is the side force that would keep the film under the probe in place. If it is at most the
+    coefficient of friction times the force of the press, the film sticks to the probe, and the side force is the
+    holding force. Otherwise the film slips, and the side force is reduced to this limit.
 
     Args:
         solved: Press without a side force.
