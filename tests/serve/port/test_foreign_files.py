@@ -3,8 +3,8 @@
 import pytest
 from mcap.writer import Writer
 
-from isocharge.common.errors import InputError, RecordingError
-from isocharge.serve import Port, Recorder, Recording, open_source
+from isocharge.common.errors import InputError
+from isocharge.serve import Port, Recorder, open_source
 from isocharge.serve.port.file_source import Chunk, FileSource
 from isocharge.serve.record.formats import csv_header
 
@@ -82,9 +82,3 @@ def test_bytes_of_a_board_in_a_file_are_read_by_a_stream_only(tmp_path, text):
             assert b"".join(chunk.data for chunk in source) == text.encode()
     with pytest.raises(InputError, match="expected a port, got a file; only `isocharge serve stream`"), Port(str(path)):
         pass
-
-
-def test_replay_of_an_mcap_file_names_the_kind_of_the_file(tmp_path):
-    mcap(tmp_path / "touch.mcap")
-    with pytest.raises(RecordingError, match=r"got an MCAP file; MCAP files hold results.*serve replay touch\.rec"):
-        Recording(tmp_path / "touch.mcap")

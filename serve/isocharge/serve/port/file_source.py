@@ -158,11 +158,8 @@ def open_file(path: Path) -> Iterator[FileSource]:
         The source.
 
     Raises:
-        InputError: If the file cannot be read, or does not come from a board.
+        OSError: If the file cannot be read.
+        InputError: If the file does not come from a board.
     """
-    try:
-        file = path.open("rb", buffering=0)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a file of frames") from error
-    with file:
+    with path.open("rb", buffering=0) as file:
         yield FileSource(file.fileno(), str(path))

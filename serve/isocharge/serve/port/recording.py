@@ -28,7 +28,7 @@ from isocharge.common.errors import RecordingError, cut, is_printable
 from isocharge.common.files import AtomicWriter, StrPath, as_output_errors, bounded_lines
 from isocharge.common.structs import WrongKey, parse_json
 from isocharge.serve.model.metadata import ModelLabel
-from isocharge.serve.port.file_source import RECORDING_START, Chunk, Moment, foreign_kind
+from isocharge.serve.port.file_source import Chunk, Moment
 
 VERSION = 1
 """Version of the format of the file."""
@@ -183,10 +183,6 @@ class Recording:
                 raise RecordingError("there is no file of that name")
             with path.open("rb") as file:
                 first_line = file.readline(LONGEST_ENTRY)  # empty if the file is empty
-            if not first_line.startswith(RECORDING_START):
-                kind = foreign_kind(str(path), first_line)
-                if kind:
-                    raise RecordingError(f"got {kind}")
             header = parse_json(first_line.decode("utf-8", "replace"), "first line", RecordingError, _Header)
         except (OSError, ValueError) as error:  # RecordingError is a ValueError
             raise RecordingError(
