@@ -17,7 +17,7 @@ from itertools import islice
 from msgspec import structs
 
 from isocharge.serve.frames.device_clock import elapsed_s
-from isocharge.serve.live.stream import RESTART_OUTAGE_s, TouchStream
+from isocharge.serve.live.stream import TouchStream
 from isocharge.serve.model.predictor import Predictor
 from isocharge.serve.port.file_source import Chunk
 from isocharge.serve.port.recording import Marker, Recorder, Recording
@@ -179,7 +179,7 @@ class RecordedStream:
         deque(self._stream.feed(preamble), maxlen=0)
         if self.recorder is not None:  # the recording may have been ended before this chunk
             self.recorder.chunk(preamble, [])
-        return chunk._replace(outage_s=max(chunk.outage_s, RESTART_OUTAGE_s))
+        return chunk._replace(outage_s=max(chunk.outage_s, 1e-6))
 
     def _end_recording(self) -> None:
         """End the present recording, and close its recorder unless the caller has opened the recorder."""

@@ -21,9 +21,6 @@ from isocharge.serve.port.file_source import Chunk
 from isocharge.serve.record.record import NO_CONTACT, UNKNOWN_CONTACT, PredictionRecord, flags_in_order
 from isocharge.serve.signal_chain.stage import Device, Setup
 
-RESTART_OUTAGE_s = 1e-6
-"""Outage that a chunk states if a new recording begins after the first frames, s. Every outage of a port is longer."""
-
 log = logging.getLogger(__name__)
 
 
@@ -122,7 +119,7 @@ class ReadingStream:
             NoFramesError: If the stream has contained no intact frame in many bytes.
         """
         if chunk.outage_s > 0.0:
-            self._reconnect(chunk.outage_s)
+            self._reconnect()
         frames = self.parser.feed(chunk.data)
         if not frames:
             self._check_recognised()
@@ -180,17 +177,13 @@ class ReadingStream:
             "each line of text needs the numbers of all channels, and of all columns that the device file names"
         )
 
-    def _reconnect(self, outage_s: float) -> None:
+    def _reconnect(self) -> None:
         """Discard the state of the parser, the clock and the tare after an outage of the port.
 
         The state before the outage is no longer valid, because frames are missing and the film may have been touched
         during the outage. The next frame gets the flag `reconnected`.
-
-        Args:
-            outage_s: Length of the outage, s. An outage that only marks the beginning of a recording is not counted.
         """
-        if outage_s > RESTART_OUTAGE_s:
-            self.parser.counts.reconnects += 1
+        self.parser.counts.reconnects += 1
         self.parser.reset()
         self.clock.reset()
         self.tare()
