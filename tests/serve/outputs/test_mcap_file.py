@@ -25,7 +25,6 @@ from rosbags.rosbag2 import Reader, storage_mcap
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import get_types_from_msg
 
-from isocharge.common.errors import InputError
 from isocharge.serve import PredictionRecord
 from isocharge.serve.model.contact import Contact
 from isocharge.serve.outputs.mcap_file import McapFile
@@ -271,12 +270,3 @@ def test_full_disk_ends_the_mcap_file_but_not_the_stream(tmp_path, press, fill_d
     recovered = whole_messages(path.read_bytes())
     assert 20 < len(recovered) < 2000
     assert recovered == [record.to_json() for record in written[: len(recovered)]]
-
-
-@pytest.mark.parametrize("timestamp", [None, -1.0, 2.0**31, 1e11])
-def test_timestamp_outside_the_range_of_ros2_is_refused(tmp_path, press, timestamp):
-    with closing(McapFile(tmp_path / "touch.mcap", ELECTRODES, is_ros2=False, is_live=True)) as file:
-        with pytest.raises(InputError, match=r"timestamp .*: expected unix seconds from 1970 to 2038"):
-            file.write(press(0, timestamp=timestamp))
-        file.write(press(1))
-    assert file.records == 1

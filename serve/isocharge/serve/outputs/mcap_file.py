@@ -86,7 +86,7 @@ class McapFile(FileOutput):
         """Write a record, its wrench if the force is known, and its pose if something touches the film.
 
         Raises:
-            InputError: If a time stamp of ROS 2 cannot represent the time of the record.
+            struct.error: If a time stamp of ROS 2 cannot represent the time of the record.
             OSError: If the disk is full or was removed.
         """
         values = with_tracked_contact(record.json_values)

@@ -24,16 +24,11 @@ from typing import Any
 
 import numpy as np
 
-from isocharge.common.errors import InputError
-
 DEFLECTION_STD_m = 5e-3
 """Standard deviation of z, m. The model does not estimate the deflection of the film, which is a few millimetres."""
 
 ROTATION_VARIANCE_rad2 = math.pi**2 / 3.0
 """Variance of every rotation, rad^2. It is the variance of an angle that is uniformly distributed over a full turn."""
-
-MAX_TIMESTAMP_S = 1 << 31
-"""Upper limit of the time in a ROS 2 time stamp, unix seconds. It is in the year 2038."""
 
 ENCAPSULATION = b"\x00\x01\x00\x00"
 """First bytes of a CDR message: little endian, no options."""
@@ -89,16 +84,8 @@ def ros_time_ns(record: Mapping[str, Any]) -> int:
 
     Args:
         record: Values of the prediction record by name.
-
-    Raises:
-        InputError: If a time stamp of ROS 2 cannot represent this time.
     """
-    seconds: float | None = record["timestamp"]
-    if seconds is None or not 0.0 <= seconds < MAX_TIMESTAMP_S:
-        raise InputError(
-            f"timestamp {seconds!r}: expected unix seconds from 1970 to 2038, as ROS 2 holds them; set the clock of "
-            "the computer that reads the sensor"
-        )
+    seconds: float = record["timestamp"]
     return round(seconds * 1e6) * 1000
 
 

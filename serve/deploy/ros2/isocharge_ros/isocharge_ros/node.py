@@ -140,7 +140,7 @@ class TouchNode(Node):
 
     def with_header(self, message, record):
         """Copy the coordinate frame and the time of a record into the header of a message, and return the message."""
-        time_ns = ros_time_ns({"timestamp": record.timestamp})  # checks that ROS 2 can express the time
+        time_ns = ros_time_ns({"timestamp": record.timestamp})
         seconds, nanoseconds = divmod(time_ns, NANOSECONDS_PER_SECOND)
         message.header.frame_id = record.frame_id
         message.header.stamp.sec = seconds
