@@ -26,7 +26,7 @@ from typing import Self
 import numpy as np
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import PortError, SceneError
+from isocharge.common.errors import SceneError
 from isocharge.common.files import as_output_errors
 from isocharge.serve.frames.formats import encode_frame
 from isocharge.serve.frames.frame import SEQ_MODULUS, T_US_MODULUS, Frame
@@ -187,13 +187,7 @@ class VirtualSensor:
 
     @property
     def url(self) -> str:
-        """Path of the port for the reader.
-
-        Raises:
-            PortError: If the context is not active.
-        """
-        if not self.port_path:
-            raise PortError("the virtual sensor does not play; use `with VirtualSensor(...) as sensor`")
+        """Path of the port for the reader, while the context is active."""
         return str(self._link or self.port_path)
 
     def frames(self) -> Iterator[bytes]:
@@ -260,7 +254,6 @@ class VirtualSensor:
     def __exit__(self, *_: object) -> None:
         """Stop the thread that writes the frames, and close the port."""
         self._port_stack.close()
-        self.port_path = ""
 
     def _play(self, port: PseudoPort, stop: threading.Event) -> None:
         """Write each frame to the port when it is due, until the event `stop` is set.
