@@ -154,16 +154,16 @@ class ForwardMap:
         # Increase the number of nodes until the interpolated charges are sufficiently accurate. If the error is very
         # large, the next number of nodes would not suffice either and is skipped, unless it is the last.
         error = relative_error(forward_map.charges(contact, rotation), check_charges)
-        index = 0  # of the number of nodes
-        while not error <= INTERPOLATION_ERROR:
+        count_index = 0
+        while not error <= INTERPOLATION_ERROR:  # also if the error is NaN
             may_next_suffice = error <= SKIP_RATIO * INTERPOLATION_ERROR
-            index += 1 if may_next_suffice or index + 2 == len(counts) else 2
-            if index >= len(counts):
+            count_index += 1 if may_next_suffice or count_index + 2 == len(counts) else 2
+            if count_index >= len(counts):
                 raise SolveError(
                     f"the forward map of {sensor.name} up to {radius:g} mm and {force_range[1]:g} N interpolates to "
                     f"{error:.2g} only, expected {INTERPOLATION_ERROR:g}; ask for a smaller radius or range of forces"
                 )
-            forward_map = build_map(counts[index], same_mesh)
+            forward_map = build_map(counts[count_index], same_mesh)
             error = relative_error(forward_map.charges(contact, rotation), check_charges)
         return replace(forward_map, error=error)
 
@@ -320,7 +320,7 @@ class ForwardMap:
         if not self.probe.grows:
             return self._same_mesh_charges(position, is_odd, slice(n_force), np.float32)
         single_forces = [slice(index, index + 1) for index in range(n_force)]
-        return np.concatenate([self._same_mesh_charges(position, is_odd, one, np.float64) for one in single_forces])
+        return np.concatenate([self._same_mesh_charges(position, is_odd, force, np.float64) for force in single_forces])
 
     def _same_mesh_charges(self, position: Array, is_odd: Booleans, forces: slice, precision: type) -> Array:
         """Compute the charges of each stress field for some forces of the family, whose presses have the same mesh.
@@ -335,8 +335,8 @@ class ForwardMap:
         Returns:
             Charges, shape (n_selected_force, n, n_electrode, n_field), pC.
         """
-        # Create a map with a single force. At each node, its fields are those of the first force, followed by those of
-        # the other forces.
+        # The integration points depend on the mesh, and not on the force. Create a map with a single force, whose
+        # fields at each node are those of the first selected force, followed by those of the other selected forces.
         family = self.family
         force = family.force[forces]
         n_field = is_odd.size
@@ -455,7 +455,7 @@ class ForwardMap:
         film = self.sensor.film
         n_field = is_odd.size
         direction = np.angle(position)  # from the centre of the film to the press, rad
-        # The stress refers to the probe or, if the probe is axisymmetric, to the direction of the press.
+        # The frame of the mesh rotates with the probe or, under an axisymmetric probe, with the press.
         rotation = np.zeros_like(direction) if self.probe.is_axisymmetric else orientation - direction
         template = template_for(self.resolution, self.probe.topology, not film.is_axisymmetric)
         oval = film_oval(film, direction)
@@ -467,12 +467,12 @@ class ForwardMap:
         interpolated = weights.astype(self.table.dtype) @ self.table  # one row for each press
         stress = interpolated.reshape(position.size, -1, n_field, 3).swapaxes(1, 2)  # shape (n, n_field, n_node, 3)
 
-        # Convert the components of the stress, which refer to the frame of the mesh, into charge per area. A reflection
-        # changes the signs of some components.
+        # Convert the components of the stress, which refer to the frame of the mesh, into charge per area. If only half
+        # of the film is meshed, there is a second sign for the reflection of the mesh.
         frame_angle = direction + rotation + self.probe.angle
-        charge_per_frame_stress = rotate_stress(np.eye(3), frame_angle[:, None]) @ charge_per_stress.T
+        charge_per_frame_stress = rotate_stress(np.eye(3), frame_angle[:, None]) @ charge_per_stress.T  # (n, 3, n_kind)
         signs = _reflection_signs(is_odd) if template.half else np.ones((n_field, 3, 1))
-        # Axes: press, field, stress component, sign (of the mesh or of its reflection), kind of piece
+        # Shape (n, n_field, 3, n_sign, n_kind)
         coefficients = signs[..., None] * charge_per_frame_stress[:, None, :, None]
         density = stress @ coefficients.reshape(*stress.shape[:2], 3, -1).astype(stress.dtype)
 

@@ -155,9 +155,10 @@ class ElectrodePieces:
             counts: Numbers of Gauss points along a side of a near piece and of a distant piece.
 
         Yields:
-            The integration points of some of the pairs of a press and a piece.
+            The integration points of some of the pairs of a press and a piece. Together, the rules contain every pair.
         """
-        # The pairs of a press and a piece are described by four arrays. In the first round, they are all pairs.
+        # Four arrays describe the pairs of a press and a piece, or of a press and a part of a piece. The first round
+        # has all pairs. Each further round has the parts into which near pieces are divided.
         near_count, distant_count = counts
         press, piece = np.indices((position.size, len(self.corners))).reshape(2, -1)
         corners = self.corners[piece]
@@ -174,7 +175,6 @@ class ElectrodePieces:
                     points, area = gauss_quadrilaterals(corners[chunk], line_area[chunk], count)
                     yield PieceRule(press[chunk], piece[chunk], points, area)
 
-            # Continue with both halves of the pieces that are halved.
             press = np.tile(press[is_halved], 2)
             piece = np.tile(piece[is_halved], 2)
             line_area = np.tile(0.5 * line_area[is_halved], 2)

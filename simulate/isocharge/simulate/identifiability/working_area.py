@@ -245,8 +245,8 @@ def find_ambiguous_pairs(
     second, residual = local_minima(charge_map, charge, noise.sigma(charge), starts=STARTS, min_change=1e-4)
     first = np.broadcast_to(contact[:, None], second.shape)  # shape (n, STARTS, 3)
 
-    # Select the pairs whose positions are distant, and whose charges agree within the noise. A search that has found
-    # the first contact again is thus discarded.
+    # Select the pairs whose positions are distant, and whose charges agree within the noise. The results of searches
+    # that find the first contact again are thus discarded.
     position_std = limits_at(charge_map, contact, noise).position  # shape (n,)
     min_distance = min(MIN_DISTANCE, MIN_RELATIVE_DISTANCE * domain_radius)
     min_distances = np.maximum(min_distance, MIN_DISTANCE_SIGMAS * position_std)
