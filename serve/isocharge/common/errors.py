@@ -163,6 +163,7 @@ class RequestError(InputError):
     """
 
     def __init__(self, message: str, status: int = 400, *headers: tuple[bytes, bytes]) -> None:
+        """Create the error for a response with the given status and headers."""
         super().__init__(message)
         self.status = status
         self.headers = headers

@@ -77,6 +77,7 @@ class WrongKey(ValueError):
     """
 
     def __init__(self, key: str, expected: str = "", got: object = None) -> None:
+        """Create the error. Its message states the expected and the given value, or is empty if the key is missing."""
         super().__init__(f"expected {expected}, got {shown(got)}" if expected else "")
         self.key = key
 

@@ -60,10 +60,12 @@ def run_demo(folder: Path) -> None:
         draw_page(forward_map, equilibrium, followed, draft / "demo.png")
     say(f"   {folder / 'demo.png'}")
 
-    live_median_mm, live_p95_mm = np.percentile(position_error(followed[:, 1], followed[:, 0]), (50, 95))
+    true_contacts = followed[:, 0]
+    estimated_contacts = followed[:, 1]
+    live_median_mm, live_p95_mm = np.percentile(position_error(estimated_contacts, true_contacts), (50, 95))
     results = {
         "model": predictor.metadata.label,
-        "errors": dict(predictor.metadata.errors),
+        "errors": predictor.metadata.errors,
         "live_errors": {"position_median_mm": live_median_mm, "position_p95_mm": live_p95_mm},
         "folder": str(folder),
     }

@@ -36,6 +36,6 @@ def bench_command(
         "seconds": seconds,
         "machine": machine(),
         "timings": [timing._asdict() for timing in timings],
-        "errors": dict(loaded.metadata.errors),
+        "errors": loaded.metadata.errors,
     }
     show_result(report, json=json)

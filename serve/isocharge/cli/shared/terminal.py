@@ -125,8 +125,8 @@ def _value_text(value: Any, separator: str = ", ") -> str:
     if isinstance(value, dict):
         return separator.join(f"{key} {_value_text(item)}" for key, item in value.items())
     if isinstance(value, list):
-        is_text = bool(value) and isinstance(value[0], str)
-        return (separator if is_text else ", ").join(map(_value_text, value)) or "none"
+        has_texts = value and isinstance(value[0], str)
+        return (separator if has_texts else ", ").join(map(_value_text, value)) or "none"
     return printable(str(value))
 
 
@@ -201,6 +201,7 @@ def stop_timer(seconds: float | None, has_expired: Event) -> Iterator[None]:
     """
 
     def interrupt() -> None:
+        """Stop the block in the same way as Ctrl-C, and store that the time has expired."""
         has_expired.set()
         raise KeyboardInterrupt
 
@@ -258,6 +259,7 @@ def warnings_to_stderr() -> Iterator[None]:
     """
 
     def print_warning(record: logging.LogRecord) -> None:
+        """Print a warning. The warnings of a running service have no word in front of them."""
         caution = "" if record.name.startswith("isocharge.serve") else "caution: "
         say(caution + record.getMessage())
 

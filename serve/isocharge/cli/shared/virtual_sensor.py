@@ -50,6 +50,7 @@ def film_charges(forward_map: ForwardMap) -> Charges:
     min_force_N = forward_map.domain.force_range[0]
 
     def charges(contact: Array) -> Array:
+        """Compute the charges at forces of the map, and scale them down to smaller forces."""
         x_mm, y_mm, force_N = contact.T
         map_force_N = force_N.clip(min=min_force_N)
         map_charge_pC = forward_map.charges(np.column_stack([x_mm, y_mm, map_force_N]))

@@ -92,7 +92,8 @@ def read_charge_map(version_folder: Path, electrodes: tuple[str, ...]) -> Charge
             electrodes=electrodes,
             coefficients=coefficients.astype(float),
             node_MPa=arrays["node_MPa"],
-            directions=arrays.get("directions", np.zeros((1, 1, 1, 2, 0, 1))).astype(float),  # by default none
+            # If the file contains no directions, their number K is 0, which is the size of the fifth axis.
+            directions=arrays.get("directions", np.zeros((1, 1, 1, 2, 0, 1))).astype(float),
             log_size=arrays.get("log_size"),
             is_folded=bool(arrays["is_folded"]),
             **{name: float(arrays[name]) for name in NUMBERS},

@@ -59,6 +59,7 @@ class AccessCheck:
         token: str | None = None,
         any_host: bool = False,
     ) -> None:
+        """Check and store the names of the server and the token; the docstring of the class describes the arguments."""
         names = [allowed_hosts] if isinstance(allowed_hosts, str) else allowed_hosts
         self._allowed_names = frozenset(map(host_name, names))
         self._host_names = self._allowed_names | {"localhost", host.lower()}

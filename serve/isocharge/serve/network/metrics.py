@@ -117,6 +117,7 @@ class RequestLog(logging.Handler):
     """
 
     def __init__(self, write: Callable[[str], object]) -> None:
+        """Create a handler of the module `logging` that writes lines with the given function."""
         super().__init__()
         self._write = write
         self.setFormatter(logging.Formatter())  # otherwise, `basicConfig` sets a format that repeats level and logger

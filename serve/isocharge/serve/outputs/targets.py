@@ -29,6 +29,7 @@ ROS2_SUFFIX = ".ros2.mcap"
 
 
 def _open_mcap(target: str, context: OutputContext) -> Output:
+    """Create the MCAP file at the path `target`; the end of its name states whether the records are ROS 2 messages."""
     from isocharge.serve.outputs.mcap_file import McapFile  # needs the extra `record`
 
     is_ros2 = target.endswith(ROS2_SUFFIX)

@@ -84,7 +84,9 @@ class PressErrors:
         noise_correlation = correlation_matrices(self.predicted) * noise_share[:, :, None] * noise_share[:, None, :]
         correlation = np.nan_to_num(noise_correlation)  # an unknown error has no correlations
         correlation[:, range(3), range(3)] = 1.0
-        deviation = np.nan_to_num(self.error / std)[:, :, None]
+
+        # After division by the standard deviations, the covariance of the errors is `correlation`, shape (n, 3, 3).
+        deviation = np.nan_to_num(self.error / std)[:, :, None]  # shape (n, 3, 1)
         return np.asarray((deviation * np.linalg.solve(correlation, deviation)).sum(axis=(1, 2)))
 
     @property

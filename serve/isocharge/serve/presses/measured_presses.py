@@ -82,11 +82,13 @@ class MeasuredPresses:
     ignored: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        """Check the names of the electrodes, the shapes of the arrays and all values."""
         _check_electrodes(self.electrodes)
         self._check_shapes()
         self._check_values()
 
     def __len__(self) -> int:
+        """Return the number n of presses."""
         return len(self.lines)
 
     def __getitem__(self, rows: int | slice | Sequence[int] | Integers | Booleans) -> "MeasuredPresses":

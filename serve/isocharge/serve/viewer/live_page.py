@@ -98,6 +98,11 @@ class Marker(PageRequest):
     text: str = ""
 
     def __post_init__(self) -> None:
+        """Check the text, which is shown on the page and stored in the recording.
+
+        Raises:
+            WrongKey: If the text is too long, or contains characters that are not printable.
+        """
         if len(self.text) > MAX_MARKER_CHARACTERS or not is_printable(self.text):
             raise WrongKey("text", f"at most {MAX_MARKER_CHARACTERS} printable characters", self.text)
 

@@ -81,5 +81,5 @@ async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = 
         service.end_streams()
         try:
             await server.stop(limits.grace_seconds)
-        finally:  # no effect unless the stop is cancelled
+        finally:  # ends all calls at once if the stop is cancelled, and has no effect otherwise
             await server.stop(None)

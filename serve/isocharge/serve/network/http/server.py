@@ -207,11 +207,15 @@ class Connection(HttpToolsProtocol):
         self._allow(self._limits.header_seconds)  # the time in which the client must have received the refusal
 
 
-def _within_open_files(limits: ServerLimits) -> ServerLimits:
-    """Let the process open as many files as the system permits, and return limits with so many connections at most.
+def _raise_file_limit(limits: ServerLimits) -> ServerLimits:
+    """Let the process open as many files as the system permits, and return the limits that the server then can keep.
 
-    Each connection needs an open file. An eighth of the files remains free, because a server without a free file could
-    not accept a connection, nor end another connection for it.
+    Each connection needs an open file. The number of connections is reduced if it exceeds seven eighths of the number
+    of files. The remaining files are free, because a server without a free file could not accept a connection, nor end
+    another connection for it.
+
+    Args:
+        limits: Requested limits of the server.
     """
     _, permitted = resource.getrlimit(resource.RLIMIT_NOFILE)
     with suppress(ValueError, OSError):  # macOS refuses an unlimited number
@@ -245,7 +249,7 @@ class HttpServer(uvicorn.Server):
             InputError: If a TLS file cannot be used.
             ListenError: If the address is in use or cannot be used.
         """
-        limits = _within_open_files(application.limits)
+        limits = _raise_file_limit(application.limits)
         tls_context = tls.context() if tls else None
         self._address = address
         self._socket = address.listen()
@@ -279,6 +283,7 @@ class HttpServer(uvicorn.Server):
         """
 
         async def serve() -> None:
+            """Open the context `beside`, which `shutdown` closes, and answer requests until the server is stopped."""
             async with AsyncExitStack() as self._beside:
                 await self._beside.enter_async_context(beside or nullcontext())
                 await self.serve([self._socket])

@@ -95,6 +95,7 @@ def _show_server(_: Request) -> Json:
 
 
 def _show_metrics(request: Request) -> Response:
+    """Return the metrics of the server and of its models in the text format of Prometheus."""
     return response_of(200, CONTENT_TYPE, generate_latest(request.traffic.registry))
 
 
@@ -125,6 +126,7 @@ def _load(request: Request) -> Json:
 
 
 def _unload(request: Request) -> Json:
+    """Remove all versions of a model, and return an empty object."""
     request.store.unload(request.name)
     return {}
 
