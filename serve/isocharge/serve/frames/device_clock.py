@@ -235,14 +235,11 @@ class DeviceClock:
         delay_s = arrival_s - self._predicted_s  # positive if the chunk arrived later than predicted
         step_s = (self._device_us - self._fitted_us) * 1e-6  # since the previous correction of the fit
         self._fitted_us = self._device_us
-        was_clock_set = abs(delay_s) > MAX_DELAY_s
-        if was_clock_set and not self._is_fit_provisional:
-            self._latest_host_s = -math.inf  # allows the host time of the next reading to be earlier
         # Readings that a board stored before the connection may have moved the host time far ahead of the arrival.
         self._latest_host_s = min(self._latest_host_s, arrival_s + MAX_LEAD_s)
 
         # A provisional fit relies on the arrival of only one chunk. A fit that begins at this arrival replaces it.
-        if was_clock_set or self._is_fit_provisional:
+        if abs(delay_s) > MAX_DELAY_s or self._is_fit_provisional:
             self._fitted_host_s = arrival_s
             self._fit_age_s = 0.0
             self.rate = 1.0
