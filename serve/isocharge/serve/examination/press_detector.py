@@ -47,14 +47,14 @@ def touched_blocks(values: Array, times_s: Array, min_noise: float = 0.0) -> tup
     # Whole numbers have a rounding error between -0.5 and 0.5, whose standard deviation is 12**-0.5.
     are_whole_numbers = ((values == np.round(values)) | ~np.isfinite(values)).all(axis=0)
     noise = np.maximum(estimate_noise(values), np.where(are_whole_numbers, 12.0**-0.5, 0.0))
-    return block_times_s, levels, _detect_touches(levels, block_times_s, np.maximum(noise, min_noise))
+    return block_times_s, levels, _detect_touches(levels, np.maximum(noise, min_noise))
 
 
 BLOCK_RULE = TouchRule(sigmas=26.0, floor_pC=0.0)
 """Threshold of a touch, which is about 20 standard deviations of the noise of three channels."""
 
 
-def _detect_touches(levels: Array, times_s: Array, noise: Array) -> Booleans:
+def _detect_touches(levels: Array, noise: Array) -> Booleans:
     """Return whether something touches the film in each block, shape (blocks,).
 
     The stage `Touch` of a stream detects the touches. The charges of this stage are the differences from the levels
@@ -63,17 +63,15 @@ def _detect_touches(levels: Array, times_s: Array, noise: Array) -> Booleans:
 
     Args:
         levels: Levels of the channels, shape (blocks, channels), in any unit.
-        times_s: Times of the blocks, shape (blocks,), s.
         noise: Noise of each channel, shape (channels,), in the unit of the levels.
     """
     channels = tuple(map(str, range(len(noise))))
     detector = Touch(Setup(channels, Device(rules={TouchRule: BLOCK_RULE}), has_any_sign=True))
-    steps_s = np.diff(times_s, prepend=0.0).tolist()  # longer than `BLOCK_S` if frames are rare or were lost
     is_touched = np.zeros(len(levels), dtype=bool)
     for number, level in enumerate(levels):
         if not is_touched[number - 1]:  # true for the first block, because the last element is still False
             rest = levels[max(number - CHANGE_BLOCKS, 0)]
-        frame = Frame(seq=None, t_us=None, values=(), dt_s=steps_s[number], charge_pC=level - rest)
+        frame = Frame(seq=None, t_us=None, values=(), dt_s=BLOCK_S, charge_pC=level - rest)
         frame.noise_pC = noise
         detector.step(frame)
         is_touched[number] = frame.is_contact
