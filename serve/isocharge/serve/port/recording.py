@@ -179,8 +179,6 @@ class Recording:
         """
         self._path = path = Path(path)
         try:
-            if not path.is_file():
-                raise RecordingError("there is no file of that name")
             with path.open("rb") as file:
                 first_line = file.readline(LONGEST_ENTRY)  # empty if the file is empty
             header = parse_json(first_line.decode("utf-8", "replace"), "first line", RecordingError, _Header)

@@ -141,11 +141,10 @@ class Port:
         if is_path and not path.exists():
             raise PortError(f"{self.url}: there is no such port: plug the board in, check the name, or wait for it")
         if is_path and path.is_file():
-            with open_file(path):  # raises another error for a file that does not come from a board
-                raise InputError(
-                    f"{self.url}: expected a port, got a file; only `isocharge serve stream` reads the bytes of a "
-                    "board from a file"
-                )
+            raise InputError(
+                f"{self.url}: expected a port, got a file; only `isocharge serve stream` reads the bytes of a board "
+                "from a file"
+            )
         try:
             if self.url.startswith(UDP_SCHEME):
                 self._line = UdpSocket(self.url)
