@@ -358,7 +358,7 @@ def test_values_that_are_not_numbers_or_out_of_range_are_not_finite():
         ('"A","B"', "{n},4.7", "A,B"),
         ("state,,A,B", "run,{n}.5,4.7,-2.2", ""),
         ("A,B,", "run {n} 4.7", "A,B"),
-        ("# B,A", "{n},4.7", "B,A"),
+        ("# | Pad B | Pad A |", "| {n} | 4.7 |", "Pad B,Pad A"),
         ("// B A", "{n} 4.7", "B,A"),
         ("# 3 channels, 24 bits", "{n},4.7", ""),
         ("n\tA B", "{n}\t4.7", "n,A B"),

@@ -509,8 +509,11 @@ def _value(number: str) -> float:
 
 
 def _separator(text: Container[str]) -> str | None:
-    """Return the mark that separates the columns of a text or a skeleton; None if only blanks separate them."""
-    return next((mark for mark in "\t;," if mark in text), None)
+    """Return the mark that separates the columns of a text or a skeleton; None if only blanks separate them.
+
+    In a skeleton, a bar is escaped.
+    """
+    return next((mark for mark in "\t;,|" if mark in text or re.escape(mark) in text), None)
 
 
 def header_names(header: str, line: Line) -> tuple[str, ...]:
