@@ -272,8 +272,7 @@ def require(*extras: str) -> Iterator[None]:
     try:
         yield
     except (ModuleNotFoundError, MissingExtra) as error:  # another `require` inside the block may raise MissingExtra
-        missing_module = error.name or ""
-        package = missing_module.partition(".")[0]  # for example "google" for the module "google.protobuf"
+        package, _, _ = (error.name or "").partition(".")  # for example "google" for the module "google.protobuf"
         if not extras or package in ("", "isocharge"):
             raise
         raise MissingExtra(

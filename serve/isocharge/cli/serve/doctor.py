@@ -141,8 +141,8 @@ def doctor_command(
     if obstacle or not examination.good:
         raise typer.Exit(1)
     if write:
-        has_model = model and not model.endswith(".toml")  # otherwise, the printed command contains a placeholder
-        _write_device_file(write, examination, str(model) if has_model else "MODEL")
+        shown_model = model if model and not model.endswith(".toml") else "MODEL"  # a placeholder without a model
+        _write_device_file(write, examination, shown_model)
 
 
 def _electrodes_of(model: str | None, models: Path | None) -> tuple[str, ...]:

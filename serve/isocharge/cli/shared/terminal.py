@@ -120,7 +120,7 @@ def _value_text(value: Any, separator: str = ", ") -> str:
     """
     if value is None:
         return "-"
-    if isinstance(value, float):
+    if isinstance(value, float):  # with five significant digits, but without an exponent below 1e9
         return f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.5g}"
     if isinstance(value, dict):
         return separator.join(f"{key} {_value_text(item)}" for key, item in value.items())

@@ -89,9 +89,10 @@ class CsvTable:
         checked_lines = self._checked_lines(lines)
         first_lines = list(islice(checked_lines, _MAX_LINES_TO_HEADER))
         lines_above, self._separator, header_line = _find_header(first_lines or [""], names)
+        # The header may have lost the mark of a comment. The lines below the header follow unchanged.
         table_lines = chain([header_line], first_lines[lines_above + 1 :], checked_lines)
         self._rows = self._numbered_rows(table_lines, lines_above)
-        _, header = next(self._rows, (0, []))
+        _, header = next(self._rows, (0, []))  # the first row, or no cells if there is no row
         if not header:
             raise self.error(f": empty; expected {expected}")
         if len(header) > MAX_COLUMNS:
@@ -333,8 +334,8 @@ class CsvTable:
     def _numbered_rows(self, lines: Iterable[str], lines_above: int) -> Iterator[tuple[int, list[str]]]:
         """Yield the line number and the cells of each row that is neither blank nor a comment.
 
-        The first line of the file has the number 1. If a row extends over several lines, the line number is the number
-        of its last line.
+        A row whose first cell begins with # is a comment, unless the cell is the name of a column. The first line of
+        the file has the number 1. If a row extends over several lines, the line number is the number of its last line.
 
         Args:
             lines: Lines of the text, each with its line end.
