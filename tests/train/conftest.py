@@ -19,7 +19,7 @@ def rough_training():
     """Search for folds on few rings, train fewer networks in a cross-validation, and fit the covariance roughly."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(working_area, "RADIUS_STEP", 0.5)
-        patch.setattr(cross_fit, "HELD_PARTS", 3)
+        patch.setattr(cross_fit, "N_FOLDS", 3)
         patch.setattr(contact_training, "REFIT_PRESSES", 1)
         patch.setattr(contact_training, "LOSS_TOLERANCE", 1e-3)
         yield

@@ -37,7 +37,7 @@ ONE = Hypothesis(
 def _one_hypothesis(monkeypatch):
     """Estimate a film under one hypothesis, with nearly normal weights of the presses."""
     monkeypatch.setattr(estimator, "hypotheses", lambda *_: [ONE])
-    monkeypatch.setattr(estimator, "TYPICAL", ONE.sizes)
+    monkeypatch.setattr(estimator, "SEARCH_SIZES", ONE.sizes)
     monkeypatch.setattr(RobustProblem, "estimate", partialmethod(RobustProblem.estimate, tolerance=1e-4))
     monkeypatch.setattr(estimator, "RobustProblem", partial(RobustProblem, freedom=1e9))
 

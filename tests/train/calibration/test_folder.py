@@ -30,7 +30,7 @@ def written(problem, synthetic, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(calibrate_module, "SAME_FILM_STD", np.inf)
         patch.setattr(compact_map, "_nodes", lambda _: np.zeros(1))
-        patch.setattr(film_network, "PRESSES", 6_000)
+        patch.setattr(film_network, "N_PRESSES", 6_000)
         patch.setattr(film_network, "_outside_presses", lambda *_: None)
         use_few_hypotheses(patch)
         patch.setattr(film_network, "yield_force", lambda *_: 0.9)

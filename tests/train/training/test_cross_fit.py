@@ -345,7 +345,7 @@ def test_a_real_pad_is_learned_better_than_by_boosted_trees(monkeypatch):
 
     Boosted trees have errors of 6.93 mm and 27.0 % on the held-out presses.
     """
-    monkeypatch.setattr("isocharge.train.training.cross_fit.HELD_PARTS", 5)  # as usual
+    monkeypatch.setattr("isocharge.train.training.cross_fit.N_FOLDS", 5)  # as usual
     presses = read_presses(REAL_PAD)
     is_held_out = position_ranks(presses.contact) < 0.2
     fitted = fit_presses(presses[~is_held_out], "pad")

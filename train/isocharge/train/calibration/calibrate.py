@@ -45,7 +45,7 @@ NOT_CONVERGED = (
 MAX_USUAL_NOISE = 0.01
 """Noise that is proportional to the charge, above which a caution is given, dimensionless."""
 
-PLACEMENT = ("shift_x", "shift_y", "rotation")
+PLACEMENT_PROPERTIES = ("shift_x", "shift_y", "rotation")
 """Names of the properties that describe where the electrodes are."""
 
 UNUSUAL_DEVIATION = 3.0
@@ -284,7 +284,7 @@ def _check_placement(film: FilmEstimate) -> None:
     for film_property in film.layout.prior.properties:
         lowest, highest = film_property.limits
         value = film.value(film_property.name)
-        if film_property.name in PLACEMENT and not lowest < value < highest:
+        if film_property.name in PLACEMENT_PROPERTIES and not lowest < value < highest:
             raise PressError(
                 f"{film_property.meaning}: the presses agree best with {value:.3g} {film_property.unit}, which is an "
                 "end of the range that is searched: is the origin of the stage the centre of the film, are its axes "

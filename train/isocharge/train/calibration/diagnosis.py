@@ -29,7 +29,7 @@ those of the other channels on some possible film, and for presses of unknown pl
 UNPLACED_RATIO = 0.2
 """Factor of this limit for presses of unknown places and forces, which may all be near one electrode."""
 
-UNITS = {
+UNIT_CORRECTIONS = {
     "the forces are in g, not N": (1.0, 9.80665e-3, 1.0),
     "the forces are in mN, not N": (1.0, 1e-3, 1.0),
     "the forces are in kg, not N": (1.0, 9.80665, 1.0),
@@ -69,7 +69,7 @@ SUSPICIOUS_MISFIT = 8.0
 BETTER_MISFIT_RATIO = 0.25
 """Ratio of two misfits below which one explanation of the presses counts as clearly better than another."""
 
-AXES = {
+AXIS_CORRECTIONS = {
     "they are turned by 90 degrees": ("-y", "x"),
     "they are turned by 180 degrees": ("-x", "-y"),
     "they are turned by -90 degrees": ("y", "-x"),
@@ -288,7 +288,7 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
     """
     contact = presses.contact
     charge = presses.charge_pC
-    for sentence, (position_factor, force_factor, charge_factor) in UNITS.items():
+    for sentence, (position_factor, force_factor, charge_factor) in UNIT_CORRECTIONS.items():
         yield sentence, contact * [position_factor, position_factor, force_factor], charge * charge_factor
     if is_one_place(presses):
         return
@@ -314,7 +314,7 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
 
     x, y, force = contact.T
     coordinates = {"x": x, "-x": -x, "y": y, "-y": -y}
-    for description, (correct_x, correct_y) in AXES.items():
+    for description, (correct_x, correct_y) in AXIS_CORRECTIONS.items():
         rotated_contact = np.column_stack([coordinates[correct_x], coordinates[correct_y], force])
         yield f"the rig's axes are not the film's: {description}", rotated_contact, charge
 

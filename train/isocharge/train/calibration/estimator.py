@@ -121,7 +121,7 @@ def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
         yield Hypothesis(imperfections, discrepancy, tuple(session_std), errors, float(np.prod(probabilities)))
 
 
-TYPICAL = np.array([1.0, 1.0, 1.0, 0.01, *(one.stds[-1][0] for one in SESSION)])
+SEARCH_SIZES = np.array([1.0, 1.0, 1.0, 0.01, *(one.stds[-1][0] for one in SESSION)])
 """Sizes of the parts of the prior covariance with which the most probable unknowns are searched.
 
 No size is zero, so that all unknowns can differ from their means.
@@ -274,7 +274,7 @@ def _most_probable_point(
         data.charge,
         charge_variance[:, None] * np.eye(charge_variance.shape[1]),
         prior.mean,
-        prior.covariance(TYPICAL),
+        prior.covariance(SEARCH_SIZES),
         measured_contacts=data.contact,
         contact_std=data.contact_std,
     )

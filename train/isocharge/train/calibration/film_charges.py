@@ -19,7 +19,7 @@ from isocharge.simulate.forward.family import nearest_to_clamp
 from isocharge.simulate.sensor.film_properties import PRETENSION, UNEVEN_TENSIONS, FilmProperty, changed_film
 from isocharge.simulate.solver.press import needed_resolution
 
-STEP = 1.0 / 3.0
+DIFFERENCE_STEP = 1.0 / 3.0
 """Step of the difference quotients, in prior standard deviations of the property."""
 
 LOG_FORCE = slice(2, None)
@@ -229,7 +229,7 @@ class FilmCharges:
         Returns:
             Central difference quotients, shape (n, n_electrode), pC per unit.
         """
-        step = STEP * film_property.std
+        step = DIFFERENCE_STEP * film_property.std
         sensors = [changed_film(sensor, self.film.probe, {film_property.name: change})[0] for change in (step, -step)]
         forward, backward = (_read(self.film, changed).charges(contact) for changed in sensors)
         return (forward - backward) / (2.0 * step)

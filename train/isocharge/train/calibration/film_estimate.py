@@ -254,7 +254,7 @@ class FilmEstimate:
 REMAINING_DISCREPANCY = 0.3
 """Size of the discrepancy that an earlier calibration could not show, relative to the size of the hypothesis."""
 
-PLANNED = np.array([1.0, 0.5, 0.5, 0.01, *(one.stds[0][0] for one in SESSION)])
+PLANNING_SIZES = np.array([1.0, 0.5, 0.5, 0.01, *(one.stds[0][0] for one in SESSION)])
 """Sizes of the parts of the prior covariance with which presses are planned before the first press."""
 
 

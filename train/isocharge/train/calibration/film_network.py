@@ -20,7 +20,7 @@ from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.data.presses import LabelledPresses, draw_contacts
 from isocharge.train.training.training_data import TrainingData
 
-PRESSES = 60_000
+N_PRESSES = 60_000
 """Number of presses from which the network learns."""
 
 
@@ -37,13 +37,13 @@ def training_data(
     """
     rng = np.random.default_rng([SEED, 1])
     domain = series.domain
-    contact = draw_contacts(rng, domain, PRESSES)
+    contact = draw_contacts(rng, domain, N_PRESSES)
     charge = _drawn_charges(series, rng, contact)
     # The film is estimated for the middle of the session. After the session, the gain differs by half of the drift, and
     # may change further or return. The root mean square of the drift follows from its estimate and its standard
     # deviation.
     drift_rms = np.hypot(film.value("drift"), film.std("drift"))
-    gain_error = 0.5 * drift_rms * rng.standard_normal((PRESSES, 1))
+    gain_error = 0.5 * drift_rms * rng.standard_normal((N_PRESSES, 1))
     charge *= 1.0 + gain_error
     sensor, probe = charges.prior.film(film.film_values)
     return TrainingData(

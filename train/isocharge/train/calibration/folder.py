@@ -52,7 +52,7 @@ from isocharge.train.model_release.release import release
 from isocharge.train.training.config import FitConfig
 from isocharge.train.training.fit import Fitted, fit
 
-DIGITS = 6
+CORRELATION_DIGITS = 6
 """Number of decimal digits of a correlation."""
 
 Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
@@ -91,7 +91,7 @@ def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any
     std = np.sqrt(np.diag(film.covariance))
     std_product = np.outer(std, std)
     correlations = np.divide(film.covariance, std_product, out=np.zeros_like(std_product), where=std_product > 0.0)
-    rounded_correlations = np.clip(np.round(correlations, DIGITS), -1.0, 1.0)
+    rounded_correlations = np.clip(np.round(correlations, CORRELATION_DIGITS), -1.0, 1.0)
     return {
         "format_version": 6,  # the version that `_CalibrationFile` reads
         "probe": problem.probe.rotated_notation,
@@ -193,7 +193,7 @@ def _correlation_matrix(path: Path, rows: list[list[float]], count: int) -> Arra
     lower_triangle = np.eye(count)
     lower_triangle[np.tril_indices(count, -1)] = [number for row in rows for number in row]
     eigenvalues, vectors = np.linalg.eigh(lower_triangle, UPLO="L")  # of the symmetric matrix with this triangle
-    largest_rounding_error = count * 10.0**-DIGITS  # of an eigenvalue, if each correlation was rounded
+    largest_rounding_error = count * 10.0**-CORRELATION_DIGITS  # of an eigenvalue, if each correlation was rounded
     if eigenvalues[0] < -largest_rounding_error:
         raise PressError(
             f"{path}: correlations: expected a positive semidefinite matrix, got one with the eigenvalue "

@@ -9,7 +9,7 @@ from isocharge.simulate.plots.film import draw_layout
 from isocharge.train.calibration.contact_error import spread_contacts
 from isocharge.train.calibration.result import CalibrationResult
 
-FITTED = "#3a7ca5"
+GOOD_PRESS_COLOUR = "#3a7ca5"
 """Colour of the residuals of good presses."""
 
 
@@ -42,7 +42,7 @@ def calibration_picture(result: CalibrationResult) -> Figure:
     # The residual of each press, relative to the expected size. A press without redundant measurements has no residual.
     relative_residual = np.sqrt(np.nan_to_num(result.estimation.press_chi2))
     largest_shown = max(3.0, 1.1 * relative_residual[~is_bad].max(initial=0.0))
-    residual_axes.bar(result.presses.lines, relative_residual, color=np.where(is_bad, FELT, FITTED))
+    residual_axes.bar(result.presses.lines, relative_residual, color=np.where(is_bad, FELT, GOOD_PRESS_COLOUR))
     residual_axes.set_ylim(0.0, largest_shown)  # presses that were left out may extend beyond
     residual_axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     residual_axes.axhline(1.0, color=INK, lw=0.8, ls="--")  # the expected size

@@ -11,7 +11,7 @@ from isocharge.simulate.forward.family import check_family
 from isocharge.simulate.noise import NOISE_LEVELS
 from isocharge.simulate.sensor.film_properties import PRETENSION
 from isocharge.train.calibration.film_charges import round_probe
-from isocharge.train.calibration.film_estimate import PLANNED, FilmEstimate, Layout, Prior
+from isocharge.train.calibration.film_estimate import PLANNING_SIZES, FilmEstimate, Layout, Prior
 
 POSITION_MARGIN_MM = 0.5
 """Distance by which the solved presses extend beyond the working area, mm, because the places have errors."""
@@ -80,7 +80,7 @@ class CalibrationProblem:
     @property
     def film_before(self) -> FilmEstimate:
         """Distribution of the unknowns before the presses, with which the first presses are planned."""
-        return FilmEstimate(self.prior.layout, self.prior.mean, self.prior.covariance(PLANNED), self.noise)
+        return FilmEstimate(self.prior.layout, self.prior.mean, self.prior.covariance(PLANNING_SIZES), self.noise)
 
     @property
     def domain(self) -> Domain:

@@ -25,7 +25,7 @@ from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.problem import CalibrationProblem, domain_words
 from isocharge.train.calibration.result import CalibrationResult
 
-ENOUGH = 0.5
+SUFFICIENT_ERROR_RATIO = 0.5
 """Ratio of two position errors up to which a session is complete.
 
 The ratio is that of the error by the uncertainty of the film to the error by noise."""
@@ -106,7 +106,7 @@ class PressSession:
         presses: MeasuredPresses | None = None,
         position_std_mm: float = POSITION_STD_MM,
         force_std: float = FORCE_STD,
-        until: float = ENOUGH,
+        until: float = SUFFICIENT_ERROR_RATIO,
         executor: Executor | None = None,
     ) -> None:
         """Begin a session, or continue an earlier session.
@@ -119,7 +119,7 @@ class PressSession:
             position_std_mm: Standard deviation of the positions of further presses, mm.
             force_std: Standard deviation of the forces of further presses, relative to the force.
             until: The session is complete when the position error due to the film, divided by that due to the noise,
-                is at most this number, as `ENOUGH`. With 0, the session is never complete.
+                is at most this number, as `SUFFICIENT_ERROR_RATIO`. With 0, the session is never complete.
             executor: Executor that runs the solves; None for this process.
         """
         self.problem = problem

@@ -19,7 +19,7 @@ from isocharge.simulate import NoiseModel, noise_model
 from isocharge.simulate.noise import GaussianNoise
 from isocharge.train.data.contact_errors import rms, rounded
 
-NEIGHBOURS = 16
+N_NEIGHBOURS = 16
 """Number of contacts to which a quadratic function is fitted, which has ten coefficients."""
 
 MIN_REPEATED_CONTACTS = 10
@@ -31,14 +31,14 @@ reference contact would not show how the noise depends on the charge."""
 SAME_CONTACT_DECIMALS = 3
 """Decimals of the unit coordinates in which two contacts agree if they count as the same contact."""
 
-OUTLIER = 3.0
+OUTLIER_STDS = 3.0
 """Number of standard deviations beyond which residuals count less, because they are not due to noise."""
 
-LEAST_SHARE = 0.01
+SMALL_SHARE = 0.01
 """Smallest white noise of a channel, relative to the noise of its gain at a charge of the usual size.
 
 The lower limit is needed because the presses do not determine the white noise if no charge is small. The quantiles of
-the charges at `LEAST_SHARE` and at 1 - `LEAST_SHARE` show whether the charges of a channel vary, and whether they have
+the charges at `SMALL_SHARE` and at 1 - `SMALL_SHARE` show whether the charges of a channel vary, and whether they have
 both signs.
 """
 
@@ -54,13 +54,13 @@ LARGEST_LOGARITHM = 50.0
 Its exponential is finite in single precision, also for charges that are far from those of the training.
 """
 
-LEAST_GAIN = 1e-4
+MIN_GAIN_NOISE = 1e-4
 """Smallest relative noise of the gain, which is that of a good amplifier.
 
 With a smaller value, the level asinh(gain Q / white) / gain would be practically equal to Q / white.
 """
 
-CANDIDATES = 8
+N_CANDIDATE_PLANES = 8
 """Number of planes that are compared in the search for the nearest point of all planes."""
 
 
@@ -113,16 +113,16 @@ class ChannelNoise(GaussianNoise):
 
         # Fit the noise of each channel.
         white_std, gain_std = np.transpose(list(map(_fit_noise, exact_charge.T, residual.T)))
-        gain = np.maximum(gain_std, LEAST_GAIN)
+        gain = np.maximum(gain_std, MIN_GAIN_NOISE)
         # The presses do not determine the white noise if all charges are large. The lower limit of the white noise is a
         # small fraction of the noise of the gain at the usual charge.
-        smallest_white = LEAST_SHARE * gain * usual_size(noisy_charge)
+        smallest_white = SMALL_SHARE * gain * usual_size(noisy_charge)
         return cls(np.maximum(white_std, smallest_white), gain)
 
     @classmethod
     def alike(cls, noise: NoiseModel) -> "ChannelNoise":
         """Create a noise model with the same noise on every electrode, whose parameters have the shape ()."""
-        return cls(np.array(noise.white), np.array(max(noise.gain, LEAST_GAIN)), noise.name)
+        return cls(np.array(noise.white), np.array(max(noise.gain, MIN_GAIN_NOISE)), noise.name)
 
     def level(self, charge: Array) -> Array:
         """Convert charges Q, shape (n, n_electrode), pC, into the levels asinh(gain Q / white) / gain.
@@ -150,7 +150,7 @@ class ChannelNoise(GaussianNoise):
         Returns:
             Transition charges, shape (n_electrode,), pC.
         """
-        low_charge, high_charge = np.quantile(charge, (LEAST_SHARE, 1.0 - LEAST_SHARE), axis=0)
+        low_charge, high_charge = np.quantile(charge, (SMALL_SHARE, 1.0 - SMALL_SHARE), axis=0)
         has_both_signs = (low_charge < 0.0) & (high_charge > 0.0)  # shape (n_electrode,)
         lower_limit = np.where(has_both_signs, MIN_TRANSITION_RATIO * usual_size(charge), 0.0)
         return np.maximum(self.white / self.gain, lower_limit)
@@ -205,7 +205,7 @@ class LocalPlanes:
         """
         # Find the neighbours of each contact. The nearest contact is the contact itself.
         contact, mean_value, press_count, _ = _average_repeated(unit_contact, values)
-        distance, nearest = cKDTree(contact).query(contact, min(NEIGHBOURS + 1, len(contact)))
+        distance, nearest = cKDTree(contact).query(contact, min(N_NEIGHBOURS + 1, len(contact)))
         neighbours = nearest[:, 1:]
 
         # The terms of the function are a constant, the offsets of the neighbours, and the products of two offsets.
@@ -231,8 +231,8 @@ class LocalPlanes:
         """Compute the difference between each set of k values and the nearest point of all planes.
 
         A plane is a linear function from contacts to values. It describes the values of the contacts near one press, up
-        to the distance of the farthest neighbour of the press. Each set of values is compared with `CANDIDATES` planes:
-        those whose values at their own press are nearest to the set.
+        to the distance of the farthest neighbour of the press. Each set of values is compared with `N_CANDIDATE_PLANES`
+        planes: those whose values at their own press are nearest to the set.
 
         Args:
             values: m sets of values, shape (m, k).
@@ -240,7 +240,8 @@ class LocalPlanes:
         Returns:
             Differences, shape (m, k).
         """
-        _, candidate_planes = cKDTree(self.value).query(values, CANDIDATES)  # indices, shape (m, CANDIDATES)
+        # Indices of the candidates, shape (m, N_CANDIDATE_PLANES)
+        _, candidate_planes = cKDTree(self.value).query(values, N_CANDIDATE_PLANES)
         inverse_slope = np.linalg.pinv(self.slope)  # shape (n, 3, k)
         smallest_residual = np.full(values.shape, np.inf)
         for plane_index in candidate_planes.T:  # index of one plane for each set of values, shape (m,)
@@ -318,8 +319,8 @@ def _fit_noise(charge: Array, residual: Array) -> Array:
     """Estimate the white noise and the noise of the gain of one channel from residuals.
 
     The variance of a residual is white^2 + gain^2 Q^2, where Q is the charge. The likelihood of the residuals is
-    maximised. It is that of a normal distribution with longer tails beyond `OUTLIER` standard deviations (Huber 1964,
-    proposal 2).
+    maximised. It is that of a normal distribution with longer tails beyond `OUTLIER_STDS` standard deviations (Huber
+    1964, proposal 2).
 
     A channel that is silent below a threshold does not show its noise there. Charges that are zero and have no residual
     are therefore left out. Otherwise, the likelihood would be infinite without white noise.
@@ -341,10 +342,10 @@ def _fit_noise(charge: Array, residual: Array) -> Array:
         """Return the mean negative logarithm of the likelihood, without a constant."""
         white, gain = units * np.exp(log_std)
         variance = np.maximum(white**2 + (gain * charge) ** 2, smallest_number)
-        # The squared deviation counts up to `OUTLIER` squared, and only its logarithm beyond.
+        # The squared deviation counts up to `OUTLIER_STDS` squared, and only its logarithm beyond.
         square = residual**2 / variance
-        tail = OUTLIER**2 * np.log(np.maximum(square / OUTLIER**2, 1.0))
-        terms = np.log(variance) + np.minimum(square, OUTLIER**2) + tail
+        tail = OUTLIER_STDS**2 * np.log(np.maximum(square / OUTLIER_STDS**2, 1.0))
+        terms = np.log(variance) + np.minimum(square, OUTLIER_STDS**2) + tail
         return float(np.mean(np.where(is_silent, 0.0, terms)))
 
     solution = minimize(loss, [-0.5, -0.5], method="Nelder-Mead").x

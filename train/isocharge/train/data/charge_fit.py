@@ -57,10 +57,10 @@ change more with the position than their logarithms, and the few presses of a ca
 SIZE_DEGREE = 4
 """Degree of the polynomial that approximates the logarithm of the size S of the charges as a function of l."""
 
-REFERENCE = noise_model("reference")
+REFERENCE_NOISE = noise_model("reference")
 """Noise for which the error of a series is chosen."""
 
-FEWEST_PER_TERM = 8
+MIN_PRESSES_PER_TERM = 8
 """Smallest number of presses per coefficient. Fewer presses would not determine the slopes near the edge."""
 
 RIDGE = math.sqrt(np.finfo(float).eps)
@@ -70,7 +70,7 @@ The ridge is needed because the polynomials are defined on a square, whose corne
 presses.
 """
 
-GOOD_ENOUGH = 1.5e-4
+SUFFICIENT_ERROR = 1.5e-4
 """Relative rms error of the charges below which no higher degree is tried, about a tenth of the reference noise."""
 
 
@@ -79,7 +79,7 @@ def fit_charge_series(
     electrodes: tuple[str, ...],
     presses: LabelledPresses,
     validation: LabelledPresses,
-    white_pC: float = REFERENCE.white,
+    white_pC: float = REFERENCE_NOISE.white,
 ) -> ChargeSeries:
     """Fit a charge series to presses by least squares, and choose its degrees by the error on other presses.
 
@@ -98,13 +98,13 @@ def fit_charge_series(
         TrainingError: If there are too few presses for the smallest degrees.
     """
     unit_contact = domain.to_unit(presses.contact)
-    if presses.signed:
+    if presses.has_nonpositive_charges:
         # The values of the series are Q / S with the typical size S of the charges. Charges near zero would have large
         # relative errors. Their errors are therefore relative to the charge of which the noise is proportional.
         candidate_degrees = SIGNED_CANDIDATE_DEGREES
         log_size = _fit_log_size(unit_contact[:, 2], presses.charge)
         target = presses.charge / series_size(log_size, unit_contact[:, 2])[0]
-        error_unit = np.hypot(validation.charge, white_pC / REFERENCE.gain)
+        error_unit = np.hypot(validation.charge, white_pC / REFERENCE_NOISE.gain)
     else:
         candidate_degrees = CANDIDATE_DEGREES
         log_size = None
@@ -115,7 +115,7 @@ def fit_charge_series(
     best_series: ChargeSeries | None = None
     for degree, largest_force_degree in candidate_degrees:
         force_degree = determined_degree(unit_contact[:, 2], largest_force_degree)
-        fewest = FEWEST_PER_TERM * series_term_count(degree, force_degree)
+        fewest = MIN_PRESSES_PER_TERM * series_term_count(degree, force_degree)
         if fewest > len(presses):
             break
         coefficients = fit_series(unit_contact, target, degree, force_degree)[None]
@@ -123,7 +123,7 @@ def fit_charge_series(
         error = rms((series.charges(validation.contact) - validation.charge) / error_unit)
         if best_series is None or error < best_series.charge_std:
             best_series = replace(series, charge_std=error)
-        if error < GOOD_ENOUGH:
+        if error < SUFFICIENT_ERROR:
             break
     if best_series is None:  # the presses are too few for the first degrees
         raise TrainingError(f"expected at least {fewest} presses to fit the charges by, got {len(presses)}")

@@ -16,17 +16,17 @@ from isocharge.common.errors import PressError, shown
 from isocharge.serve.model.contact import box_middle, inside_polygon
 from isocharge.serve.presses.measured_presses import CONTACT, MeasuredPresses
 from isocharge.simulate import Domain
-from isocharge.train.data.channel_noise import LEAST_SHARE
+from isocharge.train.data.channel_noise import SMALL_SHARE
 
 HULL_RATIO = 0.3
 """Length above which an edge of the outline bends inwards to further places, dimensionless. The value 0 is the shortest
 distance between neighbouring places, and 1 is the longest distance.
 """
 
-LEAST_RANGE = 1.1
+MIN_FORCE_RATIO = 1.1
 """Smallest ratio of the largest to the smallest force of a domain, which applies even if all forces are equal."""
 
-LEAST_INDEPENDENCE = 1e-4
+MIN_INDEPENDENCE = 1e-4
 """Smallest ratio of the smallest to the largest singular value of columns that are linearly independent.
 
 The columns are the standardised charges of the channels, or the coordinates of the places.
@@ -62,10 +62,10 @@ class PressedArea(Domain):
         force = contact[:, 2]
         min_force = float(force.min())
         max_force = float(force.max())
-        if max_force < LEAST_RANGE * min_force:
+        if max_force < MIN_FORCE_RATIO * min_force:
             # Both ends are moved by the same factor, so that their geometric mean remains.
-            min_force /= LEAST_RANGE**0.5
-            max_force *= LEAST_RANGE**0.5
+            min_force /= MIN_FORCE_RATIO**0.5
+            max_force *= MIN_FORCE_RATIO**0.5
         distance_from_middle = np.linalg.norm(corners - box_middle(corners), axis=1)
         corner_places = tuple((x, y) for x, y in corners.tolist())
         return cls(float(distance_from_middle.max()), (min_force, max_force), corner_places)
@@ -111,7 +111,7 @@ def outline(places: Array) -> Array:
     """
     # The singular values are proportional to the extents of the places along their principal axes.
     length, width = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
-    if width <= LEAST_INDEPENDENCE * length:
+    if width <= MIN_INDEPENDENCE * length:
         raise PressError(f"expected presses over an area, got {len(places)} places on one line; press beside it, too")
 
     # The nearest place is the place itself, and the second nearest is its nearest neighbour.
@@ -124,10 +124,10 @@ def outline(places: Array) -> Array:
     return np.asarray(closed_outline[:0:-1])
 
 
-USUAL_SHARE = 0.9
+USUAL_DISTANCE_QUANTILE = 0.9
 """Share of the values of a column whose distance from the median is at most the usual distance, dimensionless."""
 
-FARTHEST = 1_000.0
+MAX_DISTANCE_RATIO = 1_000.0
 """Largest distance of a value from the median of its column, as a multiple of the usual distance."""
 
 
@@ -166,10 +166,10 @@ def _check_variation(name: str, charge: Array) -> None:
         charge: Charges of the channel, shape (n,), pC.
 
     Raises:
-        PressError: If all charges are in ascending order, or if all are equal, except for the share `LEAST_SHARE` of
+        PressError: If all charges are in ascending order, or if all are equal, except for the share `SMALL_SHARE` of
             the largest and of the smallest.
     """
-    low, high = np.quantile(charge, (LEAST_SHARE, 1.0 - LEAST_SHARE))
+    low, high = np.quantile(charge, (SMALL_SHARE, 1.0 - SMALL_SHARE))
     if np.isclose(low, high, atol=0.0):
         equal_count = np.isclose(charge, low, atol=0.0).sum()
         raise PressError(
@@ -197,15 +197,15 @@ def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compare
             function of the values.
 
     Raises:
-        PressError: If the largest distance exceeds `FARTHEST` times the usual distance.
+        PressError: If the largest distance exceeds `MAX_DISTANCE_RATIO` times the usual distance.
     """
     distance = np.abs(compared_values - np.median(compared_values))
     if not distance.any():  # all values are equal
         return
     # Distances of zero are left out, because the usual distance would otherwise be zero if most values are equal.
-    usual_distance = float(np.quantile(distance[distance > 0.0], USUAL_SHARE))
+    usual_distance = float(np.quantile(distance[distance > 0.0], USUAL_DISTANCE_QUANTILE))
     row = int(distance.argmax())
-    if distance[row] > FARTHEST * usual_distance:
+    if distance[row] > MAX_DISTANCE_RATIO * usual_distance:
         raise PressError(
             f"line {presses.lines[row]}, column {shown(name)}: expected a value of the size of the others, whose "
             f"median is {np.median(values):.3g}, got {values[row]:.6g}; correct it, or remove the line"
@@ -226,14 +226,14 @@ def _check_independence(presses: MeasuredPresses) -> None:
     standardised_charge = (charge - charge.mean(axis=0)) / charge.std(axis=0)
     _, singular_values, directions = np.linalg.svd(standardised_charge, full_matrices=False)
     largest, *_, smallest = singular_values
-    if smallest > LEAST_INDEPENDENCE * largest:
+    if smallest > MIN_INDEPENDENCE * largest:
         return
     # The last singular vector, a unit vector, contains the coefficients of a combination of the channels that is nearly
     # zero.
     dependent_names = [
         shown(name)
         for name, coefficient in zip(presses.electrodes, directions[-1], strict=True)
-        if abs(coefficient) > LEAST_INDEPENDENCE
+        if abs(coefficient) > MIN_INDEPENDENCE
     ]
     raise PressError(
         f"channels {', '.join(dependent_names)}: expected charges that are linearly independent, got channels of which "

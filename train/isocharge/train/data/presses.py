@@ -34,13 +34,13 @@ SOLVER = "solver"
 YIELD_FORCE = "yield_force_N"
 """Name of the manifest entry with the force at which the film yields."""
 
-FEWEST = 500
+MIN_PRESSES = 500
 """Smallest number of presses for a fit."""
 
 PLACE_STEP_mm = 0.02
 """Largest distance between neighbouring positions that count as one place, mm. The noise of encoders is smaller."""
 
-FEWEST_PLACES = 50
+MIN_PLACES = 50
 """Smallest number of places for a fit, and smallest number of measured presses for a training or for errors."""
 
 
@@ -69,7 +69,7 @@ class LabelledPresses:
         return len(self.contact)
 
     @property
-    def signed(self) -> bool:
+    def has_nonpositive_charges(self) -> bool:
         """Whether at least one charge is zero or negative, so that it has no logarithm."""
         return bool((self.charge <= 0.0).any())
 
@@ -229,7 +229,7 @@ def position_ranks(contact: Array) -> Array:
     return rank[position_of_press.ravel()]  # some versions of NumPy return two axes
 
 
-def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
+def presses_of(dataset: Dataset, fewest: int = MIN_PRESSES) -> LabelledPresses:
     """Return the presses of a dataset after checking them.
 
     Args:
@@ -245,9 +245,9 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
     """
     presses = LabelledPresses.of(dataset.samples)
     n_position = place_count(presses.contact)
-    if len(presses) < fewest or n_position < FEWEST_PLACES:
+    if len(presses) < fewest or n_position < MIN_PLACES:
         raise DatasetError(
-            f"expected at least {fewest} presses at {FEWEST_PLACES} positions, got {len(presses)} at "
+            f"expected at least {fewest} presses at {MIN_PLACES} positions, got {len(presses)} at "
             f"{n_position}; sweep or measure more (of a described film, `isocharge train calibrate` needs only a few)"
         )
 
@@ -264,7 +264,7 @@ def presses_of(dataset: Dataset, fewest: int = FEWEST) -> LabelledPresses:
     return presses
 
 
-HELD_PARTS = 5
+N_FOLDS = 5
 """Number of parts of measured presses, of which one is held out for the measurement of errors.
 
 It is also the number of networks of a cross-validation.
@@ -280,7 +280,7 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
         probe: Probe with which the presses were made.
 
     Raises:
-        PressError: If a column is missing, or fewer than `FEWEST_PLACES` presses remain.
+        PressError: If a column is missing, or fewer than `MIN_PLACES` presses remain.
     """
     check_known_columns(presses)
     complete_presses = presses[complete(presses)]
@@ -334,11 +334,11 @@ def check_enough(count: int, total_count: int, sensor: str) -> None:
         sensor: Name of the sensor, for the message.
 
     Raises:
-        PressError: If there are fewer than `FEWEST_PLACES` presses that can be used.
+        PressError: If there are fewer than `MIN_PLACES` presses that can be used.
     """
-    if count < FEWEST_PLACES:
+    if count < MIN_PLACES:
         raise PressError(
-            f"expected at least {FEWEST_PLACES} presses with known place, force and charges, within the "
+            f"expected at least {MIN_PLACES} presses with known place, force and charges, within the "
             f"model's forces and radius, got {count} of {total_count}; fewer calibrate a film: isocharge train "
             f"calibrate PRESSES.csv --sensor {sensor} -o FOLDER"
         )

@@ -29,8 +29,8 @@ from isocharge.train.data.channel_noise import misfit_noise
 from isocharge.train.data.charge_fit import fit_charge_series
 from isocharge.train.data.contact_errors import contact_error_statistics, rms, rounded
 from isocharge.train.data.presses import (
-    FEWEST_PLACES,
-    HELD_PARTS,
+    MIN_PLACES,
+    N_FOLDS,
     LabelledPresses,
     check_enough,
     have_charges_of,
@@ -327,7 +327,7 @@ def split_presses(
             hold_out = min(hold_out, model.made_with["config"]["training"]["hold_out"])
         return split_by_position(presses_of(dataset), hold_out)
 
-    presses, held_out = split_by_position(presses_of(dataset, FEWEST_PLACES), 1.0 / HELD_PARTS)
+    presses, held_out = split_by_position(presses_of(dataset, MIN_PLACES), 1.0 / N_FOLDS)
     is_learned = have_charges_of(held_out.charge, _calibration_charges(model_folder, model))
     if is_learned.all():
         raise PressError(

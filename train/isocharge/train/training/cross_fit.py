@@ -28,11 +28,11 @@ from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.serve.presses.table_file import csv_text
 from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes, usual_size
 from isocharge.train.data.contact_errors import rms, rounded
-from isocharge.train.data.measured_sensor import LEAST_RANGE, PressedArea, check_measured_presses
+from isocharge.train.data.measured_sensor import MIN_FORCE_RATIO, PressedArea, check_measured_presses
 from isocharge.train.data.presses import (
-    FEWEST,
-    FEWEST_PLACES,
-    HELD_PARTS,
+    MIN_PLACES,
+    MIN_PRESSES,
+    N_FOLDS,
     LabelledPresses,
     PLACE_STEP_mm,
     check_known_columns,
@@ -57,7 +57,7 @@ from isocharge.train.training.network import (
 
 _log = logging.getLogger(__name__)
 
-CHANNELS = (3, 32)
+CHANNEL_COUNTS = (3, 32)
 """Smallest and largest number of channels."""
 
 DEFAULT_STEPS = 1_200
@@ -130,8 +130,8 @@ def fit_presses(
         # Cross-validation: train a network for each fold, and compute the answers to the presses of the fold.
         create_network = partial(InverseNetwork, domain, features, labelled.charge, settings.network, force_std)
         network = create_network()  # the network that is returned, which learns from the networks of the folds
-        fold_networks = [create_network() for _ in range(HELD_PARTS)]
-        fold_of_press = (HELD_PARTS * position_ranks(uncertain_places(usable))).astype(int)
+        fold_networks = [create_network() for _ in range(N_FOLDS)]
+        fold_of_press = (N_FOLDS * position_ranks(merged_uncertain_places(usable))).astype(int)
         contact, std, misfit = _cross_validate(fold_networks, labelled, unit_contact, fold_of_press, noise, training)
         position_factor, force_factor = std_factors(contact, std, labelled.contact)
         if force_std is not None:
@@ -155,8 +155,8 @@ def fit_presses(
         "config": settings.to_dict(),
         "measured": {
             "presses": len(labelled),
-            "places": place_count(uncertain_places(usable)),
-            "folds": HELD_PARTS,
+            "places": place_count(merged_uncertain_places(usable)),
+            "folds": N_FOLDS,
             "std_factors": [rounded(position_factor), rounded(force_factor)],
         },
     }
@@ -197,7 +197,7 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
             `check_measured_presses` finds a fault.
     """
     channel_names = presses.electrodes
-    fewest_channels, most_channels = CHANNELS
+    fewest_channels, most_channels = CHANNEL_COUNTS
     if not fewest_channels <= len(channel_names) <= most_channels:
         raise PressError(
             f"expected {fewest_channels} to {most_channels} channels, got {len(channel_names)} "
@@ -213,10 +213,10 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
     check_known_columns(presses)
     usable = presses[complete(presses)]  # the place, the force and all charges of each press are known
     usable = replace(usable, contact=merged_places(usable.contact))
-    usable_places = place_count(uncertain_places(usable))
-    if len(usable) < FEWEST or usable_places < FEWEST_PLACES:
+    usable_places = place_count(merged_uncertain_places(usable))
+    if len(usable) < MIN_PRESSES or usable_places < MIN_PLACES:
         raise PressError(
-            f"expected at least {FEWEST} presses at {FEWEST_PLACES} places with known place, force and charges, got "
+            f"expected at least {MIN_PRESSES} presses at {MIN_PLACES} places with known place, force and charges, got "
             f"{len(usable)} at {usable_places}; measure more, or describe the sensor in a file and use "
             "`isocharge train calibrate`, which needs only a few"
         )
@@ -239,7 +239,7 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
     return usable
 
 
-def uncertain_places(presses: MeasuredPresses) -> Array:
+def merged_uncertain_places(presses: MeasuredPresses) -> Array:
     """Return the contacts (x, y, F), in which all presses at one place have the same position, shape (n, 3), mm and N.
 
     A robot does not return to a place exactly, and the errors of its positions are known from `position_std_mm`.
@@ -262,7 +262,7 @@ def constant_force_std(presses: MeasuredPresses) -> float | None:
         The standard deviation, dimensionless; None if the forces vary.
     """
     force = presses.contact[:, 2]
-    if force.max() >= LEAST_RANGE * force.min():
+    if force.max() >= MIN_FORCE_RATIO * force.min():
         return None
     return float(np.hypot(np.std(np.log(force)), rms(presses.force_std)))
 

@@ -13,7 +13,7 @@ from isocharge.simulate import ChargeMap, Dataset, Domain, NoiseModel, Sensor
 from isocharge.simulate.forward.charge_map import within
 from isocharge.simulate.identifiability.working_area import working_area
 from isocharge.train.data.channel_noise import ChannelNoise, misfit_noise
-from isocharge.train.data.charge_fit import GOOD_ENOUGH, fit_charge_series
+from isocharge.train.data.charge_fit import SUFFICIENT_ERROR, fit_charge_series
 from isocharge.train.data.presses import (
     YIELD_FORCE,
     LabelledPresses,
@@ -90,7 +90,7 @@ class TrainingData:
         )
 
 
-MAX_ERROR_OF_CERTAIN_FOLD = 2.0 * GOOD_ENOUGH
+MAX_ERROR_OF_CERTAIN_FOLD = 2.0 * SUFFICIENT_ERROR
 """Largest relative error of the fitted charges at which a fold counts as certain.
 
 A poor fit has spurious folds, in the outer fifth of the domain.
@@ -104,7 +104,7 @@ SEARCHED_RADIUS_RATIO = 0.98
 
 At the edge of the domain, the presses do not determine the derivatives of the charges accurately."""
 
-SMALLEST_SHARE = 0.2
+MIN_RADIUS_RATIO = 0.2
 """Smallest ratio of the radius without folds to the radius of the dataset at which a network can be trained."""
 
 
@@ -127,7 +127,7 @@ def invertible_domain(
         The domain, which is the disk with the range of forces, and the sentences.
 
     Raises:
-        DatasetError: If the radius of the disk is less than `SMALLEST_SHARE` of the radius of the field.
+        DatasetError: If the radius of the disk is less than `MIN_RADIUS_RATIO` of the radius of the field.
     """
     requested_radius = field.domain.radius
     area = working_area(within(field, SEARCHED_RADIUS_RATIO * requested_radius), noise, search_pairs=False)
@@ -143,7 +143,7 @@ def invertible_domain(
         cautions = (probable_fold,) if fold_radius < PROBABLE_FOLD_RATIO * requested_radius else ()
         return field.domain, cautions
 
-    if fold_radius < SMALLEST_SHARE * requested_radius:
+    if fold_radius < MIN_RADIUS_RATIO * requested_radius:
         raise DatasetError(
             f"the map from contacts to charges folds {fold_radius:g} mm from the centre, of {requested_radius:g} mm "
             "asked for: beyond, two contacts give the same charges; add an electrode, or take a biaxial film"
@@ -219,7 +219,7 @@ class Split:
             noise: Noise of the charges, which determines the typical charges or the lower limit of the charges.
         """
         charge = self.train.charge
-        has_both_signs = self.train.signed or self.test.signed
+        has_both_signs = self.train.has_nonpositive_charges or self.test.has_nonpositive_charges
         if not has_both_signs:
             return logarithmic_features(charge, noise.white)
         channel_noise = ChannelNoise.alike(noise)
