@@ -51,7 +51,6 @@ def samples(times_s, force_N=0.0, bits=0):
     rows["contact"] = rows["force_N"] > 0.0
     rows["flags"] = bits
     rows["records"] = 1
-    rows["latency_us"] = np.arange(len(rows))
     return rows
 
 
@@ -64,7 +63,6 @@ def test_coalesced_samples_represent_all_records(count, max_samples, seed):
     assert len(shown) == min(max_samples, count)
     assert shown["records"].sum() == count
     assert np.bitwise_or.reduce(shown["flags"].astype(int)) == np.bitwise_or.reduce(bits)
-    assert shown["latency_us"][-1] == count - 1
     assert (np.diff(shown["timestamp"]) > 0).all()
     assert shown["contact"].any() == (force_N > 0.0).any()
 
@@ -102,12 +100,6 @@ def test_live_tape_stores_the_latest_samples():
 def recorded():
     """Return an empty tape of a recording."""
     return RecordedTape(TYPE)
-
-
-def test_recorded_tape_replaces_times_that_go_back_or_are_missing(recorded):
-    assert recorded.span() == (0.0, 0.0)
-    append(recorded, [10.0, 12.0, 11.0, None, 13.0])
-    assert recorded.samples(0, 5)["timestamp"].tolist() == [10, 12, 12, 12, 13]
 
 
 def test_recorded_tape_stores_all_samples_and_the_largest_force_of_each_piece(recorded):

@@ -69,8 +69,7 @@ def coalesce(samples: Samples, max_samples: int) -> Samples:
 
     By default, the latest sample of a run is chosen. If the latest sample is not a contact, but the run contains
     contacts, the contact with the largest force is chosen instead, so that short taps are not lost. The chosen sample
-    gets the flags of all samples of the run, the largest latency in the run, and the total number of records in the
-    run.
+    gets the flags of all samples of the run, and the total number of records in the run.
 
     Args:
         samples: The samples, shape (n,).
@@ -93,11 +92,10 @@ def _coalesced_run(run: Samples) -> Samples:
         force_N = np.where(is_contact, run["force_N"], -np.inf)
         chosen_index = int(force_N.argmax())
 
-    # Combine the flags, the numbers of records and the latencies of all samples.
+    # Combine the flags and the numbers of records of all samples.
     chosen = run[[chosen_index]]  # a copy
     chosen["flags"] = np.bitwise_or.reduce(run["flags"].astype(np.int64))
     chosen["records"] = run["records"].sum()
-    chosen["latency_us"] = np.fmax.reduce(run["latency_us"])  # ignores latencies that are NaN
     return chosen
 
 
@@ -184,22 +182,13 @@ class Tape:
 
 
 class RecordedTape(Tape):
-    """Tape that stores all samples of a recording.
-
-    If the time of a sample is missing or is earlier than the time of the previous sample, the previous time is stored
-    instead. The stored times therefore never decrease.
-    """
+    """Tape that stores all samples of a recording."""
 
     def append(self, values: tuple[float | None, ...]) -> None:
-        """Append a sample. If the buffer is full, its size is doubled.
-
-        The times of the samples never decrease: an earlier time, or none, is replaced by the time of the latest sample.
-        """
+        """Append a sample. If the buffer is full, its size is doubled."""
         if self.total == len(self._ring):
             self._ring = np.concatenate([self._ring, np.zeros_like(self._ring)])
-        time_s, *others = values  # the time is the first number of a sample
-        latest_time_s = self.timestamp(self.total - 1)
-        super().append((max(latest_time_s, time_s or 0.0), *others))
+        super().append(values)
 
     def extent(self) -> dict[str, Any]:
         """Return the times of the first and the last sample, the number of samples, and an overview of the forces.
@@ -209,7 +198,7 @@ class RecordedTape(Tape):
         samples = self._ring[: self.total]
         start_s, end_s = self.span()
         elapsed = (samples["timestamp"] - start_s) / max(end_s - start_s, np.finfo(float).tiny)  # from 0 to 1
-        piece_of_sample = np.minimum(elapsed * MAX_DRAWN_SAMPLES, MAX_DRAWN_SAMPLES - 1).astype(int)
+        piece_of_sample = (elapsed * MAX_DRAWN_SAMPLES).clip(0, MAX_DRAWN_SAMPLES - 1).astype(int)
         max_force_N = np.zeros(MAX_DRAWN_SAMPLES)
         np.fmax.at(max_force_N, piece_of_sample, samples["force_N"])  # ignores forces that are NaN
         return {"span": (start_s, end_s), "samples": self.total, "overview": max_force_N.round(3).tolist()}
