@@ -220,12 +220,9 @@ def unit_sentences(unit: str) -> Iterator[str]:
         unit: Unit of the channels, such as "pC" or "counts".
     """
     if unit != "pC":
-        product = (
-            "it is the product of the volts of one unit and the feedback capacitance in pF; " if unit == "V" else ""
-        )
         yield (
             f"the channels seem to be in {unit}: state the charge of one unit in pC with --pc-per-unit NUMBER; "
-            f"{product}the number is negative if the amplifier inverts, and 1 if the channels are already in pC"
+            "the number is negative if the amplifier inverts, and 1 if the channels are already in pC"
         )
 
 
