@@ -155,8 +155,7 @@ class SerialLine:
         Returns:
             All bytes that have arrived; empty if no byte arrives in time.
         """
-        if timeout_s != self._serial.timeout:  # avoids a needless assignment, which costs a system call
-            self._serial.timeout = timeout_s
+        self._serial.timeout = timeout_s
         data: bytes = self._serial.read(1)  # waits until a byte arrives or the timeout has passed
         if data:
             data += self._serial.read(self._serial.in_waiting)
