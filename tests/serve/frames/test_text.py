@@ -206,6 +206,7 @@ NOTATIONS = {
     **dict.fromkeys(
         [
             "A nC: {a} B nC: {b} C nC: {c}",
+            "Film A [nC]: {a}, Film B [nC]: {b}, Film C [nC]: {c}",
             "A: {a} [nC], B: {b} [nC], C: {c} [nC]",
             "nC: A={a} B={b} C={c}",
             '{{"A": {{"q": {a}, "unit": "nC"}}, "B": {{"q": {b}, "unit": "nC"}}, "C": {{"q": {c}, "unit": "nC"}}}}',
@@ -213,7 +214,6 @@ NOTATIONS = {
         ],
         ("A_nC", "B_nC", "C_nC"),
     ),
-    "Film A [nC]: {a}, Film B [nC]: {b}, Film C [nC]: {c}": ("ch1_nC", "ch2_nC", "ch3_nC"),
     "Q[0]:{a} Q[1]:{b} Q[2]:{c}": ("Q[0]", "Q[1]", "Q[2]"),
     "Channel 1 = {a} nC, Channel 2 = {b} nC, Channel 3 = {c} nC": ("1_nC", "2_nC", "3_nC"),
     "CH 1: {a}\nCH 2: {b}\nCH 3: {c}": "123",

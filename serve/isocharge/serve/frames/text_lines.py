@@ -98,7 +98,7 @@ _SAME_COLUMN = r"(?:q|[^\w,;|\[(])*"
 _NEAREST_NAME = rf"(?P<word>[kuw]){_SAME_COLUMN}(?P<number>[0t])"
 """Regular expression, for the shape of a line, of the last word before a number in the same column."""
 
-_SECOND_NAME = rf"(?P<word>[kuw]){_SAME_COLUMN}[kuw]{_SAME_COLUMN}(?P<number>[0t])"
+_SECOND_NAME = rf"(?P<word>[kuw]){_SAME_COLUMN}[(\[]?[kuw]{_SAME_COLUMN}(?P<number>[0t])"
 """Regular expression, for the shape of a line, of the last word but one before a number in the same column."""
 
 _UNIT_BEHIND = r"(?P<number>[0t])(?:[\])}]*,?k)?[\]\[(){}:=]*(?P<word>[quw])"
