@@ -185,16 +185,16 @@ class Dialogue:
             InputError: If the port ends before the last press.
         """
         # Find the presses of an earlier session in the list, one after the other. Rows between them were left out.
-        row_count = 0
+        finished_count = 0  # number of rows of the list up to the last recorded press
         for recorded in self._session.presses.contact:
-            is_row = np.isclose(contacts[row_count:], recorded, equal_nan=True).all(axis=1)
-            if is_row.any():
-                row_count += int(is_row.argmax()) + 1
+            is_recorded_row = np.isclose(contacts[finished_count:], recorded, equal_nan=True).all(axis=1)
+            if is_recorded_row.any():
+                finished_count += int(is_recorded_row.argmax()) + 1
         try:
             # A press before the tare would be lost, and each later press would be assigned to the wrong row.
             self._wait_for(Phase.waiting)
-            say(f"The tare is measured. Let the machine begin with row {row_count + 1} of its list.")
-            for row_number, contact in enumerate(contacts[row_count:], row_count + 1):
+            say(f"The tare is measured. Let the machine begin with row {finished_count + 1} of its list.")
+            for row_number, contact in enumerate(contacts[finished_count:], finished_count + 1):
                 say(f"{row_number}. {describe_press(contact)}")
                 self._shown_phase = ""
                 event = self._wait_for(Phase.taken, Phase.refused)

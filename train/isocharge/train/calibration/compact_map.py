@@ -286,13 +286,18 @@ def _directions(
     Returns:
         Coefficients, as in `ChargeSeries.directions`.
     """
+    # The typical size of the charges, shape (n, 1), pC; None if the values are logarithms
     unit_contact = series.domain.to_unit(contact)
     size = None if series.log_size is None else series_size(series.log_size, unit_contact[:, 2])[0]
-    node = [node_film.change_MPa for node_film in films].index(0.0)
-    lower, upper = films[max(node - 1, 0)], films[min(node + 1, len(films) - 1)]
+
+    # Compute the changes of the values on the calibrated film, and their derivatives with respect to the pretension
+    # from the nodes beside it. A series with one node has no neighbours.
+    middle = [node_film.change_MPa for node_film in films].index(0.0)
+    lower = films[max(middle - 1, 0)]
+    upper = films[min(middle + 1, len(films) - 1)]
     examined_films = [calibrated] if lower is upper else [calibrated, lower, upper]
     changes, *neighbour_changes = _value_changes(examined_films, film, contact, size, executor)
-    slopes = np.zeros_like(changes)  # derivatives of the changes with respect to the pretension, 1/MPa
+    slopes = np.zeros_like(changes)  # 1/MPa
     if neighbour_changes:
         lower_changes, upper_changes = neighbour_changes
         slopes = (upper_changes - lower_changes) / (upper.change_MPa - lower.change_MPa)
@@ -305,11 +310,11 @@ def _directions(
     *_, n_unknown = changes.shape
     all_effects = np.stack(effects_at_films).reshape(-1, n_unknown)
     _, singular_values, rotation = np.linalg.svd(all_effects, full_matrices=False)
-    kept = rotation[singular_values > MIN_DIRECTION * np.sqrt(len(all_effects))]  # shape (n_direction, n_unknown)
+    directions = rotation[singular_values > MIN_DIRECTION * np.sqrt(len(all_effects))]  # shape (n_direction, n_unknown)
 
     # Fit a series to the change and the slope of each direction. The axes of the effects are the contact, change or
     # slope, direction and electrode. The series has three axes for the degrees in place of the first one.
-    effects = np.stack([changes @ kept.T, slopes @ kept.T], axis=1).swapaxes(2, 3)
+    effects = np.stack([changes @ directions.T, slopes @ directions.T], axis=1).swapaxes(2, 3)
     coefficients = fit_series(unit_contact, effects.reshape(len(contact), -1), *DIRECTION_DEGREES)
     *degree_axes, _ = coefficients.shape
     return coefficients.reshape(*degree_axes, *effects.shape[1:])
@@ -340,7 +345,7 @@ def _value_changes(
 
     halves = np.array_split(contact, 2)  # two workers share each film
     jobs = [partial(one.linearised, half) for one in films for half in halves]
-    results = in_order(executor, call, jobs)
+    results = in_order(executor, call, jobs)  # an iterator, from which each step of the loop takes two results
     changes = []
     for first, second in zip(results, results, strict=True):  # the two halves of one film follow one another
         film_charge, jacobian = map(np.concatenate, zip(first, second, strict=True))

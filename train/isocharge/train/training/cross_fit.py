@@ -14,7 +14,6 @@ training step, random noise with half of the estimated size is added to the char
 
 import logging
 from dataclasses import replace
-from functools import partial
 from statistics import NormalDist
 
 import numpy as np
@@ -128,9 +127,10 @@ def fit_presses(
     with threads_and_seed(training.threads, training.seed):
         features = signed_features(labelled.charge, noise.transition_charge(labelled.charge))
         # Cross-validation: train a network for each fold, and compute the answers to the presses of the fold.
-        create_network = partial(InverseNetwork, domain, features, labelled.charge, settings.network, force_std)
-        network = create_network()  # the network that is returned, which learns from the networks of the folds
-        fold_networks = [create_network() for _ in range(N_FOLDS)]
+        # The first network is that which is returned. It learns from the networks of the folds.
+        network, *fold_networks = (
+            InverseNetwork(domain, features, labelled.charge, settings.network, force_std) for _ in range(1 + N_FOLDS)
+        )
         fold_of_press = (N_FOLDS * position_ranks(merged_uncertain_places(usable))).astype(int)
         contact, std, misfit = _cross_validate(fold_networks, labelled, unit_contact, fold_of_press, noise, training)
         position_factor, force_factor = std_factors(contact, std, labelled.contact)
