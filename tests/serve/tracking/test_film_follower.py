@@ -173,14 +173,14 @@ def test_errors_of_the_charge_map_are_not_taken_for_changes_of_the_film(series, 
 
 @pytest.mark.first_cases(1)
 @pytest.mark.parametrize("change_MPa", [-0.3, 0.3])
-def test_a_sudden_change_is_followed_after_twenty_touches(series, model, change_MPa):
+def test_a_sudden_change_is_followed_after_eight_touches(series, model, change_MPa):
     """The forty touches before the change must not determine the pretension too well."""
     rng = np.random.default_rng(1)
     errors = []
     for _ in range(2):
         _, charge_before = touches(series, [0.0, 0.7, -0.8], rng, 40)
         contact, charge = touches(series, [change_MPa, 0.7, -0.8], rng, 40)
-        follower, _ = followed(model, np.concatenate([charge_before, charge[:20]]), rng, frames=4)
+        follower, _ = followed(model, np.concatenate([charge_before, charge[:8]]), rng, frames=4)
         errors.append(force_errors(follower, model, contact[20:], NOISE.add(charge[20:], rng)))
     rms_error, covered_share = np.mean(errors, axis=0)
     assert rms_error < 0.04

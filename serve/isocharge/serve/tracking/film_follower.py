@@ -14,9 +14,9 @@ together with the contact of the touch. The prior distribution of the state is G
 touches. The contact has no prior distribution, because nothing is known about it before the touch.
 
 The pretension, the gains and the offset may change between touches. Before each touch, their variances therefore
-increase a little, up to those before the first touch. A sudden change of the pretension is followed within about twenty
-touches. The changes along the uncertain directions belong to properties that a film keeps, so their variances only
-decrease.
+increase a little, up to those before the first touch. If a touch disagrees with the estimate, the pretension may have
+changed suddenly, and its variance becomes again that before the first touch. The changes along the uncertain directions
+belong to properties that a film keeps, so their variances only decrease.
 
 The network was trained for the film as it was calibrated. The charges of a frame are therefore converted into charges
 that the same contact would cause on the calibrated film, and the network computes the contact from the converted
@@ -127,6 +127,13 @@ MAX_MEAN_SQUARE = 3.0
 A squared distance is divided by the number of independent residuals of a touch.
 """
 
+SUDDEN_MEAN_SQUARE = 6.0
+"""Mean squared distance of a touch from the predicted touch, above which the pretension may have changed suddenly.
+
+A squared distance is divided by the number of independent residuals of a touch, and refers to the scaled errors. With a
+larger value, sudden changes are noticed later. With a smaller value, forces on an unchanged film are less accurate.
+"""
+
 CLEAR_CHANGE = 3.0
 """Number of standard deviations above which the change of an unknown is clear.
 
@@ -134,16 +141,11 @@ An unknown at an end of its range is implausible only if its change is clear, be
 film is always close to its lower end.
 """
 
-FADING_TOUCHES = 256
-"""Number of touches that decides how fast the variance of the pretension increases between touches.
+FADING_TOUCHES = 512
+"""Number of touches that decides how fast the variances of the pretension, the gains and the offset increase.
 
-After this number of touches without information about the pretension, 63 % of the information from earlier touches is
-lost. With a larger number, a sudden change after a long time without changes is hardly noticed. With a smaller number,
-forces are less accurate.
+After this number of touches without information about an unknown, 63 % of the information from earlier touches is lost.
 """
-
-SLOW_FADING_TOUCHES = 2 * FADING_TOUCHES
-"""Value of `FADING_TOUCHES` for the gains and the offset, which change more slowly than the pretension."""
 
 UNCHANGED_ODDS = 0.5
 """Odds, before the first touch, that the pretension has not changed since the calibration.
@@ -233,15 +235,13 @@ class FilmFollower(Stage):
         # The state consists of the state of the charge map, the logarithms of the gains and the common offset.
         film_size = 1 + series.direction_count
         self._film = slice(0, film_size)
+        self._directions = slice(1, film_size)
         self._gains = slice(film_size, film_size + len(electrodes))
         self._offset = self._gains.stop
         direction_std = np.ones(series.direction_count)
         gain_std = np.full(len(electrodes), GAIN_STD)
         std = np.hstack([series.tension_std_MPa, direction_std, gain_std, self._offset_std_pC])
         self._initial_std = np.maximum(std, SMALLEST_STD)
-        self._fading_touches = np.full(std.size, SLOW_FADING_TOUCHES, float)  # for each unknown
-        self._fading_touches[self._film] = math.inf
-        self._fading_touches[0] = FADING_TOUCHES
         highest = MAX_DEVIATION * self._initial_std
         lowest = -highest
         lowest[0], highest[0] = series.node_MPa[[0, -1]]
@@ -314,7 +314,8 @@ class FilmFollower(Stage):
         self._covariance[0, 0] += self._rule.drift_MPa_per_root_hour**2 * elapsed_hours
         # Each touch also restores a small part of the variance that earlier touches have removed.
         lost_variance = np.maximum(self._initial_std**2 - self._covariance.diagonal(), 0.0)
-        self._covariance += np.diag(lost_variance / self._fading_touches)
+        lost_variance[self._directions] = 0.0  # a film keeps these properties
+        self._covariance += np.diag(lost_variance / FADING_TOUCHES)
 
         # Compute the covariance of the three errors of the charges.
         touch_offset_pC = self._offset_std_pC * self._offset_ratio
@@ -336,10 +337,10 @@ class FilmFollower(Stage):
         self._touch_count += 1
 
         # Twice the cost is the sum of the squared residuals, in which large residuals have little weight. The residuals
-        # are divided by the scaled errors. Multiply by the scale, so that the sum refers to the unscaled errors. A
-        # touch has three independent residuals fewer than charges, because its contact is unknown.
-        mean_square = 2.0 * scale * estimate.cost / (charge_pC.size - 3)
-        self._mean_square += (mean_square - self._mean_square) / MEMORY_TOUCHES
+        # are divided by the scaled errors. A touch has three independent residuals fewer than charges, because its
+        # contact is unknown. Multiplied by the scale, the mean refers to the unscaled errors.
+        mean_square = 2.0 * estimate.cost / (charge_pC.size - 3)
+        self._mean_square += (scale * mean_square - self._mean_square) / MEMORY_TOUCHES
 
         # Decide whether the film is lost.
         is_changed = np.abs(estimate.state) > CLEAR_CHANGE * np.sqrt(self._covariance.diagonal())
@@ -352,6 +353,10 @@ class FilmFollower(Stage):
         elif not self.is_lost:
             self._apply_estimate()
             self._conversion = None  # the stored conversion belongs to the earlier state
+
+        # After a sudden change, the next touches determine the pretension, and not those before the change.
+        if mean_square > SUDDEN_MEAN_SQUARE:
+            self._covariance[0, 0] = max(self._covariance[0, 0], self._initial_std[0] ** 2)
 
     @property
     def _error_scale(self) -> float:
