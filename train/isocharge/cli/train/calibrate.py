@@ -61,6 +61,15 @@ def calibrate_command(
     force: ForceRangeOption = DEFAULT_FORCE_RANGE,
     position_std_mm: PositionStdOption = 0.1,
     force_std: ForceStdOption = 0.01,
+    charge_std_pC: Annotated[
+        float,
+        typer.Option(
+            "--charge-std",
+            metavar="PC",
+            min=1e-3,
+            help="Standard deviation of the charges of a frame at rest, pC; noise_pC of `isocharge serve doctor`.",
+        ),
+    ] = 1.0,
     next_count: Annotated[
         int,
         typer.Option(
@@ -100,7 +109,10 @@ def calibrate_command(
         )
     if file is None and output is not None:
         raise InputError("--output: nothing is calibrated without PRESSES.csv; give presses, or leave --output out")
-    problem = CalibrationProblem(load_sensor(sensor), parse_probe(probe), radius, force, stress_limit=stress_limit)
+    noise = replace(CalibrationProblem.noise, white=charge_std_pC)
+    problem = CalibrationProblem(
+        load_sensor(sensor), parse_probe(probe), radius, force, stress_limit=stress_limit, noise=noise
+    )
     if output is not None:
         check_calibration_folder(output, problem.electrodes)
 

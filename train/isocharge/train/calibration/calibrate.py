@@ -302,7 +302,8 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
     if errors.noise.gain > MAX_USUAL_NOISE:
         cautions.append(
             f"the charges scatter by about {100.0 * film.noise.gain:.2g} %, which the standard deviations of the model "
-            "contain: are the charges read at rest, does the film lie still, and is the noise of the board below 1 pC?"
+            "contain: are the charges read at rest, does the film lie still, and is the noise of the board at most "
+            f"{film.noise.white:g} pC (--charge-std)?"
         )
     if errors.position_ratio > 1.0:
         cautions.append(
