@@ -364,35 +364,42 @@ class ChargeDensity:
     def integrate(self, pieces: ElectrodePieces) -> Array:
         """Integrate the charge per area, which is known at the nodes of the mesh, over electrodes.
 
-        If only half of the film is meshed, points in the other half are reflected into the meshed half.
+        Each electrode consists of pieces. The integral over a piece is a sum over integration points. At a point, the
+        charge per area is interpolated between the nodes of the element that contains the point. If only half of the
+        film is meshed, points in the other half are reflected into the meshed half.
 
         Args:
             pieces: Pieces of the electrodes.
 
         Returns:
-            Charges without gains and crosstalk, shape (n, n_electrode, n_field), pC.
+            Charges without gains and crosstalk under n presses, shape (n, n_electrode, n_field), pC.
         """
         n_field = self.values.shape[-1]
         charge = np.zeros((self.position.size, pieces.electrode.max() + 1, n_field))
-        # After the rotation, the press is on the x axis. The unit is the radius of the film.
+        # The mesh is made for a press on the x axis, in units of the radius of the film. This factor rotates and scales
+        # a film point (x + iy) to the coordinates of the mesh under each press, shape (n,).
         rotation_and_scale = np.exp(-1j * np.angle(self.position)) / self.film_radius
+
+        # A rule contains the integration points and their areas, shape (n_pair, n_point), of some pairs of a press and
+        # a piece. In each pair, `press` and `piece` are the indices of the two.
         for rule in pieces.rules(self.probe, self.position):
-            # For each point, find its element, and select the charge per area at the nodes of the element, shape
-            # (n_pair, n_point, n_local, n_field).
-            points = rule.points * rotation_and_scale[rule.press, None]
+            press = rule.press[:, None]  # one row for each pair, and one column for all of its points
+            piece = rule.piece[:, None]
+
+            # For each point, find its element, and select the charge per area at the nodes of the element.
+            points = rule.points * rotation_and_scale[press]
             element, xi, eta, is_reflected = locate_points(self.placement[rule.press], self.template, points)
-            sign = is_reflected.astype(np.intp)  # index of the sign: 0 or 1
-            kind = pieces.kind[rule.piece, None]
-            nodal_density = self.values[sign, kind, rule.press[:, None], element]
+            reflection = is_reflected.astype(np.intp)  # index on the first axis of `values`: 0 or 1
+            nodal_density = self.values[reflection, pieces.kind[piece], press, element]
+            nodal_density = nodal_density.reshape(len(press), -1, n_field)  # shape (n_pair, n_point * n_local, n_field)
 
             # The weight of a node in the integral is the area of the point times the basis function of the node.
             basis_values = tensor_values(self.template.resolution.order, xi.ravel(), eta.ravel())
             node_weights = rule.area.reshape(-1, 1) * basis_values  # shape (n_pair * n_point, n_local)
 
-            # For each pair of press and piece, sum over its points and over the nodes of their elements. Then add the
-            # charges of all pieces of an electrode.
-            n_pair = len(rule.press)
-            pair_weights = node_weights.reshape(n_pair, 1, -1).astype(nodal_density.dtype)
-            pair_charge = pair_weights @ nodal_density.reshape(n_pair, -1, n_field)  # shape (n_pair, 1, n_field)
+            # For each pair, sum over its points and over the nodes of their elements. Then add the charge of the piece
+            # to that of its electrode.
+            pair_weights = node_weights.reshape(len(press), 1, -1).astype(nodal_density.dtype)
+            pair_charge = pair_weights @ nodal_density  # shape (n_pair, 1, n_field)
             np.add.at(charge, (rule.press, pieces.electrode[rule.piece]), pair_charge[:, 0])
         return charge

@@ -75,8 +75,9 @@ class MirrorRegion:
     def of(cls, charges: ChargeMap, radius: float, whole_film: ChargeMap, noise: NoiseModel) -> "MirrorRegion":
         """Compute which presses outside the working area have the same charges as a press inside the working area.
 
-        The part of the film outside the working area is divided into rings, and each ring is divided into sectors. The
-        presses lie in the middle of the sectors.
+        The part of the film outside the working area is divided into rings, and each ring is divided into sectors. In
+        the middle of each sector, presses with several forces are tested. The share of a sector is the fraction of its
+        presses whose charges also belong to a press inside the working area, within the noise.
 
         Args:
             charges: Accurate charge map of the working area.
@@ -85,13 +86,15 @@ class MirrorRegion:
             noise: Noise of the readings.
         """
         min_force, max_force = whole_film.domain.force_range
-        forces = np.geomspace(max(min_force, max_force / FORCE_RATIO), max_force, N_FORCES)
-        outer = whole_film.domain.radius
-        middles = Rings.between(radius, outer, N_RINGS, N_SECTORS)
-        presses = np.concatenate([middles.contacts(force) for force in forces.tolist()])
+        min_tested_force = max(min_force, max_force / FORCE_RATIO)
+        forces = np.geomspace(min_tested_force, max_force, N_FORCES)
+        outer_radius = whole_film.domain.radius
+        sector_middles = Rings.between(radius, outer_radius, N_RINGS, N_SECTORS)
+        presses = np.concatenate([sector_middles.contacts(force) for force in forces.tolist()])
+
         is_mirrored = has_mirror(within(charges, radius), whole_film.charges(presses), noise)
-        share = is_mirrored.reshape(N_FORCES, N_RINGS, N_SECTORS).mean(axis=0)
-        return cls(radius, outer, forces, share)
+        share = is_mirrored.reshape(N_FORCES, N_RINGS, N_SECTORS).mean(axis=0)  # mean over the forces
+        return cls(radius, outer_radius, forces, share)
 
     @property
     def edges(self) -> Array:

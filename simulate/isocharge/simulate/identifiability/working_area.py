@@ -234,28 +234,30 @@ def find_ambiguous_pairs(
         places: Number of positions, which are distributed evenly over the disk.
 
     Returns:
-        The pairs, ordered by the distance of the outer contact from the centre.
+        The pairs, ordered by the distance of the outer contact from the centre. The outer contact is the contact that
+        is farther from the centre.
     """
-    # Choose the first contacts. For each of them, several searches find a second contact with similar charges. Their
-    # tolerance is coarse, because one digit of the difference of the charges is sufficient.
+    # Choose n first contacts (x, y, F). For each of them, several searches find a second contact with similar charges.
+    # Their tolerance is coarse, because one digit of the difference of the charges is sufficient.
     domain_radius = charge_map.domain.radius
     first_position = INNER_RADIUS * domain_radius * sunflower(places)
-    contact = np.concatenate([contacts_at(first_position, force) for force in forces])
+    contact = np.concatenate([contacts_at(first_position, force) for force in forces])  # shape (n, 3)
     charge = charge_map.charges(contact)
     second, residual = local_minima(charge_map, charge, noise.sigma(charge), starts=STARTS, min_change=1e-4)
-    first = np.broadcast_to(contact[:, None], second.shape)  # shape (n, STARTS, 3)
+    first = np.broadcast_to(contact[:, None], second.shape)  # shape (n, STARTS, 3), like `second`
 
     # Select the pairs whose positions are distant, and whose charges agree within the noise. The results of searches
     # that find the first contact again are thus discarded.
-    position_std = limits_at(charge_map, contact, noise).position  # shape (n,)
+    distance = np.linalg.norm(second[:, :, :2] - first[:, :, :2], axis=2)  # shape (n, STARTS), mm
+    position_std = limits_at(charge_map, contact, noise).position  # of an estimated position, shape (n,), mm
     min_distance = min(MIN_DISTANCE, MIN_RELATIVE_DISTANCE * domain_radius)
-    min_distances = np.maximum(min_distance, MIN_DISTANCE_SIGMAS * position_std)
-    distance = np.linalg.norm((second - first)[..., :2], axis=2)  # shape (n, STARTS), mm
-    charge_difference = np.linalg.norm(residual, axis=2)
-    is_ambiguous = (distance > min_distances[:, None]) & (charge_difference < INDISTINGUISHABLE_SIGMAS)
+    min_distance_of_contact = np.maximum(min_distance, MIN_DISTANCE_SIGMAS * position_std)
+    is_distant = distance > min_distance_of_contact[:, None]
+    charge_difference = np.linalg.norm(residual, axis=2)  # in standard deviations of the noise
+    is_ambiguous = is_distant & (charge_difference < INDISTINGUISHABLE_SIGMAS)
 
     # Several searches of a first contact often find the same second contact, which counts once.
-    is_ambiguous &= ~_is_repeated(second[..., :2], is_ambiguous, position_std)
+    is_ambiguous &= ~_is_repeated(second[:, :, :2], is_ambiguous, position_std)
     pairs = AmbiguousPairs(first[is_ambiguous], second[is_ambiguous], charge_difference[is_ambiguous])
     order = np.argsort(pairs.outer_radius, kind="stable")
     return AmbiguousPairs(pairs.first[order], pairs.second[order], pairs.charge_difference[order])

@@ -140,8 +140,10 @@ class DesignCase:
     def _check_kept_electrodes(self) -> None:
         """Raise an error if the electrodes to be kept cannot be a part of the new layout.
 
-        The kept electrodes must exist and must be at their nominal positions. At least one electrode must be new. With
-        the readout 'edge', all squares must have the same side.
+        The attribute `keep` contains the names of electrodes of the sensor that keep their positions, and `electrodes`
+        is the number of electrodes of the new layout. At least one electrode must be new. The sensor must not be
+        calibrated, because a calibration moves its electrodes. With the readout 'edge', kept squares must have the side
+        of the new squares.
 
         Raises:
             InputError: If a rule is violated.
@@ -153,13 +155,15 @@ class DesignCase:
             raise InputError(
                 f"keep: {len(self.keep)} of {self.electrodes} electrodes are kept, so there is nothing to place"
             )
-        if self.kept_electrodes and self.sensor.calibration != Calibration():
+        is_calibrated = self.sensor.calibration != Calibration()
+        if self.kept_electrodes and is_calibrated:
             raise InputError(f"keep: {self.sensor.name} is calibrated; start from its layout without [calibration]")
 
         if self.sensor.readout != "edge":
             return
+        rounding_error = 1e-6  # mm
         for electrode in self.kept_electrodes:
-            if electrode.side is not None and abs(electrode.side - self.square_side) > 1e-6:  # rounding errors
+            if electrode.side is not None and abs(electrode.side - self.square_side) > rounding_error:
                 raise InputError(
                     f"side: with the readout 'edge' all squares have one side, got {self.square_side:g} mm"
                 )

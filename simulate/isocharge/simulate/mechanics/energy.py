@@ -270,6 +270,11 @@ class Membrane:
     def tangent(self, field: Array, added_tension: float, unknowns_per_node: int) -> Array:
         """Compute the second derivatives of the stretching energy of each element.
 
+        The energy depends on the unknowns only through the slopes, which are the derivatives of the displacements with
+        respect to the coordinates X1 and X2. The slopes are linear functions of the unknowns. With the matrix G of
+        these functions, the second derivatives with respect to the unknowns are therefore the sum of G' S G over the
+        quadrature points, where S contains the second derivatives of the energy with respect to the slopes.
+
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
             added_tension: Tension that is added to the pretension, in units of E_young A^2.
@@ -281,31 +286,31 @@ class Membrane:
             and the node of the second derivative. The derivatives with respect to a fourth unknown are zero.
         """
         mesh = self.mesh
-        gradient = mesh.gauss_gradient  # shape (n_element, n_point, 2, n_local)
         slopes = self._slopes(field)
-        deformation = self._deformation_gradient(slopes)
 
-        # The total stress (S11, S22, S12) is the sum of the elastic stress and the pretension. Multiply the stress and
-        # the material stiffness by the integration weights.
+        # Compute the two parts of S, multiplied by the integration weights of the points. One part is caused by the
+        # stress (S11, S22, S12), which is the sum of the elastic stress and the pretension. The other part is the
+        # stiffness of the material.
         elastic_stress = strain(slopes, self.groups.squared_amplitude) @ self.groups.elasticity
         total_stress = elastic_stress + self._pretension + added_tension * EQUAL_TENSION
-        weighted_stress = _symmetric_matrix(total_stress * mesh.weights[..., None])
-        weighted_stiffness = self._material_stiffness(deformation) * mesh.weights[..., None, None, None, None]
+        weighted_stress = _symmetric_matrix(total_stress * mesh.weights[..., None])  # (n_element, n_point, 2, 2)
+        stiffness = self._material_stiffness(self._deformation_gradient(slopes))  # (n_element, n_point, 2, 3, 2, 3)
+        weighted_stiffness = stiffness * mesh.weights[..., None, None, None, None]
 
         # Compute one block of the matrix for each pair (i, j) of displacement components. The matrix is symmetric, so
         # the blocks below the diagonal are transposed copies of the blocks above the diagonal.
+        gradient = mesh.gauss_gradient  # G, shape (n_element, n_point, 2, n_local)
+        transposed_gradient = np.ascontiguousarray(mesh.stacked_gradient.transpose(0, 2, 1))  # G', all points in a row
         n_element, _, _, n_local = gradient.shape
-        transposed_gradient = np.ascontiguousarray(mesh.stacked_gradient.transpose(0, 2, 1))
         matrix = np.zeros((n_element, unknowns_per_node, n_local, unknowns_per_node, n_local))
         for i, j in combinations_with_replacement(range(3), 2):
-            # Second derivatives of the energy density with respect to the slopes of the components i and j, shape
-            # (n_element, n_point, 2, 2). The stress contributes only if both components are the same.
+            # S for the slopes of the components i and j, shape (n_element, n_point, 2, 2). The stress contributes only
+            # if both components are the same.
             slope_stiffness = weighted_stiffness[..., i, :, j].copy()
             if i == j:
                 slope_stiffness += self._slope_weights[i] * weighted_stress
 
-            # Compute gradient' slope_stiffness gradient, summed over the quadrature points and the two derivatives at
-            # each point.
+            # The product of G' and the stacked S G also sums over the points and over the two slopes at each point.
             stacked_product = (slope_stiffness @ gradient).reshape(n_element, -1, n_local)
             np.matmul(transposed_gradient, stacked_product, out=matrix[:, i, :, j])
             if i != j:

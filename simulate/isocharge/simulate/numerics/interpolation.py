@@ -300,10 +300,20 @@ class Turns:
         return list(zip(self.direction[:n_solved].tolist(), self.rotation[:n_solved].tolist(), strict=True))
 
     def weights(self, direction: Array, rotation: Array) -> Array:
-        """Compute the weights with which values at all turns are interpolated at other presses.
+        """Compute the weights with which the values at all turns are interpolated at other presses.
 
-        A turn is a pair of a direction and a rotation at which presses are solved. The values depend on both angles
-        like a Fourier series, so the value at a press is a weighted sum of the values at all turns.
+        A turn is a pair of angles, a direction and a rotation, at which presses are solved. Let a be the angles of a
+        press, and b_j the angles of the turn j. A value v depends on the angles like the Fourier series
+
+            v(a) = sum over h of c_h exp(i h.a),
+
+        where h is a pair of integers in `harmonics`. The turns are the points of a lattice on which the terms are
+        orthogonal, so that c_h is the mean of v(b_j) exp(-i h.b_j) over all turns. The value at the press is therefore
+        the sum of w_j v(b_j) with the weights
+
+            w_j = (sum over h of exp(i h.a) exp(-i h.b_j)) / n_turn.
+
+        The sum over h is real, because `harmonics` contains -h for each h.
 
         Args:
             direction: Directions from the centre of the film to the presses, plus the rotation of a probe that is not
@@ -313,15 +323,13 @@ class Turns:
         Returns:
             Weights, shape (n, n_turn). The weights of each press sum to 1.
         """
-        # Phase of each term exp(i phase) of the Fourier series at the presses and at the turns
-        press_angles = np.stack(np.broadcast_arrays(direction, rotation), axis=1)
-        press_phase = press_angles @ self.harmonics.T  # shape (n, n_term)
-        turn_angles = np.stack([self.direction, self.rotation], axis=1)
-        turn_phase = turn_angles @ self.harmonics.T  # shape (n_turn, n_term)
+        press_angles = np.stack(np.broadcast_arrays(direction, rotation), axis=1)  # a, shape (n, 2)
+        turn_angles = np.stack([self.direction, self.rotation], axis=1)  # b, shape (n_turn, 2)
+        press_phase = press_angles @ self.harmonics.T  # h.a, shape (n, n_term)
+        turn_phase = turn_angles @ self.harmonics.T  # h.b, shape (n_turn, n_term)
 
-        # A weight is the sum of exp(i (phase at the press - phase at the turn)) over the terms, divided by `n_turn`.
+        sum_over_terms = np.exp(1j * press_phase) @ np.exp(-1j * turn_phase).T  # shape (n, n_turn)
         n_turn = self.rotation.size
-        sum_over_terms = np.exp(1j * press_phase) @ np.exp(-1j * turn_phase).T
         return np.asarray(sum_over_terms.real / n_turn)
 
 

@@ -233,13 +233,17 @@ class FilmPrior:
 
     @cached_property
     def properties(self) -> tuple[FilmProperty, ...]:
-        """Declarations of all unknown properties of a real film, in the order of the vector of their values."""
+        """Declarations of all unknown properties of a real film, in the order of the vector of their values.
+
+        The properties in `FILM_PROPERTIES` come first. The radius of a circular probe and the gains of the electrodes
+        follow.
+        """
         # No electrode may reach the rim. A shift of the electrodes may use half of the gap between the electrodes and
-        # the rim, and an oval clamp the other half. Each of them has two components of up to this size, whose vector
-        # sum is larger by a factor of sqrt(2).
-        largest_shift = 0.5 * self._rim_gap / math.sqrt(2.0)
-        largest_oval = largest_shift / self.sensor.film.radius
-        largest_values = {
+        # the rim, and an oval clamp the other half. Each of them has two components. If both components have the
+        # largest size, the length of their vector sum is sqrt(2) times this size.
+        largest_shift = 0.5 * self._rim_gap / math.sqrt(2.0)  # mm
+        largest_oval = largest_shift / self.sensor.film.radius  # relative to the radius of the film
+        largest_sizes = {
             "shift_x": largest_shift,
             "shift_y": largest_shift,
             "oval_x": largest_oval,
@@ -248,17 +252,31 @@ class FilmPrior:
         properties = []
         for film_property in FILM_PROPERTIES:
             low, high = film_property.limits
-            largest = largest_values.get(film_property.name, math.inf)
-            properties.append(replace(film_property, bounds=(max(low, -largest), min(high, largest))))
+            largest_size = largest_sizes.get(film_property.name, math.inf)
+            bounds = (max(low, -largest_size), min(high, largest_size))
+            properties.append(replace(film_property, bounds=bounds))
 
-        # Append the radius of the probe and the gains of the electrodes.
         if isinstance(self.probe, Circle):
             radius = self.probe.radius
-            bounds = (-MAX_RADIUS_DEVIATION * radius, MAX_RADIUS_DEVIATION * radius)
-            std = min(0.3, 0.3 * radius)
-            properties.append(FilmProperty("probe_radius", "radius of the probe", "mm", std, 0.01, bounds=bounds))
+            largest_deviation = MAX_RADIUS_DEVIATION * radius
+            probe_radius = FilmProperty(
+                name="probe_radius",
+                meaning="radius of the probe",
+                unit="mm",
+                std=min(0.3, 0.3 * radius),
+                drift=0.01,
+                bounds=(-largest_deviation, largest_deviation),
+            )
+            properties.append(probe_radius)
         for name in self.sensor.electrode_names:
-            gain = FilmProperty(f"gain {name}", f"ln of the gain of {name}", "1", 0.05, 0.005, bounds=(-1.5, 1.5))
+            gain = FilmProperty(
+                name=f"gain {name}",
+                meaning=f"ln of the gain of {name}",
+                unit="1",
+                std=0.05,
+                drift=0.005,
+                bounds=(-1.5, 1.5),
+            )
             properties.append(gain)
         return tuple(properties)
 

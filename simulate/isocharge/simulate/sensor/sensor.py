@@ -153,18 +153,21 @@ class Electrode:
 
     @cached_property
     def side(self) -> float | None:
-        """Side of a square electrode as `of_square` creates it, mm; None for all other electrodes.
+        """Side of the electrode if it is a square whose sides are parallel to the axes, mm; otherwise None.
 
-        The edge readout accepts only such squares.
+        The corners of the square must begin at the lower left and follow anticlockwise, as `of_square` creates them.
+        The square must be the only metal on the front, and the back must be completely covered with metal.
         """
-        if self.more or self.back or len(self.corners) != 4:
+        has_other_polygons = self.more or self.back
+        if has_other_polygons or len(self.corners) != 4:
             return None
 
-        # Compare the corners with those of a square of the same width.
-        (left_x, _), (right_x, _), *_ = self.corners  # the lower corners of a square
-        side = right_x - left_x
+        # Compare the corners with those of a square whose lower side has the same length.
+        (lower_left_x, _), (lower_right_x, _), *_upper_corners = self.corners
+        side = lower_right_x - lower_left_x
         square = Electrode.of_square(self.name, self.centre, side)
-        is_square = side > 0.0 and np.allclose(self.corners, square.corners, rtol=0.0, atol=1e-9 * side)
+        rounding_error = 1e-9 * side
+        is_square = side > 0.0 and np.allclose(self.corners, square.corners, rtol=0.0, atol=rounding_error)
         return side if is_square else None
 
     @property

@@ -370,22 +370,27 @@ def _first_resolution(case: LoadCase) -> Resolution:
 def _needs_more_sectors(case: LoadCase) -> bool:
     """Return whether eight elements around the innermost circle of the mesh are too few for a press.
 
-    They are too few in two cases. In the first case, the footprint is not circular, and the circle that encloses it
-    with the full gap does not fit on the film. In the second case, the uneven part of the pretension is not small
-    compared with the stress that the force causes. The deflection around the probe then depends strongly on the
-    direction.
+    The innermost circle encloses the footprint of the probe, and the rings of the mesh lie around it. Eight elements
+    are too few in two cases:
+
+    - The footprint is not circular, and the innermost circle with the normal gap around the footprint does not fit on
+      the film.
+    - The uneven part of the pretension is not small compared with the stress that the force causes. The deflection
+      around the probe then depends strongly on the direction.
 
     Args:
         case: The press.
     """
     film = case.film
     probe = case.probe
-    enclosing_extent = farthest_distance(film, probe, case.at) + CLEARANCE * probe.reach
-    is_crowded = not probe.topology.fills_circle and enclosing_extent > film.radius
+    normal_gap = CLEARANCE * probe.reach
+    extent_with_gap = farthest_distance(film, probe, case.at) + normal_gap  # distance from the centre of the film
+    is_crowded = not probe.topology.fills_circle and extent_with_gap > film.radius
 
     load_stress = film.young * amplitude_squared(film, case.force)
     uneven_stress = np.hypot(*film.deviator)
-    return is_crowded or bool(uneven_stress > MAX_UNEVENNESS * load_stress)
+    is_uneven = bool(uneven_stress > MAX_UNEVENNESS * load_stress)
+    return is_crowded or is_uneven
 
 
 def _thin_ring_count(placement: Placement, total_width: float) -> int:
