@@ -203,21 +203,31 @@ def spread_contacts(domain: Domain) -> Array:
 
 
 def _candidates(problem: CalibrationProblem) -> Array:
-    """Return the contacts (x, y, F) of the presses that are compared, shape (n, 3), mm and N.
+    """Return the contacts (x, y, F) from which the next press of a calibration is chosen.
 
-    Positions and forces are rounded to grids, so that a person can set them. No force causes too large a stress.
+    The positions cover the working area evenly. Each position occurs with each of a few forces. Positions and forces
+    are rounded to grids, so that a person can set them. No force causes a larger stress than the problem allows.
+
+    Args:
+        problem: The calibration problem, with the film, the probe, the working area and the largest allowed stress.
+
+    Returns:
+        Contacts, shape (n, 3), mm and N.
     """
     domain = problem.domain
-    grid_position = np.unique(np.round(sunflower(N_CONTACTS) * domain.radius / GRID_MM), axis=0)
-    rounded_position = GRID_MM * grid_position + 0.0  # not -0.0
-    position = rounded_position[np.hypot(*rounded_position.T) <= domain.radius]
+    even_position = domain.radius * sunflower(N_CONTACTS)  # shape (N_CONTACTS, 2), mm
+    rounded_position = GRID_MM * np.round(even_position / GRID_MM)
+    rounded_position += 0.0  # replaces -0.0 by 0.0, which is easier to read
+    rounded_position = np.unique(rounded_position, axis=0)
+    distance = np.hypot(rounded_position[:, 0], rounded_position[:, 1])  # from the centre
+    position = rounded_position[distance <= domain.radius]
 
     low, high = domain.force_range
     film_limit = force_within_stress(problem.sensor.film, problem.probe, problem.stress_limit, domain.force_range)
     high_within_stress = min(high, film_limit)
     force = log_spaced_forces(np.array(CANDIDATE_FORCES), (low, high_within_stress))
     grid_N = min(GRID_N, low)
-    rounded_force = np.clip(np.round(force / grid_N) * grid_N, low, high_within_stress)
+    rounded_force = np.clip(grid_N * np.round(force / grid_N), low, high_within_stress)
     return np.array([(x, y, force_N) for x, y in position for force_N in rounded_force])
 
 

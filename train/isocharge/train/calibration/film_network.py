@@ -29,22 +29,30 @@ def training_data(
 ) -> TrainingData:
     """Draw the presses from which the network of a calibrated film learns.
 
+    Each press is made on another film, which is drawn from the posterior distribution of the calibrated film.
+
     Args:
         charges: Charges of the solved film and of similar films.
         film: The estimate of the film.
         series: The compact charge map of the film.
         executor: Executor that solves the presses outside the working area; None for this process.
+
+    Returns:
+        The presses inside and outside the working area, with the sensor, the probe and the force at which it yields.
     """
     rng = np.random.default_rng([SEED, 1])
     domain = series.domain
     contact = draw_contacts(rng, domain, N_PRESSES)
-    charge = _drawn_charges(series, rng, contact)
-    # The film is estimated for the middle of the session. After the session, the gain differs by half of the drift, and
-    # may change further or return. The root mean square of the drift follows from its estimate and its standard
-    # deviation.
+    charge = _drawn_charges(series, rng, contact)  # shape (N_PRESSES, n_electrode), pC
+
+    # The property "drift" is the relative change of the gain during the session of measured presses. The film is
+    # estimated for the middle of the session. After the session, the gain therefore differs from the estimate by half
+    # of the drift, and may change further or return. One gain error is drawn for each press.
     drift_rms = np.hypot(film.value("drift"), film.std("drift"))
-    gain_error = 0.5 * drift_rms * rng.standard_normal((N_PRESSES, 1))
+    gain_error_std = 0.5 * drift_rms
+    gain_error = gain_error_std * rng.standard_normal((N_PRESSES, 1))
     charge *= 1.0 + gain_error
+
     sensor, probe = charges.prior.film(film.film_values)
     return TrainingData(
         sensor=sensor,

@@ -121,6 +121,9 @@ def export_c(model: Path, output: Path, device: Device = ANY_BOARD, *, command: 
 def c_files(model: Path, device: Device, command: str) -> dict[str, str]:
     """Return the texts of all files of an export, by their paths in the folder of the export.
 
+    The export contains the sources of the model and of the signal chain, a test of them, an example for a computer, and
+    an Arduino sketch.
+
     Args:
         model: Version folder of the model.
         device: Board, for the settings of its signal chain.
@@ -131,21 +134,24 @@ def c_files(model: Path, device: Device, command: str) -> dict[str, str]:
         DeviceError: If a setting of the device file is for other electrodes.
     """
     loaded = load_model(model)
-    path = loaded.folder / "model.onnx"
     metadata = loaded.metadata
-    network = read_graph(path.read_bytes(), str(path))
     n_electrode = len(metadata.electrodes)
-    # The README contains the command between backticks, so the command itself must not contain any.
-    command_in_one_line = " ".join(command.replace("`", "'").split())
-    sketch = {
+    graph_path = loaded.folder / "model.onnx"
+    network = read_graph(graph_path.read_bytes(), str(graph_path))
+
+    # Sources that every program needs
+    sources = {
         "isocharge_model.h": model_header(metadata, network),
         "isocharge_model.c": model_source(metadata, network),
         "isocharge_device.h": device_header(device, metadata.electrodes, has_any_sign=metadata.has_any_sign),
     }
     for name in ("isocharge_chain.h", "isocharge_chain.c", "isocharge_frames.h", "isocharge_frames.c"):
-        sketch[name] = source_text(name)
+        sources[name] = source_text(name)
+
+    # The README contains the command between backticks, so the command itself must not contain any.
+    command_in_one_line = " ".join(command.replace("`", "'").split())
     files = {
-        **sketch,
+        **sources,
         "host_example.c": source_text("host_example.c"),
         "self_test.c": self_test(loaded.golden, metadata),
         "README.md": source_text(
@@ -157,7 +163,12 @@ def c_files(model: Path, device: Device, command: str) -> dict[str, str]:
             origin=settings_origin(device),
         ),
     }
-    # The Arduino sketch has a folder of its own with copies of the sources. Each electrode has an analogue pin.
-    sketch["isocharge_device.h"] = SINGLE_PRECISION + sketch["isocharge_device.h"]
-    sketch["isocharge_sketch.ino"] = source_text("sketch.ino", pins=", ".join(f"A{pin}" for pin in range(n_electrode)))
+    # The Arduino sketch has a folder of its own with copies of the sources. Each electrode has an analogue pin, such as
+    # A0. The signal chain of the sketch computes in single precision.
+    pins = ", ".join(f"A{index}" for index in range(n_electrode))
+    sketch = {
+        **sources,
+        "isocharge_device.h": SINGLE_PRECISION + sources["isocharge_device.h"],
+        "isocharge_sketch.ino": source_text("sketch.ino", pins=pins),
+    }
     return files | {f"arduino/isocharge_sketch/{name}": text for name, text in sketch.items()}
