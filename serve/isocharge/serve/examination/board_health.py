@@ -285,14 +285,15 @@ def channel_sentences(
 
 
 def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress) -> Iterator[str]:
-    """Yield one sentence for each missing setting or property that is needed for the force of a held press.
+    """Yield one sentence for each setting or property that is missing for the force of a press that is held.
 
-    Without the setting, the computed force changes during the press, because the amplifiers leak. Touches are computed
-    in any case.
+    The charge amplifiers leak: the charge of a held press decays with a time constant, which the section `[leak]` of
+    the device file states. The program corrects the leak with the times of the frames. Two things may be missing:
 
-    - If the device file contains time constants of a leak, each frame must contain the time of a clock of the device.
-    - If no press was held, the time constants of the amplifiers are requested, unless the device file contains them.
-      If a press was held, the result of the port check already states its time constants.
+    - A device clock. If the leak is corrected, each frame should contain the time of a clock of the device.
+    - The time constants. They are requested if the device file contains no leak and no press was held during the
+      check. If a press was held, its description already states the time constants. A board that sends currents instead
+      of charges needs no time constants.
 
     Args:
         capture: The frames, at least one.
@@ -300,12 +301,14 @@ def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress
         held_press: Press that was held during the check.
     """
     has_device_clock = capture.frames[0].t_us is not None
-    if device.rule(LeakRule) is not None and not has_device_clock:
+    is_leak_corrected = device.rule(LeakRule) is not None
+    if is_leak_corrected and not has_device_clock:
         yield (
             "send the time of a device clock in each frame (t_us, t_ms or t_s): without it the leak is corrected with "
             "the arrival times, which jitter"
         )
-    if not held_press.description and device.rule(LeakRule) is None and not device.has_currents:
+    was_press_held = held_press.description != ""
+    if not was_press_held and not is_leak_corrected and not device.has_currents:
         yield (
             "state the time constants of the amplifiers in a device file ([leak] tau_s): without them the force of a "
             "held press seems to decrease. The time constants follow from the circuit. To measure them instead, listen "

@@ -42,10 +42,18 @@ A reading cannot arrive before it was taken, so the limit is smaller than that o
 
 
 def elapsed_s(previous: Chunk, chunk: Chunk) -> float:
-    """Return the time between two chunks of one source, s. The result does not depend on the wall clock.
+    """Return the time between the arrivals of two chunks of one source, at least 0 s.
 
-    All chunks of a file have the same time of arrival, so the result is 0. If the caller that created the chunks states
-    no monotonic time, so that `clock_ns` is constant, the times of arrival are used.
+    A chunk contains the bytes that arrived together, and the two times of their arrival: `timestamp` on the wall clock
+    and `clock_ns` on a monotonic clock. The wall clock may be set at any time, so the monotonic clock is used, with two
+    exceptions:
+
+    - All chunks of a file have the same `timestamp`. The result is then 0.
+    - All chunks have the same `clock_ns` if their source does not state a monotonic time. The wall clock is then used.
+
+    Args:
+        previous: The earlier chunk.
+        chunk: The later chunk.
     """
     wall_s = chunk.timestamp - previous.timestamp
     monotonic_ns = chunk.clock_ns - previous.clock_ns

@@ -245,13 +245,21 @@ class TextParser(DelimitedParser):
         self._cycle = []
 
     def _update_seq_modulus(self, seq: int) -> None:
-        """Use the next value of the counter to determine the value at which the counter wraps."""
-        largest_seq = self._last_seq  # if the counter has wrapped
+        """Infer from the next value of the frame counter the value `seq_modulus` at which the counter wraps to 0.
+
+        If the counter decreases from 99, 255, 999, 9999 or 65535, it has wrapped, and the modulus is the next number,
+        such as 100. If the counter reaches the modulus that was assumed, a larger modulus is assumed: 256 or 65536.
+
+        Args:
+            seq: Next value of the frame counter.
+        """
+        previous_seq = self._last_seq
         self._last_seq = seq
-        if seq < largest_seq and largest_seq + 1 in SEQ_MODULI:
-            self.seq_modulus = largest_seq + 1
+        if seq < previous_seq and previous_seq + 1 in SEQ_MODULI:
+            self.seq_modulus = previous_seq + 1
         elif seq >= self.seq_modulus:
-            self.seq_modulus = SEQ_MODULI[0] if seq < SEQ_MODULI[0] else SEQ_MODULUS
+            byte_modulus = SEQ_MODULI[0]
+            self.seq_modulus = byte_modulus if seq < byte_modulus else SEQ_MODULUS
 
     def _collect_line(self, text: str, size: int) -> list[Frame]:
         """Collect a line until a layout is recognised, and then return the frames in the collected lines.
@@ -409,20 +417,23 @@ def _has_channel_number(layout: Layout, lines: Sequence[Line]) -> bool:
         layout: Layout of a frame with its names.
         lines: The lines since the beginning.
     """
-    if len(layout.patterns) > 1:
+    if len(layout.patterns) > 1:  # a frame consists of several lines, whose values all have names
         return False
-    rows = [row for line in lines[-MAX_CYCLE_LINES:] if (row := line_values(layout.patterns[0], line.text))]
-    columns = np.array(rows).T  # shape (columns, lines)
+    (pattern,) = layout.patterns
+    values_of_lines = [line_values(pattern, line.text) for line in lines[-MAX_CYCLE_LINES:]]
+    columns = np.array([values for values in values_of_lines if values]).T  # shape (n_column, n_line)
+
+    n_varying = np.sum(np.ptp(columns, axis=1) > 0.0)
+    if n_varying == 1 and len(columns) > 3:  # the other columns, at least three, are constant charges
+        return False
+
     decreases = np.any(columns != np.sort(columns), axis=1)  # whether each column decreases at least once
-    varies = np.ptp(columns, axis=1) > 0.0
-    if varies.sum() == 1 and len(columns) > 3:
-        return False
-    return any(
-        name not in {SEQ, *ascii_uppercase}
-        and decreases.sum() - decreases[index] < 3
-        and _counts_up_repeatedly(columns[index])
-        for index, name in enumerate(layout.names)
-    )
+    for name, column, column_decreases in zip(layout.names, columns, decreases, strict=True):
+        has_other_meaning = name in {SEQ, *ascii_uppercase}
+        n_others_decreasing = decreases.sum() - column_decreases
+        if not has_other_meaning and n_others_decreasing < 3 and _counts_up_repeatedly(column):
+            return True
+    return False
 
 
 def _counts_up_repeatedly(column: Array) -> bool:
@@ -431,7 +442,8 @@ def _counts_up_repeatedly(column: Array) -> bool:
     Args:
         column: Numbers in the column, shape (lines,).
     """
-    numbers, ranks = np.unique(column, return_inverse=True)  # the different numbers, and the index of each line's
+    # The different numbers in ascending order, and for each line the index of its number among them
+    numbers, ranks = np.unique(column, return_inverse=True)
     if not 3 <= len(numbers) <= 8 or numbers[0] not in range(100):
         return False
     are_consecutive = np.all(np.diff(numbers) == 1.0)

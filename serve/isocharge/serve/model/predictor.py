@@ -78,10 +78,10 @@ class Predictor:
     def with_noise(self, white_pC: ArrayLike, gain: ArrayLike) -> "Predictor":
         """Return a predictor of the same model for charges with another noise.
 
-        The predicted contacts are the same. Noise beyond that of the training increases the covariance of a contact.
-        The increase is computed from predictions with changed charges. With less noise than in the training, the
-        standard deviations do not change. The misfit is in units of the larger noise.
-        `predict_into` ignores the noise.
+        The predicted positions and forces are the same. If the given noise is larger than that of the training, it
+        increases the standard deviations of the contacts, and the misfit is in units of the given noise. If the given
+        noise is smaller, the standard deviations and the misfit do not change. The method `predict_into` ignores the
+        given noise.
 
         Args:
             white_pC: Standard deviation of the part of the noise that does not depend on the charge, pC. It is one
@@ -92,15 +92,17 @@ class Predictor:
         Raises:
             ChargeError: If a standard deviation is not a finite number of at least 0, or if a list has another length.
         """
-        stated = {"name": "stated", "white_pC": np.asarray(white_pC).tolist(), "gain": np.asarray(gain).tolist()}
-        noise = convert(stated, ModelNoise, "noise", ChargeError)
+        content = {"name": "stated", "white_pC": np.asarray(white_pC).tolist(), "gain": np.asarray(gain).tolist()}
+        noise = convert(content, ModelNoise, "noise", ChargeError)  # checks the types and the signs
         try:
-            structs.replace(self.metadata, noise=noise)  # runs the checks of the metadata
+            structs.replace(self.metadata, noise=noise)  # only to check the lengths of the lists
         except WrongKey as error:
             raise ChargeError(f"{error.key}: {error}") from error
-        # The new predictor is made without `__init__`, which would load the model again, and uses the same session.
+
+        # The charges of a touch must exceed the stated noise, too.
+        validity = replace(self.validity, white_pC=noise.white_pC)
+        # Copy the attributes of this predictor. A call of `__init__` would load the model again.
         new_predictor = object.__new__(type(self))
-        validity = replace(self.validity, white_pC=noise.white_pC)  # a touch must also exceed the stated noise
         new_predictor.__dict__.update(self.__dict__, noise=noise, validity=validity)
         return new_predictor
 

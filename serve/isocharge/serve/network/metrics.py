@@ -143,19 +143,28 @@ class Traffic:
     """
 
     def __init__(self, log: RequestLog | None = None) -> None:
-        """Create the metrics of a server that has not received any request."""
+        """Create a registry with the metrics of a server that has not received any request.
+
+        Each metric adds itself to the registry that it is given.
+
+        Args:
+            log: Log to which each request is written, or None if there is no log.
+        """
+        self.log = log
         registry = CollectorRegistry()
-        ProcessCollector(registry=registry)
+        self.registry = registry
+        ProcessCollector(registry=registry)  # memory and processor time of the process
         Info("isocharge", "Version of the server.", registry=registry).info({"version": package_version()})
+
         requests = Counter(
             "isocharge_requests",
             "Requests that were answered or refused.",
             ("transport", "route", "status"),
             registry=registry,
         )
-        self._requests = cache(requests.labels)  # is faster, and clients cannot create further labels
-        self.log = log
-        self.registry = registry
+        # The method `labels` returns the counter for given values of the labels, and takes some time. Its results are
+        # stored. Clients cannot choose the values of the labels, so only a few counters are stored.
+        self._requests = cache(requests.labels)
         self.open = Gauge(
             "isocharge_open", "Open connections of HTTP and open calls of gRPC.", ("transport",), registry=registry
         )

@@ -86,20 +86,23 @@ class CsvTable:
         self._names = names
         self._error_class = error_class
         self._expected = expected
-        checked_lines = self._checked_lines(lines)
-        first_lines = list(islice(checked_lines, _MAX_LINES_TO_HEADER))
-        lines_above, self._separator, header_line = _find_header(first_lines or [""], names)
-        # The header may have lost the mark of a comment. The lines below the header follow unchanged.
-        table_lines = chain([header_line], first_lines[lines_above + 1 :], checked_lines)
-        self._rows = self._numbered_rows(table_lines, lines_above)
-        _, header = next(self._rows, (0, []))  # the first row, or no cells if there is no row
-        if not header:
-            raise self.error(f": empty; expected {expected}")
-        if len(header) > MAX_COLUMNS:
-            raise self.error(f": expected at most {MAX_COLUMNS:,} columns, got {len(header):,}")
-        self.header = tuple(name if name in names else name.strip() for name in header)
         self._mark = ""  # decimal mark; empty until it is known
-        self._is_mark_certain = False
+        self._is_mark_certain = False  # whether a number has shown that the mark does not separate thousands
+
+        # Search the header among the first lines. If the header is a comment, `header_line` does not have its mark.
+        line_iterator = self._checked_lines(lines)
+        first_lines = list(islice(line_iterator, _MAX_LINES_TO_HEADER))
+        lines_above, self._separator, header_line = _find_header(first_lines or [""], names)
+
+        # Read the rows of the header and of all lines below it, as they are needed.
+        first_lines_below = first_lines[lines_above + 1 :]
+        self._rows = self._numbered_rows(chain([header_line], first_lines_below, line_iterator), lines_above)
+        _line_number, header_cells = next(self._rows, (0, []))  # no cells if there is no row
+        if not header_cells:
+            raise self.error(f": empty; expected {expected}")
+        if len(header_cells) > MAX_COLUMNS:
+            raise self.error(f": expected at most {MAX_COLUMNS:,} columns, got {len(header_cells):,}")
+        self.header = tuple(name if name in names else name.strip() for name in header_cells)
 
     def error(self, message: str) -> InputError:
         """Return an error whose message consists of the name of the file and the given text."""

@@ -156,15 +156,21 @@ class Warming(Stage):
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:
-        """Return the settings.
+        """Return the settings of the section `[common_mode]` for the C sources, by name; empty without this section.
+
+        The C sources assume that a warming adds the same charge to all electrodes.
+
+        Args:
+            setup: Device file and model for which C sources are written.
 
         Raises:
-            DeviceError: If the settings contain charges for each electrode, or there are too few electrodes.
+            DeviceError: If `pC_per_K` states a charge for each electrode, or if the model has too few electrodes.
         """
         settings = super().c_settings(setup)
         if settings:
-            warming_ratios(setup)  # raises an error for too few electrodes
-        if settings.pop("pC_per_K", None) is not None:
+            warming_ratios(setup)  # only to raise its error for too few electrodes
+        charge_pC_per_K = settings.pop("pC_per_K", None)
+        if charge_pC_per_K is not None:
             raise DeviceError(f"{setup.device.where}: common_mode.pC_per_K: {NOT_IN_C}")
         return settings
 

@@ -143,10 +143,11 @@ class Tape:
         """Append a sample. If the buffer is full, the sample replaces the oldest sample.
 
         Args:
-            values: The numbers of the sample in the order of its type. None is stored as NaN.
+            values: The numbers of the sample, in the order of the fields of the type `dtype`. None is stored as NaN.
         """
-        self._ring[self.total % len(self._ring)] = values
-        self.total += 1
+        place = self.total % len(self._ring)  # after the last place, the first place is used again
+        self._ring[place] = values
+        self.total += 1  # only now, because other threads read all samples that are counted
 
     def samples(self, start: int, stop: int) -> Samples:
         """Return the samples with the numbers from `start` to `stop` - 1, except those that were overwritten."""
@@ -185,9 +186,15 @@ class RecordedTape(Tape):
     """Tape that stores all samples of a recording."""
 
     def append(self, values: tuple[float | None, ...]) -> None:
-        """Append a sample. If the buffer is full, its size is doubled."""
-        if self.total == len(self._ring):
-            self._ring = np.concatenate([self._ring, np.zeros_like(self._ring)])
+        """Append a sample. If the buffer is full, double its size first, so that no sample is replaced.
+
+        Args:
+            values: The numbers of the sample, in the order of the fields of the type `dtype`. None is stored as NaN.
+        """
+        is_full = self.total == len(self._ring)
+        if is_full:
+            empty_half = np.zeros_like(self._ring)
+            self._ring = np.concatenate([self._ring, empty_half])
         super().append(values)
 
     def extent(self) -> dict[str, Any]:

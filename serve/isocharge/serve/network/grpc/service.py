@@ -147,9 +147,14 @@ class Service:
             name: Name of the method.
             _messages: Iterator over the messages. It is not used, because the messages are read from the context.
             context: Context of the call, from which messages are read and to which responses are written.
+
+        Raises:
+            CancelledError: If the client has ended the call.
         """
-        message = ""
+        error_message = ""
         self._open_count += 1
+        # At the end of the `with` block, the call is counted and logged with the status that the block has set. The
+        # status is "CANCELLED" until it is set.
         with self._handler.traffic.exchange("grpc", context.peer()) as call:
             call.route = name
             try:
@@ -157,15 +162,15 @@ class Service:
                 await self._answer(name, context)
                 call.status = "OK"
             except grpc.aio.InternalError as error:  # the client ended the call while a message was read or sent
-                raise asyncio.CancelledError from error  # the status remains "CANCELLED", and nothing is sent
+                raise asyncio.CancelledError from error
             except Exception as error:  # every error is sent to the client
-                is_late = isinstance(error, TimeoutError)
-                status, message = refusal(RequestError(TIMEOUT_MESSAGE, 408) if is_late else error)
-                call.status = GRPC_STATUSES[status]
+                reported_error = RequestError(TIMEOUT_MESSAGE, 408) if isinstance(error, TimeoutError) else error
+                http_status, error_message = refusal(reported_error)
+                call.status = GRPC_STATUSES[http_status]
             finally:
                 self._open_count -= 1
-        if message:
-            await context.abort(grpc.StatusCode[str(call.status)], message)
+        if error_message:
+            await context.abort(grpc.StatusCode[str(call.status)], error_message)
 
     async def _answer(self, name: str, context: grpc.aio.ServicerContext) -> None:
         """Check the token, and answer the messages of a call.

@@ -135,22 +135,25 @@ class Connection(HttpToolsProtocol):
     def close_if_overdue(self, now: float) -> None:
         """End the connection if a deadline has passed. If a request has begun, the client receives the reason.
 
-        The time between two requests has a deadline of its own, which replaces the timer of uvicorn. A client could
-        stop that timer by an empty line, with which no request begins.
+        The method also sets the deadline of the next request, and the deadline until which the client must read a
+        response.
 
         Args:
             now: Present time on the clock of the event loop, s.
         """
-        if self.is_idle and self.deadline == math.inf:  # all requests are answered since the previous call
+        # If all requests are answered since the previous call, limit the time until the next request. This limit
+        # replaces the timer of uvicorn, which a client could stop by an empty line, with which no request begins.
+        if self.is_idle and self.deadline == math.inf:
             self._allow(self._limits.idle_seconds)
-        if not self.flow.write_paused:  # uvicorn pauses if the client does not read its responses
+        # uvicorn pauses writing if the client does not read its responses. From then on, the deadline stays the same.
+        if not self.flow.write_paused:
             self._write_deadline = now + self._limits.body_seconds
+
         if min(self.deadline, self._write_deadline) > now:
             return
         if self._is_reading:
-            self._is_reading = (
-                False  # if the client does not read the refusal in time either, the connection is aborted
-            )
+            # If the client does not read the refusal in time either, a later call aborts the connection.
+            self._is_reading = False
             self.refuse(408, "waited too long for the rest of the request")
         else:
             self.transport.abort()
