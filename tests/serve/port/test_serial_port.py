@@ -171,9 +171,14 @@ def test_unplugged_port_raises_port_lost():
             next(iter(port))
 
 
-def test_port_without_a_descriptor_is_read_by_pyserial():
-    """The port `loop://` of pyserial returns the bytes that are written to it."""
+def test_port_without_a_descriptor_is_read_by_pyserial(monkeypatch):
+    """The port `loop://` of pyserial returns the bytes that are written to it. Reading changes no setting of the port.
+
+    A changed setting of a port `rfc2217://` takes at least 50 ms, because the server must accept it.
+    """
     with Port("loop://") as port:
+        monkeypatch.setattr(port._line._serial, "_reconfigure_port", None)
+        assert port.read(0.01) is None
         port._line.write(b"1,2\n")
         assert next(iter(port)).data == b"1,2\n"
 

@@ -90,7 +90,8 @@ class SerialLine:
         serial = importlib.import_module("serial")
         if url.startswith("tcp://"):  # pyserial has another name for this scheme
             url = url.replace("tcp://", "socket://", 1)
-        self._serial: Any = serial.serial_for_url(url, baudrate=baud, exclusive=True)
+        # The timeout of an attempt to read never changes, because RFC 2217 would negotiate all settings again.
+        self._serial: Any = serial.serial_for_url(url, baudrate=baud, exclusive=True, timeout=QUIET_TIME_s)
         # Without this mode, USB adapters collect bytes for 16 ms. Some systems and ports do not have the mode.
         with suppress(AttributeError, NotImplementedError, OSError, ValueError):
             self._serial.set_low_latency_mode(True)
@@ -155,8 +156,10 @@ class SerialLine:
         Returns:
             All bytes that have arrived; empty if no byte arrives in time.
         """
-        self._serial.timeout = timeout_s
-        data: bytes = self._serial.read(1)  # waits until a byte arrives or the timeout has passed
+        deadline_s = time.monotonic() + timeout_s
+        data = b""
+        while not data and time.monotonic() < deadline_s:
+            data = self._serial.read(1)  # waits until a byte arrives or the timeout of the line has passed
         if data:
             data += self._serial.read(self._serial.in_waiting)
         return data
