@@ -158,6 +158,16 @@ def test_bytes_that_waited_during_a_stall_are_few_chunks(board):
     assert remaining_bytes == 0
 
 
+def test_program_that_reads_more_slowly_than_the_board_sends_causes_one_warning(board, monkeypatch, caplog):
+    monkeypatch.setattr("isocharge.serve.port.source.MAX_READ_BYTES", 8)
+    with Port(board.url) as port:
+        chunks = iter(port)
+        for length, n_warning in ((8, 0), (1, 0), (8, 0), (8, 1), (8, 1), (1, 1), (8, 1), (8, 1)):
+            board.write_whole(bytes(length))
+            assert len(next(chunks).data) == length
+            assert caplog.text.count("reads more slowly than the board sends") == n_warning
+
+
 def test_reading_a_port_that_is_not_open_is_an_error(board):
     with pytest.raises(PortError, match="not open"):
         next(iter(Port(board.url)))

@@ -32,6 +32,7 @@ from typing import Any, Protocol, Self
 from isocharge.common.errors import InputError, PortError, PortLost
 from isocharge.serve.port.file_source import STDIN, Chunk, FileSource, open_file
 from isocharge.serve.port.serial_line import (
+    MAX_READ_BYTES,
     OPEN_ERRORS,
     READ_ERRORS,
     UDP_SCHEME,
@@ -176,10 +177,13 @@ class Port:
     def __iter__(self) -> Iterator[Chunk]:
         """Yield chunks as they arrive. If the port is lost and `reconnect` is true, open the port again.
 
+        After two chunks of the largest size in succession, a warning is logged once, because bytes wait to be read.
+
         Raises:
             PortLost: If the port disappears or stays silent for too long, and `reconnect` is false.
             PortError: If the port is not open.
         """
+        full_chunk_count = 0  # in succession
         while True:
             wait_start_s = time.monotonic()
             try:
@@ -196,6 +200,14 @@ class Port:
                 log.warning("%s; trying again until it is back", error)
                 chunk = self._read_after_reconnecting()._replace(outage_s=time.monotonic() - wait_start_s)
             self._max_silence_s = self._silence_s
+            if full_chunk_count < 2:
+                full_chunk_count = full_chunk_count + 1 if len(chunk.data) >= MAX_READ_BYTES else 0
+                if full_chunk_count == 2:
+                    log.warning(
+                        "%s: the program reads more slowly than the board sends: records are late; do less for each "
+                        "record, or lower the frame rate",
+                        self.url,
+                    )
             yield chunk
 
     def read(self, timeout_s: float) -> Chunk | None:
