@@ -1,6 +1,7 @@
 """Files of recordings: their content, incomplete last lines, and files that are refused."""
 
 import json
+import os
 
 import pytest
 
@@ -77,6 +78,12 @@ def test_file_that_is_no_recording_is_refused(tmp_path, first, message):
     with pytest.raises(RecordingError, match=message) as caught:
         Recording(path)
     assert len(str(caught.value)) < 600
+
+
+def test_pipe_is_refused_instead_of_losing_its_first_chunks(tmp_path):
+    os.mkfifo(tmp_path / "touch.rec")
+    with pytest.raises(RecordingError, match="no regular file of that name"):
+        Recording(tmp_path / "touch.rec")
 
 
 NOT_LABELS = ["/any/path", "../x", "models/m/1", "m/../../x", "m", "m/1\n", "file://m/1", "~/m"]

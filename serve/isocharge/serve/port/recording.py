@@ -179,6 +179,8 @@ class Recording:
         """
         self._path = path = Path(path)
         try:
+            if not path.is_file():  # the file is opened twice, but a pipe can be read only once
+                raise RecordingError("there is no regular file of that name")
             with path.open("rb") as file:
                 first_line = file.readline(LONGEST_ENTRY)  # empty if the file is empty
             header = parse_json(first_line.decode("utf-8", "replace"), "first line", RecordingError, _Header)
