@@ -102,6 +102,12 @@ def recorded():
     return RecordedTape(TYPE)
 
 
+def test_recorded_tape_replaces_times_that_go_back(recorded):
+    """The page could not show a recording that ends before its beginning."""
+    append(recorded, [10.0, 12.0, 2.0, 13.0])
+    assert recorded.samples(0, 4)["timestamp"].tolist() == [10, 12, 12, 13]
+
+
 def test_recorded_tape_stores_all_samples_and_the_largest_force_of_each_piece(recorded):
     force_N = np.zeros(36_000)
     force_N[18_000] = 1.5

@@ -188,14 +188,19 @@ class RecordedTape(Tape):
     def append(self, values: tuple[float | None, ...]) -> None:
         """Append a sample. If the buffer is full, double its size first, so that no sample is replaced.
 
+        If the clock was set back, the time of the previous sample replaces an earlier time, so that the page can show
+        the recording up to each time.
+
         Args:
             values: The numbers of the sample, in the order of the fields of the type `dtype`. None is stored as NaN.
         """
         is_full = self.total == len(self._ring)
         if is_full:
-            empty_half = np.zeros_like(self._ring)
-            self._ring = np.concatenate([self._ring, empty_half])
-        super().append(values)
+            larger_ring: Samples = np.zeros(2 * self.total, self._ring.dtype)  # uses no memory until it is written
+            larger_ring[: self.total] = self._ring
+            self._ring = larger_ring
+        time_s, *others = values
+        super().append((max(self.timestamp(self.total - 1), time_s or 0.0), *others))
 
     def extent(self) -> dict[str, Any]:
         """Return the times of the first and the last sample, the number of samples, and an overview of the forces.
