@@ -115,8 +115,10 @@ def examine(
         DeviceError: If the gain is not valid, or is stated for other electrodes.
     """
 
-    def has_frames(received_at_baud: ReceivedData) -> bool:  # a large share shows that the baud rate is right
-        return read_frames(received_at_baud, _board(received_at_baud, device)).intact_share >= INTACT_SHARE
+    def has_frames(received_at_baud: ReceivedData) -> bool:
+        """Return whether most of the bytes belong to intact frames, which shows that the baud rate is right."""
+        board = _board(received_at_baud, device)
+        return read_frames(received_at_baud, board).intact_share >= INTACT_SHARE
 
     received = listen(url, bauds, seconds, request or device.request, has_frames, wait)
     return examine_received(received, device=device, electrodes=electrodes, gain=gain)
@@ -243,14 +245,15 @@ def electrodes_by_position(capture: Capture, device: Device, electrodes: tuple[s
     """
     last_frame = capture.frames[-1]
     if device.channels:
-        return {
-            position: electrode
-            for electrode, channel in device.channels.items()
-            if (position := channel_index(channel, last_frame)) is not None
-        }
+        position_of_electrode = {name: channel_index(channel, last_frame) for name, channel in device.channels.items()}
+        return {position: name for name, position in position_of_electrode.items() if position is not None}
+
+    # A setting of the gain is one number for all electrodes, or a dictionary with a number for each electrode.
+    names = electrodes
     rule = device.rule(GainRule)
-    gain_settings = () if rule is None else (rule.offset, rule.pC_per_unit)
-    names = electrodes or next((tuple(numbers) for numbers in gain_settings if isinstance(numbers, dict)), ())
+    if rule is not None and not names:
+        dictionaries = [setting for setting in (rule.offset, rule.pC_per_unit) if isinstance(setting, dict)]
+        names = tuple(dictionaries[0]) if dictionaries else ()
     with suppress(ChargeError):  # a stream reports this error when it begins
         positions = Channels(Setup(names), any_unit=True).indices_by_name_or_order(last_frame)
         if positions:  # empty without names, and None if the numbers of channels and names differ

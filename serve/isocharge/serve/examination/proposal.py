@@ -125,8 +125,9 @@ def _choose_channels(
     """
     # A channel is left out if its values vary much less than the others, or are mostly not finite. If no channel
     # varies, all channels are candidates.
-    noise = estimate_noise(values)
-    noise[2 * np.isfinite(values).sum(axis=0) <= len(values)] = 0.0
+    noise = estimate_noise(values)  # standard deviation of each channel
+    is_mostly_finite = 2 * np.isfinite(values).sum(axis=0) > len(values)
+    noise[~is_mostly_finite] = 0.0
     usual_noise = np.median(noise[noise > 0.0]) if noise.any() else 0.0
     candidates = np.flatnonzero(noise >= min_noise_share * usual_noise).tolist()
     if not electrodes:
@@ -140,12 +141,14 @@ def _choose_channels(
         return dict(zip(electrodes, positions, strict=True))
     if len(candidates) < len(electrodes):
         return {}
-    # Compare the groups of adjacent channels by their largest noise over the smallest one, in powers of ten.
+    # Choose the group of adjacent channels in which the ratio of the largest to the smallest noise is smallest. The
+    # ratios are compared by their powers of ten, and the first of equal groups is chosen.
     log_noise = np.log10(np.maximum(noise[candidates], np.finfo(float).tiny))
-    groups = np.lib.stride_tricks.sliding_window_view(log_noise, len(electrodes))
+    groups = np.lib.stride_tricks.sliding_window_view(log_noise, len(electrodes))  # shape (groups, electrodes)
     log_ratios = np.round(np.ptp(groups, axis=1))
-    first_of_group = int(np.argmin(log_ratios))
-    return dict(zip(electrodes, candidates[first_of_group:], strict=False))
+    begin = int(np.argmin(log_ratios))
+    end = begin + len(electrodes)
+    return dict(zip(electrodes, candidates[begin:end], strict=True))
 
 
 def _rest_level(values: Array) -> float:

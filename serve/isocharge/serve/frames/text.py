@@ -288,7 +288,8 @@ class TextParser(DelimitedParser):
         if layout is None:
             # Keep as many lines as the longest cycles need, and reject the older lines.
             while len(self._collected_lines) > RECOGNITION_REPEATS * MAX_CYCLE_LINES:
-                self._reject(self._collected_lines.pop(0)[1])
+                _oldest_line, oldest_size = self._collected_lines.pop(0)
+                self._reject(oldest_size)
             return []
 
         self._set_layout(layout)
@@ -365,12 +366,13 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
     if last_skeleton not in earlier_skeletons:
         return []
     cycle_length = earlier_skeletons[::-1].index(last_skeleton) + 1
-    if skeletons[-repeats * cycle_length :] != skeletons[-cycle_length:] * repeats:
+    last_cycle = skeletons[-cycle_length:]
+    if skeletons[-repeats * cycle_length :] != repeats * last_cycle:
         return []
 
     lines = lines[-repeats * cycle_length :]
     cycle = lines[:cycle_length]
-    has_equal_lines = len(set(skeletons[-cycle_length:])) < cycle_length
+    has_equal_lines = len(set(last_cycle)) < cycle_length
     if has_equal_lines or cycle_length == 1:  # for example, three frames and then a temperature
         most_frequent_line = max(cycle, key=lambda line: skeletons.count(line.skeleton))
         return [most_frequent_line]

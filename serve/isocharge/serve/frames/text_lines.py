@@ -221,12 +221,12 @@ def parse_line(text: str, *, has_header: bool = False, meanings: Mapping[str, st
     names = _alternating_names(parts, has_header=has_header) or _preceding_names(parts, counters)
     names_with_units = _with_units(names, _units(parts, names), counters)
     return Line(
-        text,
-        _skeleton(parts, names, number_pattern),
-        tuple(meanings.get(name, name) for name in names_with_units),
-        tuple(part.start for part in parts if part.is_number),
-        _is_prose(parts),
-        tuple(part.name for part in parts if part.symbol in "kquw"),
+        text=text,
+        skeleton=_skeleton(parts, names, number_pattern),
+        names=tuple(meanings.get(name, name) for name in names_with_units),
+        starts=tuple(part.start for part in parts if part.is_number),
+        is_prose=_is_prose(parts),
+        words=tuple(part.name for part in parts if part.symbol in "kquw"),  # keys, quoted texts, units and words
     )
 
 
@@ -284,24 +284,30 @@ def _index_positions(parts: list[_Part]) -> list[int]:
     - There are several pairs. Their first numbers count up from 0 or 1, and the same word or mark precedes each,
       as in `pad #1 801 pad #2 799` and `[1] 801 [2] 799`.
     """
+    # The shape of a line has one symbol for each part: 0 for a number, w for a word and u for a unit. Marks stand for
+    # themselves.
     shape = _shape(parts)
     numbers = [position for position, symbol in enumerate(shape) if symbol == "0"]
 
-    def first_numbers(pair: str) -> list[int]:  # the pattern of a shape, in which 0 is a number and w is a word
-        """Find the pairs of the given shape at the end of the line, and return the position of each first number."""
+    def first_numbers(pair: str) -> list[int]:
+        """Return the position of the first number of each pair at the end of the line.
+
+        Args:
+            pair: Regular expression of the shape of a pair.
+        """
         pairs = re.search(rf"(?:[^0]*{pair})+[^0]*$", shape)
         return [] if pairs is None else numbers[-pairs[0].count("0") :: 2]
 
-    indices = first_numbers(r"0[)\]]?[:=]0")
+    indices = first_numbers(r"0[)\]]?[:=]0")  # such as `1:801`
     if len(indices) > 1 or 2 * len(indices) == len(numbers):
         return indices
 
-    indices = first_numbers(r"[uw#(\[=]0[)\]>(\[]?0")
-    counts = list(map(str, range(len(indices) + 1)))
+    indices = first_numbers(r"[uw#(\[=]0[)\]>(\[]?0")  # such as `pad 1 801` or `[1] 801`
+    counts = [str(count) for count in range(len(indices) + 1)]
     contents = [parts[position].content for position in indices]
+    counts_up = contents in (counts[:-1], counts[1:])  # from 0 or from 1
     previous_contents = {parts[position - 1].content for position in indices}
-    is_counted = len(previous_contents) == 1 < len(indices) and contents in (counts[:-1], counts[1:])
-    return indices if is_counted else []
+    return indices if counts_up and len(previous_contents) == 1 < len(indices) else []
 
 
 def _skeleton(parts: list[_Part], names: list[str], number_pattern: str) -> tuple[str, ...]:

@@ -12,7 +12,6 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import partial
-from itertools import islice
 
 from msgspec import structs
 
@@ -256,13 +255,14 @@ def replay(
     due_s = 0.0  # monotonic time at which the replay of the next chunk begins
     records: Iterator[PredictionRecord] = iter(())  # records of the previous chunk that were not yielded yet
     for event in recording.events():
-        if event.latency_us is not None:
-            for record in islice(records, 1):
+        if event.latency_us is not None:  # the recorded stream has yielded the next record of the chunk
+            record = next(records, None)
+            if record is not None:
                 yield structs.replace(record, latency_us=event.latency_us)
             continue
 
         # If the recording program ended within the chunk, its last records were not recorded. The stream processes the
-        # whole chunk all the same.
+        # whole chunk all the same, but the remaining records are discarded.
         deque(records, maxlen=0)
         chunk = event.chunk
         if event.marker is not None:

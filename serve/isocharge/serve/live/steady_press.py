@@ -246,19 +246,24 @@ class PressWatch:
         scatter_pC = (charge_pC - mean_pC - np.outer(centred_s, slope_pC_per_s)).std(axis=0)
         drift_pC = np.abs(slope_pC_per_s) * (times_s[-1] - times_s[0])
 
-        # A charge that is smaller than the mean magnitude may change as much as a charge of the mean magnitude. The
-        # change of a line through n values has the standard deviation sqrt(12 / n) times that of one value.
+        # Divide the drift by its limit. A charge that is smaller than the mean magnitude may change as much as a charge
+        # of the mean magnitude. Because of the scatter, the change of a line through n values has the standard
+        # deviation sqrt(12 / n) times that of one value.
         magnitude_pC = np.abs(mean_pC)
         reference_pC = np.maximum(magnitude_pC, magnitude_pC.mean())
         drift_std_pC = scatter_pC * math.sqrt(12.0 / len(times_s))
-        relative_drift = drift_pC / (self.MAX_RELATIVE_DRIFT * reference_pC + self.DRIFT_SIGMAS * drift_std_pC)
-        hand_noise_pC = self.RELATIVE_NOISE * magnitude_pC.mean()
-        relative_scatter = scatter_pC / (self.MAX_SCATTER_SIGMAS * np.hypot(noise_pC, hand_noise_pC))
+        max_drift_pC = self.MAX_RELATIVE_DRIFT * reference_pC + self.DRIFT_SIGMAS * drift_std_pC
+        relative_drift = drift_pC / max_drift_pC
 
-        shaking = relative_scatter.argmax()
-        drifting = relative_drift.argmax()
-        if relative_scatter[shaking] > 1.0:
-            reason = f"the charge of {self._electrodes[shaking]} shakes by {scatter_pC[shaking]:.2g} pC"
+        # Divide the scatter by its limit.
+        hand_noise_pC = self.RELATIVE_NOISE * magnitude_pC.mean()
+        max_scatter_pC = self.MAX_SCATTER_SIGMAS * np.hypot(noise_pC, hand_noise_pC)
+        relative_scatter = scatter_pC / max_scatter_pC
+
+        scattering = relative_scatter.argmax()  # index of the charge with the largest relative scatter
+        drifting = relative_drift.argmax()  # index of the charge with the largest relative drift
+        if relative_scatter[scattering] > 1.0:
+            reason = f"the charge of {self._electrodes[scattering]} shakes by {scatter_pC[scattering]:.2g} pC"
         elif relative_drift[drifting] > 1.0:
             reason = (
                 f"the charge of {self._electrodes[drifting]} changes by {slope_pC_per_s[drifting]:.2g} pC per second "

@@ -319,8 +319,9 @@ class ChargeSeries:
             Derivatives of the charges with respect to the contact, as `linearised` returns them.
         """
         slopes = value[:, 1:].swapaxes(1, 2)  # shape (n, n_electrode, 3)
-        if self.log_size is None:  # Q = exp(v)
-            charge_pC = charge_per_value = _limited_exp(value[:, 0])
+        if self.log_size is None:  # Q = exp(v), so the derivative with respect to v is Q, too
+            charge_pC = _limited_exp(value[:, 0])
+            charge_per_value = charge_pC
             by_unit_contact = charge_pC[:, :, None] * slopes
         else:  # Q = S(l) v, so the derivative with respect to l is S (v' + (ln S)' v)
             size_pC, log_size_slope = series_size(self.log_size, nearest[:, 2], excess[:, 2])

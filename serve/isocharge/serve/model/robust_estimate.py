@@ -126,6 +126,7 @@ class RobustProblem:
         self._measured = np.nan_to_num(measured_contacts)
         # One over the standard deviations of the measured coordinates; 0 where a coordinate was not measured
         self._contact_weight = np.broadcast_to(np.nan_to_num(1.0 / np.asarray(contact_std)), (n_press, 3))
+        # Number of independent residuals of each press: its measurements minus the three unknown coordinates
         measured_count = np.count_nonzero(self._contact_weight, axis=1)
         self._degrees = n_electrode + measured_count - 3.0
 
@@ -188,15 +189,22 @@ class RobustProblem:
             state: State, shape (p,).
             contacts: Contacts, shape (n, 3).
         """
+        # Residuals divided by their standard deviations. Those of the charges are whitened, and those of coordinates
+        # that were not measured are 0.
         values = self._model(contacts, state)
-        residual = (self._whitening @ (self._charge_pC - values.charge_pC)[:, :, None])[:, :, 0]
-        contact_residual = (self._measured - contacts) * self._contact_weight
+        charge_difference_pC = self._charge_pC - values.charge_pC
+        residual = (self._whitening @ charge_difference_pC[:, :, None])[:, :, 0]  # shape (n, e)
+        contact_residual = (self._measured - contacts) * self._contact_weight  # shape (n, 3)
         chi2 = (residual**2).sum(axis=1) + (contact_residual**2).sum(axis=1)  # shape (n,)
 
-        # Weights and costs of a Student t distribution with nu degrees of freedom
+        # Weights and costs of a Student t distribution with nu degrees of freedom (`_freedom`), for a press with
+        # `_degrees` independent residuals
         weights = (self._freedom + self._degrees) / (self._freedom + chi2)
         press_cost = 0.5 * (self._freedom + self._degrees) * np.log1p(chi2 / self._freedom)
+
+        # Cost of the deviation of the state from its Gaussian prior
         deviation = state - self._prior_mean
+        prior_cost = 0.5 * deviation @ self._precision @ deviation
         return RobustPoint(
             state=state,
             contacts=contacts,
@@ -206,7 +214,7 @@ class RobustProblem:
             contact_residual=contact_residual,
             chi2=chi2,
             weights=weights,
-            cost=float(press_cost.sum() + 0.5 * deviation @ self._precision @ deviation),
+            cost=float(press_cost.sum() + prior_cost),
         )
 
     def _normal_equations(

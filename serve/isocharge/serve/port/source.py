@@ -297,9 +297,10 @@ def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> context
 
     scheme, separator, _address = url.partition("://")
     is_path = not separator
-    for entry_point in () if is_path else entry_points(group=ENTRY_POINTS, name=scheme):
-        added_source: contextlib.AbstractContextManager[Source] = entry_point.load()(url)
-        return added_source
+    if not is_path:
+        for entry_point in entry_points(group=ENTRY_POINTS, name=scheme):  # another package may add a source
+            added_source: contextlib.AbstractContextManager[Source] = entry_point.load()(url)
+            return added_source
 
     # Wait until the path exists, because the type of a missing path (a file or a port) is unknown.
     path = Path(url)

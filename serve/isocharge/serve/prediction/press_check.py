@@ -192,10 +192,10 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     is_selected = is_compared & ~is_bad
     selected_count = int(is_selected.sum())
     agreement = Agreement.from_errors(errors, is_selected)
-    # The errors and the standard deviations, each of shape (n, 3). The columns before that of the force are x and y.
-    parts = (errors.error[is_selected], errors.noise_std[is_selected], errors.rig_std[is_selected])
-    position = ErrorSummary.from_errors(*(part[:, :FORCE] for part in parts))
-    force = ErrorSummary.from_errors(*(100.0 * part[:, FORCE:] for part in parts))  # in percent
+    # Each array has the columns x, y (mm) and F (relative), shape (n_selected, 3). `FORCE` is the index of the last.
+    selected = (errors.error[is_selected], errors.noise_std[is_selected], errors.rig_std[is_selected])
+    position_mm = ErrorSummary.from_errors(*[columns[:, :FORCE] for columns in selected])
+    force_percent = ErrorSummary.from_errors(*[100.0 * columns[:, FORCE:] for columns in selected])
     misfit_text = _misfit_statement(errors, is_selected, metadata)  # empty unless too many presses have a large misfit
 
     fits = None  # remains None if there are too few presses for a verdict
@@ -209,7 +209,7 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     # Collect the explanations for the user.
     notes: list[str] = []
     if fits is False:
-        notes += _remedies(errors, is_selected, position, force, misfit_text)
+        notes += _remedies(errors, is_selected, position_mm, force_percent, misfit_text)
     notes += _exclusion_notes(errors, predictor.validity)
     if is_bad.any():
         notes.append(f"{errors.presses[is_bad].line_words}: nothing like the other presses, left out; look at it")
@@ -219,11 +219,11 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
         model=metadata.label,
         presses=len(presses),
         compared=selected_count,
-        position_mm=position,
-        force_percent=force,
+        position_mm=position_mm,
+        force_percent=force_percent,
         agreement=agreement,
         fits=fits,
-        verdict=_verdict(fits, selected_count, position, force, misfit_text),
+        verdict=_verdict(fits, selected_count, position_mm, force_percent, misfit_text),
         notes=tuple(notes),
         errors=errors,
         std_factor=std_factor,
@@ -279,8 +279,11 @@ def _misfit_statement(errors: PressErrors, is_selected: Booleans, metadata: Mode
     selected_count = int(is_selected.sum())
     limit = misfit_limit(metadata)
     misfit_count = np.count_nonzero(errors.predicted[is_selected, COLUMNS["misfit"]] > limit)
+    if misfit_count == 0:
+        return ""
     probability_of_at_most = binomial_distribution(selected_count, MISFIT_FRACTION)
-    if misfit_count == 0 or 1.0 - probability_of_at_most[misfit_count - 1] >= TEST_SIGNIFICANCE:
+    probability_of_so_many = 1.0 - probability_of_at_most[misfit_count - 1]  # or more, if all presses are good
+    if probability_of_so_many >= TEST_SIGNIFICANCE:
         return ""
     return (
         f"{misfit_count} of {selected_count} presses have a misfit above {limit:.3g}, although "

@@ -257,7 +257,8 @@ def common_error(error: Array, variance: Array, rig_std: Array) -> CommonError:
 
     # Significance of the means in view of an error of the rig that is equal in all presses
     common_rig_std = COMMON_RATIO * np.nansum(weight * rig_std, axis=0) / total_weight
-    return CommonError(mean, std, mean / np.hypot(std, common_rig_std))
+    significance = mean / np.hypot(std, common_rig_std)
+    return CommonError(mean, std, significance)
 
 
 @dataclass(frozen=True)

@@ -94,11 +94,12 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
         is_touch_of_rows = predictor.validity.is_touch(block).tolist()
         rows = zip(block.tolist(), np.asarray(contacts).tolist(), flags_of_rows, is_touch_of_rows, strict=True)
         for charges, values, flags, is_touch in rows:
+            contact_fields = dict(zip(Contact._fields, values, strict=True)) if is_touch else NO_CONTACT
             yield PredictionRecord(
                 timestamp=None,
                 t_device_us=None,
                 seq=None,
-                **(dict(zip(Contact._fields, values, strict=True)) if is_touch else NO_CONTACT),
+                **contact_fields,
                 contact=is_touch,
                 charge_pC=dict(zip(metadata.electrodes, charges, strict=True)),
                 charge_raw_pC=None,

@@ -197,8 +197,9 @@ def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDiv
     # equally many, the pair is chosen.
     best_division: dict[int, FrameDivision] = {}
     for codes in (pairs, single_bytes):
-        positions = np.argsort(codes, kind="stable")  # first all positions of the smallest code
-        distances = np.diff(positions) * (np.diff(codes[positions]) == 0)  # 0 between two codes
+        positions = np.argsort(codes, kind="stable")  # first all positions of the smallest code, then of the next
+        has_same_code = np.diff(codes[positions]) == 0
+        distances = np.where(has_same_code, np.diff(positions), 0)  # from each position to the next of the same code
         for length in range(MIN_FRAME_BYTES, MAX_FRAME_BYTES + 1):
             starts = positions[:-1][distances == length]
             best_code = np.bincount(codes[starts], minlength=1).argmax()

@@ -68,16 +68,20 @@ class Hum(Stage):
         self._elapsed_s = 0.0
 
     def step(self, frame: Frame) -> None:
-        """Subtract the hum from a frame, and update the estimate of the hum."""
+        """Subtract the hum from a frame, and update the estimate of the hum.
+
+        The hum of a channel is the real part of p u, where the phasor p contains its amplitude and phase, and the unit
+        phasor u = exp(2 pi i f t) turns with the frequency f of the mains. The frame is compared with an earlier frame,
+        the reference. If u has changed by z since then, the charges should have changed by the real part of p z.
+        """
         if frame.charge_pC is None:
             return
         rule = self._rule
         raw_pC = frame.charge_pC
-        unit_phasor = cmath.exp(2j * math.pi * rule.frequency_Hz * frame.clock_s)
-        phasor_step = unit_phasor - self._reference_phasor
+        unit_phasor = cmath.exp(2j * math.pi * rule.frequency_Hz * frame.clock_s)  # u
+        phasor_step = unit_phasor - self._reference_phasor  # z
         squared_step = abs(phasor_step) ** 2
-
-        self._elapsed_s += frame.dt_s
+        self._elapsed_s += frame.dt_s  # since the reference
 
         # If the unit phasor has hardly changed, the change of the charges contains little hum.
         has_turned = squared_step > MIN_SQUARED_STEP

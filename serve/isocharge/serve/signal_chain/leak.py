@@ -210,7 +210,9 @@ class Leak(Stage):
             has_gap = False
         self._charge_pC = self._charge_pC + surplus_pC
         if has_gap:
-            self._is_falsified |= self._is_large(np.abs(surplus_pC) * (self._growth(frame) - 1.0) / 2.0, frame)
+            # Error if the charge arrived at the beginning of the gap, and not evenly, as assumed
+            largest_error_pC = np.abs(surplus_pC) * (self._growth(frame) - 1.0) / 2.0
+            self._is_falsified |= self._is_large(largest_error_pC, frame)
 
     def _innovation_pC(self, output_pC: Array, decay: Array) -> Array:
         """Return the change of the output that the leak does not explain, shape (n_electrode,), pC.
@@ -308,7 +310,8 @@ class Integrator(Leak):
         mean_pC = (current_pC + self._current_pC) / 2.0
         interval_s = max(self._elapsed_s / self._interval_count, SUM_TOLERANCE_s)
         may_be_noise = np.abs(mean_pC) <= 3.0 * frame.noise_pC
-        missing_pC = missing_count * np.where(may_be_noise, self._inflow.pC_per_s * interval_s, mean_pC)
+        inflow_pC = self._inflow.pC_per_s * interval_s
+        missing_pC = missing_count * np.where(may_be_noise, inflow_pC, mean_pC)
         frame.charge_pC = current_pC + missing_pC if frame.intervals > 0 else np.zeros_like(current_pC)
         super().step(frame)
 

@@ -129,6 +129,7 @@ class Warming(Stage):
         self._waited_s += dt_s
         if self._waited_s < rule.every_s - SUM_TOLERANCE_s:  # no estimate in this frame
             return 0.0
+        # The common charge changes like a random walk, whose variance increases in proportion to the time.
         self._variance_pC2 += rule.wander_pC**2 * self._waited_s
         self._waited_s = 0.0
 

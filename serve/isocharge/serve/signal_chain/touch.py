@@ -214,17 +214,21 @@ class Touch(Stage):
             self._is_contact = True
             self._peak_size = min(size, self._previous_size)  # a spike of a single frame is not a peak
             self._touch_direction = charge / size
-            # The sum of the noise of currents changes slowly. The mean of the latest charges still contains it.
-            limit = 0.75 if self._setup.device.has_currents else 0.5
+            # The charge at rest may have drifted if the mean charges before the touch already exceeded half of the
+            # threshold, or if the base was opposite to the touch, so that the change is larger than the charges. The
+            # sum of the noise of currents changes slowly, and the mean charges still contain it.
+            drift_limit = 0.75 if self._setup.device.has_currents else 0.5
             slow_rise = self._idle_mean_charge - self._base_charge
-            # The change is larger than the charges if the base was opposite to them.
-            self._may_have_drifted = max(math.sqrt(slow_rise @ slow_rise), change_size - size) > limit
+            slow_rise_size = math.sqrt(slow_rise @ slow_rise)
+            self._may_have_drifted = max(slow_rise_size, change_size - size) > drift_limit
             return
         elif is_remainder and size < math.sqrt(self._base_charge @ self._base_charge):
             self._base_charge = charge  # the charge that remains of the latest touch becomes smaller
             self._idle_mean_charge = charge
 
-        self._idle_mean_charge = charge + math.exp(-frame.dt_s / RISE_S) * (self._idle_mean_charge - charge)
+        # Exponential mean of the charges with the time constant `RISE_S`
+        decay = math.exp(-frame.dt_s / RISE_S)
+        self._idle_mean_charge = charge + decay * (self._idle_mean_charge - charge)
         if size > 1.0 and charge @ direction < 0.0:
             frame.flags.append(NEGATIVE)
         self._rest_s = 0.0 if size > 1.0 else self._rest_s + frame.dt_s

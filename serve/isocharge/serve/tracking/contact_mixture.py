@@ -170,7 +170,8 @@ class ContactMixture:
         frame.set_contact(contact, self._validity)
         self.other = None
         if best.probability < CERTAIN_PROBABILITY:
-            self.other = OtherContact(*others[0].values_after(delay_s), others[0].probability)
+            second_best = others[0]
+            self.other = OtherContact(*second_best.values_after(delay_s), second_best.probability)
         vx_mm_s, vy_mm_s = best.mean[VELOCITY].tolist()
         return TrackedContact(*contact[:6], vx_mm_s, vy_mm_s, best.moving_probability)
 
@@ -270,8 +271,10 @@ class ContactMixture:
         axis = _longest_axis(components.covariance[0])
         distant_states = components.mean[0] + CLEAR_DISTANCE * np.array([axis, -axis])
         is_across_fold = self._is_across_fold(np.vstack([distant_states, components.mean]))
-        self._hypotheses = _hypotheses_of(components, is_across_fold[2:, 2:])
-        if is_across_fold[2, :2].any():  # a Gaussian component describes only the contacts on one side of a fold
+        best_row = 2  # the first component follows the two distant states
+        self._hypotheses = _hypotheses_of(components, is_across_fold[best_row:, best_row:])
+        has_fold_within_best = is_across_fold[best_row, :best_row].any()
+        if has_fold_within_best:  # a Gaussian component describes only the contacts on one side of a fold
             components = split_first_component(components, axis, SPLIT_DISTANCE)
         self._components = components
 
@@ -326,12 +329,15 @@ def _hypotheses_of(components: Components, is_across_fold: Booleans) -> list[Con
         is_same[first] = True  # even if rounding errors make it appear to be across a fold
         is_remaining &= ~is_same
 
-        # Compute the mean and the covariance of the mixture of these components.
+        # Compute the mean and the covariance of the mixture of these components. The covariance is the mean of their
+        # covariances plus the covariance of their means.
         group = components.select(is_same)
-        share = weight[is_same] / weight[is_same].sum()
+        group_weight = weight[is_same].sum()
+        share = weight[is_same] / group_weight
         mean = share @ group.mean
         deviation = group.mean - mean
-        covariance = np.tensordot(share, group.covariance, 1) + (share * deviation.T) @ deviation
-        probability = weight[is_same].sum() / weight.sum()
+        spread = (share * deviation.T) @ deviation
+        covariance = np.tensordot(share, group.covariance, 1) + spread
+        probability = group_weight / weight.sum()
         hypotheses.append(ContactHypothesis(mean, covariance, float(probability)))
     return sorted(hypotheses, key=lambda hypothesis: -hypothesis.probability)

@@ -285,12 +285,14 @@ class FilmFollower(Stage):
         """
         frame.film = self.film
         if frame.contact is not None and frame.charge_pC is not None:
-            # A corrected contact is valid within the limits of the calibrated film.
-            frame.set_contact(self.follow_contact(frame.contact, frame.charge_pC), self.predictor.validity)
-            self._peak.add_frame(frame.contact, frame.charge_pC, (*frame.flags, *frame.contact_flags))
+            corrected_contact = self.follow_contact(frame.contact, frame.charge_pC)
+            # The corrected contact is a contact on the calibrated film, so the limits of this film apply.
+            frame.set_contact(corrected_contact, self.predictor.validity)
+            all_flags = (*frame.flags, *frame.contact_flags)
+            self._peak.add_frame(corrected_contact, frame.charge_pC, all_flags)  # averages the strongest frames
             if self.is_lost:
                 frame.flags.append(FILM)
-        elif frame.is_valid:
+        elif frame.is_valid:  # no contact, so a touch that had begun has ended
             mean_charge_pC = self._peak.mean_charge_pC
             self.reset()
             if mean_charge_pC is not None:
@@ -382,7 +384,9 @@ class FilmFollower(Stage):
         """
         change_MPa = self._state[0]
         variance = self._covariance[0, 0]
-        density_ratio = self._initial_std[0] / math.sqrt(variance) * math.exp(-0.5 * change_MPa**2 / variance)
+        # The density of a normal distribution at t = 0 is exp(-0.5 mean^2 / variance) / std, up to a constant factor.
+        std_ratio = self._initial_std[0] / math.sqrt(variance)
+        density_ratio = std_ratio * math.exp(-0.5 * change_MPa**2 / variance)
         unchanged_odds = UNCHANGED_ODDS * density_ratio
         unchanged_probability = unchanged_odds / (1.0 + unchanged_odds)
 
@@ -393,26 +397,31 @@ class FilmFollower(Stage):
         self._applied_covariance[self._offset, self._offset] += self._error_scale * self._offset_std_pC**2
 
     def _values(self, contacts: Array, state: Array) -> ModelValues:
-        """Compute the measured charges of touches and their derivatives.
+        """Compute the charges that the board would measure under touches, and their derivatives.
 
-        The measured charge of an electrode is the charge of the film, multiplied by the gain of the electrode, plus the
-        common offset, multiplied by the offset ratio of the electrode. The state contains the logarithms of the gains.
+        The measured charge of an electrode is g q + r p, where q is the charge of the film, g is the gain of the
+        electrode, p is the common offset, and r is the given ratio of the electrode's offset to p.
 
         Args:
-            contacts: Contacts (x, y, ln F), shape (n, 3), mm and the logarithm of N.
-            state: State, shape (n_state,).
-        """
-        film = self._series.in_state(contacts_of(contacts), state[self._film])
-        gains = np.exp(state[self._gains])
-        amplified_pC = film.charge_pC * gains  # shape (n, n_electrode)
-        charge_pC = amplified_pC + state[self._offset] * self._offset_ratio
+            contacts: Contacts (x, y, ln F) of n touches, shape (n, 3), mm and the logarithm of N.
+            state: State, shape (n_state,). It consists of the state of the film, ln g of each electrode, and p.
 
-        # A gain only changes the charge of its own electrode, in proportion to this charge.
-        by_state = np.zeros((*charge_pC.shape, state.size))
-        by_state[:, :, self._film] = film.by_state * gains[:, None]
+        Returns:
+            The charges, and their derivatives with respect to each contact and with respect to the state.
+        """
+        film = self._series.in_state(contacts_of(contacts), state[self._film])  # q and its derivatives
+        gains = np.exp(state[self._gains])
+        amplified_pC = gains * film.charge_pC  # g q, shape (n, n_electrode)
+        offset_pC = state[self._offset] * self._offset_ratio  # r p, shape (n_electrode,)
+
+        # The derivative of g q with respect to ln g is g q for the gain of the same electrode, and otherwise 0. The
+        # axes of a derivative are the touch, the electrode, and the variable of the derivative.
+        electrode_gains = gains[:, None]
+        by_state = np.zeros((*amplified_pC.shape, state.size))
+        by_state[:, :, self._film] = electrode_gains * film.by_state
         by_state[:, :, self._gains] = amplified_pC[:, :, None] * np.eye(gains.size)
         by_state[:, :, self._offset] = self._offset_ratio
-        return ModelValues(charge_pC, film.by_contact * gains[:, None], by_state)
+        return ModelValues(amplified_pC + offset_pC, electrode_gains * film.by_contact, by_state)
 
     def _log_contact(self, contact: Contact) -> Array:
         """Return (x, y, ln F) of a contact, moved into the bounds of the charge map, shape (1, 3)."""

@@ -98,13 +98,15 @@ def predict_components(components: Components, dt_s: float) -> Components:
             which is the most probable.
         dt_s: Time since the previous step, s.
     """
+    # Add the component, which has the index -1. Its rates are independent of its other values.
     present = components.with_copies_of_first(1)
     present.mean[-1, RATES] = 0.0
     present.covariance[-1, RATES] = 0.0
     present.covariance[-1, :, RATES] = 0.0
     present.covariance[-1, RATES, RATES] = np.diag(INITIAL_RATE_STD**2)
-    present.log_weight[-1] += math.log(dt_s / MEAN_MODE_TIME_s)
+    present.log_weight[-1] += math.log(dt_s / MEAN_MODE_TIME_s)  # the rates change once in the mean mode time
 
+    # Predict all components: the values change by the rates, and the accelerations increase the covariances.
     transition = np.eye(present.mean.shape[1])
     transition[VALUES, RATES] = dt_s * np.eye(3)
     covariance = transition @ present.covariance @ transition.T
@@ -134,8 +136,11 @@ def update_components(
         charge_pC: Measured charges, shape (n_electrode,), pC.
         variance_pC2: Variances of the noise of the charges, shape (n_electrode,), pC^2.
         iterations: Number of iterations.
+
+    Returns:
+        The updated components, with their squared misfits and the sums of squared misfit and squared change of state.
     """
-    states = prior.mean
+    states = prior.mean  # shape (n_component, n_state)
     jacobian = np.zeros((len(states), charge_pC.size, states.shape[1]))  # J
     for iteration in range(iterations + 1):
         # Predict the measured charges and their derivatives with respect to the state. A measured charge is the charge
@@ -146,7 +151,8 @@ def update_components(
         jacobian[:, :, VALUES] = film_jacobian * gains[:, :, None]
         jacobian[:, :, GAINS] = predicted_pC[:, :, None] * np.eye(charge_pC.size)
 
-        # Compute the innovation v and its covariance S, relative to the charges of the prior mean.
+        # Compute the innovation v and its covariance S. The innovation is the difference of the measured charges from
+        # the linearised charges at the prior mean, shape (n_component, n_electrode, 1).
         cross_covariance = jacobian @ prior.covariance  # J P
         charge_covariance = cross_covariance @ jacobian.swapaxes(1, 2)  # J P J^T
         innovation_covariance = charge_covariance + np.diag(variance_pC2)
@@ -154,12 +160,14 @@ def update_components(
         innovation = residual_pC[:, :, None] - jacobian @ (prior.mean - states)[:, :, None]
         weighted_innovation = np.linalg.solve(innovation_covariance, innovation)  # S^-1 v
         if iteration < iterations:  # move the state, unless this is the last evaluation
-            # From the present state to the Kalman update of the prior mean, shape (n_component, n_state)
-            step = prior.mean + (cross_covariance.swapaxes(1, 2) @ weighted_innovation)[:, :, 0] - states
-            relative_length = np.abs(step[:, VALUES]) / MAX_ITERATION_STEP
-            states = states + step / np.maximum(relative_length.max(axis=1, keepdims=True), 1.0)
+            kalman_correction = (cross_covariance.swapaxes(1, 2) @ weighted_innovation)[:, :, 0]  # P J^T S^-1 v
+            step = prior.mean + kalman_correction - states
+            # Shorten a step in which x, y or ln F changes by more than its entry of `MAX_ITERATION_STEP`.
+            relative_length = (np.abs(step[:, VALUES]) / MAX_ITERATION_STEP).max(axis=1, keepdims=True)
+            states = states + step / np.maximum(relative_length, 1.0)
 
     squared_misfit = (residual_pC**2 / variance_pC2).sum(axis=1)
+    # The change of the state, relative to its prior covariance: v^T S^-1 J P J^T S^-1 v
     squared_change = (weighted_innovation * (charge_covariance @ weighted_innovation)).sum(axis=(1, 2))
     squared_distance = squared_misfit + squared_change
     log_weight = prior.log_weight - 0.5 * (squared_distance + np.linalg.slogdet(innovation_covariance).logabsdet)

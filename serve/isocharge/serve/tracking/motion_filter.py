@@ -320,19 +320,23 @@ class ContactFilter:
         # Update the filter, or begin a new contact at the second frame that does not belong to the contact.
         motion = self._motion
         belongs = motion is not None and motion.step(t_s - self.time_s, measured, covariance)
-        self._is_outlier = not (motion is None or belongs or self._is_outlier)
-        if motion is None or not (belongs or self._is_outlier):
+        is_second_outlier = self._is_outlier and not belongs
+        if motion is None or is_second_outlier:
             motion = MotionFilter(measured, covariance)
             self._motion = motion
-        if not self._is_outlier:
+            belongs = True
+        self._is_outlier = not belongs
+        if belongs:
             self._noise.update(measured, model_covariance, t_s)
         self.time_s = t_s
 
-        # Combine the modes, and add the constant errors.
+        # Average the states of the modes, shape (6,). The variance of the average also contains the spread of the
+        # modes. Add the variances of the errors that are the same in every frame.
         mean = motion.probability @ motion.mean
         spread = (motion.mean - mean) ** 2
         variances = motion.probability @ (np.diagonal(motion.covariance, axis1=1, axis2=2) + spread)
-        smoothed_std = np.sqrt(variances[VALUES] + self._constant_share * stated_covariance.diagonal())
+        constant_variances = self._constant_share * stated_covariance.diagonal()
+        smoothed_std = np.sqrt(variances[VALUES] + constant_variances)
         x_std_mm, y_std_mm, log_force_std = smoothed_std.tolist()
         x_mm, y_mm, log_force, vx_mm_s, vy_mm_s, _ = mean.tolist()
         smoothed_N = math.exp(min(log_force, LARGEST_LOG_FORCE))

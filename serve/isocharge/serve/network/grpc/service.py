@@ -190,7 +190,8 @@ class Service:
         """
         if ROUTE_OF_METHOD[name].needs_token:
             metadata = dict(context.invocation_metadata() or ())
-            self._handler.access.check_token(str(metadata.get("authorization", "")).encode())
+            authorization = str(metadata.get("authorization", ""))
+            self._handler.access.check_token(authorization.encode())
         timeout_s = self._handler.limits.header_seconds
         while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:
             if name.startswith("RepositoryModel"):  # loading a model takes a long time
