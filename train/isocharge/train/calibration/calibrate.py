@@ -317,14 +317,16 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
             "standard deviations of the model do not contain errors that many forces share"
         )
     cautions.extend(film.session_cautions())
-    cautions.extend(
-        f"{one.meaning}: {film.value(one.name):.3g} {one.unit}".removesuffix(" 1")  # the unit of a ratio
-        + ", which is unusually far from the sensor file: is the origin of the stage the centre of the film, are "
-        "its axes those of the film, are the forces in N and the charges in pC, and has each channel the gain of the "
-        "sensor file?"
-        for one in film.layout.prior.properties
-        if not one.is_imperfection and abs(film.value(one.name) - one.mean) > UNUSUAL_DEVIATION * one.std
-    )
+    for declared in film.layout.prior.properties:
+        value = film.value(declared.name)
+        is_unusual = abs(value - declared.mean) > UNUSUAL_DEVIATION * declared.std
+        if is_unusual and not declared.is_imperfection:
+            value_text = f"{value:.3g} {declared.unit}".removesuffix(" 1")  # a ratio has the unit 1
+            cautions.append(
+                f"{declared.meaning}: {value_text}, which is unusually far from the sensor file: is the origin of the "
+                "stage the centre of the film, are its axes those of the film, are the forces in N and the charges in "
+                "pC, and has each channel the gain of the sensor file?"
+            )
     if is_one_place(presses):
         cautions.append("all known positions are at one place, so they do not determine where the electrodes are")
     return cautions

@@ -300,17 +300,16 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
         column_of_electrode = np.argsort(electrode_of_column)  # the inverse permutation
         yield sentence, contact, charge[:, column_of_electrode]
 
-    # A gain is the typical ratio of measured to expected charges of a channel, relative to that of the other channels.
-    # The median is that over the films and the presses, shape (n_electrode,).
+    # The gain of a channel is the median ratio of measured to expected charges over the similar films (axis 0) and the
+    # presses (axis 1), relative to the median over all channels. A channel with the wrong sign has no gain, so the
+    # logarithms of the gains are limited.
     log_ratios = np.nanmedian(_log_ratio(charge, expected_charges(charges, contact)), axis=(0, 1))
-    # A channel with the wrong sign has no gain, so the gains are limited.
-    gains = np.exp(np.clip(log_ratios - np.median(log_ratios), -3.0, 3.0))
-    for name, is_own, gain in zip(electrodes, np.eye(len(electrodes)), gains, strict=True):
-        yield (
-            f"the gain of {name} is about {gain:.1g} times that of the sensor file",
-            contact,
-            charge / gain**is_own,
-        )
+    log_gains = np.clip(log_ratios - np.median(log_ratios), -3.0, 3.0)
+    for column, gain in enumerate(np.exp(log_gains)):
+        corrected_charge = charge.copy()
+        corrected_charge[:, column] /= gain
+        sentence = f"the gain of {electrodes[column]} is about {gain:.1g} times that of the sensor file"
+        yield sentence, contact, corrected_charge
 
     x, y, force = contact.T
     coordinates = {"x": x, "-x": -x, "y": y, "-y": -y}

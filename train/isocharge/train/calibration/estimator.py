@@ -278,10 +278,12 @@ def _most_probable_point(
         measured_contacts=data.contact,
         contact_std=data.contact_std,
     )
-    unknowns, log_contact = prior.mean, data.contact
+    start_unknowns = prior.mean
+    start_contact = data.contact
     if previous is not None:
-        unknowns, log_contact = previous.film.values, with_log_force(previous.contact)
-    return problem.estimate(unknowns, log_contact, state_bounds=prior.bounds)
+        start_unknowns = previous.film.values
+        start_contact = with_log_force(previous.contact)
+    return problem.estimate(start_unknowns, start_contact, state_bounds=prior.bounds)
 
 
 class _Average(NamedTuple):

@@ -206,10 +206,14 @@ class FilmCharges:
         Returns:
             Derivatives by the name of the property, each of shape (n, n_electrode), pC per unit.
         """
-        film, fields = _read(self.slopes.film, sensor), _read(self.slopes.fields, sensor)
-        slopes = replace(self.slopes, film=film, fields=fields).jacobian(contact)
+        # Use the solved stresses with the electrodes and the coefficients of the given sensor.
+        slopes_of_sensor = replace(
+            self.slopes, film=_read(self.slopes.film, sensor), fields=_read(self.slopes.fields, sensor)
+        )
+        slopes = slopes_of_sensor.jacobian(contact)
         # The radius of the probe is only a property if the probe is a circle.
         derivatives = {name: slope for name, slope in slopes.items() if name in self.prior.names}
+
         # Let q be a function of F / (E h) and of the tensions T / E. Then Q = E q, ln h changes Q like -ln F, and ln E
         # changes Q by Q - dQ/d(ln F) - sum of T dQ/dT.
         derivatives["thickness"] = -force_slope

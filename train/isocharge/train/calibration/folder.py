@@ -331,10 +331,15 @@ def usable_held_out(
             which a factor for standard deviations follows.
     """
     domain = problem.domain
-    held_out, presses = (one.of_electrodes(problem.electrodes, problem.sensor.name) for one in (held_out, presses))
-    _refuse_learned(held_out, presses, "held-out presses that are not among those of the calibration")
-    is_known = np.isfinite(held_out.charge_pC).all(axis=1) & np.isfinite(held_out.contact).any(axis=1)
-    usable = held_out[is_known & ~domain.is_outside(held_out.contact)]
+    sensor_name = problem.sensor.name
+    held_out = held_out.of_electrodes(problem.electrodes, sensor_name)
+    learned = presses.of_electrodes(problem.electrodes, sensor_name)
+    _refuse_learned(held_out, learned, "held-out presses that are not among those of the calibration")
+
+    has_all_charges = np.isfinite(held_out.charge_pC).all(axis=1)
+    has_position_or_force = np.isfinite(held_out.contact).any(axis=1)
+    is_inside = ~domain.is_outside(held_out.contact)
+    usable = held_out[has_all_charges & has_position_or_force & is_inside]
     if len(usable) < FEWEST_HELD_OUT:
         raise PressError(
             f"expected at least {FEWEST_HELD_OUT} held-out presses {domain_words(domain)}, with all charges and a "

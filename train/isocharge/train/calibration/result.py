@@ -102,23 +102,25 @@ class CalibrationResult:
     @property
     def summary(self) -> tuple[str, ...]:
         """Sentences about the errors, the properties that the presses determine, and the presses."""
-        after, before, noise = self.film_error, self.film_error_before, self.sensitivity.noise_error
+        after = self.film_error
+        before = self.film_error_before
+        noise = self.sensitivity.noise_error
         sentences = [
             f"The uncertainty of the film causes errors of {after.position_mm:.2g} mm and {after.force_percent:.2g} % "
             f"(before the presses {before.position_mm:.2g} mm and {before.force_percent:.2g} %); noise alone causes "
             f"{noise.position_mm:.2g} mm and {noise.force_percent:.2g} %."
         ]
-        identified = {name: one for name, one in self.properties.items() if one.identified}
+        identified = [estimate for estimate in self.properties.values() if estimate.identified]
         if identified:
-            shown = [
-                f"{one.meaning} {one.value:.3g} +- {one.std:.2g} {one.unit}".removesuffix(" 1")  # the unit of a ratio
-                for one in identified.values()
+            texts = [
+                f"{estimate.meaning} {estimate.value:.3g} +- {estimate.std:.2g} {estimate.unit}".removesuffix(" 1")
+                for estimate in identified  # " 1" is the unit of a ratio
             ]
             sentences.append(
                 "The presses determine the following changes from the sensor file (of the mean pretension, the value "
-                f"itself): {'; '.join(shown)}."
+                f"itself): {'; '.join(texts)}."
             )
-        unidentified = [name.replace("_", " ") for name in self.properties if name not in identified]
+        unidentified = [name.replace("_", " ") for name, estimate in self.properties.items() if not estimate.identified]
         if unidentified:
             sentences.append(
                 f"They hardly determine {', '.join(unidentified)}. Contacts depend only on combinations of these "

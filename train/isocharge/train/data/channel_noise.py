@@ -223,9 +223,13 @@ class LocalPlanes:
 
         # A residual contains the noise of the mean value and the noise of the plane. The value of the plane is the sum
         # of the mean values of the neighbours with the weights in the first row.
-        plane_variance = (weights[:, 0] ** 2 / press_count[neighbours]).sum(axis=1)
+        plane_variance = (weights[:, 0] ** 2 / press_count[neighbours]).sum(
+            axis=1
+        )  # relative to that of a single press
         relative_std = np.sqrt(1.0 / press_count + plane_variance)
-        return cls(value, slope, (mean_value - value) / relative_std[:, None], distance[:, -1])
+        residual = (mean_value - value) / relative_std[:, None]
+        farthest_distance = distance[:, -1]
+        return cls(value, slope, residual, farthest_distance)
 
     def residuals(self, values: Array) -> Array:
         """Compute the difference between each set of k values and the nearest point of all planes.

@@ -99,8 +99,9 @@ def fit_charge_series(
     """
     unit_contact = domain.to_unit(presses.contact)
     if presses.has_nonpositive_charges:
-        # The values of the series are Q / S with the typical size S of the charges. Charges near zero would have large
-        # relative errors. Their errors are therefore relative to the charge of which the noise is proportional.
+        # The series describes Q / S, where Q is a charge, and S is the typical size of charges at the same force. For
+        # charges near zero, errors relative to Q would be too large, so the unit of an error does not decrease below
+        # the charge at which the white noise equals the noise that is proportional to the charge.
         candidate_degrees = SIGNED_CANDIDATE_DEGREES
         log_size = _fit_log_size(unit_contact[:, 2], presses.charge)
         target = presses.charge / series_size(log_size, unit_contact[:, 2])[0]
@@ -108,7 +109,7 @@ def fit_charge_series(
     else:
         candidate_degrees = CANDIDATE_DEGREES
         log_size = None
-        target = np.log(presses.charge)
+        target = np.log(presses.charge)  # the series describes ln Q
         error_unit = validation.charge
 
     # Try the degrees until the error is small enough, or the presses are too few for the next degrees.

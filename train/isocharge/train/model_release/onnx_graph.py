@@ -105,20 +105,20 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     bias = next(constants)
     last = Layer(weight=next(constants), bias=bias)
     # ONNX repeats a single number for all columns, but the C code does not, so such a bias is refused.
-    has_biases = all(layer.bias.shape == layer.weight.shape[1:] for layer in (*hidden, last, Layer(skip, bias)))
+    layers = (*hidden, last, Layer(skip, bias))
+    has_biases = all(layer.bias.shape == layer.weight.shape[1:] for layer in layers)
     if not (hidden and has_biases):
         raise ValueError("expected hidden layers, and a bias for each column of the weights")
 
     # Each matrix contains the weights of the contact perceptron in its first rows and columns, and those of the misfit
-    # perceptron in the others. Find the first column of the misfit perceptron in each layer, from the last layer to the
-    # first. In a hidden layer, it is the first row of the next layer with a weight for the misfit perceptron.
+    # perceptron in the others. Find the first column of the misfit perceptron in each layer, from the last layer
+    # backwards. The columns of a layer are the rows of the next layer, so the first column of the misfit perceptron is
+    # the first of these rows with a weight for the misfit perceptron.
     misfit_starts = [ANGLES.stop]  # of the last layer, whose first columns are the answers about the contact
-    for weight, _ in (last, *hidden[:0:-1]):  # the last layer, and the hidden layers backwards without the first
-        has_misfit_weight = weight[:, misfit_starts[0] :].any(
-            axis=1
-        )  # for each row, which is a unit of the layer before
-        first_misfit_row = int(has_misfit_weight.argmax())
-        misfit_starts.insert(0, first_misfit_row)
+    for next_layer in (last, *reversed(hidden[1:])):
+        misfit_weights = next_layer.weight[:, misfit_starts[0] :]
+        row_has_weight = misfit_weights.any(axis=1)
+        misfit_starts.insert(0, int(row_has_weight.argmax()))
 
     joined = Perceptron(tuple(hidden), last, skip)
     contact = _select_units(joined, [slice(start) for start in misfit_starts])

@@ -107,7 +107,9 @@ def contact_stage(
         posterior = network.posterior(noisy_charge)
         # The two losses have separate gradients. The first loss does not change the outputs for the covariance, and the
         # second loss does not change the mean.
-        return (mean_loss(posterior, target) + covariance_loss(posterior, target - posterior.mean)).mean()
+        loss_of_mean = mean_loss(posterior, target)
+        loss_of_covariance = covariance_loss(posterior, target - posterior.mean)
+        return (loss_of_mean + loss_of_covariance).mean()
 
     sizes = config.sizes(network.features.n_electrode)
     rate = config.learning_rate * sizes.rate_factor

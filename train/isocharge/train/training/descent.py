@@ -66,7 +66,8 @@ class Soap:
         Args:
             rate: Learning rate, which is approximately the change of each entry.
         """
-        # Update the moving averages, and at times the eigenbases.
+        # Update the moving averages. The eigenbases of the two moments are updated at times, each by one step of an
+        # orthogonal iteration.
         gradient = self.parameter.grad
         assert gradient is not None
         new_weight = 1.0 - DECAY
