@@ -45,9 +45,11 @@ def touched_blocks(values: Array, times_s: Array, min_noise: float = 0.0) -> tup
     block_times_s = medians[:, 0]
     levels = np.nan_to_num(medians[:, 1:])
     # Whole numbers have a rounding error between -0.5 and 0.5, whose standard deviation is 12**-0.5.
-    are_whole_numbers = ((values == np.round(values)) | ~np.isfinite(values)).all(axis=0)
-    noise = np.maximum(estimate_noise(values), np.where(are_whole_numbers, 12.0**-0.5, 0.0))
-    return block_times_s, levels, _detect_touches(levels, np.maximum(noise, min_noise))
+    are_whole_numbers = ((values == np.round(values)) | ~np.isfinite(values)).all(axis=0)  # of each channel
+    rounding_noise = np.where(are_whole_numbers, 12.0**-0.5, 0.0)
+    noise = np.maximum(estimate_noise(values), rounding_noise)
+    is_touched = _detect_touches(levels, np.maximum(noise, min_noise))
+    return block_times_s, levels, is_touched
 
 
 BLOCK_RULE = TouchRule(sigmas=26.0, floor_pC=0.0)
@@ -69,7 +71,8 @@ def _detect_touches(levels: Array, noise: Array) -> Booleans:
     detector = Touch(Setup(channels, Device(rules={TouchRule: BLOCK_RULE}), has_any_sign=True))
     is_touched = np.zeros(len(levels), dtype=bool)
     for number, level in enumerate(levels):
-        if not is_touched[number - 1]:  # true for the first block, because the last element is still False
+        was_touched = number > 0 and is_touched[number - 1]
+        if not was_touched:
             rest = levels[max(number - CHANGE_BLOCKS, 0)]
         frame = Frame(seq=None, t_us=None, values=(), dt_s=BLOCK_S, charge_pC=level - rest)
         frame.noise_pC = noise
@@ -144,5 +147,6 @@ def estimate_noise(values: Array) -> Array:
         differences = np.abs(np.diff(channel_values[np.isfinite(channel_values)]))
         if len(differences) > 0:
             median_estimate = np.median(differences) / (0.6745 * math.sqrt(2.0))
-            noise[column] = median_estimate or differences.mean() * math.sqrt(math.pi) / 2.0
+            mean_estimate = differences.mean() * math.sqrt(math.pi) / 2.0
+            noise[column] = median_estimate if median_estimate > 0.0 else mean_estimate
     return noise

@@ -248,7 +248,7 @@ def _has_decimal_commas(text: str) -> bool:
         return False
     if number_count == 1:
         return named_count == 1
-    are_named = 1 < comma_count == named_count
+    are_named = comma_count > 1 and named_count == comma_count
     return are_named or re.search(r"[\[({]", text) is None
 
 

@@ -461,14 +461,18 @@ class FilmFollower(Stage):
             contact: Contact on the calibrated film.
             state: State of the film, shape (n_state,).
         """
+        # Charges of the contact on the changed and on the calibrated film, and the derivatives of the latter charges
+        # with respect to the contact (x, y, ln F), shape (n_electrode, 3)
         log_contact = self._log_contact(contact)
-        present = self._values(log_contact, state)
+        changed = self._values(log_contact, state)
         (calibrated_pC,), (slopes_pC,) = self._series.linearised(contacts_of(log_contact))
+        shift_pC = calibrated_pC - changed.charge_pC[0]
 
-        # An error of the state shifts the contact whose charges are nearest to the converted charges. The distance of
-        # charges is measured in standard deviations of their noise.
-        weight = 1.0 / np.sqrt(self.predictor.noise.variance(calibrated_pC))[:, None]
-        contact_by_state = np.linalg.pinv(weight * slopes_pC) @ (weight * present.by_state[0])  # shape (3, n_state)
+        # An error of the state shifts the contact whose charges are nearest to the converted charges (least squares).
+        # The distance of charges is measured in standard deviations of their noise.
+        noise_std_pC = np.sqrt(self.predictor.noise.variance(calibrated_pC))
+        weight = 1.0 / noise_std_pC[:, None]
+        contact_by_state = np.linalg.pinv(weight * slopes_pC) @ (weight * changed.by_state[0])  # shape (3, n_state)
         contact_by_state[2] *= contact.force_N  # from ln F to F
         covariance = contact_by_state @ self._applied_covariance @ contact_by_state.T
-        return _Conversion(contact, calibrated_pC - present.charge_pC[0], covariance)
+        return _Conversion(contact, shift_pC, covariance)

@@ -204,21 +204,27 @@ class MotionFilter:
         """Replace the modes by their prediction a time `dt_s` later, s. The mode may change within this time."""
         # Mix the states of the previous modes (columns) for each new mode (row). The position and the force start or
         # stop to change independently, so the probability of a change of both is the product of the two probabilities.
-        change = min(dt_s / MEAN_MODE_TIME_s, 0.5)
-        mode_transition = change**_MODE_DIFFERENCE * (1.0 - change) ** (2.0 - _MODE_DIFFERENCE)
+        change = min(dt_s / MEAN_MODE_TIME_s, 0.5)  # probability of a change of the position, or of the force
+        mode_transition = change**_MODE_DIFFERENCE * (1.0 - change) ** (2.0 - _MODE_DIFFERENCE)  # shape (4, 4)
         joint_probability = mode_transition * self.probability
         self.probability = joint_probability.sum(axis=1)
         weights = joint_probability / self.probability[:, None]
-        mean = weights @ self.mean
+        mean = weights @ self.mean  # shape (4, 6)
+
+        # The covariance of a mixture is the mean of the covariances plus the spread of the means.
         deviation = self.mean - mean[:, None]  # of each previous mode (axis 1) from the mean of each new mode (axis 0)
         spread = (weights[:, :, None] * deviation).swapaxes(1, 2) @ deviation
         mixed_covariance = np.einsum("nm,mij->nij", weights, self.covariance) + spread
 
-        # Predict the states. The rate of a held value is that of a movement that would begin now: zero on average.
+        # Compute the covariance that is added until the next frame: by the accelerations of moving values, by the
+        # unknown rates of held values, and by the drift of held values.
         squared_speed = (mean[:, VELOCITY] ** 2).sum(axis=1, keepdims=True)
         density = _IS_MOVING * (ACCELERATION_DENSITY + squared_speed * SPEED_CHANGE_RATE)
         noise = density[:, None] * UNIT_NOISE * dt_s**TIME_EXPONENT
         noise += _HELD_RATE_COVARIANCE + dt_s * HELD_DRIFT_DENSITY
+
+        # Predict the states. A value changes by its rate times the time. The rate of a held value is that of a movement
+        # that would begin now: zero on average.
         transition = (_IDENTITY + dt_s * _INTEGRATION) * _HAS_EFFECT
         self.mean = (transition @ mean[:, :, None])[:, :, 0]
         self.covariance = transition @ mixed_covariance @ transition.swapaxes(1, 2) + noise

@@ -173,10 +173,11 @@ class _ChangedFilm:
         Returns:
             Charges, shape (n, n_electrode), pC, and derivatives, shape (n, n_electrode, n_unknown), pC per unit.
         """
-        charge, _, by_property = self.charges.linearised(self.values, contact)
+        charge, _, by_changed_property = self.charges.linearised(self.values, contact)
+        by_property = by_changed_property @ self.by_calibrated  # chain rule
         by_offset = np.ones((*charge.shape, 1))
         by_coefficient = discrepancy_jacobian(charge, contact, self.charges.domain)
-        return charge, np.concatenate([by_property @ self.by_calibrated, by_offset, by_coefficient], axis=2)
+        return charge, np.concatenate([by_property, by_offset, by_coefficient], axis=2)
 
 
 def _fit_followable_nodes(

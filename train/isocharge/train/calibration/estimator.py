@@ -455,8 +455,9 @@ class _HypothesisGroup:
         weighted = [cho_solve((factor, True), self.residual, check_finite=False) for factor in factors]  # S^-1 r
         chi2 = self.other_chi2 + np.array(weighted) @ self.residual
         log_determinant = 2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)  # of S
-        log_probability = np.log([one.probability for one in self.hypotheses])
-        return chi2, self.log_volume - 0.5 * (chi2 + log_determinant) + log_probability
+        log_density = self.log_volume - 0.5 * (chi2 + log_determinant)  # of the residuals
+        log_prior_probability = np.log([hypothesis.probability for hypothesis in self.hypotheses])
+        return chi2, log_density + log_prior_probability
 
     def posterior(self, weight: Array) -> tuple[Array, Array]:
         """Compute the estimates of the unknowns under the hypotheses whose weight is positive.

@@ -69,7 +69,7 @@ class FilmCharges:
         # The sensor file itself may describe a film without axial symmetry.
         film = replace(sensor.film, deviator=(0.0, 0.0), young_ratio=1.0, shear=None, oval=0.0)
         slopes = FilmSlopes.build(replace(sensor, film=film), round_probe(probe), domain, executor=executor)
-        return cls(prior, even_values, slopes.film, slopes, even_values)
+        return cls(prior=prior, values=even_values, film=slopes.film, slopes=slopes, even_values=even_values)
 
     @property
     def even(self) -> "FilmCharges":

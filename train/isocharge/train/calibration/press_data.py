@@ -65,14 +65,15 @@ class PressData:
         log_contact = with_log_force(presses.contact)
         is_contact_known = np.isfinite(log_contact)
         measured_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std])
-        count = len(presses)
+        number = np.arange(len(presses))
+        last_number = max(len(presses) - 1, 1)  # at least 1, to avoid a division by 0
         return cls(
             charge=charge,
             charge_std=np.where(is_charge_known, noise.sigma(charge), UNKNOWN_STD),
             noise=noise,
             contact=np.where(is_contact_known, log_contact, domain.centre),
             contact_std=np.where(is_contact_known, measured_std, UNKNOWN_STD),
-            time=np.arange(count) / max(count - 1, 1) - 0.5,
+            time=number / last_number - 0.5,  # from -0.5 to 0.5, as if the presses were evenly spaced in time
         )
 
     def __len__(self) -> int:

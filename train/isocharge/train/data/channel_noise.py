@@ -307,7 +307,8 @@ def _repeated_residuals(unit_contact: Array, charge: Array) -> tuple[Array, Arra
     mean = mean_charge[repeated_contact]
     count = press_count[repeated_contact, None]
     # The variance of a difference from the mean of k charges is (k - 1) / k times that of the noise.
-    return mean, (charge[is_repeated] - mean) * np.sqrt(count / (count - 1))
+    difference = charge[is_repeated] - mean
+    return mean, difference * np.sqrt(count / (count - 1))
 
 
 def usual_size(charge: Array) -> Array:

@@ -155,12 +155,12 @@ def _presses_text(metadata: ModelMetadata) -> str:
     """Return a text about the presses on which the errors were measured."""
     measured = metadata.made_with.get("measured")
     if measured is not None:
-        factors = " for positions and ".join(f"{factor:g}" for factor in measured["std_factors"])
+        position_factor, force_factor = measured["std_factors"]
         return (
             f"measured presses at {measured['places']} places, which are in `presses.csv`. They are estimated by "
             f"{measured['folds']} networks, each at the places on which it was not trained. The model learned the mean "
-            f"of their answers. The standard deviations were multiplied by {factors} for forces, so that the 68 % "
-            "intervals contain 68 % of these presses"
+            f"of their answers. The standard deviations were multiplied by {position_factor:g} for positions and "
+            f"{force_factor:g} for forces, so that the 68 % intervals contain 68 % of these presses"
         )
     return (
         "simulated presses that were not used in the training, with that noise. The forces are log-uniform, and the "
