@@ -157,6 +157,10 @@ class DeviceClock:
     def _stamp_with_device(self, frame: Frame, t_us: int, modulus: int, arrival_s: float) -> None:
         """Compute the time of a frame from the clock of the device, and write it into the frame.
 
+        A straight line converts the clock to the time of the host (`_predicted_s`). The line was fitted to the arrivals
+        of earlier readings. A new fit begins if there is none, if the device has restarted, or if the predicted time is
+        far after the arrival.
+
         If the clock went back by at most `MAX_DELAY_s`, the reading arrived late: for example, another datagram has
         overtaken it. If the clock went back by more, the device has restarted. However, if the clock went back by at
         least half of its range, it is assumed to have wrapped.
@@ -231,6 +235,10 @@ class DeviceClock:
 
     def _fit_arrival(self, arrival_s: float) -> None:
         """Fit the clock of the device to the arrival time of a chunk, whose readings have been processed.
+
+        The fit is a straight line: the host time is `_fitted_host_s` when the clock of the device is `_fitted_us`, and
+        then advances by `rate` seconds per second of the device. The time that the line predicts for the latest reading
+        is `_predicted_s`.
 
         The fit is corrected with one step of a second-order delay-locked loop (Adriaensen 2005). The gain of the loop
         is w = 2 pi * bandwidth * step_s, but at most `MAX_LOOP_GAIN`, because the loop would become unstable with a

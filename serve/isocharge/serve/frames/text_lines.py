@@ -384,6 +384,8 @@ def _alternating_names(parts: list[_Part], *, has_header: bool) -> list[str]:
         parts: Parts of the line.
         has_header: Whether a header names the numbers.
     """
+    # The shape has one symbol for each part: t for a time, u for a unit, w for another word, and 0 for a number. Marks
+    # stand for themselves.
     shape = _shape(parts)
     # A single word and a single number, as in `A,3.5`, are a name and its value even below a header with two columns.
     is_pair = re.fullmatch("[t ,;]*[uw][,;|]0[uw]?", shape) is not None
@@ -418,6 +420,7 @@ def _preceding_names(parts: list[_Part], counters: Container[str]) -> list[str]:
     words = {part.name for part in parts if part.kind == "word"}
     channels = [index for index, name in enumerate(names) if name not in TIMES_US]
 
+    # In the shape of a line, u is a unit and w is another word. Only marks may follow the last word.
     ends_with_word = re.search(r"[uw]\W*$", _shape(parts)) is not None
     if channels and not names[channels[0]] and ends_with_word:
         names = ["" if name in words else name for name in names]

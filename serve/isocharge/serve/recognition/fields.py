@@ -170,11 +170,13 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[
 def _number_parts(
     number_bytes: Bytes, constant_bytes: NDArray[np.int64], type_name: FieldType, frame_rate_Hz: float
 ) -> Iterator[Part]:
-    """Yield the possible parts of a frame for bytes that contain a number of a given type.
+    """Yield the possible meanings of some bytes of each frame, under the assumption that they are a number of a type.
 
     Every number may be a channel, and some numbers may also be the frame counter or a clock. Nothing is yielded for
-    floating-point numbers that are implausibly small or large. Each part has a score in bits, which is lower for a more
-    probable part.
+    floating-point numbers that are implausibly small or large.
+
+    Each part has a score in bits, which is lower for a more probable part. The score of a channel is the mean number of
+    bits that its steps from frame to frame need, because the bytes of a true number change little.
 
     Args:
         number_bytes: Bytes of the number, the lowest first, shape (n, size).
@@ -190,8 +192,8 @@ def _number_parts(
     if type_name[0] == "f":
         if not 1e-7 < magnitude < 1e10:  # a Unix time is the largest of the usual numbers
             return
-        # Only the share `Weights.fraction` of the bytes contains the digits of the number. Low bytes that are always 0
-        # contain no digits.
+        # A floating-point number of n bytes has digits in n * `Weights.fraction` bytes, and therefore represents steps
+        # of its magnitude divided by 256 to this power. Low bytes that are always 0 contain no digits.
         low_zero_byte_count = np.argmax(constant_bytes != 0)
         unit = magnitude * 256.0 ** (low_zero_byte_count - Weights.fraction * size)
 

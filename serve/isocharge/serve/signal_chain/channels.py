@@ -304,11 +304,15 @@ class Gain(Stage):
         self._skipped_intervals = 0
 
     def step(self, frame: Frame) -> None:
-        """Convert the values of a frame to charges, and mark the frame if a value cannot be a charge.
+        """Convert the values of a frame to charges, and mark the frame as invalid if a value cannot be a charge.
+
+        An invalid frame gets no charges. Its time step and its sampling intervals are added to those of the next valid
+        frame.
 
         Raises:
             ChargeError: If the frame has no value for an electrode.
         """
+        # The channels of the electrodes are searched only if the names or the number of the values have changed.
         layout = (frame.names, len(frame.values))
         if layout != self._layout:
             self._select = itemgetter(*self._channels.channel_indices(frame))

@@ -173,12 +173,14 @@ class Leak(Stage):
         frame.base_relax_s = self._rule.relax_s
 
     def _advance(self, frame: Frame, previous: Frame, output_pC: Array) -> None:
-        """Add the charge that is new since the previous frame to the touch charge.
+        """Add the charge that is new since the previous frame to the touch charge (`_charge_pC`).
 
         The new charge is the output, minus the part of the previous output that the leak has left, minus the inflow
-        (pC/s) times the time since the previous frame. Out of contact, the touch charge should be zero. Except during a
-        pause after a release, the method then lets it decay to zero, and learns the inflow from the new charge. If
-        frames are missing, the touch may have ended meanwhile, or its charge may have become wrong.
+        times the time since the previous frame. The inflow is a slow current into the amplifiers, pC/s.
+
+        Out of contact, the touch charge should be zero, so it decays to zero. Except during a pause after a release,
+        the inflow is then learned from the new charge. If frames are missing during a touch, the touch may have ended
+        meanwhile, or its charge may have become wrong (`_is_falsified`).
 
         Args:
             frame: The frame.

@@ -115,11 +115,13 @@ class Warming(Stage):
             frame.flags.append(BLIND)
 
     def _estimate(self, charge_pC: Array, dt_s: float) -> float:
-        """Update the estimate of the charge that the warming has caused, and return its change, pC.
+        """Update the estimate of the charge p that warming has added to each electrode, and return its change, pC.
 
-        The squared misfit of the charges is computed for several trial values of the change, and a parabola is fitted
-        to it. If the parabola is too flat, the warming cannot be distinguished from the force (`blind`). The estimate
-        is then not changed.
+        The estimate (`_charge_pC`) and its variance (`_variance_pC2`) are those of a Kalman filter. A change of p is
+        measured as follows. Trial values of the change are subtracted from the charges. The misfit of a trial value is
+        the distance of the remaining charges from those of the nearest contact. A parabola is fitted to the squared
+        misfits, and its minimum is the measured change. If the parabola is too flat, warming cannot be distinguished
+        from force. The estimate is then not changed.
 
         Args:
             charge_pC: Touch charges from which the present estimate has been subtracted, shape (n_electrode,), pC.

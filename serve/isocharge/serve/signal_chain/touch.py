@@ -184,28 +184,36 @@ class Touch(Stage):
             self._touch_direction = self._touch_direction + charge / size
 
     def _await(self, frame: Frame, charge: Array, size: float) -> None:
-        """Update the base, which contains the charges that belong to no touch, or begin a touch.
+        """Process a frame while nothing touches the film: begin a touch, or update the base.
 
-        A touch begins if both the charges and the charges above the base exceed the threshold in the expected
-        direction. The base decays to zero. If the charges change against this direction, the base becomes the mean of
-        the latest charges. While charges of the latest touch may remain, the expected direction is that of the latest
-        touch. Later, it is that of equal positive charges. If touches may have charges of any sign, it is the zero
-        vector, with which every direction is accepted.
+        The base (`_base_charge`) contains the charges that belong to no touch. Out of contact, it decays to zero.
+
+        - If the change of the charges since the base is opposite to the expected direction, the base becomes the mean
+          of the latest charges (`_idle_mean_charge`).
+        - Otherwise, if both the charges and their change exceed the threshold, a touch begins.
+        - Otherwise, if the base is what remains of the latest touch, and the charges are smaller, they become the base.
+
+        While charges of the latest touch may remain, the expected direction is that of the latest touch. Later, it is
+        that of equal positive charges. If touches may have charges of any sign, it is the zero vector, with which every
+        direction is accepted.
 
         Args:
             frame: The frame.
             charge: Charges relative to the touch thresholds, shape (n_electrode,), dimensionless.
-            size: Size of the charges.
+            size: Size of the charges, which is the norm of their vector. A size of 1 is the threshold.
         """
-        if self._rest_s >= RISE_S - SUM_TOLERANCE_s:
+        if self._rest_s >= RISE_S - SUM_TOLERANCE_s:  # the charges have been small for some time
             self._touch_direction = self._rest_directions[self._setup.has_any_sign]
         direction = self._touch_direction
+        # If a product of charges with `direction` is below this limit times the size of the charges, they are opposite.
         opposing_limit = OPPOSING_COSINE * math.sqrt(direction @ direction)
+
         # After a touch, the base is the charge that remains of it. While the finger leaves the film, the charge at rest
         # is held, and the base must not decay, because the finger still causes this charge.
         is_remainder = self._base_charge @ direction >= 0.0
         if not (frame.is_base_held and is_remainder):
             self._base_charge = self._base_charge * math.exp(-frame.dt_s / frame.base_relax_s)
+
         change = charge - self._base_charge
         change_size = math.sqrt(change @ change)
         if change @ direction < opposing_limit * change_size:
