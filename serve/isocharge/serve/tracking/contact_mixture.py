@@ -178,9 +178,9 @@ class ContactMixture:
     def update(self, charge_pC: Array, t_s: float) -> list[ContactHypothesis]:
         """Process the charges of a frame, and return the contacts that explain the charges of the latest update.
 
-        The frames within `NOISE_INTERVAL_s` are one step, because their noise is partly the same. The mixture is updated
-        at the end of each step, with the mean charges of its frames. The components of the mixture (`_components`) are
-        Gaussian distributions of the contact; None if no contact explains the charges.
+        The frames within `NOISE_INTERVAL_s` are one step, because their noise is partly the same. The mixture is
+        updated at the end of each step, with the mean charges of its frames. The components of the mixture
+        (`_components`) are Gaussian distributions of the contact; None if no contact explains the charges.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
