@@ -192,7 +192,9 @@ class Capture:
         channel_count = len(self.frames[-1].values)
         frames = [frame for frame in self.frames if len(frame.values) == channel_count]
         values = np.array([frame.values for frame in frames], dtype=float)
-        return np.where(np.abs(values) > LARGEST, np.copysign(np.inf, values), values), elapsed_times(frames)
+        is_too_large = np.abs(values) > LARGEST
+        limited_values = np.where(is_too_large, np.copysign(np.inf, values), values)
+        return limited_values, elapsed_times(frames)
 
 
 def elapsed_times(frames: Sequence[Frame]) -> Array:

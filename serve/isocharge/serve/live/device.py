@@ -91,7 +91,11 @@ class Prediction(Stage):
         self._touch_predictor: Predictor | None = None  # for the noise before the present touch
 
     def step(self, frame: Frame) -> None:
-        """Predict the contact of a frame, unless nothing touches the film or the frame has no charges."""
+        """Predict the contact of a frame, unless nothing touches the film or the frame has no charges.
+
+        In the first frame of a touch, the predictor of the touch is chosen. If the noise at rest is much larger than
+        the noise of the model, the standard deviations of the touch are those for the noise at rest.
+        """
         if frame.charge_pC is None or not frame.is_contact:
             self._touch_predictor = None
             return

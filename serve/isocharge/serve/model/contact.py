@@ -160,9 +160,11 @@ def correlation_matrices(contacts: ArrayLike) -> Array:
     Args:
         contacts: The ten numbers of each contact, shape (..., 10).
     """
-    correlations = np.asarray(contacts, dtype=float)[..., CORRELATION_COLUMNS]
+    correlations = np.asarray(contacts, dtype=float)[..., CORRELATION_COLUMNS]  # shape (..., 3)
+    # `CORRELATION_PAIRS` contains the index of the correlation of each pair, and -1 on the diagonal, shape (3, 3).
     matrices = correlations.take(CORRELATION_PAIRS, axis=-1) / (1.0 + CORRELATION_RIDGE)
-    return np.where(CORRELATION_PAIRS < 0, 1.0, matrices)
+    is_diagonal = CORRELATION_PAIRS < 0
+    return np.where(is_diagonal, 1.0, matrices)
 
 
 def write_finite(write: Callable[..., object], values: Any) -> bool:
@@ -365,8 +367,11 @@ class Validity:
         x_end, y_end = np.roll(self.corners_mm, -1, axis=0).T  # the last edge ends at the first corner
         with np.errstate(invalid="ignore"):  # if the last corner repeats the first corner, an edge has the length 0
             signed_distance_mm = (x_start * y_end - x_end * y_start) / np.hypot(x_end - x_start, y_end - y_start)
-        # The distances are positive if the corners are in anticlockwise order, and negative if they are clockwise.
-        return float(max(np.nanmin(signed_distance_mm), -np.nanmax(signed_distance_mm), 0.0)) ** 2
+        # The distances are positive if the corners are in anticlockwise order, and negative if they are clockwise. If
+        # the origin is outside, both of the following radii are negative.
+        anticlockwise_radius_mm = np.nanmin(signed_distance_mm)
+        clockwise_radius_mm = -np.nanmax(signed_distance_mm)
+        return float(max(anticlockwise_radius_mm, clockwise_radius_mm, 0.0)) ** 2
 
     def flags(self, contact: Contact) -> tuple[str, ...]:
         """Return the flags of one contact, which are the reasons why the contact may be wrong.

@@ -325,7 +325,8 @@ class Agreement:
 def chi_squared_deviate(statistic: ArrayLike, degrees: ArrayLike) -> Array:
     """Convert chi-squared variables to variables with a standard normal distribution, shape (n,).
 
-    The cube root of a chi-squared variable is approximately normal (Wilson and Hilferty 1931).
+    The cube root of a chi-squared variable, divided by its degrees of freedom k, is approximately normal with the mean
+    1 - 2 / (9 k) and the variance 2 / (9 k) (Wilson and Hilferty 1931).
 
     Args:
         statistic: The chi-squared variables, shape (n,), not negative.

@@ -79,7 +79,8 @@ class FrameDivision(NamedTuple):
         starts = self.starts + distance
         width = self.length + next_bytes
         whole_starts = starts[starts + width <= len(self.stream)]
-        return np.asarray(self.stream[whole_starts[:, None] + np.arange(width)])
+        positions = whole_starts[:, None] + np.arange(width)  # of all bytes of each frame, shape (frames, width)
+        return np.asarray(self.stream[positions])
 
 
 def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:

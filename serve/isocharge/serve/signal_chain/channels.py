@@ -160,16 +160,22 @@ class Channels:
         return tuple(range(len(self._electrodes)))
 
     def _matches(self, names: tuple[str, ...]) -> list[list[int]]:
-        """Return, for each electrode, the indices of the names that contain its name; see the class."""
+        """Return, for each electrode, the indices of the names that belong to it.
+
+        A name belongs to an electrode if the name of the electrode is among its words, as in `A_pC`, or is the part in
+        which the names differ, as in `chA` and `chB`. Capital and small letters are not distinguished.
+
+        Args:
+            names: Names of channels, or words of a line of text.
+        """
         folded_names = [name.casefold() for name in names]
-        words = [
-            {*_words_of(name), distinctive_part}
-            for name, distinctive_part in zip(folded_names, _distinctive_parts(folded_names), strict=True)
-        ]
-        return [
-            [index for index, channel_words in enumerate(words) if channel_words.issuperset(electrode_words)]
-            for electrode_words in (_words_of(electrode.casefold()) for electrode in self._electrodes)
-        ]
+        distinctive_parts = _distinctive_parts(folded_names)
+        words_of_names = [{*_words_of(name), part} for name, part in zip(folded_names, distinctive_parts, strict=True)]
+        matches = []
+        for electrode in self._electrodes:
+            electrode_words = _words_of(electrode.casefold())
+            matches.append([index for index, words in enumerate(words_of_names) if words.issuperset(electrode_words)])
+        return matches
 
     def _assignment_error(self, frame: Frame, advice: str = "") -> ChargeError:
         """Return the error for a frame whose channels cannot be assigned to the electrodes.

@@ -52,15 +52,18 @@ class TouchRule(Rule, frozen=True, kw_only=True):
     def threshold_pC(self, noise_pC: Array) -> Array:
         """Return the touch threshold of each electrode, shape (n_electrode,), pC. The settings must be resolved.
 
-        The size of the noise of n electrodes, in standard deviations, has a mean of about sqrt(n) and a standard
-        deviation of about sqrt(1/2).
+        The threshold has two parts: a multiple of the noise that the noise of all electrodes together rarely exceeds,
+        and a constant part, the floor. The norm of the noise of n electrodes, in standard deviations, has a mean of
+        about sqrt(n) and a standard deviation of about sqrt(1/2).
 
         Args:
             noise_pC: Standard deviation of the charge of each electrode at rest, shape (n_electrode,), pC.
         """
         root_count = math.sqrt(len(noise_pC))
-        noise_sizes = root_count + self.sigmas * math.sqrt(0.5)
-        threshold_pC = noise_sizes * noise_pC + (self.floor_pC or 0.0) / root_count
+        largest_noise_norm = root_count + self.sigmas * math.sqrt(0.5)  # in standard deviations
+        # The norm of the floors of all electrodes is `floor_pC`.
+        floor_pC = (self.floor_pC or 0.0) / root_count
+        threshold_pC = largest_noise_norm * noise_pC + floor_pC
         return np.maximum(threshold_pC, np.finfo(float).eps)  # not 0, for a board without noise
 
 

@@ -92,6 +92,14 @@ def _outside_presses(charges: FilmCharges, domain: Domain, executor: Executor | 
 
     From these presses, the network only learns which charges belong to no contact. The imperfections of the film hardly
     matter for that, so the presses are solved on the axisymmetric film without them, under a circular probe.
+
+    Args:
+        charges: Charges of the solved film, which contain the map of the axisymmetric film.
+        domain: The working area and the range of forces.
+        executor: Executor that runs the solves; None for this process.
+
+    Returns:
+        The presses; None if the working area leaves no room for presses.
     """
     round_map = charges.slopes.film  # of the axisymmetric film
     outermost = outermost_distance(round_map.sensor.film, round_map.probe.under(domain.force_range[1]))

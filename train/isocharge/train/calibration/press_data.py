@@ -121,7 +121,10 @@ class Linearised:
 
     @classmethod
     def of(cls, model: ModelValues, data: PressData, contact: Array) -> "Linearised":
-        """Compare the charges of a model with those of presses.
+        """Compare the charges of a model, and contacts, with the measurements of presses.
+
+        The residuals of a press are those of its charges and of the three coordinates of its contact, divided by the
+        standard deviations of the measurements.
 
         Args:
             model: Charges of the presses at the contacts, and their derivatives.
@@ -164,14 +167,18 @@ class Linearised:
     def contact_change(self, change: Array) -> Array:
         """Return the changes of the contacts that minimise the squared residuals after a change of the unknowns.
 
+        The residuals depend linearly on the unknowns and on the contacts. For each press, the change of the contact is
+        the solution of a linear least-squares problem, which the pseudoinverse gives.
+
         Args:
             change: Change of the unknowns, shape (n_unknown,).
 
         Returns:
             Changes of x, y and ln F, shape (n, 3).
         """
-        residual = self.residual + self.jacobian @ change
-        return -(np.linalg.pinv(self.contact_jacobian) @ residual[:, :, None])[:, :, 0]
+        residual = self.residual + self.jacobian @ change  # after the change of the unknowns, shape (n, n_row)
+        solution = np.linalg.pinv(self.contact_jacobian) @ residual[:, :, None]
+        return -solution[:, :, 0]
 
 
 def model_values(charges: FilmCharges, layout: Layout, data: PressData, unknowns: Array, contact: Array) -> ModelValues:

@@ -90,8 +90,10 @@ class PressedArea(Domain):
             Whether each contact lies outside, shape (n,).
         """
         x, y, _ = contact.T
-        is_off_area = np.isfinite(x + y) & ~inside_polygon(x, y, np.array(self.corners))
-        return np.asarray(is_off_area | Domain(np.inf, self.force_range).is_outside(contact))
+        is_position_known = np.isfinite(x) & np.isfinite(y)
+        is_off_area = is_position_known & ~inside_polygon(x, y, np.array(self.corners))
+        any_position = Domain(np.inf, self.force_range)  # compares only the forces
+        return np.asarray(is_off_area | any_position.is_outside(contact))
 
 
 def outline(places: Array) -> Array:

@@ -106,7 +106,8 @@ def _conditions(section: Section) -> str:
 def _table_lines(sections: Sequence[Section]) -> Iterator[str]:
     """Yield the lines of the table: the header, and for each dataset the limit and the sorted methods."""
     yield _table_line(HEADER)
-    yield "|" + "---|" * TEXT_COLUMNS + "--:|" * (len(HEADER) - TEXT_COLUMNS)
+    n_number_columns = len(HEADER) - TEXT_COLUMNS
+    yield "|" + "---|" * TEXT_COLUMNS + "--:|" * n_number_columns  # numbers are aligned to the right
     for section in sections:
         if section.limits:
             limit_cells = _error_cells(section.limits)

@@ -185,7 +185,7 @@ class TrainingStage:
 
 
 def relative_rate(progress: float) -> float:
-    """Return the learning rate divided by its largest value.
+    """Return the learning rate divided by its largest value: it rises linearly, and then falls along half a cosine.
 
     Args:
         progress: Number of completed steps divided by the number of all steps.

@@ -132,5 +132,7 @@ def focused_squared_distance(vector: Tensor, target: Tensor) -> Tensor:
         vector: Estimated vectors, shape (n, n_electrode).
         target: True vectors, same shape.
     """
-    weight = 1.0 / (1.0 + torch.sum(target**2, dim=-1) / FOCUS_LENGTH**2)
-    return (weight * torch.sum((vector - target) ** 2, dim=-1)).mean()
+    squared_length = torch.sum(target**2, dim=-1)
+    weight = 1.0 / (1.0 + squared_length / FOCUS_LENGTH**2)
+    squared_distance = torch.sum((vector - target) ** 2, dim=-1)
+    return (weight * squared_distance).mean()
