@@ -102,6 +102,7 @@ def test_check_of_a_channel_without_a_number(others):
         # The board is restarted after ten frames, because its port was opened.
         (lambda k: b"t_ms:%d,A:%d,B:1\n" % (5 * k + 1_000_000 * (k < 9), 3 * k % 7), "channel B is dead"),
         (lambda _: b"t_ms:5\n", "lines of text are not understood, for example 't_ms:5'"),
+        (lambda k: b"%03X %03X %03X\n" % (k % 99, 90 - k % 9, 80 + k % 9), "and 0x before hexadecimal numbers"),
         (lambda k: f"#{k} 3.1 -2.0 5.2\n".encode(), "a line that begins with # is a comment"),
         (
             lambda k: b"%d,%d,3.1\n" % (k // 3, k % 3),

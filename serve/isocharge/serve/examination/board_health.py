@@ -152,7 +152,8 @@ def transmission_sentences(capture: Capture) -> Iterator[str]:
     elif not capture.frames and unread_line:
         yield (
             f"the lines of text are not understood, for example {unread_line}: send the numbers of all channels in "
-            "each line, with the same text between them; a line that begins with # is a comment"
+            "each line, with the same text between them, decimal points instead of commas, and 0x before hexadecimal "
+            "numbers; a line that begins with # is a comment"
         )
     elif not capture.frames:
         yield (
