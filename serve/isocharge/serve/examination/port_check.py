@@ -186,6 +186,8 @@ def examine_received(
     if is_proposed:
         table = propose(capture, rest_values, device.table["frames"], electrodes, gain or {})
         electrodes = electrodes or tuple(table.get("channels", {}))
+        # Without a stated gain, the proposed section `[gain]` is left out here, so that the values are measured in the
+        # unit in which the board sends them.
         device = device_from_table({key: value for key, value in table.items() if gain or key != "gain"}, "board")
         Gain(Setup(electrodes, device))  # raises an error for the numbers of other electrodes
     electrode_at_position = electrodes_by_position(capture, device, electrodes)

@@ -305,7 +305,9 @@ class Parser(ABC):
     def sequence_flags(self, seq: int | None, *, is_clock_reset: bool = False) -> tuple[str, ...]:
         """Compare the counter of a frame with that of the previous frame, and return the flags of the frame.
 
-        Lost frames, repeated frames and restarts of the device are added to `counts`.
+        The increase of the counter since the previous frame decides: 1 is the next frame, 0 is a repeated frame, a
+        small increase means that frames were lost, and a small decrease is a late frame. After any other change, the
+        device has restarted. Lost frames, repeated frames and restarts are added to `counts`.
 
         Args:
             seq: Counter of the frame; None if the format has no counter.

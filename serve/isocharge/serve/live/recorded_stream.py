@@ -102,6 +102,9 @@ class RecordedStream:
         must close the generator before the recorder, so that the present chunk is recorded even if the program is
         interrupted.
 
+        The bytes up to the first frame (`_preamble`) are stored, because they show the layout of the frames. A
+        recording that was requested during the stream begins with them.
+
         Args:
             chunks: Chunks of bytes from a port or from a file.
 

@@ -201,6 +201,11 @@ class Outputs:
         failed. An error while an output is discarded is written to the log, because the error that has ended the
         command is more important.
 
+        Args:
+            target: Target of the output, by which messages name it.
+            output: The output, which is open.
+            queue: Queue of the thread that writes the records of a live stream; None in a replay.
+
         Raises:
             Exception: The error of the output, if it cannot be closed.
         """

@@ -280,7 +280,8 @@ def write_calibration(
 
     # Check the folder and the presses before the training, which takes long.
     folder = Path(folder)
-    problem, film = result.problem, result.film
+    problem = result.problem
+    film = result.film
     check_calibration_folder(folder, problem.electrodes)
     if held_out is not None:
         held_out = usable_held_out(held_out, result.presses, problem)

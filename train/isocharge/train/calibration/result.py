@@ -86,12 +86,17 @@ class CalibrationResult:
 
     @cached_property
     def properties(self) -> dict[str, PropertyEstimate]:
-        """Properties of the film by name, with their standard deviations before and after the presses."""
+        """Properties of the film by name, with their standard deviations before and after the presses.
+
+        Before the presses, the standard deviation is that of an earlier calibration or, without one, the declared
+        standard deviation. A property is identified if the presses have reduced it to `IDENTIFIED_RATIO`.
+        """
         before = self.problem.film_before
         estimates = {}
         for declared in self.film.layout.prior.properties:
             name = declared.name
-            # `film_before`, with which presses are planned, has only half of the declared std of imperfections.
+            # Without an earlier calibration, `film_before` is used to plan presses, and has only half of the declared
+            # standard deviations of imperfections.
             before_std = declared.std if self.problem.earlier is None else before.std(name)
             value = self.film.value(name)
             std = self.film.std(name)
