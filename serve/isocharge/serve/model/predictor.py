@@ -228,8 +228,9 @@ class Predictor:
     def _predict_with_noise(self, charge_pC: Singles) -> Contacts:
         """Compute the contacts of n presses whose charges have more noise than those of the training.
 
-        The effects of the additional noise of all charges are added to the covariance of each contact. The misfit is
-        divided by the ratio of the present noise to the noise of the training (root mean square over the electrodes).
+        The effects of the additional noise of all charges are added to the covariance of each contact. An effect is the
+        change of the contact by one standard deviation of the additional noise of one charge. The misfit is divided by
+        the ratio of the present noise to the noise of the training (root mean square over the electrodes).
 
         Args:
             charge_pC: Touch charges, shape (n, electrodes), pC.

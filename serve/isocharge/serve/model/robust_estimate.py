@@ -267,10 +267,13 @@ class RobustProblem:
         diagonal *= 1.0 + damping
         # The smallest number is for contacts that change no charge.
         diagonal += RELATIVE_RIDGE * diagonal.sum(axis=1, keepdims=True) + np.finfo(float).tiny
+
+        # Solve for a_i and for the columns of B_i at once. The right sides are C_i' r_i + W m_i and C_i' S_i.
         charge_part = (transposed @ point.residual[:, :, None])[:, :, 0]
         contact_side = charge_part + self._contact_weight * point.contact_residual
-        mixed = transposed @ point.by_state  # shape (n, 3, p)
-        solution = np.linalg.solve(contact_matrix, np.concatenate([contact_side[:, :, None], mixed], axis=2))
+        state_sides = transposed @ point.by_state  # shape (n, 3, p)
+        right_sides = np.concatenate([contact_side[:, :, None], state_sides], axis=2)
+        solution = np.linalg.solve(contact_matrix, right_sides)
         return solution[:, :, 0], solution[:, :, 1:]
 
     def step(self, point: RobustPoint, damping: float) -> tuple[Array, Array]:

@@ -112,7 +112,8 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
         has_channel = any(part.name == CHANNEL for part in best_parts)
         if not has_channel:
             continue
-        sync = usual_bytes(rows)[0][:sync_length].tobytes()
+        frame_bytes, _is_constant = usual_bytes(rows)
+        sync = frame_bytes[:sync_length].tobytes()
         layout = FrameLayout(
             framing=division.framing,
             sync_bytes=sync.hex(" ").upper() or None,
@@ -125,7 +126,8 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
         )
         # Each byte outside of all frames contributes `Weights.noise` bits.
         covered_share = division.covered_share
-        yield covered_share * frame_score / length + (1.0 - covered_share) * Weights.noise, layout
+        score = covered_share * frame_score / length + (1.0 - covered_share) * Weights.noise
+        yield score, layout
 
 
 def _possible_distances(division: FrameDivision) -> list[int]:

@@ -215,14 +215,15 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
         sentence: misfit(replace(placed_presses, contact=contact, charge_pC=charge), charges)
         for sentence, contact, charge in _possible_corrections(placed_presses, charges)
     }
+    # A misfit is clearly smaller than another misfit if it is less than `BETTER_MISFIT_RATIO` of the other.
     largest_accepted = min(BETTER_MISFIT_RATIO * misfit(placed_presses, charges), SUSPICIOUS_MISFIT)
     smallest = min(corrected_misfits.values())
     probable = [
         sentence
-        for sentence, value in corrected_misfits.items()
-        if value < largest_accepted and BETTER_MISFIT_RATIO * value <= smallest
+        for sentence, corrected_misfit in corrected_misfits.items()
+        if corrected_misfit < largest_accepted and BETTER_MISFIT_RATIO * corrected_misfit <= smallest
     ]
-    return sorted(probable, key=corrected_misfits.__getitem__)
+    return sorted(probable, key=corrected_misfits.__getitem__)  # the smallest misfit first
 
 
 def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
@@ -249,8 +250,9 @@ def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
     log_ratio = _log_ratio(placed.charge_pC, expected_charges(charges, placed.contact))  # (n_film, n, n_electrode)
     offset = np.nanmedian(log_ratio, axis=(1, 2))
     squared_deviation = np.minimum((log_ratio - offset[:, None, None]) ** 2, MAX_SQUARED_DEVIATION)
-    scatter = np.nanmean(squared_deviation, axis=(1, 2))
-    return float(np.min(scatter / SCATTER_STD**2 + (offset / OFFSET_STD) ** 2))
+    mean_square = np.nanmean(squared_deviation, axis=(1, 2))
+    misfit_of_film = mean_square / SCATTER_STD**2 + (offset / OFFSET_STD) ** 2  # shape (n_film,)
+    return float(np.min(misfit_of_film))
 
 
 def _log_ratio(measured: Array, expected: Array) -> Array:

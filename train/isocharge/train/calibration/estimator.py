@@ -229,13 +229,15 @@ def _estimate_with_errors(
     model = model_values(charges, prior.layout, data, average.unknowns, log_contact)
     residual, _ = Linearised.of(model, data, log_contact).eliminated()
     press_chi2 = (residual**2).sum(axis=1)
+    # Divide by the number of redundant measurements. A press without redundant measurements has no residual.
+    chi2_per_measurement = press_chi2 / np.maximum(data.redundancy, 1)
     best = average.weight.argmax()
     return Estimation(
         charges=charges,
         film=FilmEstimate(prior.layout, average.unknowns, average.covariance, average.noise),
         contact=in_domain(log_contact, charges.domain),
         is_bad=is_bad,
-        press_chi2=np.where(data.redundancy > 0, press_chi2 / np.maximum(data.redundancy, 1), np.nan),
+        press_chi2=np.where(data.redundancy > 0, chi2_per_measurement, np.nan),
         chi2=float(average.chi2[best]),
         redundancy=float(data.redundancy[is_used].sum()),
         hypothesis=average.hypotheses[best],

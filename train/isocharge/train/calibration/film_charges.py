@@ -153,10 +153,10 @@ class FilmCharges:
         # multiplies the charge of its own electrode. The other derivatives are difference quotients.
         derivatives["crosstalk"] = solved_charge.sum(axis=1, keepdims=True) - solved_charge
         for name, is_own in zip(sensor.electrode_names, np.eye(len(sensor.electrodes)), strict=True):
-            derivatives[f"gain {name}"] = is_own * solved_charge
-        for one in self.prior.properties:
-            if one.name not in derivatives:
-                derivatives[one.name] = self._readout_derivative(sensor, one, contact)
+            derivatives[f"gain {name}"] = is_own * solved_charge  # `is_own` is 1 for the electrode, and 0 for others
+        for declared in self.prior.properties:
+            if declared.name not in derivatives:
+                derivatives[declared.name] = self._readout_derivative(sensor, declared, contact)
 
         columns = np.stack([derivatives[name] for name in self.prior.names], axis=2)
         return ModelValues(charge, contact_slopes, factor[:, :, None] * columns)

@@ -50,7 +50,8 @@ def terms(contact: Array, domain: Domain) -> Array:
     x, y, log_force = domain.to_unit(contact).T
     all_products = chebyshev.chebvander3d(x, y, log_force, (DEGREE, DEGREE, FORCE_DEGREE))
     product_of_degrees = all_products.reshape(-1, DEGREE + 1, DEGREE + 1, FORCE_DEGREE + 1)
-    return np.asarray(FADING ** (i + j + m) * product_of_degrees[:, i, j, m])
+    factor = FADING ** (i + j + m)  # of each term, shape (n_term,)
+    return np.asarray(factor * product_of_degrees[:, i, j, m])
 
 
 def discrepancy_jacobian(charge: Array, contact: Array, domain: Domain) -> Array:
@@ -223,7 +224,7 @@ class FilmEstimate:
         """
         layout = self.layout
         drift_std = np.zeros(len(self.values))
-        drift_std[layout.film] = [one.drift for one in layout.prior.properties]
+        drift_std[layout.film] = [declared.drift for declared in layout.prior.properties]
         drift_std[layout.coefficients] = COEFFICIENT_DRIFT
         # Each column contains the changes of all unknowns by one standard deviation of the drift of one unknown.
         drift_effects = np.diag(drift_std)
