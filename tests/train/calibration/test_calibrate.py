@@ -94,6 +94,15 @@ def test_bad_press_and_press_outside_are_named_by_their_lines(fit, press_film):
     assert "'line 6: does not agree" in str(result.cautions)
 
 
+def test_copies_of_presses_do_not_reduce_the_stated_error(fit, press_film):
+    presses = press_film(5, seed=11)
+    file_with_copies = presses[[0, 1, 2, 3, 4, 1, 2, 3, 4]]
+    file_with_copies = replace(file_with_copies, lines=tuple(range(2, 11)))
+    result = fit(file_with_copies)
+    assert result.cautions[0] == "lines 7, 8, 9, 10: the charges of an earlier press; left out"
+    assert result.film_error == fit(presses).film_error
+
+
 def test_forces_that_scatter_more_than_stated_are_named(fit, press_film):
     presses = press_film(25, seed=14)
     presses.contact[:, 2] *= np.exp(0.04 * np.random.default_rng(0).standard_normal(25))

@@ -116,6 +116,9 @@ def test_next_version_has_wider_regions_that_hold_for_held_out_presses(written, 
     moved_presses = replace(held_out, contact=np.where(np.arange(30)[:, None] < 2, 9.0, held_out.contact))
     with pytest.raises(PressError, match=r"at least 22 held-out presses within 8 mm.*got 21 of 23"):
         write_calibration(written.result, tmp_path / "few", held_out=moved_presses[:23], config=QUICK)
+    with_a_copy = held_out[[*range(21), 0]]
+    with pytest.raises(PressError, match=r"at least 22 held-out presses.*without copies, got 21 of 22"):
+        write_calibration(written.result, tmp_path / "few", held_out=with_a_copy, config=QUICK)
     assert not (tmp_path / "few").exists()
 
 

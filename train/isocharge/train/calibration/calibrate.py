@@ -25,6 +25,7 @@ from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.press_data import PressData
 from isocharge.train.calibration.problem import CalibrationProblem, domain_words
 from isocharge.train.calibration.result import CalibrationResult
+from isocharge.train.data.presses import have_charges_of_earlier
 
 MAX_SOLVED_FILMS = 4
 """Largest number of axisymmetric films that are solved one after the other."""
@@ -62,9 +63,9 @@ def calibrate(
 ) -> CalibrationResult:
     """Estimate the properties of a film from presses on this film.
 
-    The presses are checked first. Then an axisymmetric film is solved, the properties are estimated with the charges of
-    this film and their derivatives, and the film is solved again until the estimate hardly changes. If the film is
-    uneven, the uneven film itself is solved.
+    The presses are checked first, and presses with the charges of an earlier press are left out. Then an axisymmetric
+    film is solved, the properties are estimated with the charges of this film and their derivatives, and the film is
+    solved again until the estimate hardly changes. If the film is uneven, the uneven film itself is solved.
 
     Args:
         presses: The presses in the order in which they were made, with position, force or both, and the standard
@@ -80,8 +81,14 @@ def calibrate(
         PressError: If the records of the presses are impossible, if no film explains the presses, or if the electrodes
             would be too far from their described places. The message names the reason if it is found.
     """
-    ordered_presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)
-    check_places(ordered_presses, problem.sensor.film)
+    recorded_presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)
+    check_places(recorded_presses, problem.sensor.film)
+    cautions = []
+    # A press that is in the file twice would count as two independent measurements.
+    is_copy = have_charges_of_earlier(recorded_presses.charge_pC)
+    if is_copy.any():
+        cautions.append(f"{recorded_presses[is_copy].line_words}: the charges of an earlier press; left out")
+    ordered_presses = recorded_presses[~is_copy]
     if _is_uninformative(ordered_presses):
         raise PressError(
             f"{len(ordered_presses)} presses of unknown position and force: three charges only determine x, y and the "
@@ -91,7 +98,6 @@ def calibrate(
     # The solved domain is larger than the working area, because errors may move presses at its edge to the outside.
     is_outside = problem.solved_domain.is_outside(ordered_presses.contact)
     used_presses = ordered_presses[~is_outside]
-    cautions = []
     outside_words = (
         f"{ordered_presses[is_outside].line_words}: a calibration takes presses {domain_words(problem.solved_domain)} "
         "(--radius, --force)"

@@ -47,7 +47,7 @@ from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.film_network import training_data
 from isocharge.train.calibration.problem import CalibrationProblem, domain_words
 from isocharge.train.calibration.result import CalibrationResult
-from isocharge.train.data.presses import have_charges_of
+from isocharge.train.data.presses import have_charges_of, have_charges_of_earlier
 from isocharge.train.model_release.release import release
 from isocharge.train.training.config import FitConfig
 from isocharge.train.training.fit import Fitted, fit
@@ -322,6 +322,8 @@ def usable_held_out(
 ) -> MeasuredPresses:
     """Return the held-out presses that the model will answer, with all charges and a known position or force.
 
+    Presses with the charges of an earlier held-out press are left out.
+
     Args:
         held_out: Presses that were not used for the calibration.
         presses: Presses of the calibration.
@@ -340,12 +342,13 @@ def usable_held_out(
     has_all_charges = np.isfinite(held_out.charge_pC).all(axis=1)
     has_position_or_force = np.isfinite(held_out.contact).any(axis=1)
     is_inside = ~domain.is_outside(held_out.contact)
-    usable = held_out[has_all_charges & has_position_or_force & is_inside]
+    is_copy = have_charges_of_earlier(held_out.charge_pC)
+    usable = held_out[has_all_charges & has_position_or_force & is_inside & ~is_copy]
     if len(usable) < FEWEST_HELD_OUT:
         raise PressError(
             f"expected at least {FEWEST_HELD_OUT} held-out presses {domain_words(domain)}, with all charges and a "
-            f"known place or force, got {len(usable)} of {len(held_out)}; measure more, or calibrate without held-out "
-            "presses"
+            f"known place or force, without copies, got {len(usable)} of {len(held_out)}; measure more, or calibrate "
+            "without held-out presses"
         )
     return usable
 

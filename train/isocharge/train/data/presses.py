@@ -304,6 +304,18 @@ def have_charges_of(charge: Array, others: Array) -> Booleans:
     return np.asarray((charge[:, None] == others).all(axis=2).any(axis=1))
 
 
+def have_charges_of_earlier(charge: Array) -> Booleans:
+    """Return whether each press has the same charges as an earlier press, and is therefore a copy, shape (n,).
+
+    Args:
+        charge: Charges of the presses, shape (n, n_electrode), pC. A press with an unknown charge is not a copy.
+    """
+    _, first_rows = np.unique(charge, axis=0, return_index=True)
+    is_copy = np.ones(len(charge), dtype=bool)
+    is_copy[first_rows] = False
+    return is_copy
+
+
 def complete(presses: MeasuredPresses) -> Booleans:
     """Return whether each press has a known place, a known force and a known charge of every electrode, shape (n,)."""
     return presses.placed & np.isfinite(presses.charge_pC).all(axis=1)
