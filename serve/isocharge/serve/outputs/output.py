@@ -115,6 +115,7 @@ class WriterQueue(Generic[T]):
         self._write = write
         self._items: SimpleQueue[T | None] = SimpleQueue()  # None ends the thread
         self._written_count = 0
+        self._is_abandoned = False  # whether the thread must write no further item
         self.error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)  # a write may hang forever
         self._thread.start()
@@ -146,8 +147,7 @@ class WriterQueue(Generic[T]):
     def close(self) -> None:
         """Write the waiting items as long as the consumer accepts items, and close the queue.
 
-        If the consumer accepts no item within `CLOSE_TIMEOUT_s`, the waiting items count as lost. The process then ends
-        without waiting for the thread.
+        If the consumer accepts no item within `CLOSE_TIMEOUT_s`, the waiting items are dropped and counted as lost.
         """
         self._items.put(None)
 
@@ -156,12 +156,18 @@ class WriterQueue(Generic[T]):
         while self._thread.is_alive() and self._written_count != earlier_count:
             earlier_count = self._written_count
             self._thread.join(CLOSE_TIMEOUT_s)
-        self.lost += self._items.qsize()  # the final None stands for the item that the thread is writing
+
+        # End the thread. If it has not taken the final None, the item that it took last is lost, too.
+        self._is_abandoned = True
+        self._thread.join(CLOSE_TIMEOUT_s)
+        self.lost += self._items.qsize()
 
     def _run(self) -> None:
         """Write items until the queue is closed and empty, or until `write` raises an exception."""
         try:
             for item in iter(self._items.get, None):
+                if self._is_abandoned:
+                    return
                 if self._write(item) is False:
                     self.lost += 1
                 self._written_count += 1
