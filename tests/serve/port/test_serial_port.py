@@ -68,6 +68,12 @@ def test_port_that_cannot_be_opened_is_refused(url, message):
         pass
 
 
+@pytest.mark.parametrize("url", ["telepathy://x", "tcp://127.0.0.1", "udp://127.0.0.1"])
+def test_option_wait_does_not_wait_for_a_wrong_url(url):
+    with pytest.raises(PortError, match="cannot be opened"), Port(url, wait=3600.0):
+        pass
+
+
 @pytest.mark.parametrize("make", [Port, open_source])
 def test_option_wait_waits_for_a_port(board, tmp_path, make):
     link = tmp_path / "film"

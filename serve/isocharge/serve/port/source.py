@@ -114,10 +114,10 @@ class Port:
     def __enter__(self) -> Self:
         """Open the port, and discard the bytes in its buffer.
 
-        If the port cannot be opened, try again until `wait` seconds have passed.
+        If the port cannot be opened, try again until `wait` seconds have passed. A wrong URL is not tried again.
 
         Raises:
-            PortError: If the port cannot be opened within `wait` seconds.
+            PortError: If the port cannot be opened within `wait` seconds, or its URL is wrong.
             InputError: If the port is a file.
         """
         deadline_s = time.monotonic() + self._wait
@@ -125,8 +125,9 @@ class Port:
             try:
                 self._open()
                 return self
-            except PortError:
-                if time.monotonic() >= deadline_s:
+            except PortError as error:
+                is_wrong_url = isinstance(error.__cause__, ValueError)
+                if is_wrong_url or time.monotonic() >= deadline_s:
                     raise
                 time.sleep(RETRY_PAUSE_s)
 
