@@ -138,15 +138,11 @@ class RecordedStream:
             self._end_recording()
 
     def _record_chunk(self) -> None:
-        """Write the latest chunk and its records to the recording, unless this was done or tried before.
-
-        If Ctrl-C interrupts the writing, the chunk is missing in the recording.
-        """
-        unrecorded = self._unrecorded
-        self._unrecorded = None
-        if self.recorder is not None and unrecorded is not None:
-            chunk, records = unrecorded
+        """Write the latest chunk and its records to the recording, unless a call has done this before."""
+        if self.recorder is not None and self._unrecorded is not None:
+            chunk, records = self._unrecorded
             self.recorder.chunk(chunk, [record.to_json() for record in records])
+        self._unrecorded = None  # also without a recorder, because the next recording must not contain the chunk
 
     def _begin_recording(self, recorder: Recorder | None) -> None:
         """End the present recording and, unless `recorder` is None, begin another recording with an open recorder.

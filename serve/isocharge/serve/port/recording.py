@@ -85,6 +85,8 @@ class Recorder:
         header = {KIND: VERSION, "model": model, "device": dict(device)} | ({"name": name} if name else {})
         self._first_line = json.dumps(header)
         parse_json(self._first_line, "recording", RecordingError, _Header)
+        self._latest_chunk: Chunk | None = None  # chunk of the latest call of `chunk`
+        self._latest_start = 0  # size of the file before the latest chunk was written, bytes
 
     def open(self) -> None:
         """Create the file, and write its first line.
@@ -109,10 +111,17 @@ class Recorder:
     def chunk(self, chunk: Chunk, records: list[str]) -> None:
         """Write a chunk and the records that were computed from it.
 
+        If Ctrl-C interrupts a call, the caller passes the same chunk again. If the interrupted call has already written
+        the chunk, the file has grown, and the second call writes nothing.
+
         Args:
             chunk: The chunk.
             records: Records of the frames in the chunk, each as a line of JSON.
         """
+        if chunk is self._latest_chunk and self._file.tell() > self._latest_start:
+            return
+        self._latest_start = self._file.tell()
+        self._latest_chunk = chunk
         chunk_line = encode({"chunk": chunk}).decode()
         self._write("\n".join([chunk_line, *records]))
 
