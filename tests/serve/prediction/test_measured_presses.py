@@ -182,6 +182,8 @@ ROW = "1,2,3,4,5,6\n"
         ("x_mm,y_mm,Force_STD,A,B,C", "rename 'Force_STD' to 'force_std'"),
         ("x,y,force,A,B,C", "rename 'x' to 'x_mm', 'y' to 'y_mm', 'force' to 'force_N' and check"),
         ("x_um,y_um,force_N,A,B,C", "rename 'x_um' to 'x_mm', 'y_um' to 'y_mm' and check"),
+        ("x_mm,y_mm,F [N],A,B,C", r"rename 'F \[N\]' to 'force_N' and check"),
+        ("x_mm,y_mm,F_g,A,B,C", "rename 'F_g' to 'force_N' and check"),
         ("x_mm,y_mm,Force (lbf),A,B,C", r"rename 'Force \(lbf\)' to 'force_N' and check"),
     ],
 )

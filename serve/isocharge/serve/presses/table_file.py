@@ -161,6 +161,8 @@ class CsvTable:
             if name not in self.header:
                 # Without the second set, the column `ApC` would not be similar to the electrode `A`.
                 spellings = _spellings(name) | _spellings(f"{name}_pC")
+                if name == "force_N":  # the symbol of the force with a unit; `F` alone may be an electrode
+                    spellings |= {"fn", "fmn", "fg"}
                 missing_name_of_spelling |= dict.fromkeys(spellings, name)
         name_of_column = {
             column: missing_name_of_spelling[spelling]
