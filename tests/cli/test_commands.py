@@ -209,7 +209,7 @@ BAD = [
     ("simulate point SENSOR --probe cube:1", "SceneError: probe 'cube:1'"),
     ("simulate point SENSOR --temperature nan", "InputError: --temperature: expected a finite number"),
     ("simulate point SENSOR --force 1e308", "beyond small strains"),
-    ("simulate sweep SENSOR --radius 44.5 -o OUT", "leave the film of radius 45 mm"),
+    ("simulate sweep SENSOR --radius 44.5 -o OUT", "leave the film of radius 45 mm; state a smaller radius"),
     (
         "simulate sweep SENSOR --workers 2 --cluster tcp://127.0.0.1:9 -o OUT",
         "InputError: expected either --workers or --cluster, got both",

@@ -375,7 +375,7 @@ def check_family(film: Film, probe: Probe, domain: Domain) -> None:
     if radius + largest_probe.reach >= film.radius:
         raise SceneError(
             f"radius: presses up to {radius:.4g} mm from the centre with {probe.notation}, which reaches "
-            f"{largest_probe.reach:.4g} mm, leave the film of radius {film.radius:.4g} mm"
+            f"{largest_probe.reach:.4g} mm, leave the film of radius {film.radius:.4g} mm; state a smaller radius"
         )
     check_press(film, largest_probe, nearest_to_clamp(film, radius), max_force)
 
