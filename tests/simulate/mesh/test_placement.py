@@ -99,6 +99,16 @@ def test_locate_is_the_inverse_of_the_element_map(scene, seed):
     np.testing.assert_array_less(np.abs(found_again(placement, mesh, film) - film), accuracy(film, placement))
 
 
+def test_points_beyond_an_oval_rim_have_the_displacement_of_the_rim():
+    """A search for electrode positions examines squares that lie partly or completely beyond the rim."""
+    film = replace(FILM, oval=0.06, oval_axis=0.7)
+    placement = choose_mesh(LoadCase(film, Circle(1.0), (3.0, 1.0), 0.1, SolveSettings())).placement
+    points = np.array([1.1j, -1.5, 2.0 + 1.0j, 8.0])
+    circular = placement.to_circular_film(points)
+    rim = circular / np.abs(circular)
+    np.testing.assert_allclose(circular + oval_displacement(rim, placement.oval), points, atol=1e-12)
+
+
 @given(scene=presses())
 @COMMON
 def test_no_element_is_folded_and_the_footprint_has_the_area_centroid_and_load_of_the_probe(scene):

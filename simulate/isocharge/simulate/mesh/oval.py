@@ -27,6 +27,7 @@ def oval_displacement(points: Complexes, oval: Complexes) -> Complexes:
 
     Each point is displaced in the radial direction. The displacement increases with the fifth power of the distance
     from the centre. The point of the rim in the direction `angle` is displaced by e cos(2 (angle - alpha)) film radii.
+    A point beyond the rim, which a search for electrode positions may examine, has the displacement of the rim.
 
     Args:
         points: Points x + iy of the circular film, any shape, in film radii.
@@ -35,9 +36,10 @@ def oval_displacement(points: Complexes, oval: Complexes) -> Complexes:
     Returns:
         Displacements x + iy, same shape, in film radii.
     """
-    squared_distance = np.abs(points) ** 2
-    angular_factor = (np.conj(oval) * points**2).real  # squared distance times e cos(2 (angle - alpha))
-    return np.asarray(points * squared_distance * angular_factor)
+    points_of_disk = points / np.maximum(np.abs(points), 1.0)
+    squared_distance = np.abs(points_of_disk) ** 2
+    angular_factor = (np.conj(oval) * points_of_disk**2).real  # squared distance times e cos(2 (angle - alpha))
+    return np.asarray(points_of_disk * squared_distance * angular_factor)
 
 
 def circular_distance(distance: Array, oval: Complexes, reach: float) -> Array:
