@@ -280,6 +280,14 @@ def test_binary_datagrams_that_waited_are_not_joined(address, datagrams, lengths
         assert [len(chunk.data) for chunk in islice(port, len(lengths))] == lengths
 
 
+def test_second_udp_sender_causes_one_warning(address, caplog):
+    with udp_port(address, b"1,2,3\n") as port, socket.socket(type=socket.SOCK_DGRAM) as second_board:
+        for _ in range(3):
+            second_board.sendto(b"4,5,6\n", address)
+        assert next(iter(port)).data == b"1,2,3\n" + 3 * b"4,5,6\n"
+    assert caplog.text.count("give each board its own UDP port") == 1
+
+
 TEXT = (b'{"A": 1}', b"A:1\tB:2", "1 µC".encode())
 BYTES = (b"\xaa\x00", b"\xaa\x55", b"1\x002", b"\x7f", b"\x02\n")
 

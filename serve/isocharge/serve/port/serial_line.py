@@ -18,6 +18,7 @@ answer has arrived and the connection is quiet.
 
 import importlib
 import io
+import logging
 import os
 import re
 import select
@@ -28,6 +29,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
+
+log = logging.getLogger(__name__)
 
 QUIET_TIME_s = 0.002
 """Silence after which an answer is considered complete, s. Two bytes take this time at 9600 baud."""
@@ -286,6 +289,7 @@ class UdpSocket:
         self._board_ends_lines = False  # whether the board ends its lines, although a line may need several datagrams
         self._datagrams_without_end = 0  # number of successive datagrams without a line feed
         self._is_text = False  # whether the latest datagram is text, which is valid UTF-8 without control characters
+        self._senders: list[tuple[Any, ...]] = []  # host and port of the first two senders of datagrams
 
     def receive(self, timeout_s: float) -> bytes:
         """Wait for a datagram, and return it, or return all datagrams that have arrived if they are text.
@@ -302,7 +306,7 @@ class UdpSocket:
         return data
 
     def _receive_datagram(self, timeout_s: float) -> bytes:
-        """Wait for a datagram that is not empty, and return it.
+        """Wait for a datagram that is not empty, and return it. A second sender causes one warning.
 
         If the datagram is text and the board sends no line feeds, a line feed is added at the end.
 
@@ -314,7 +318,14 @@ class UdpSocket:
         """
         deadline_s = time.monotonic() + timeout_s
         while select.select([self._socket], [], [], max(0.0, deadline_s - time.monotonic()))[0]:
-            data = self._socket.recv(MAX_READ_BYTES)
+            data, sender = self._socket.recvfrom(MAX_READ_BYTES)
+            if len(self._senders) < 2 and sender not in self._senders:
+                self._senders.append(sender)
+                if len(self._senders) == 2:
+                    log.warning(
+                        "datagrams of %s and of %s are read as those of one board; give each board its own UDP port",
+                        *self._senders,
+                    )
             if data:
                 is_utf8 = data.decode("utf-8", "replace").encode() == data  # decoding replaces invalid bytes
                 self._is_text = is_utf8 and _CONTROL_CHARACTER.search(data.removesuffix(b"\0")) is None
