@@ -1,7 +1,7 @@
 """Errors of calibrated, faulty and changed films with imperfections, whose presses are solved one by one.
 
     python tests/benchmarks/bench_calibration.py [--films typical] [--seeds 0,1,2,3] [--presses 1,5,8,20]
-        [--changes 0,0.3,-0.4] [--cases all] [--gain-noise 0.002]
+        [--changes 0,0.3,-0.4] [--cases all] [--gain-noise 0.002] [--sensor four-25um-biaxial] [--radius 9]
 
 The films are those of `solved_films.py`: orthotropic, unevenly stretched, with an oval clamp and wrong gains. With
 `--films moduli`, E1 / E2 is 1.6; with `--films tension`, the ratio of the pretensions along two axes is 3. The presses
@@ -36,6 +36,7 @@ from scipy.special import chdtri
 from shared import arguments, print_results, report_progress, whitened_errors
 from solved_films import FILMS, Unevenness, draw_film, solve_charges
 
+from isocharge.common.defaults import DEFAULT_RADIUS
 from isocharge.serve import Contact, Frame, Predictor
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.tracking.film_follower import FilmFollower
@@ -57,7 +58,8 @@ HYSTERESIS = 0.01
 LARGEST_FORCE_N = 1.6
 """Largest force of a press and of a touch."""
 
-GAINS = np.array([1.03, 1.0, 1.0, 1.0])
+LARGER_GAIN = 1.03
+"""Gain of the first electrode in the case "gain"."""
 
 
 def errors(answers: list[Contact], truth: np.ndarray) -> dict[str, float]:
@@ -206,8 +208,11 @@ def film_results(bench: Bench, counts: list[int], *, has_all_cases: bool) -> dic
     _, hysteresis_predictor = bench.calibrated(contact, bench.charge)
     results["hysteresis"] = model_errors(hysteresis_predictor, truth, charge)
 
-    cases = [(f"{change:+g} MPa", change, np.ones(len(GAINS))) for change in bench.later_charge]
-    for name, change, gains in (*cases, ("gain", 0.0, GAINS)):
+    right_gains = np.ones(len(bench.problem.electrodes))
+    wrong_gains = right_gains.copy()
+    wrong_gains[0] = LARGER_GAIN
+    cases = [(f"{change:+g} MPa", change, right_gains) for change in bench.later_charge]
+    for name, change, gains in (*cases, ("gain", 0.0, wrong_gains)):
         draws = [followed_errors(bench, predictor, change, gains) for _ in range(DRAWS)]
         for way in draws[0]:
             results[f"{way}, {name}"] = mean_values([draw[way] for draw in draws])
@@ -230,8 +235,10 @@ def main() -> None:
         changes="0,0.3,-0.4",
         cases="all",
         gain_noise=0.002,
+        sensor="four-25um-biaxial",
+        radius=DEFAULT_RADIUS,
     )
-    problem = CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))
+    problem = CalibrationProblem(load_sensor(asked.sensor), Circle(1.0), asked.radius)
     changes = [float(change) for change in asked.changes.split(",")]
     counts = [int(count) for count in asked.presses.split(",")]
     all_results = []

@@ -163,7 +163,7 @@ def test_note_for_a_film_that_does_not_fit_states_the_explaining_rig_std(predict
     check = check_presses(predictor, presses)
     assert check.verdict.endswith(" beyond noise")
     assert "columns of the file take precedence" in check.notes[0]
-    assert "from 500 presses on" in check.notes[1]
+    assert "at least 500 measured presses" in check.notes[1]
     position_std, force_std = map(float, re.findall(r"-std ([\d.e-]+)", check.notes[0]))
     assert position_std == pytest.approx(np.hypot(0.2, RIG_STD_MM), rel=0.3)
     known = replace(presses, position_std_mm=np.full(30, position_std), force_std=np.full(30, force_std))

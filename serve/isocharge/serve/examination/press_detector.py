@@ -60,8 +60,8 @@ def _detect_touches(levels: Array, noise: Array) -> Booleans:
     """Return whether something touches the film in each block, shape (blocks,).
 
     The stage `Touch` of a stream detects the touches. The charges of this stage are the differences from the levels
-    `CHANGE_BLOCKS` earlier, so that a slow change is no touch. During a touch, the earlier levels are those before its
-    beginning.
+    `CHANGE_BLOCKS` earlier, so that a slow change is no touch. During a touch, they are the differences from the levels
+    before the touch.
 
     Args:
         levels: Levels of the channels, shape (blocks, channels), in any unit.

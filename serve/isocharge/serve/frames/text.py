@@ -300,8 +300,8 @@ class TextParser(DelimitedParser):
     def _recognised_layout(self, lines: Sequence[Line]) -> Layout | None:
         """Return the layout of the frames, with names from the device file or from the latest header.
 
-        The result is None if the layout cannot be recognised yet, or if the device file names more or fewer columns and
-        no header names the columns.
+        The result is None if the layout cannot be recognised yet. It is also None if the number of columns in the
+        device file differs from that of the unnamed values in a line, and no header names these values.
 
         Args:
             lines: The lines since the beginning.
@@ -311,10 +311,11 @@ class TextParser(DelimitedParser):
             return None
         unnamed_count = frame_lines[0].names.count("")  # in a cycle of several lines, all values have names
         headers = [header_names(header, frame_lines[0]) for header in reversed(self._headers)]
-        new_names = next((names for names in (self._columns, *headers) if len(names) == unnamed_count), ())
+        name_sources = (self._columns, *headers)
+        new_names = next((names for names in name_sources if len(names) == unnamed_count), ())
         layout = Layout(frame_lines, new_names, self._meanings)
-        has_other_columns = self._columns and "" in layout.names
-        if has_other_columns or _has_hexadecimal_digits(layout, lines) or _has_channel_number(layout, lines):
+        has_wrong_column_count = self._columns and "" in layout.names
+        if has_wrong_column_count or _has_hexadecimal_digits(layout, lines) or _has_channel_number(layout, lines):
             return None
         return layout
 
@@ -456,9 +457,9 @@ def _counts_up_repeatedly(column: Array) -> bool:
 def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
     """Return the index of the line with which a frame begins in repeated cycles of lines.
 
-    If every line has a clock, the lines whose clocks differ least form a frame. If some line has no clock, a frame
-    begins with the line of the counter, or else with a line that only contains the clock, or else with the first name
-    in alphabetical order.
+    If every line has a clock, the first line is chosen so that the clocks of a frame differ least. If some line has no
+    clock, the first line is the one that begins with the counter. Without a counter, it is the line that only contains
+    the clock. Without both, it is the line whose first name comes first in alphabetical order.
 
     Args:
         lines: Lines of whole cycles, in which every value has a name.
@@ -474,7 +475,8 @@ def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
         clocks = [fields[name] for fields in frame for name in TIMES_US if name in fields]
         duration = clocks[-1] - clocks[0] if len(clocks) == cycle_length else 0.0
         first_name = next((name for name in frame[0] if name not in TIMES_US), "")  # "" if the line has only a clock
-        return duration, first_name != SEQ, first_name  # False is smaller than True
+        begins_without_counter = first_name != SEQ  # False is sorted before True
+        return duration, begins_without_counter, first_name
 
     return min(range(cycle_length), key=sort_key)
 

@@ -327,9 +327,9 @@ def _remedies(
 ) -> Iterator[str]:
     """Yield notes about possible remedies for a model that does not fit.
 
-    The first note states how large the uncertainty of the rig would have to be to explain the errors. The first note is
-    omitted if no uncertainty of the rig explains the errors, for example if all positions are shifted equally, or if
-    the charges fit no press. The second note recommends a calibration, or training with the measured presses.
+    The first note states which standard deviations of the measured positions and forces would explain the errors. This
+    note is omitted if none would, for example if all positions are shifted equally, or if the charges fit no press. The
+    second note recommends a calibration, or training with the measured presses.
 
     Args:
         errors: Errors of all presses.
@@ -338,25 +338,28 @@ def _remedies(
         force: Errors of the forces; None if no force is known.
         misfit_text: Statement that too many presses have a large misfit; empty if this is not the case.
     """
-    rig_std = np.full_like(errors.rig_std, np.nan)
+    larger_rig_std = np.full_like(errors.rig_std, np.nan)  # of x, y and the force
     options = []
-    if position is not None:  # the option is the standard deviation of x and of y, not of the distance
-        rig_std[:, :FORCE] = math.hypot(position.rig, position.beyond) / math.sqrt(2.0)
-        options.append(f"--position-std {rig_std[0, 0]:.2g}")
-    if force is not None:  # the option is relative to the force, not in percent
-        rig_std[:, FORCE] = 0.01 * math.hypot(force.rig, force.beyond)
-        options.append(f"--force-std {rig_std[0, FORCE]:.2g}")
-    is_possible = not PRESS_RULES["force_std"].violations(rig_std[:, FORCE]).any()
-    is_explained = Agreement.from_errors(replace(errors, rig_std=rig_std), is_selected).acceptable
+    if position is not None:
+        distance_std = math.hypot(position.rig, position.beyond)
+        coordinate_std = distance_std / math.sqrt(2.0)
+        larger_rig_std[:, :FORCE] = coordinate_std
+        options.append(f"--position-std {coordinate_std:.2g}")
+    if force is not None:
+        force_std = 0.01 * math.hypot(force.rig, force.beyond)  # from percent
+        larger_rig_std[:, FORCE] = force_std
+        options.append(f"--force-std {force_std:.2g}")
+    is_possible = not PRESS_RULES["force_std"].violations(larger_rig_std[:, FORCE]).any()
+    is_explained = Agreement.from_errors(replace(errors, rig_std=larger_rig_std), is_selected).acceptable
     if is_possible and is_explained and not misfit_text:
         yield (
-            f"the errors would be the rig's if that were as uncertain as {' '.join(options)}; standard deviations in "
-            "columns of the file take precedence over these options"
+            f"errors of the rig would explain the differences if it were as uncertain as {' '.join(options)}; standard "
+            "deviations in columns of the file take precedence over these options"
         )
 
     yield (
-        "if the film has changed since its calibration, or was never calibrated: isocharge train calibrate; what no "
-        "film explains, `isocharge train fit PRESSES.csv` learns from 500 presses on"
+        "if the film has changed since its calibration, or was never calibrated, run `isocharge train calibrate`; if a "
+        "calibration does not help, train on at least 500 measured presses: `isocharge train fit PRESSES.csv`"
     )
 
 

@@ -135,7 +135,7 @@ class ContactMixture:
         Args:
             charges: Charges of every contact on the film.
             noise: Noise of the charges of a frame.
-            validity: Domain in which the contacts of the mixture are valid.
+            validity: Domain of the contacts that the model can answer.
         """
         self._charges = charges
         self._noise = noise
@@ -143,10 +143,10 @@ class ContactMixture:
         self.time_s = -math.inf
         self._misfit = math.nan  # misfit of the most probable component
         self.other: OtherContact | None = None
-        self._components: Components | None = None
-        self._hypotheses: list[ContactHypothesis] = []
-        self._frames: list[tuple[Array, float]] = []  # charges and time of each frame of the present step
-        self._step_begin_s = -math.inf
+        self._components: Components | None = None  # None if no contact explains the charges
+        self._hypotheses: list[ContactHypothesis] = []  # contacts after the latest update, the most probable one first
+        self._frames: list[tuple[Array, float]] = []  # charges and time of each frame since the latest update
+        self._step_begin_s = -math.inf  # time of the frame after which the latest update was made
         self._next_search_s = -math.inf  # earliest time of the next search over the whole film
 
     def step(self, frame: Frame, t_s: float) -> TrackedContact | None:

@@ -265,8 +265,8 @@ class ForwardMap:
     def derivatives(self, contact: Array, variables: slice = slice(None)) -> Array:
         """Compute the derivatives of the charges with respect to x, y and ln F by central differences.
 
-        The probe keeps its own orientation. At the edge of the domain, the central differences also evaluate presses
-        slightly outside the domain.
+        The probe has the orientation of its description. At the edge of the domain, the central differences also
+        evaluate presses slightly outside the domain.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
@@ -287,10 +287,12 @@ class ForwardMap:
                 f"expected a forward map of different forces for derivatives, got one of the force {min_force:g} N; "
                 f"build a map from {0.9 * min_force:.3g} to {1.1 * min_force:.3g} N"
             )
-        # The steps of a small probe are shorter, because the charges change within its footprint. With steps in
-        # proportion to the width of a narrow footprint, the error of the readout would dominate the differences.
-        footprint_scale = min(1.0, self.probe.under(min_force).reach)
-        steps = np.multiply(STEPS, [footprint_scale, footprint_scale, 1.0])
+        # `STEPS` are for a radius of 1 mm. The steps of a smaller probe are shorter, because the charges change within
+        # its footprint. They are in proportion to its longest radius: with steps in proportion to the width of a narrow
+        # footprint, numerical errors of the charges would dominate the differences.
+        longest_radius_mm = self.probe.under(min_force).reach
+        step_scale = min(1.0, longest_radius_mm)
+        steps = np.multiply(STEPS, [step_scale, step_scale, 1.0])
         return differences(self._unchecked_charges, contact, steps, variables)
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:

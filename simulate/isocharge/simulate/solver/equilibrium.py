@@ -113,7 +113,8 @@ def deflection(equilibrium: Equilibrium, points: Array) -> Array:
         SceneError: If a point lies outside the film.
     """
     mesh = equilibrium.mesh
-    element, xi, eta, _ = _locate(equilibrium, points)  # a reflection of points does not change the deflection
+    # The last value states which points are reflected to the meshed part. A reflection does not change the deflection.
+    element, xi, eta, _ = _locate(equilibrium, points)
     basis_values = tensor_values(mesh.resolution.order, xi, eta)  # shape (n, n_local)
     nodal_field = equilibrium.field[mesh.template.nodes[element]]  # (U1, U2, W), shape (n, n_local, 3)
     scaled_deflection = (basis_values * nodal_field[..., 2]).sum(axis=1)

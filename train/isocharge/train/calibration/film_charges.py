@@ -242,19 +242,20 @@ class FilmCharges:
 def _add_stress_changes(
     solved_charge: Array, changes: dict[str, float], derivatives: dict[str, Array]
 ) -> tuple[Array, Array]:
-    """Add the first-order effects of changed properties, which change the stress, to the charges of a solved film.
+    """Return the charges of a film whose properties differ from those of a solved film, to first order.
 
-    An effect is added to the logarithm of the magnitude of a charge. If it is larger than the charge, it is added to
-    the charge itself.
+    Only properties that change the stress count. Their effects are added to the logarithm of the magnitude of a charge,
+    unless their sum is larger than `MAX_LOG_CHANGE` times the charge. It is then added to the charge itself.
 
     Args:
         solved_charge: Charges of the solved film, shape (n, n_electrode), pC.
         changes: By how much properties differ from those of the solved film, by their names.
-        derivatives: Derivatives of the charges with respect to the properties that change the stress, by their names,
-            each of shape (n, n_electrode), pC per unit.
+        derivatives: Derivatives of the charges of the solved film with respect to the properties that change the
+            stress, by their names, each of shape (n, n_electrode), pC per unit.
 
     Returns:
-        Charges, shape (n, n_electrode), pC, and the factors by which the derivatives change, of the same shape.
+        Charges, shape (n, n_electrode), pC, and the factors by which the derivatives of these charges differ from those
+        of the solved film, of the same shape.
     """
     addition = np.zeros_like(solved_charge)
     for name, derivative in derivatives.items():

@@ -436,7 +436,7 @@ def read_earlier(folder: StrPath, problem: CalibrationProblem, *presses: Measure
 
 
 def _film_section(result: CalibrationResult, made_with: Mapping[str, Any]) -> str:
-    """Return the section of the card of a calibrated model that describes the film, in Markdown.
+    """Return the Markdown section that describes the film on the card of a calibrated model.
 
     Args:
         result: Result of the calibration.

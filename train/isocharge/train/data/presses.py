@@ -171,7 +171,7 @@ def split_by_position(presses: LabelledPresses, share: float) -> tuple[LabelledP
 
 
 def place_count(contact: Array) -> int:
-    """Count the places of contacts (x, y, F), shape (n, 3). Places within a micrometre count as the same place."""
+    """Return the number of different positions of contacts (x, y, F), shape (n, 3), rounded to 1 um."""
     return len(np.unique(np.round(contact[:, :2], 3), axis=0))
 
 

@@ -61,7 +61,7 @@ from isocharge.train.training.folded_network import (
 
 
 def layer_source(name: str, weight: Array, bias: Array | None = None, activation: str = "") -> str:
-    """Return the C text of a layer: its constant arrays, and the function `void name(x, y)`.
+    """Return C source that defines a layer: its constant arrays, and the function `void name(x, y)`.
 
     The C function computes the outputs y = f(x W + c) from the inputs x, and adds c last. If a large c were added
     first, the intermediate sums would lose accuracy.
@@ -188,7 +188,7 @@ def model_source(metadata: ModelMetadata, network: FoldedNetwork) -> str:
 
 
 def _perceptron_source(name: str, perceptron: Perceptron, features: ChargeFeatures) -> str:
-    """Return the C text of the layers of a perceptron, and of the function `void name_answers(logs, answers)`.
+    """Return C source that defines the layers of a perceptron and the function `void name_answers(logs, answers)`.
 
     The first hidden layer and the skip layer read the features from `logs`. The hidden layers write alternately to two
     rows of a buffer, and each layer reads the row that the layer before it wrote. If the features are logarithms, the
