@@ -103,7 +103,7 @@ def draw_frames(board, seed):
     charge[rng.choice(np.flatnonzero(press_pC), 3)] *= 40.0  # spikes, which are not peaks of a press
 
     gain = Gain(Setup(ELECTRODES, device(board)))
-    values = charge / gain.gain_pC + gain.zero
+    values = charge / gain.gain_pC + gain.offset
     for invalid in (np.nan, np.inf, -np.inf, 3e9, 1e300):
         values[rng.integers(0, count, 2), rng.integers(0, n_electrode, 2)] = invalid
     limited = rng.random(count) < 0.003

@@ -134,7 +134,7 @@ class Channels:
                 than pC and the gain is not known, if it is not clear to which values the names in a line of text
                 belong, or if the numbers in the names of the channels do not increase.
         """
-        indices = self._matches(frame.names)
+        indices = self._matches(frame.names)  # for each electrode, the channels that have its name
         is_each_named_once = all(len(indices_of_electrode) == 1 for indices_of_electrode in indices)
         # If the channels of the electrodes are known, the units of the other channels do not matter.
         names = [frame.names[index] for (index,) in indices] if is_each_named_once else frame.names
@@ -142,18 +142,20 @@ class Channels:
         if is_each_named_once and not advice:
             return tuple(index for (index,) in indices)
 
-        # A line of text may contain all names before or after the values, in the same order as the values.
-        places = self._matches(tuple(word for text in frame.words for word in _words_of(text)))
-        has_all_names = all(len(places_of_electrode) == 1 for places_of_electrode in places)
-        has_other_count = len(frame.values) != len(self._electrodes)
+        # A line of text may contain all names before or after the values, as in `C,A,B: 3,1,2`.
+        words = tuple(word for text in frame.words for word in _words_of(text))
+        places = self._matches(words)  # for each electrode, the positions of its name among the words
+        is_each_in_line_once = all(len(places_of_electrode) == 1 for places_of_electrode in places)
+        counts_differ = len(frame.values) != len(self._electrodes)
 
-        # Names of which some are those of electrodes must not be assigned by their order.
-        if any(indices) or advice or (has_all_names and has_other_count):
+        # The order decides only if nothing contradicts it. It is contradicted by a channel with the name of an
+        # electrode, by a wrong unit, and by a line that names all electrodes but has more or fewer values.
+        if any(indices) or advice or (is_each_in_line_once and counts_differ):
             raise self._assignment_error(frame, advice)
-        if has_other_count:
+        if counts_differ:
             return None
-        if has_all_names:
-            places_in_order = sorted(places)  # of the names of the electrodes in the line of text
+        if is_each_in_line_once:  # the first name in the line belongs to the first value, and so on
+            places_in_order = sorted(places)
             return tuple(places_in_order.index(place) for place in places)
         if not _are_in_order(frame.names):
             raise self._assignment_error(frame)
@@ -288,8 +290,8 @@ class Gain(Stage):
 
     Attributes:
         gain_pC: Charge per unit of the device, with sign, shape (n_electrode,), pC.
-        zero: Values of the device without charge, shape (n_electrode,), in the unit of the device.
-        largest: Largest magnitude of a valid value, in the unit of the device.
+        offset: Values of the device without charge, shape (n_electrode,), in the unit of the device.
+        max_magnitude: Largest magnitude of a valid value, in the unit of the device.
     """
 
     section = "gain"
@@ -299,15 +301,18 @@ class Gain(Stage):
     def __init__(self, setup: Setup) -> None:
         """Set the conversion. Without settings, the values are charges in pC."""
         self._channels = Channels(setup)
-        # Names and number of values of the previous frame, and the function that selects the values of the electrodes
-        self._layout: tuple[tuple[str, ...], int] | None = None  # None before the first frame
+        # Channel names and number of values of the previous frame, and the function that selects from the values of
+        # such a frame those of the electrodes. The first frame replaces both.
+        self._layout: tuple[tuple[str, ...], int] | None = None
         self._select: itemgetter[Any] = itemgetter(0)
         rule = setup.device.rule(GainRule) or GainRule(pC_per_unit=1.0)
         self.gain_pC = setup.for_each_electrode("gain.pC_per_unit", rule.pC_per_unit)
-        self.zero = setup.for_each_electrode("gain.offset", rule.offset)
-        self.largest = LARGEST / float(np.abs(self.gain_pC).max(initial=np.finfo(float).tiny))
+        self.offset = setup.for_each_electrode("gain.offset", rule.offset)
+        # A valid charge is at most `LARGEST` pC. Without electrodes, the smallest positive number replaces the gain.
+        largest_gain_pC = float(np.abs(self.gain_pC).max(initial=np.finfo(float).tiny))
+        self.max_magnitude = LARGEST / largest_gain_pC
         self._skipped_s = 0.0  # duration of the invalid frames since the last valid frame
-        self._skipped_intervals = 0
+        self._skipped_intervals = 0  # number of sampling intervals in this time
 
     def step(self, frame: Frame) -> None:
         """Convert the values of a frame to charges, and mark the frame as invalid if a value cannot be a charge.
@@ -326,9 +331,9 @@ class Gain(Stage):
         # With a single index, `itemgetter` returns a number, which `reshape` converts to an array with one element.
         frame.sent = np.array(self._select(frame.values), dtype=float).reshape(-1)
         with np.errstate(over="ignore"):  # a value may be so large that its conversion overflows
-            frame.raw_pC = (frame.sent - self.zero) * self.gain_pC
+            frame.raw_pC = (frame.sent - self.offset) * self.gain_pC
         magnitude = math.hypot(*frame.sent.tolist())  # at least the largest absolute value; NaN if a value is NaN
-        if not magnitude <= self.largest:  # the condition is negated, so that it is true for NaN
+        if not magnitude <= self.max_magnitude:  # the condition is negated, so that it is true for NaN
             self._skipped_s += frame.dt_s
             self._skipped_intervals += frame.intervals
             frame.is_valid = False
@@ -344,7 +349,7 @@ class Gain(Stage):
     def c_settings(cls, setup: Setup) -> dict[str, Any]:
         """Return the offset and the gain of each channel, and the largest valid value, by name."""
         gain = cls(setup)
-        return {"zero": gain.zero, "pC": gain.gain_pC, "largest": gain.largest}
+        return {"zero": gain.offset, "pC": gain.gain_pC, "largest": gain.max_magnitude}
 
 
 class SaturationRule(Rule, frozen=True, kw_only=True):

@@ -175,8 +175,8 @@ class Leak(Stage):
     def _advance(self, frame: Frame, previous: Frame, output_pC: Array) -> None:
         """Add the charge that is new since the previous frame to the touch charge (`_charge_pC`).
 
-        The new charge is the output, minus the part of the previous output that the leak has left, minus the inflow
-        times the time since the previous frame. The inflow is a slow current into the amplifiers, pC/s.
+        The new charge is i - b dt, with the symbols at the beginning of this module. The innovation i is the change of
+        the output that the leak does not explain. The inflow b is a slow current into the amplifiers, pC/s.
 
         Out of contact, the touch charge should be zero, so it decays to zero. Except during a pause after a release,
         the inflow is then learned from the new charge. If frames are missing during a touch, the touch may have ended
@@ -187,11 +187,14 @@ class Leak(Stage):
             previous: The previous frame with charges; the frame itself if it is the first.
             output_pC: Output of the amplifiers above the tare, shape (n_electrode,), pC.
         """
-        # Compute the charge that is new since the previous frame.
         dt_s = frame.dt_s
-        self._charge_pC = self._charge_pC - previous.warming_pC  # the part that warming, and not a touch, has caused
-        innovation_pC = self._innovation_pC(output_pC, np.exp(-dt_s / self._tau_s))
-        surplus_pC = innovation_pC - self._inflow.pC_per_s * dt_s  # new touch charge and noise
+        # A later stage has found that warming, and not a touch, has caused this part of the charge.
+        self._charge_pC = self._charge_pC - previous.warming_pC
+
+        # Compute the charge that is new since the previous frame.
+        decay = np.exp(-dt_s / self._tau_s)  # a, the share of a charge that the leak leaves
+        innovation_pC = self._innovation_pC(output_pC, decay)  # i
+        surplus_pC = innovation_pC - self._inflow.pC_per_s * dt_s  # i - b dt: new touch charge and noise
 
         # Out of contact, let the touch charge decay, and learn the inflow unless it is paused.
         if previous.is_contact:
@@ -212,9 +215,11 @@ class Leak(Stage):
             has_gap = False
         self._charge_pC = self._charge_pC + surplus_pC
         if has_gap:
-            # Error if the charge arrived at the beginning of the gap, and not evenly, as assumed
-            largest_error_pC = np.abs(surplus_pC) * (self._growth(frame) - 1.0) / 2.0
-            self._is_falsified |= self._is_large(largest_error_pC, frame)
+            # The surplus is right if the charge arrived evenly in the gap. A charge that arrived at its beginning is
+            # larger by the factor (1 + 1/a) / 2, which is 1 + (1/a - 1) / 2.
+            largest_error_pC = np.abs(surplus_pC) * (self._inverse_decay(frame) - 1.0) / 2.0
+            if self._is_large(largest_error_pC, frame):
+                self._is_falsified = True
 
     def _innovation_pC(self, output_pC: Array, decay: Array) -> Array:
         """Return the change of the output that the leak does not explain, shape (n_electrode,), pC.
@@ -225,8 +230,8 @@ class Leak(Stage):
         """
         return (output_pC - decay * self._output_pC) * 2.0 / (1.0 + decay)
 
-    def _growth(self, frame: Frame) -> Array:
-        """Return the ratio of a charge before the leak of one frame to the same charge after it, shape (n_electrode,).
+    def _inverse_decay(self, frame: Frame) -> Array:
+        """Return 1/a: the ratio of a charge before the leak of one frame to the same charge after it, (n_electrode,).
 
         The ratio is limited to avoid an overflow.
         """
@@ -235,21 +240,24 @@ class Leak(Stage):
     def _has_ended_in_gap(self, frame: Frame, surplus_pC: Array) -> bool:
         """Return whether a touch has ended in a gap, during which frames were missing.
 
-        When a touch ends, a charge arrives that cancels the charge of the touch. It is not known when it arrived. If
-        it arrived early, most of it has leaked since, so the output shows only a small part of it. The touch may have
-        ended if the touch charges would be almost zero if the new charge had arrived at the beginning of the gap. Up to
-        5 % of a charge may remain, because the time constant and the inflow have errors.
+        When a touch ends, a charge arrives that cancels the charge of the touch. It is not known when it arrived. The
+        earlier it arrived, the more of it has leaked since, and the larger it must have been to cause the present
+        output. It is therefore largest if it arrived at the beginning of the gap. If even this charge does not cancel
+        the touch charge, the touch has not ended.
 
         Args:
             frame: The frame after the gap.
             surplus_pC: New touch charge, if it arrived evenly in the gap, shape (n_electrode,), pC.
         """
-        growth = self._growth(frame)
-        sign = np.sign(self._charge_pC)
+        inverse_decay = self._inverse_decay(frame)  # 1/a
+        sign = np.sign(self._charge_pC)  # of the charge before the gap
+        # The output may differ from zero by four standard deviations of the noise, or by 5 % of the charge, because the
+        # time constant and the inflow have errors.
         margin_pC = np.maximum(4.0 * frame.noise_pC, 0.05 * np.abs(self._charge_pC))
-        # An even arrival needs on average half of the correction for the leak that an arrival at the beginning needs.
-        smallest_pC = self._charge_pC + surplus_pC * (1.0 + growth) / 2.0
-        return bool((sign * smallest_pC <= growth * margin_pC).all())
+        # A charge that arrived at the beginning of the gap is (1 + 1/a) / 2 times the surplus. The margin applies after
+        # the leak of the gap. It corresponds to a margin that is larger by the factor 1/a before this leak.
+        remaining_pC = self._charge_pC + surplus_pC * (1.0 + inverse_decay) / 2.0
+        return bool((sign * remaining_pC <= inverse_decay * margin_pC).all())
 
     def _is_large(self, error_pC: Array, frame: Frame) -> bool:
         """Return whether an error of the touch charge exceeds both the noise and 1 % of the touch charge.
@@ -284,7 +292,9 @@ class Integrator(Leak):
     def reset(self) -> None:
         """Discard the state."""
         super().reset()
-        self._inflow.learned_s = 0.0  # the tare is the mean of only a few currents, whose error would add up
+        # The first frames correct the inflow completely, because it does not begin with a prior of zero. The tare has
+        # already subtracted an offset, but it is the mean of only a few currents, and its error would add up.
+        self._inflow.learned_s = 0.0
         self._current_pC = np.zeros(len(self._tau_s))  # current of the previous valid frame
         self._elapsed_s = 0.0  # time over which the mean sampling interval is computed
         self._interval_count = 1  # sampling intervals in this time, and one more, which avoids a division by 0
@@ -308,17 +318,20 @@ class Integrator(Leak):
         if current_pC is None:
             return
 
-        # Add the assumed charges of the missing frames.
-        mean_pC = (current_pC + self._current_pC) / 2.0
-        interval_s = max(self._elapsed_s / self._interval_count, SUM_TOLERANCE_s)
-        may_be_noise = np.abs(mean_pC) <= 3.0 * frame.noise_pC
+        # Add the assumed charges of the missing frames. A current is the charge of one sampling interval.
+        interval_s = max(self._elapsed_s / self._interval_count, SUM_TOLERANCE_s)  # mean sampling interval
         inflow_pC = self._inflow.pC_per_s * interval_s
+        mean_pC = (current_pC + self._current_pC) / 2.0
+        may_be_noise = np.abs(mean_pC) <= 3.0 * frame.noise_pC
         missing_pC = missing_count * np.where(may_be_noise, inflow_pC, mean_pC)
-        frame.charge_pC = current_pC + missing_pC if frame.intervals > 0 else np.zeros_like(current_pC)
+        frame.charge_pC = current_pC + missing_pC
+        if frame.intervals == 0:  # a copy of the previous frame, or a late frame that has counted as missing
+            frame.charge_pC = np.zeros_like(current_pC)
         super().step(frame)
 
-        # Mark the touch if the error of the assumed charges may be large.
-        error_pC = missing_count * np.abs(current_pC - self._current_pC) / 2.0  # if the current rose or fell steadily
+        # Mark the touch if the error of the assumed charges may be large. If the missing currents lie between the
+        # currents before and after the gap, each differs from their mean by at most half of their difference.
+        error_pC = missing_count * np.abs(current_pC - self._current_pC) / 2.0
         self._current_pC = current_pC
         frame.noise_pC = frame.noise_pC * math.sqrt(max(1.0, 0.5 * self._rule.relax_s / interval_s))
         if self._is_large(error_pC, frame):

@@ -110,7 +110,9 @@ class Tare(Stage):
         if self._follows:
             if self._previous is not None:
                 self._tare_pC = self._tare_pC + self._change_pC(self._previous)
-            # The stage of the touches lets the charge out of contact decay, but not that of a finger that is leaving.
+            # The touch detection keeps a base, the charges that belong to no touch. The base decays as fast as the tare
+            # takes over the charge at rest. A base that remains of the latest touch is held and does not decay, because
+            # a finger that is leaving the film may still cause it.
             frame.is_base_held = True
             if self._rule is not None:
                 frame.base_relax_s = self._rule.relax_s

@@ -118,10 +118,10 @@ class Touch(Stage):
         self._setup = setup
         rule = setup.device.rule(TouchRule)
         self._rule = None if rule is None else rule.resolved(has_currents=setup.device.has_currents)
-        # Expected direction of the charges without an earlier touch. The keys state whether touches may have charges of
-        # any sign. If so, the zero vector accepts every direction.
-        n_electrode = len(setup.electrodes)
-        self._rest_directions = {False: np.ones(n_electrode), True: np.zeros(n_electrode)}
+        # Expected directions of the charges without an earlier touch: that of equal positive charges, and the zero
+        # vector, which accepts every direction, for touches whose charges may have any sign.
+        self._positive_direction = np.ones(len(setup.electrodes))
+        self._any_direction = np.zeros(len(setup.electrodes))
         self._noise_pC: Array | None = None  # noise of the latest tare
         self._threshold_pC = np.zeros(0)  # touch thresholds of the electrodes with this noise
         self.reset()
@@ -170,14 +170,18 @@ class Touch(Stage):
             charge: Charges relative to the touch thresholds, shape (n_electrode,), dimensionless.
             size: Size of the charges.
         """
-        # Update the peak, from which the release threshold follows.
+        # Update the peak, from which the release threshold follows. The touch threshold is the size 1, and the release
+        # threshold is at least half of it. A smaller release threshold of a weak touch could be below the noise, so the
+        # touch would never end.
         held_size = min(size, self._previous_size)  # a spike of a single frame is not a peak
         self._peak_size = max(self._peak_size, held_size)
-        release_size = max((rule.release_share or 0.0) * self._peak_size, 0.5)
+        half_threshold = 0.5
+        release_size = max((rule.release_share or 0.0) * self._peak_size, half_threshold)
 
-        # End the touch if the charges are small, or have changed their sign.
-        reference = self._previous_charge if self._setup.has_any_sign else self._rest_directions[False]
-        is_reversed = charge @ reference < 0.0
+        # End the touch if the charges are small, or have changed their sign. If charges may have any sign, they are
+        # compared with those of the previous frame. Otherwise, most charges of a touch are positive, as is their sum.
+        usual_charge = self._previous_charge if self._setup.has_any_sign else self._positive_direction
+        is_reversed = charge @ usual_charge < 0.0
         if size < release_size or is_reversed:
             self._is_contact = False
             self._base_charge = charge
@@ -189,12 +193,14 @@ class Touch(Stage):
     def _await(self, frame: Frame, charge: Array, size: float) -> None:
         """Process a frame while nothing touches the film: begin a touch, or update the base.
 
-        The base (`_base_charge`) contains the charges that belong to no touch. Out of contact, it decays to zero.
+        The base (`_base_charge`) contains the charges that belong to no touch. Out of contact, it decays to zero. The
+        change is the difference of the charges from the base. The first of these rules that applies is used:
 
-        - If the change of the charges since the base is opposite to the expected direction, the base becomes the mean
-          of the latest charges (`_idle_mean_charge`).
-        - Otherwise, if both the charges and their change exceed the threshold, a touch begins.
-        - Otherwise, if the base is what remains of the latest touch, and the charges are smaller, they become the base.
+        - If the change is opposite to the expected direction, it is a release or a drift. The base becomes the mean of
+          the latest charges (`_idle_mean_charge`).
+        - If both the charges and the change exceed the threshold, and the charges are not opposite to the expected
+          direction, a touch begins.
+        - If the base is what remains of the latest touch, and the charges are smaller, they become the base.
 
         While charges of the latest touch may remain, the expected direction is that of the latest touch. Later, it is
         that of equal positive charges. If touches may have charges of any sign, it is the zero vector, with which every
@@ -206,9 +212,9 @@ class Touch(Stage):
             size: Size of the charges, which is the norm of their vector. A size of 1 is the threshold.
         """
         if self._rest_s >= RISE_S - SUM_TOLERANCE_s:  # the charges have been small for some time
-            self._touch_direction = self._rest_directions[self._setup.has_any_sign]
+            self._touch_direction = self._any_direction if self._setup.has_any_sign else self._positive_direction
         direction = self._touch_direction
-        # If a product of charges with `direction` is below this limit times the size of the charges, they are opposite.
+        # Charges are opposite if their scalar product with `direction` is below this limit times their size.
         opposing_limit = OPPOSING_COSINE * math.sqrt(direction @ direction)
 
         # After a touch, the base is the charge that remains of it. While the finger leaves the film, the charge at rest
@@ -225,9 +231,9 @@ class Touch(Stage):
             self._is_contact = True
             self._peak_size = min(size, self._previous_size)  # a spike of a single frame is not a peak
             self._touch_direction = charge / size
-            # The charge at rest may have drifted if the mean charges before the touch already exceeded half of the
-            # threshold, or if the base was opposite to the touch, so that the change is larger than the charges. The
-            # sum of the noise of currents changes slowly, and the mean charges still contain it.
+            # The charge at rest may have drifted in two cases. The mean charges before the touch already exceeded half
+            # of the threshold, or the base was opposite to the touch, so that the change is larger than the charges.
+            # For currents, the limit is higher, because the sum of their noise changes slowly, like a drift.
             drift_limit = 0.75 if self._setup.device.has_currents else 0.5
             slow_rise = self._idle_mean_charge - self._base_charge
             slow_rise_size = math.sqrt(slow_rise @ slow_rise)
