@@ -27,13 +27,7 @@ from isocharge.serve.model.robust_estimate import ModelValues, RobustPoint, Robu
 from isocharge.simulate import NoiseModel
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, Prior
-from isocharge.train.calibration.press_data import (
-    Linearised,
-    PressData,
-    PressErrors,
-    in_domain,
-    model_values,
-)
+from isocharge.train.calibration.press_data import Linearised, PressData, PressErrors, in_domain, model_values
 
 BAD_PROBABILITY = 1e-5
 """Probability of residuals as large as those of a press, below which the press is left out."""
@@ -102,19 +96,19 @@ def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
     """Yield all hypotheses about presses: all combinations of the sizes that are not known beforehand.
 
     The sizes are independent, so the probability of a hypothesis is the product of the probabilities of its sizes.
-    Hypotheses with the same errors of the presses follow one another.
+    Hypotheses with the same errors of the presses follow one another, because the sizes of these errors come first.
 
     Args:
         noise: Noise of a frame from a good amplifier.
     """
-    noises = [
+    noises = [  # only ratios below 1 change the white noise, see `NOISE_RATIOS`
         (replace(noise, white=min(ratio, 1.0) * noise.white, gain=ratio * noise.gain), probability)
         for ratio, probability in NOISE_RATIOS
     ]
-    session = [session_property.stds for session_property in SESSION]
-    # Each factor of the product is a list of sizes with their probabilities.
-    factors = (noises, POSITION_RATIOS, FORCE_SCATTERS, IMPERFECTION_SCALES, DISCREPANCY_SIZES, *session)
-    for combination in product(*factors):
+    session_stds = [session_property.stds for session_property in SESSION]
+    # Each list contains the sizes of one kind as pairs (size, probability). A combination has one pair of each list.
+    lists = (noises, POSITION_RATIOS, FORCE_SCATTERS, IMPERFECTION_SCALES, DISCREPANCY_SIZES, *session_stds)
+    for combination in product(*lists):
         sizes, probabilities = zip(*combination, strict=True)
         press_noise, position_ratio, force_scatter, imperfections, discrepancy, *session_std = sizes
         errors = PressErrors(press_noise, position_ratio, force_scatter)
@@ -166,9 +160,10 @@ class Estimation:
 def estimate(charges: FilmCharges, data: PressData, prior: Prior, previous: Estimation | None = None) -> Estimation:
     """Estimate a film from presses, with the derivatives of one solved film.
 
-    The search begins with the stated errors of the presses. If a press seems bad, the search is repeated with larger
-    errors, with which the press may agree with the others. The search is then repeated with the most probable errors,
-    until it has assumed these errors.
+    Each search assumes certain errors of the presses. The first search assumes the stated errors. A further search
+    assumes the errors of the hypothesis that was most probable in the search before it. The searches end when these
+    errors are equal to the assumed errors. If the first search finds a bad press, the press may only seem bad because
+    the true errors are larger than the stated errors. The second search then assumes larger errors.
 
     Args:
         charges: Charges of a solved film and of similar films.
@@ -179,17 +174,19 @@ def estimate(charges: FilmCharges, data: PressData, prior: Prior, previous: Esti
     all_hypotheses = list(hypotheses(data.noise))
     assumed = PressErrors(data.noise)
     estimation = _estimate_with_errors(charges, data, assumed, prior, all_hypotheses, previous)
-    probable = estimation.hypothesis.errors
+    next_assumed = estimation.hypothesis.errors
     if estimation.is_bad.any():
-        # With larger errors of the positions, a press at a wrong place would not be recognised.
+        # Assume the largest noise, which is that of the last hypothesis, but only the middle size of the errors of the
+        # positions. With the largest size, a press at a wrong place would not be recognised.
+        largest_noise = all_hypotheses[-1].errors.noise
         middle_ratio, _ = POSITION_RATIOS[len(POSITION_RATIOS) // 2]
-        probable = PressErrors(all_hypotheses[-1].errors.noise, middle_ratio)  # the largest noise
+        next_assumed = PressErrors(largest_noise, middle_ratio)
     for _ in range(MAX_SEARCHES):
-        if probable == assumed:
+        if next_assumed == assumed:
             break
-        assumed = probable
+        assumed = next_assumed
         estimation = _estimate_with_errors(charges, data, assumed, prior, all_hypotheses, estimation)
-        probable = estimation.hypothesis.errors
+        next_assumed = estimation.hypothesis.errors
     return estimation
 
 
@@ -212,19 +209,21 @@ def _estimate_with_errors(
         previous: Estimate from which the search begins; None for the prior mean and the measured contacts.
     """
     data = stated.with_errors(assumed)
-    point = _most_probable_point(charges, data, prior, previous)
-    is_bad = _find_bad_presses(data.redundancy, point.chi2)
+    found = _most_probable_point(charges, data, prior, previous)
+    is_bad = _find_bad_presses(data.redundancy, found.chi2)
     is_used = ~is_bad
 
-    # The second average is linearised at the first average, and considers only its hypotheses. If the evidence is
-    # smaller there, the charges are too nonlinear, and the second average is discarded.
+    # Average the estimates of all hypotheses, for which the charges are linearised at the point that was found. Repeat
+    # this once at the first average, which is a better point, with the hypotheses that have a weight. If the evidence
+    # is smaller at the first average, the charges are too nonlinear, and the second average is discarded.
     average_estimates = partial(_average_estimates, charges, stated[is_used], data[is_used], prior)
-    average = average_estimates(all_hypotheses, point.state, point.contacts[is_used])
+    average = average_estimates(all_hypotheses, found.state, found.contacts[is_used])
     second_average = average_estimates(average.hypotheses, average.unknowns, average.log_contact)
     if second_average.largest_log_evidence >= average.largest_log_evidence:
         average = second_average
 
-    log_contact = point.contacts.copy()
+    # Compute the residuals of all presses, also of the bad ones, whose contacts remain those that were found.
+    log_contact = found.contacts.copy()
     log_contact[is_used] = average.log_contact
     model = model_values(charges, prior.layout, data, average.unknowns, log_contact)
     residual, _ = Linearised.of(model, data, log_contact).eliminated()
@@ -270,11 +269,14 @@ def _most_probable_point(
         prior: Prior distribution of the unknowns.
         previous: Estimate from which the search begins; None for the prior mean and the measured contacts.
     """
-    charge_variance = np.nan_to_num(data.charge_std**2)  # the largest number for a charge that was not measured
-    problem = RobustProblem(
+    # The variance of a charge that was not measured is infinite. Replace it by the largest number, because the search
+    # needs finite numbers. The noise of each press has a diagonal covariance.
+    charge_variance = np.nan_to_num(data.charge_std**2)  # shape (n, n_electrode)
+    charge_covariance = charge_variance[:, None] * np.eye(charge_variance.shape[1])
+    problem = RobustProblem(  # its state is the vector of the unknowns
         lambda contacts, state: model_values(charges, prior.layout, data, state, contacts),
         data.charge,
-        charge_variance[:, None] * np.eye(charge_variance.shape[1]),
+        charge_covariance,
         prior.mean,
         prior.covariance(SEARCH_SIZES),
         measured_contacts=data.contact,
@@ -322,20 +324,22 @@ def _average_estimates(
     unknowns: Array,
     log_contact: Array,
 ) -> _Average:
-    """Estimate the unknowns under each hypothesis, and average the estimates by the evidence of the hypotheses.
+    """Estimate the unknowns under each hypothesis, and average the estimates with weights.
 
-    The charges are linearised at given unknowns and contacts. Hypotheses with a weight below `MIN_WEIGHT` are left out.
+    The weight of a hypothesis is its evidence, divided by the sum over all hypotheses. Hypotheses with a weight below
+    `MIN_WEIGHT` are left out. The charges are linearised at given unknowns and contacts.
 
     Args:
         charges: Charges of a solved film and of similar films.
         stated: The presses with their stated errors, which a hypothesis replaces by its own.
-        data: The presses with assumed errors, with which the contacts follow the mean unknowns.
+        data: The same presses with the errors that the search has assumed, with which the contacts are changed.
         prior: Prior distribution of the unknowns.
         all_hypotheses: The hypotheses. Those with the same errors of the presses follow one another.
         unknowns: Unknowns at which the charges are linearised, shape (n_unknown,).
         log_contact: Contacts (x, y, ln F) at which the charges are linearised, shape (n, 3).
     """
-    # Compare the hypotheses. Those with the same errors of the presses share one linearised problem.
+    # Compare the hypotheses. Those with the same errors of the presses share one linearised problem. They follow one
+    # another, so that `groupby` finds them.
     model = model_values(charges, prior.layout, data, unknowns, log_contact)
     groups = [
         _HypothesisGroup.of(model, stated.with_errors(errors), log_contact, unknowns, prior, list(group))
@@ -349,16 +353,19 @@ def _average_estimates(
     weight = all_weights[is_probable]
     probable = list(compress(all_hypotheses, is_probable))
 
-    # Compute the means and the covariances of the unknowns under the probable hypotheses, and average them.
+    # Average the means of the unknowns under the probable hypotheses. The weights are split at the ends of the groups,
+    # except that of the last group, which is the end of the weights.
     group_ends = np.cumsum([len(group.hypotheses) for group in groups])
     weights_of_groups = np.split(all_weights, group_ends[:-1])
     posteriors = [group.posterior(weights) for group, weights in zip(groups, weights_of_groups, strict=True)]
     means = np.concatenate([mean for mean, _ in posteriors])
     mean = weight @ means
+
+    # The covariance of the average is the mean prior covariance, minus the mean reduction by the presses, plus the
+    # covariance of the means of the hypotheses. The mean prior covariance is that of the mean squared sizes.
     mean_squared_sizes = weight @ np.array([one.sizes**2 for one in probable])
     covariance = prior.covariance(np.sqrt(mean_squared_sizes))
     covariance -= sum(reduction for _, reduction in posteriors)
-    # The means of the hypotheses differ, which adds to the covariance of the average.
     covariance += np.cov(means, rowvar=False, ddof=0, aweights=weight)
     contact_change = Linearised.of(model, data, log_contact).contact_change(mean - unknowns)
     gains = np.maximum([one.errors.noise.gain for one in probable], stated.noise.gain)
@@ -378,9 +385,10 @@ def _average_estimates(
 class _HypothesisGroup:
     """Hypotheses with the same errors of the presses, and the linearised residuals of the presses with these errors.
 
-    The residuals r at the prior means, without the effect of the contacts, have the covariance S = 1 + J P J', where
-    J contains their derivatives, and P is the prior covariance of the unknowns. The prior covariance, and therefore S,
-    depends on the hypothesis.
+    The residuals r at the prior means, without the effect of the contacts, have the covariance S = 1 + J P J'. The
+    matrix J contains their derivatives with respect to the unknowns, and P is the prior covariance of the unknowns,
+    which depends on the hypothesis. It is a sum of parts, and a hypothesis states by which squared size each part is
+    multiplied.
 
     Attributes:
         hypotheses: The hypotheses.
@@ -403,13 +411,7 @@ class _HypothesisGroup:
 
     @classmethod
     def of(
-        cls,
-        model: ModelValues,
-        data: PressData,
-        contact: Array,
-        unknowns: Array,
-        prior: Prior,
-        hypotheses: list[Hypothesis],
+        cls, model: ModelValues, data: PressData, contact: Array, unknowns: Array, prior: Prior, group: list[Hypothesis]
     ) -> "_HypothesisGroup":
         """Linearise the residuals, and eliminate the contacts from them, so that they only depend on the unknowns.
 
@@ -423,20 +425,19 @@ class _HypothesisGroup:
             contact: Contacts (x, y, ln F), shape (n, 3).
             unknowns: The unknowns, shape (n_unknown,).
             prior: Prior distribution of the unknowns.
-            hypotheses: Hypotheses with the given errors.
+            group: Hypotheses with the given errors.
         """
         linearised = Linearised.of(model, data, contact)
         eliminated, eliminated_jacobian = linearised.eliminated()
-        is_changed = eliminated_jacobian.any(axis=2)  # False for a coordinate that was not measured
+        is_changed = eliminated_jacobian.any(axis=2)  # by any unknown; False for a coordinate that was not measured
         basis, jacobian = np.linalg.qr(eliminated_jacobian[is_changed])
         residual = basis.T @ eliminated[is_changed]
-        prior_change = unknowns - prior.mean  # the residuals at the prior means follow from those at the unknowns
-        # The density of an error at zero is proportional to the inverse of its standard deviation.
+        # The density of a measurement contains the inverse of its standard deviation as a factor.
         log_density = -np.log(data.measured_std[np.isfinite(data.measured_std)]).sum()
         return cls(
-            hypotheses=hypotheses,
+            hypotheses=group,
             prior=prior,
-            residual=residual - jacobian @ prior_change,
+            residual=residual - jacobian @ (unknowns - prior.mean),  # at the prior means instead of the given unknowns
             jacobian=jacobian,
             parts=jacobian @ prior.parts @ jacobian.T,
             other_chi2=float((eliminated**2).sum() - residual @ residual),
@@ -446,7 +447,7 @@ class _HypothesisGroup:
     def chi2_and_log_evidence(self) -> tuple[Array, Array]:
         """Compute how well the measurements agree with each hypothesis.
 
-        Under a hypothesis, the residuals are normally distributed with the covariance S. The evidence is their
+        Under a hypothesis, the residuals r are normally distributed with the covariance S. The evidence is their
         probability density, times the prior probability of the hypothesis.
 
         Returns:
@@ -455,32 +456,36 @@ class _HypothesisGroup:
         """
         factors = np.linalg.cholesky(self._covariance(self._squared_sizes))  # shape (n_hypothesis, m, m)
         weighted = [cho_solve((factor, True), self.residual, check_finite=False) for factor in factors]  # S^-1 r
-        chi2 = self.other_chi2 + np.array(weighted) @ self.residual
+        chi2 = self.other_chi2 + np.array(weighted) @ self.residual  # the second term is r' S^-1 r
         log_determinant = 2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)  # of S
         log_density = self.log_volume - 0.5 * (chi2 + log_determinant)  # of the residuals
         log_prior_probability = np.log([hypothesis.probability for hypothesis in self.hypotheses])
         return chi2, log_density + log_prior_probability
 
     def posterior(self, weight: Array) -> tuple[Array, Array]:
-        """Compute the estimates of the unknowns under the hypotheses whose weight is positive.
+        """Estimate the unknowns under each of the n hypotheses whose weight is positive.
 
-        The covariance of an estimate is P - P J' S^-1 J P: the prior covariance minus a reduction by the presses.
+        The estimate under a hypothesis is a normal distribution. Its mean is the prior mean minus P J' S^-1 r. Its
+        covariance is P - P J' S^-1 J P: the prior covariance minus a reduction, which the presses cause.
 
         Args:
             weight: Weight of each hypothesis, shape (n_hypothesis,).
 
         Returns:
-            Means of the unknowns under each of these hypotheses, shape (n, n_unknown), and the weighted sum of the
-            reductions, shape (n_unknown, n_unknown).
+            Means of the unknowns under the n hypotheses, shape (n, n_unknown), and the sum of the reductions of these
+            hypotheses times their weights, shape (n_unknown, n_unknown).
         """
         is_used = weight > 0.0
-        squared_sizes = self._squared_sizes[is_used]
-        gain = np.tensordot(squared_sizes, self.jacobian @ self.prior.parts, 1)  # J P, shape (n, m, n_unknown)
-        gain_by_covariance = np.linalg.solve(self._covariance(squared_sizes), gain)  # S^-1 J P, same shape
-        means = self.prior.mean - self.residual @ gain_by_covariance
-        # Sum the products P J' S^-1 J P of all hypotheses, with their weights.
-        weighted_gain = weight[is_used, None, None] * gain_by_covariance
-        return means, np.tensordot(gain, weighted_gain, ((0, 1), (0, 1)))
+        squared_sizes = self._squared_sizes[is_used]  # shape (n, n_part)
+        residual_covariance = self._covariance(squared_sizes)  # S, shape (n, m, m)
+        jacobian_by_part = self.jacobian @ self.prior.parts  # J times each part of P, shape (n_part, m, n_unknown)
+        cross_covariance = np.tensordot(squared_sizes, jacobian_by_part, 1)  # J P, shape (n, m, n_unknown)
+        gain = np.linalg.solve(residual_covariance, cross_covariance)  # S^-1 J P, shape (n, m, n_unknown)
+        means = self.prior.mean - self.residual @ gain
+        # Multiply (J P)' by S^-1 J P. The product is summed over the hypotheses and over the residuals.
+        weighted_gain = weight[is_used, None, None] * gain
+        summed_axes = (0, 1)
+        return means, np.tensordot(cross_covariance, weighted_gain, (summed_axes, summed_axes))
 
     @property
     def _squared_sizes(self) -> Array:

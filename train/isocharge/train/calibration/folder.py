@@ -320,9 +320,10 @@ def write_calibration(
 def usable_held_out(
     held_out: MeasuredPresses, presses: MeasuredPresses, problem: CalibrationProblem
 ) -> MeasuredPresses:
-    """Return the held-out presses that the model will answer, with all charges and a known position or force.
+    """Select the held-out presses that show how large the errors of the model are.
 
-    Presses with the charges of an earlier held-out press are left out.
+    These are the presses in the working area with all charges and with a known position or force. Presses with the
+    charges of an earlier held-out press are left out.
 
     Args:
         held_out: Presses that were not used for the calibration.
@@ -330,8 +331,8 @@ def usable_held_out(
         problem: The calibration problem.
 
     Raises:
-        PressError: If a held-out press is also one of the calibration, or if fewer than the 22 presses remain from
-            which a factor for standard deviations follows.
+        PressError: If a held-out press is also one of the calibration, or if fewer than `FEWEST_HELD_OUT` presses
+            remain, so that the factor for the standard deviations of the model cannot be computed.
     """
     domain = problem.domain
     sensor_name = problem.sensor.name

@@ -34,16 +34,20 @@ SAME_CONTACT_DECIMALS = 3
 OUTLIER_STDS = 3.0
 """Number of standard deviations beyond which residuals count less, because they are not due to noise."""
 
-SMALL_SHARE = 0.01
-"""Smallest white noise of a channel, relative to the noise of its gain at a charge of the usual size.
+MIN_WHITE_RATIO = 0.01
+"""Smallest white noise of a channel, relative to the noise of its gain at a charge of the median magnitude.
 
-The lower limit is needed because the presses do not determine the white noise if no charge is small. The quantiles of
-the charges at `SMALL_SHARE` and at 1 - `SMALL_SHARE` show whether the charges of a channel vary, and whether they have
-both signs.
+The lower limit is needed because the presses do not determine the white noise if no charge is small.
+"""
+
+EXTREME_SHARE = 0.01
+"""Share of the smallest charges of a channel, and share of its largest charges, that count as exceptions.
+
+The other charges show whether the charges of a channel vary, and whether they have both signs.
 """
 
 MIN_TRANSITION_RATIO = 0.5
-"""Smallest `ChannelNoise.transition_charge` of a channel with both signs, relative to the usual size of its charges.
+"""Smallest `ChannelNoise.transition_charge` of a channel with both signs, relative to `median_magnitude`.
 
 With a smaller value, the features of charges with little noise would have a kink where the charge changes its sign.
 """
@@ -83,40 +87,39 @@ class ChannelNoise(GaussianNoise):
     def estimate(cls, charge: Array, unit_contact: Array) -> "ChannelNoise":
         """Estimate the noise of each channel from measured presses.
 
-        Presses that are copies of other presses are left out, because they contain no further noise. If every channel
-        has charges at `MIN_REPEATED_CONTACTS` or more repeated contacts, the residuals are the differences between the
-        repeated charges and their means. Otherwise, the residuals are the differences between the charges of a press
-        and a quadratic function, which is fitted to the neighbours of the press. These differences also contain the
-        error of the quadratic approximation. The white noise and the noise of the gain are fitted to the residuals.
-        Both kinds of noise have lower limits.
+        The noise of a channel is fitted to residuals, which are differences between measured charges and estimates of
+        the charges without noise. If enough contacts were pressed repeatedly, the estimates are the mean charges of
+        these contacts. Otherwise, the estimates are the values of quadratic functions, which are fitted to the
+        neighbours of each contact. The residuals then also contain the error of the quadratic approximation. Presses
+        that are copies of other presses are left out, because they contain no further noise.
 
         Args:
             charge: Measured charges, shape (n, n_electrode), pC.
             unit_contact: Contacts in unit coordinates, shape (n, 3).
 
         Returns:
-            Noise model with the white noise and the noise of the gain of each channel.
+            Noise model with the white noise and the noise of the gain of each channel. Both have lower limits.
         """
         # Leave out copies of presses.
         different_rows = np.unique(np.column_stack([unit_contact, charge]), axis=0)
         contact = different_rows[:, :3]
         noisy_charge = different_rows[:, 3:]
 
-        # Compute the charges without noise and the residuals, each of shape (m, n_electrode). A channel that is silent
-        # at repeated contacts does not show its noise there, so only contacts with a charge count.
-        exact_charge, residual = _repeated_residuals(contact, noisy_charge)
-        repeated_charges = np.unique(exact_charge, axis=0)  # one row for each repeated contact
-        if np.count_nonzero(repeated_charges, axis=0).min() < MIN_REPEATED_CONTACTS:
+        # Estimate the charges without noise at repeated contacts, shape (m, n_electrode).
+        estimated_charge, residual = _repeated_residuals(contact, noisy_charge)
+        # Count the repeated contacts that show the noise of a channel. A contact at which the channel is silent does
+        # not show its noise.
+        charges_of_contacts = np.unique(estimated_charge, axis=0)  # one row for each repeated contact
+        contact_counts = np.count_nonzero(charges_of_contacts, axis=0)  # shape (n_electrode,)
+        if contact_counts.min() < MIN_REPEATED_CONTACTS:
             planes = LocalPlanes.fit(contact, noisy_charge)
-            exact_charge = planes.value
+            estimated_charge = planes.value
             residual = planes.residual
 
         # Fit the noise of each channel.
-        white_std, gain_std = np.transpose(list(map(_fit_noise, exact_charge.T, residual.T)))
+        white_std, gain_std = np.transpose(list(map(_fit_noise, estimated_charge.T, residual.T)))
         gain = np.maximum(gain_std, MIN_GAIN_NOISE)
-        # The presses do not determine the white noise if all charges are large. The lower limit of the white noise is a
-        # small fraction of the noise of the gain at the usual charge.
-        smallest_white = SMALL_SHARE * gain * usual_size(noisy_charge)
+        smallest_white = MIN_WHITE_RATIO * gain * median_magnitude(noisy_charge)
         return cls(np.maximum(white_std, smallest_white), gain)
 
     @classmethod
@@ -150,9 +153,9 @@ class ChannelNoise(GaussianNoise):
         Returns:
             Transition charges, shape (n_electrode,), pC.
         """
-        low_charge, high_charge = np.quantile(charge, (SMALL_SHARE, 1.0 - SMALL_SHARE), axis=0)
+        low_charge, high_charge = np.quantile(charge, (EXTREME_SHARE, 1.0 - EXTREME_SHARE), axis=0)
         has_both_signs = (low_charge < 0.0) & (high_charge > 0.0)  # shape (n_electrode,)
-        lower_limit = np.where(has_both_signs, MIN_TRANSITION_RATIO * usual_size(charge), 0.0)
+        lower_limit = np.where(has_both_signs, MIN_TRANSITION_RATIO * median_magnitude(charge), 0.0)
         return np.maximum(self.white / self.gain, lower_limit)
 
     def scaled(self, factor: float) -> "ChannelNoise":
@@ -189,12 +192,12 @@ class LocalPlanes:
 
     @classmethod
     def fit(cls, unit_contact: Array, values: Array) -> "LocalPlanes":
-        """For each contact, fit a quadratic function to the values of its neighbours by least squares.
+        """Fit a quadratic function to the neighbours of each contact by least squares, and return its tangent plane.
 
         The function maps the unit coordinates of a contact to the k values. Unit coordinates are x, y and ln F, scaled
         such that each of them ranges from -1 to 1. The plane is the tangent of the function at the contact. The values
         at the contact itself are not used in the fit, so that its residual is independent of the plane. The residuals
-        are scaled so that their variance is equal to that of the noise of the values.
+        are scaled so that their variance is equal to that of the noise of a single press.
 
         Args:
             unit_contact: Contacts in unit coordinates, shape (n, 3).
@@ -208,26 +211,28 @@ class LocalPlanes:
         distance, nearest = cKDTree(contact).query(contact, min(N_NEIGHBOURS + 1, len(contact)))
         neighbours = nearest[:, 1:]
 
-        # The terms of the function are a constant, the offsets of the neighbours, and the products of two offsets.
+        # The terms of the function are a constant, the 3 offsets of a neighbour, and the 6 products of two offsets.
         offsets = contact[neighbours] - contact[:, None]  # shape (n, number of neighbours, 3)
         first, second = np.triu_indices(3)
         products = offsets[:, :, first] * offsets[:, :, second]
-        terms = np.concatenate([np.ones_like(offsets[:, :, :1]), offsets, products], axis=2)
+        constant = np.ones((*neighbours.shape, 1))
+        terms = np.concatenate([constant, offsets, products], axis=2)
 
-        # The pseudoinverse contains the weights of the neighbours in the least-squares solution. The first coefficient
-        # is the value at the contact, and the next three are the slopes.
+        # Each coefficient of the least-squares solution is a weighted sum of the values of the neighbours. The weights
+        # are the rows of the pseudoinverse. The first coefficient is the value at the contact, and the next three are
+        # the slopes.
         weights = np.linalg.pinv(terms)  # shape (n, 10, number of neighbours)
         coefficients = weights @ mean_value[neighbours]  # shape (n, 10, k)
         value = coefficients[:, 0]
         slope = coefficients[:, 1:4].swapaxes(1, 2)  # shape (n, k, 3)
 
-        # A residual contains the noise of the mean value and the noise of the plane. The value of the plane is the sum
-        # of the mean values of the neighbours with the weights in the first row.
-        plane_variance = (weights[:, 0] ** 2 / press_count[neighbours]).sum(
-            axis=1
-        )  # relative to that of a single press
-        relative_std = np.sqrt(1.0 / press_count + plane_variance)
-        residual = (mean_value - value) / relative_std[:, None]
+        # The difference between the mean value at a contact and the plane contains the noise of both. If the noise of a
+        # single press has the variance 1, the mean of several presses has the variance 1 / press_count. The variance of
+        # the plane follows from the weights of the neighbours.
+        value_weights = weights[:, 0]
+        plane_variance = (value_weights**2 / press_count[neighbours]).sum(axis=1)
+        difference_std = np.sqrt(1.0 / press_count + plane_variance)
+        residual = (mean_value - value) / difference_std[:, None]
         farthest_distance = distance[:, -1]
         return cls(value, slope, residual, farthest_distance)
 
@@ -311,7 +316,7 @@ def _repeated_residuals(unit_contact: Array, charge: Array) -> tuple[Array, Arra
     return mean, difference * np.sqrt(count / (count - 1))
 
 
-def usual_size(charge: Array) -> Array:
+def median_magnitude(charge: Array) -> Array:
     """Return the median magnitude of the nonzero charges of each channel, shape (n_electrode,), pC.
 
     Args:
@@ -323,37 +328,47 @@ def usual_size(charge: Array) -> Array:
 def _fit_noise(charge: Array, residual: Array) -> Array:
     """Estimate the white noise and the noise of the gain of one channel from residuals.
 
-    The variance of a residual is white^2 + gain^2 Q^2, where Q is the charge. The likelihood of the residuals is
-    maximised. It is that of a normal distribution with longer tails beyond `OUTLIER_STDS` standard deviations (Huber
-    1964, proposal 2).
+    The variance of a residual is white^2 + gain^2 Q^2, where Q is the charge. The function searches for the white noise
+    and the noise of the gain that maximise the likelihood of the residuals. Residuals of up to `OUTLIER_STDS` standard
+    deviations have the density of a normal distribution. For larger residuals, the density decreases more slowly, so
+    that outliers have little effect on the result (Huber 1964, proposal 2).
 
-    A channel that is silent below a threshold does not show its noise there. Charges that are zero and have no residual
-    are therefore left out. Otherwise, the likelihood would be infinite without white noise.
+    A channel that is silent below a threshold does not show its noise there. Its charges of zero without a residual are
+    therefore left out. If they were used, the likelihood would be infinite for a white noise of zero.
 
     Args:
-        charge: Charges Q without noise, shape (n,), pC.
+        charge: Estimates of the charges Q without noise, shape (n,), pC.
         residual: Residuals, shape (n,), pC.
 
     Returns:
         The standard deviation of the white noise, pC, and the relative standard deviation of the gain.
     """
-    # The unknowns are the logarithms of white and gain, in units of the values with which each of them alone explains
-    # the residuals. The units are needed because charges may be very large or small.
     is_silent = (charge == 0.0) & (residual == 0.0)
-    smallest_number = np.finfo(float).tiny
+    square_limit = OUTLIER_STDS**2
+    smallest_number = np.finfo(float).tiny  # keeps the units and the variances above zero
+    # White noise of the size rms(residual) would explain the residuals without noise of the gain. Noise of the gain of
+    # the size rms(residual) / rms(charge) would explain them without white noise. White and gain are searched in these
+    # units, because charges may be very large or small, and as logarithms, because they are positive.
     units = smallest_number + rms(residual) / np.array([1.0, rms(charge)])
 
     def loss(log_std: Array) -> float:
-        """Return the mean negative logarithm of the likelihood, without a constant."""
+        """Return -2 times the logarithm of the density of a residual, without a constant, averaged over the residuals.
+
+        Args:
+            log_std: Logarithms of white and gain in their units, shape (2,).
+        """
         white, gain = units * np.exp(log_std)
         variance = np.maximum(white**2 + (gain * charge) ** 2, smallest_number)
-        # The squared deviation counts up to `OUTLIER_STDS` squared, and only its logarithm beyond.
-        square = residual**2 / variance
-        tail = OUTLIER_STDS**2 * np.log(np.maximum(square / OUTLIER_STDS**2, 1.0))
-        terms = np.log(variance) + np.minimum(square, OUTLIER_STDS**2) + tail
+        # For a normal distribution, the term of a residual is its squared deviation. Beyond the limit, the term only
+        # increases with the logarithm of the squared deviation.
+        squared_deviation = residual**2 / variance
+        normal_term = np.minimum(squared_deviation, square_limit)
+        tail_term = square_limit * np.log(np.maximum(squared_deviation / square_limit, 1.0))  # 0 up to the limit
+        terms = np.log(variance) + normal_term + tail_term
         return float(np.mean(np.where(is_silent, 0.0, terms)))
 
-    solution = minimize(loss, [-0.5, -0.5], method="Nelder-Mead").x
+    start = [-0.5, -0.5]  # both kinds of noise contribute
+    solution = minimize(loss, start, method="Nelder-Mead").x
     return np.asarray(units * np.exp(solution))
 
 

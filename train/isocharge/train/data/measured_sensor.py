@@ -16,7 +16,7 @@ from isocharge.common.errors import PressError, shown
 from isocharge.serve.model.contact import box_middle, inside_polygon
 from isocharge.serve.presses.measured_presses import CONTACT, MeasuredPresses
 from isocharge.simulate import Domain
-from isocharge.train.data.channel_noise import SMALL_SHARE
+from isocharge.train.data.channel_noise import EXTREME_SHARE
 
 HULL_RATIO = 0.3
 """Length above which an edge of the outline bends inwards to further places, dimensionless. The value 0 is the shortest
@@ -168,10 +168,10 @@ def _check_variation(name: str, charge: Array) -> None:
         charge: Charges of the channel, shape (n,), pC.
 
     Raises:
-        PressError: If all charges are in ascending order, or if all are equal, except for the share `SMALL_SHARE` of
-            the largest and of the smallest.
+        PressError: If all charges are in ascending order, or if all are equal without the share `EXTREME_SHARE` of the
+            largest and of the smallest charges.
     """
-    low, high = np.quantile(charge, (SMALL_SHARE, 1.0 - SMALL_SHARE))
+    low, high = np.quantile(charge, (EXTREME_SHARE, 1.0 - EXTREME_SHARE))
     if np.isclose(low, high, atol=0.0):
         equal_count = np.isclose(charge, low, atol=0.0).sum()
         raise PressError(

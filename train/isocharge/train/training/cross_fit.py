@@ -25,7 +25,7 @@ from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import PressError, cut
 from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.serve.presses.table_file import csv_text
-from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes, usual_size
+from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes, median_magnitude
 from isocharge.train.data.contact_errors import rms, rounded
 from isocharge.train.data.measured_sensor import MIN_FORCE_RATIO, PressedArea, check_measured_presses
 from isocharge.train.data.presses import (
@@ -276,7 +276,7 @@ def _unit_log_sizes(charge: Array) -> Array:
     Args:
         charge: Charges, shape (n, n_channel), pC.
     """
-    size = np.linalg.norm(charge / usual_size(charge), axis=1)  # each channel has the same weight
+    size = np.linalg.norm(charge / median_magnitude(charge), axis=1)  # each channel has the same weight
     log_size = np.log(np.maximum(size, np.finfo(float).tiny))
     return np.asarray(np.interp(log_size, [log_size.min(), log_size.max()], [-1.0, 1.0]))
 
@@ -379,7 +379,7 @@ def _distillation_stage(
 ) -> TrainingStage:
     """Define the training of a network on the mean outputs of other networks (distillation).
 
-    The inputs are copies of the charges, with noise of several sizes.
+    The network learns from several copies of each press, whose charges contain noise of different sizes.
 
     Args:
         network: Network to train.
@@ -390,18 +390,19 @@ def _distillation_stage(
     """
     rng = np.random.default_rng(config.seed)
     copies = [noise.scaled(factor).add(presses.charge, rng) for factor in DISTILLATION_NOISE_FACTORS]
-    charge = as_tensor(np.concatenate(copies))
-    # The targets are the outputs (means, logarithms of standard deviations, turns), averaged over the fold networks.
+    charge = as_tensor(np.concatenate(copies))  # shape (number of copies * number of presses, n_electrode)
+    # The target of a row of charges is the mean of the outputs of all fold networks for this row. The outputs are the
+    # means of the contact, the logarithms of its standard deviations, and the turns that determine its correlations.
     with torch.no_grad():
         outputs = [torch.cat(fold_network.posterior(charge), dim=1) for fold_network in fold_networks]
-    target = torch.stack(outputs).mean(dim=0)  # shape (number of copies, n_output)
-    # The differences of the means are divided by the standard deviations, and their squares are halved, as in the
-    # likelihood of a normal distribution.
+    target = torch.stack(outputs).mean(dim=0)  # shape (number of rows, n_output)
+    # The loss below is a weighted sum of squared differences from the targets. As in the likelihood of a normal
+    # distribution, the weight of a mean is half of its inverse variance. The weights of all other outputs are 1.
     weight = torch.ones_like(target)
     weight[:, MEAN] = 0.5 * torch.exp(-2.0 * target[:, LOG_STD])
 
     def loss(random: torch.Generator) -> Tensor:
-        """Return the squared differences from the targets, summed over the outputs and averaged over a random batch."""
+        """Return the weighted squared differences, summed over the outputs and averaged over a random batch of rows."""
         rows = torch.randint(len(charge), (config.batch,), generator=random)
         difference = torch.cat(network.posterior(charge[rows]), dim=1) - target[rows]
         return (weight[rows] * difference**2).sum(dim=1).mean()
