@@ -116,10 +116,12 @@ def bounded_step(point: Array, residual: Array, slopes: Array, damping: Array) -
 
 
 def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -> tuple[Array, Array]:
-    """Modify the normal equations of points on an edge of the domain D such that each step does not leave D.
+    """Modify the normal equations of points on an edge of the domain D such that each step runs along the edge.
 
-    The domain D is the unit disk times the interval [-1, 1]. The normal equations J'J step = -J'r belong to a
-    least-squares problem with the residuals r and their Jacobian J.
+    The domain D is the unit disk times the interval [-1, 1]. A step without a constraint solves the normal equations
+    J'J step = -J'r, where r are the residuals and J is their Jacobian. The vector J'r is the gradient of the function
+    f = |r|^2 / 2 that is minimised, and J'J approximates its second derivatives. A point leaves an edge towards the
+    inside of D if this decreases f. Otherwise, the edge is active, and the step must not cross it.
 
     Args:
         normals: Outward normals of both edges of D at each point, shape (n, 2, 3): of the circle that bounds x and y,
@@ -131,23 +133,25 @@ def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -
     Returns:
         Modified matrices, shape (n, 3, 3), and modified gradients, shape (n, 3).
     """
-    # An edge is active if the negative gradient has an outward component.
-    outward = -(normals @ gradient[..., None])  # shape (n, 2, 1)
-    active_normals = normals * (outward > 0.0)
+    # An edge is active if the negative gradient, the direction in which f decreases, has an outward component.
+    outward = -(normals @ gradient[..., None])  # outward component for each edge, shape (n, 2, 1)
+    active_normals = normals * (outward > 0.0)  # the normal of an inactive edge becomes zero
 
-    # A step along the tangent (-y, x, 0) of the circle must also turn with the circle. The turn adds the outward
-    # component to the second derivative along the tangent.
-    x, y, _ = active_normals[:, 0].T  # zeros if the circle is not active
-    tangent = np.column_stack([-y, x, np.zeros_like(x)])
+    # The circle is curved. After a motion by the angle a along the circle, the displacement is a t - a^2 n / 2, where n
+    # is the normal and t is the tangent. Because of the second term, the second derivative of f along the circle is
+    # larger than t' J'J t by the outward component. Add the difference to the matrix.
+    normal_x, normal_y, _ = active_normals[:, 0].T  # zeros if the circle is not active
+    tangent = np.column_stack([-normal_y, normal_x, np.zeros_like(normal_x)])
     circle_outward = outward[:, :1]  # shape (n, 1, 1)
     matrix = matrix + circle_outward * tangent[:, :, None] * tangent[:, None, :]
 
-    # Remove the components across the active edges. The trace makes the matrix regular in these directions.
-    across = active_normals.swapaxes(1, 2) @ active_normals  # projection onto the active normals, shape (n, 3, 3)
-    along = np.eye(3) - across
-    matrix_along = along @ matrix @ along
-    gradient_along = along @ gradient[..., None]
-    return matrix_along + trace * across, gradient_along[..., 0]
+    # Remove the components across the active edges from the gradient and from the matrix. The matrix would then be
+    # singular. The multiple of the projection onto the normals makes it regular, and does not change the step.
+    onto_normals = active_normals.swapaxes(1, 2) @ active_normals  # projection matrices, shape (n, 3, 3)
+    onto_edges = np.eye(3) - onto_normals
+    projected_matrix = onto_edges @ matrix @ onto_edges
+    projected_gradient = onto_edges @ gradient[..., None]
+    return projected_matrix + trace * onto_normals, projected_gradient[..., 0]
 
 
 CANDIDATES = 4096

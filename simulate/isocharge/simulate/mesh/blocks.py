@@ -149,18 +149,20 @@ class Blocks:
     def half_edge_ends(self) -> Array:
         """Ends of all half edges of the core polygon in the meshed part, shape (2 * n_meshed_corner + 1, n_corner + 1).
 
-        The core polygon is the part of the footprint whose elements have straight sides. Along its boundary, the
-        middles of the edges and the corners alternate anticlockwise. The first point is the middle of the edge before
-        the first corner. The last point is the middle of the edge after the last corner of the meshed part. Each point
-        is a weighted sum of all corners and of the centroid, and is described by its row of weights.
+        The core polygon is the part of the footprint whose elements have straight sides. A half edge extends from a
+        corner to the middle of an edge at this corner. The ends are listed anticlockwise along the boundary: the middle
+        of the edge before the first corner, the first corner, the middle of the next edge, and so on. The last end is
+        the middle of the edge after the last corner of the meshed part.
+
+        The positions of the corners are not known here. Each end is therefore described by weights, with which it is a
+        sum of the corners and of the centroid. There is one row for each end. Its columns are the weights of the
+        corners, followed by the weight of the centroid.
         """
         # The weights of a corner are 1 for the corner itself, and 0 for all other corners and for the centroid.
         corners = np.eye(self.n_corner, self.n_corner + 1)
         middles_before = 0.5 * (corners + np.roll(corners, 1, axis=0))  # of the edge before each corner
-        closed_boundary = np.empty((2 * self.n_corner + 1, self.n_corner + 1))
-        closed_boundary[:-1:2] = middles_before
-        closed_boundary[1::2] = corners
-        closed_boundary[-1] = middles_before[0]
+        alternating = np.stack([middles_before, corners], axis=1).reshape(-1, self.n_corner + 1)
+        closed_boundary = np.append(alternating, middles_before[:1], axis=0)  # ends where it begins
         return closed_boundary[: 2 * self.n_meshed_corner + 1]
 
     @cached_property
@@ -200,7 +202,7 @@ class Blocks:
         The core polygon is divided into one quadrilateral for each of its corners. The inner side of a quadrilateral
         extends from the centroid of the core polygon to the middle of the edge after the corner. The outer side extends
         from the middle of the edge before the corner to the corner. A quadrilateral is divided into a square grid of
-        n_half_edge * n_half_edge elements.
+        n_half_edge * n_half_edge elements. All points are described by weights, as in `half_edge_ends`.
 
         Returns:
             First and last corner of the inner side, and first and last corner of the outer side of each element, shape
@@ -211,12 +213,16 @@ class Blocks:
         middles = self.half_edge_ends[::2]
         corners = self.half_edge_ends[1::2]
 
-        # Divide the inner and the outer side, and then the lines from the inner to the outer side. The axes of the grid
-        # are the radial and the angular direction, the quadrilateral and the weight.
+        # Divide the inner and the outer side of each quadrilateral into equal parts, shape (n_grid, n_meshed_corner,
+        # n_corner + 1). The first axis is the position along the side, and the second axis is the quadrilateral.
         n_grid = self.n_half_edge + 1  # points along a side
-        inner_side = np.linspace(centroid, middles[1:], n_grid)
-        outer_side = np.linspace(middles[:-1], corners, n_grid)
-        grid = np.linspace(inner_side, outer_side, n_grid)
+        middles_before = middles[:-1]  # of the edge before each corner
+        middles_after = middles[1:]
+        inner_side = np.linspace(centroid, middles_after, n_grid)
+        outer_side = np.linspace(middles_before, corners, n_grid)
+
+        # Divide the lines between opposite points of both sides. The new first axis is the position along these lines.
+        grid = np.linspace(inner_side, outer_side, n_grid)  # shape (n_grid, n_grid, n_meshed_corner, n_corner + 1)
 
         # Neighbouring points of the grid are the corners of an element.
         inner_first = grid[:-1, :-1]
@@ -224,7 +230,7 @@ class Blocks:
         outer_first = grid[1:, :-1]
         outer_last = grid[1:, 1:]
         element_corners = np.stack([inner_first, inner_last, outer_first, outer_last], axis=3)
-        by_quadrilateral = np.moveaxis(element_corners, 2, 0)
+        by_quadrilateral = np.moveaxis(element_corners, 2, 0)  # the axis of the quadrilaterals becomes the first axis
         return by_quadrilateral.reshape(self.n_quad, 4, self.n_corner + 1)
 
     def rotated_elements(self, steps: int, steps_per_turn: int) -> Integers:

@@ -135,8 +135,9 @@ def sector_angles(
 ) -> Array:
     """Compute the angles at which the sides of the sectors meet the innermost circle of the mesh.
 
-    The innermost circle encloses the footprint of the probe. The sectors divide the rings between this circle and the
-    rim of the film. The sides of the sectors begin where rays from the centroid of the footprint meet the circle.
+    The innermost circle encloses the footprint of the probe. Its centre lies on the line from the centre of the film to
+    the centroid of the footprint, but not always at the centroid. The sectors divide the rings between this circle and
+    the rim of the film. The sides of the sectors begin where rays from the centroid meet the circle.
 
     Args:
         blocks: The elements.
@@ -158,9 +159,12 @@ def sector_angles(
     circle_centre = centre[..., None]
     circle_radius = radius[..., None]
 
+    # Choose the directions of the rays. The ratio of radii describes how much space the rays have to turn.
+    inner_radius = np.abs(inner_points - circle_centre).max(axis=-1, keepdims=True)  # of the farthest inner point
+    radius_ratio = circle_radius / inner_radius
+    ray_angle = _ray_angles(blocks, inner_points - ray_origin, radius_ratio)
+
     # Compute the intersections of the rays with the circle, relative to the centre of the circle.
-    inner_radius = np.abs(inner_points - circle_centre).max(axis=-1, keepdims=True)  # of the farthest point
-    ray_angle = _ray_angles(blocks, inner_points - ray_origin, circle_radius / inner_radius)
     ray = np.exp(1j * ray_angle)  # unit vectors, shape (..., n_sector + 1)
     intersection = _intersections_with_circle(ray_origin - circle_centre, ray, circle_radius)
 
@@ -203,30 +207,33 @@ def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) ->
     Returns:
         Angles, shape (..., n_sector + 1), rad.
     """
-    # Directions of the inner points, and evenly spaced directions, each of shape (..., n_point). The mean of both is
-    # the same. The last direction is omitted from the mean, because it repeats the first one after a full turn.
-    inner_angle = np.unwrap(np.angle(inner_points))
-    angle_from_first = np.linspace(0.0, math.tau / blocks.copies, inner_angle.shape[-1])
-    first_even_angle = np.mean((inner_angle - angle_from_first)[..., :-1], axis=-1, keepdims=True)
+    # Compute the directions of the inner points, and evenly spaced directions, each of shape (..., n_point). The first
+    # even direction is chosen such that the even directions have the same mean as the directions of the points. The
+    # last point is omitted from the means, because it repeats the first point after the meshed part of a full turn.
+    point_angle = np.unwrap(np.angle(inner_points))
+    angle_from_first = np.linspace(0.0, math.tau / blocks.copies, point_angle.shape[-1])
+    first_even_angle = np.mean((point_angle - angle_from_first)[..., :-1], axis=-1, keepdims=True)
     even_angle = first_even_angle + angle_from_first
 
-    # Rotate each direction by up to half of the difference from the even direction. If the circle is close to the inner
-    # points, the rotation is small. The function `tanh` limits the rotation smoothly.
+    # Rotate each direction towards the even direction, by half of their difference if the gap between the points and
+    # the circle is at least `CLEARANCE`. A ray cannot turn within a narrow gap, so the rotation is proportional to the
+    # gap. The function `tanh` limits the rotation smoothly to the largest rotation.
     max_rotation = _max_ray_rotation(inner_points)
-    relative_gap = np.minimum((radius_ratio - 1.0) / CLEARANCE, 1.0)
-    unlimited_rotation = 0.5 * relative_gap * (even_angle - inner_angle)
+    relative_gap = np.minimum((radius_ratio - 1.0) / CLEARANCE, 1.0)  # from 0 to 1
+    unlimited_rotation = 0.5 * relative_gap * (even_angle - point_angle)
     rotation = max_rotation * np.tanh(unlimited_rotation / max_rotation)
 
     # Add the rays between the rays of the inner points.
-    return divide_intervals(inner_angle + rotation, blocks.n_half_edge)
+    return divide_intervals(point_angle + rotation, blocks.n_half_edge)
 
 
 def _max_ray_rotation(inner_points: Complexes) -> Array:
     """Compute the largest angle by which rays may be rotated from the directions of points on an inner boundary.
 
-    Elements would fold where a ray meets an edge of the boundary at a small angle. The largest rotation is therefore
-    0.2 rad if the ray to the middle of each edge is perpendicular to the edge. It decreases to zero with the cosine of
-    the smallest angle between an edge and the ray to its middle.
+    An element folds if a ray meets an edge of the boundary at a small angle and is then rotated too far. The largest
+    rotation is therefore 0.2 (1 - |cos(t)|) rad, where t is the smallest angle between an edge and the ray to the
+    middle of this edge. The result is 0.2 rad if all these rays are perpendicular to their edges, as in a square. It is
+    zero if one of the rays is parallel to its edge.
 
     Args:
         inner_points: Points x + iy on the inner boundary, relative to the origin of the rays, shape (..., n_point).
@@ -235,10 +242,10 @@ def _max_ray_rotation(inner_points: Complexes) -> Array:
     Returns:
         Angle, shape (..., 1), rad.
     """
-    middle = inner_points[..., :-1:2]
+    middle = inner_points[..., :-1:2]  # without the last middle, which no corner follows
     corner_after_middle = inner_points[..., 1::2]
-    angle_at_middle = np.angle((corner_after_middle - middle) / middle)  # from the ray to the edge
-    largest_cosine = np.abs(np.cos(angle_at_middle)).max(axis=-1, keepdims=True)
+    edge_angle = np.angle((corner_after_middle - middle) / middle)  # from the ray through the middle to the edge
+    largest_cosine = np.abs(np.cos(edge_angle)).max(axis=-1, keepdims=True)  # of the smallest angle
     return np.asarray(0.2 * (1.0 - largest_cosine))
 
 
@@ -326,14 +333,17 @@ def ring_edges(resolution: Resolution, template_radius: Array, thin_ring_width: 
     # With the total width t, the thin rings extend from r = 1 - t to r = 1, over which ln(r) increases by about t.
     # According to the definition of the depth, the depth increases by t / ln(1 / r0).
     requested_thin_depth = -thin_ring_width / np.log(template_radius)
-    # All thin rings together are at most as deep as each of the other rings. The limit is smooth, because fields at the
-    # nodes are interpolated between presses at different distances.
+    # All thin rings together are at most as deep as each of the other rings. If x is the requested depth and m is the
+    # limit, the depth is x / sqrt(1 + (x / m)^2), which is about x if x is small, and approaches m if x is large. The
+    # limit is smooth, because fields at the nodes are interpolated between presses at different distances.
     max_thin_depth = 1.0 / (resolution.rings + 1)
     limited_thin_depth = requested_thin_depth / (1.0 + (requested_thin_depth / max_thin_depth) ** 2) ** 0.5
     thin_depth = limited_thin_depth[..., None]
 
-    # The even rings share the remaining depth. The part of the thin rings outside edge i is 3^-i of their total depth.
+    # The even rings share the depth up to the thin rings. The outer edge of the thin ring number i = 1, 2, ... is
+    # thin_depth / 3^i away from the rim, so that each ring is a third as wide as the previous ring.
     edges_of_even_rings = even_edges * (1.0 - thin_depth)
-    edges_of_thin_rings = 1.0 - thin_depth * 3.0 ** -np.arange(1.0, resolution.rim + 1)
+    distances_from_rim = thin_depth * 3.0 ** -np.arange(1.0, resolution.rim + 1)
+    edges_of_thin_rings = 1.0 - distances_from_rim
     edges_of_thin_rings[..., -1] = 1.0  # the last ring extends to the rim
     return np.concatenate([edges_of_even_rings, edges_of_thin_rings], axis=-1)

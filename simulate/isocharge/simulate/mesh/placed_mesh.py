@@ -293,10 +293,12 @@ def _film_gradient(derivatives: Array, points: Complexes) -> Array:
     Returns:
         Derivatives with respect to (X1, X2), shape (n_element, n_point, 2, n_local).
     """
-    # With the derivatives z_xi and z_eta of the film points z = x + iy, the derivatives of a function f are
-    # f_x + i f_y = i (z_xi f_eta - z_eta f_xi) / determinant, where the determinant is that of the Jacobian of z.
+    # The film points z = x + iy and a basis function f are functions of xi and eta. According to the chain rule,
+    #   f_xi = x_xi f_x + y_xi f_y   and   f_eta = x_eta f_x + y_eta f_y.
+    # The solution of both equations, in complex numbers, is
+    #   f_x + i f_y = i (z_xi f_eta - z_eta f_xi) / determinant   with   determinant = x_xi y_eta - y_xi x_eta.
     z_xi, z_eta = _point_derivatives(derivatives, points)
-    determinant = cross_product(z_xi, z_eta)
+    determinant = cross_product(z_xi, z_eta)  # of the Jacobian matrix of (x, y)
     f_xi, f_eta = derivatives
     complex_gradient = 1j * (z_xi[..., None] * f_eta - z_eta[..., None] * f_xi) / determinant[..., None]
     return np.stack([complex_gradient.real, complex_gradient.imag], axis=2)

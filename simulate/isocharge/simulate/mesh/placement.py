@@ -81,7 +81,8 @@ class Placement:
 
         The innermost circle of the mesh encloses the footprint of the probe. The method determines this circle, the
         conformal map that converts the template plane into the film, and the angles and depths of the elements between
-        the circle and the rim.
+        the circle and the rim. If the clamp of the real film is oval, the mesh is first created on a circular film, and
+        its points are displaced later.
 
         Args:
             blocks: The elements. Their topology must be the topology of the probe.
@@ -92,11 +93,13 @@ class Placement:
             rotation: Additional rotation of the footprint, a number or of the shape of `distance`, rad.
             oval: Shape of the clamp in the frame of the press, a number or of the shape of `distance`.
         """
-        # Corners of the core polygon on the circular film, followed by the centroid of the footprint. The centroid is a
-        # real number, because the press lies on the x axis. On a film with an oval clamp, the footprint is displaced.
+        # Compute the position of the centroid on the real film and on the circular film. Both are coordinates on the x
+        # axis, because the press lies on this axis.
         displaced_centroid = distance / film_radius
         reach = probe.reach / film_radius
         centroid = circular_distance(displaced_centroid, np.asarray(oval), reach)
+
+        # Compute the corners of the core polygon on the circular film, followed by the centroid of the footprint.
         rotation_factor: Complexes = np.exp(1j * np.broadcast_to(rotation, centroid.shape))
         rotation_and_scale = rotation_factor / film_radius
         core_corners = _on_film(probe.core(), centroid, rotation_and_scale)
@@ -110,13 +113,15 @@ class Placement:
             outline = _on_film(probe.outline, centroid, rotation_and_scale)
             centre, radius = enclosing_circle(outline, centroid)
 
-        # The last layer of elements inside the circle connects the circle to an inner boundary. The inner boundary is
-        # the edge of the core polygon, or the edge of the footprint if there are two layers. `inner_points` are the
-        # points of the inner boundary that belong to the middles of the edges and to the corners of the core polygon.
+        # The last layer of elements inside the circle connects the circle to an inner boundary. With one layer, the
+        # inner boundary is the edge of the core polygon. `inner_points` are its middles of edges and its corners.
         inner_points: Complexes = np.asarray(corners @ blocks.half_edge_ends.T)
         if blocks.n_layer == 2:
+            # The inner boundary is the edge of the footprint. The elements of the first layer connect the ends of the
+            # half edges to these points. There are `n_half_edge` elements along each half edge.
             assert isinstance(probe, CurvedProbe)
-            boundary = probe.boundary(blocks.boundary_parameter[:: blocks.n_half_edge])
+            parameter_of_half_edge_ends = blocks.boundary_parameter[:: blocks.n_half_edge]
+            boundary = probe.boundary(parameter_of_half_edge_ends)
             inner_points = _on_film(boundary, centroid, rotation_and_scale)
 
         # Compute the conformal map of the innermost circle, and the angles and depths of the elements around it.
@@ -279,16 +284,20 @@ class Placement:
         Returns:
             Points x + iy of the inner sides and of the outer sides, each of shape (n, k), in film radii.
         """
-        # Compute the sides as if they were straight. The points of curved sides are replaced below. The four corners of
-        # an element (i) are sums over the corners and the centroid of the core polygon (j).
+        # Compute the sides as if they were straight. The points of curved sides are replaced below. Each of the four
+        # corners of an element (index i) is a weighted sum of the corners and the centroid of the core polygon (j).
         element_corners = np.einsum("nij,nj->in", blocks.inner_corner_weights[element], self.corners)
         inner_first, inner_last, outer_first, outer_last = element_corners[:, :, None]  # each of shape (n, 1)
         inner = _interpolate(inner_first, inner_last, angular)
         outer = _interpolate(outer_first, outer_last, angular)
 
-        # The outer sides of the last layer lie on the innermost circle.
+        # The elements are numbered from the inside to the outside: first the `n_quad` elements of the core polygon,
+        # whose sides are straight, and then `n_sector` elements of each layer. The sector of an element is its position
+        # within its layer. An element of the core polygon also gets a number, but the number is not used.
         in_last_layer = element >= blocks.n_inner - blocks.n_sector
-        sector = (element[:, None] - blocks.n_quad) % blocks.n_sector  # not used for elements of the core polygon
+        sector = (element[:, None] - blocks.n_quad) % blocks.n_sector
+
+        # The outer sides of the last layer lie on the innermost circle.
         circle_points = self._circle_points(sector, angular)
         outer[in_last_layer] = circle_points[in_last_layer]
 

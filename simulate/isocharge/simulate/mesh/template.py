@@ -133,7 +133,9 @@ def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tu
 def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Complexes) -> tuple[Integers, Array]:
     """Find the elements that contain points between the innermost circle of the mesh and the rim of the film.
 
-    There, the mesh consists of rings, which are divided into sectors.
+    There, the mesh consists of rings, which are divided into sectors. The depth of a point determines its ring, and the
+    angle of the point determines its sector. The depth increases from 0 on the innermost circle to 1 on the rim, in
+    proportion to the logarithm of the distance from the origin of the template plane.
 
     Args:
         placement: Positions of the mesh under k presses, one for each row of points.
@@ -144,18 +146,20 @@ def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Comp
     Returns:
         Index of the element, shape (k, n). Radial and angular coordinate in the element from 0 to 1, shape (2, k, n).
     """
-    # The depth increases from 0 on the innermost circle to 1 on the rim.
+    # Find the rings. `_locate_in_intervals` expects the edges of the intervals along the first axis, so the arrays of
+    # the placement are transposed, and an axis is added for the n points of each row.
     depth = placement.depth(template_points)
     ring_edges = placement.ring_depths.T[..., None]  # shape (n_ring + 1, k, 1)
     ring, radial = _locate_in_intervals(ring_edges, depth)
 
-    # Angles at which the sides of the sectors lie at the depths of the points, shape (n_sector + 1, k, n). Along a
-    # side, the angle changes linearly from its value on the innermost circle to its value on the rim.
+    # Compute the angles at which the sides of the sectors lie at the depths of the points. Along a side, the angle
+    # changes linearly with the depth, from its value on the innermost circle to its value on the rim.
     circle_angles = placement.circle_angles.T[..., None]  # shape (n_sector + 1, k, 1)
     rim_angles = placement.rim_angles.T[..., None]
-    side_angles = circle_angles + depth * (rim_angles - circle_angles)
+    side_angles = circle_angles + depth * (rim_angles - circle_angles)  # shape (n_sector + 1, k, n)
 
-    # If the whole film is meshed, add full turns such that each angle lies within one turn after the first side.
+    # Find the sectors. If the whole film is meshed, add full turns such that each angle lies within one turn after the
+    # first side.
     angle = np.angle(template_points)
     if not blocks.half:
         angle = side_angles[0] + np.mod(angle - side_angles[0], math.tau)

@@ -263,8 +263,8 @@ class Turns:
     def spread(cls, largest_harmonics: tuple[int, ...], period: float, *, has_directions: bool) -> "Turns":
         """Choose the smallest number of turns whose presses determine the coefficients of a Fourier series.
 
-        A turn is a pair of two angles: the direction d of a press, and the rotation r of the probe. A term of the
-        series is proportional to exp(i (2 m d + k r)).
+        A turn is a pair of two angles: the rotation r of the probe relative to the direction of a press, and the sum d
+        of this direction and the rotation. The term (m, k) of the series is proportional to exp(i (2 m d + k r)).
 
         Args:
             largest_harmonics: Largest |k| of the terms of the series for |m| = 0, 1, 2, and so on. Without directions,
@@ -273,23 +273,24 @@ class Turns:
             has_directions: Whether the angle d varies. It does not vary if the film is axisymmetric, so that d has no
                 effect, or if the probe keeps its orientation on the film, so that d is zero.
         """
-        # Choose the pairs (m, k) of the terms of the series.
+        # Choose the terms (m, k) of the series. A real function needs the term (-m, -k) for each term (m, k).
         has_rotations = period > 0.0
         largest_m = len(largest_harmonics) - 1 if has_directions else 0
-        pairs: list[tuple[int, int]] = []
+        terms: list[tuple[int, int]] = []
         for m in range(-largest_m, largest_m + 1):
             largest_k = largest_harmonics[abs(m)] if has_rotations else 0
-            pairs.extend((m, k) for k in range(-largest_k, largest_k + 1))
-        harmonics = np.array(pairs)
+            terms.extend((m, k) for k in range(-largest_k, largest_k + 1))
+        term_orders = np.array(terms)  # shape (n_term, 2)
 
-        # Choose the angles. Only even harmonics of d occur, so half a turn is the period of d.
+        # Choose the angles. From each turn to the next, the angle r increases by an n-th part of a full turn, and d by
+        # a multiple of an n-th part of half a turn. Half a turn is the period of d, because only even harmonics occur.
         symmetry_order = round(math.tau / period) if has_rotations else 1
-        n_turn, step = _smallest_lattice(harmonics, symmetry_order)
+        n_turn, step = _smallest_lattice(term_orders, symmetry_order)
         turn = np.arange(n_turn)
         return cls(
             direction=np.pi * step * turn / n_turn if has_directions else np.zeros(n_turn),
             rotation=math.tau * turn / n_turn if has_rotations else np.zeros(n_turn),
-            harmonics=harmonics * np.array([2, 1]),  # (2 m, k)
+            harmonics=term_orders * np.array([2, 1]),  # (2 m, k)
             symmetry_order=symmetry_order,
         )
 
@@ -333,32 +334,40 @@ class Turns:
         return np.asarray(sum_over_terms.real / n_turn)
 
 
-def _smallest_lattice(harmonics: Integers, symmetry_order: int) -> tuple[int, int]:
-    """Find the smallest lattice of turns on which any two harmonics differ in at least one value.
+def _smallest_lattice(term_orders: Integers, symmetry_order: int) -> tuple[int, int]:
+    """Find the fewest turns at which no two terms of a Fourier series have the same values.
 
-    A turn is a pair of the direction d of a press and the rotation r of the probe. A lattice has n turns and the step
-    s, and the turn j has the angles d = pi s j / n and r = 2 pi j / n. The harmonic exp(i (2 m d + k r)) has the phase
-    2 pi (m s + k) j / n at the turn j. Two harmonics therefore have the same values at all turns if and only if the
-    remainders of m s + k after the division by n are equal.
+    A turn is a pair of two angles: the rotation r of the probe relative to the direction of the press, and the sum d of
+    this direction and the rotation. The n turns form a lattice with the step s. The turn j has the angles
 
-    While the rotation increases by one period of the probe, the direction must increase by the same angle plus a
-    multiple of half a turn. The difference s - 2 is therefore a multiple of the symmetry order.
+        r = 2 pi j / n   and   d = pi s j / n   for j = 0, 1, ..., n - 1.
+
+    The term (m, k) of the series therefore has the value
+
+        exp(i (2 m d + k r)) = exp(2 pi i (m s + k) j / n)
+
+    at the turn j. The value does not change if n is added to m s + k. Two terms with the same remainder of m s + k
+    after the division by n therefore have the same values at all turns, so that their coefficients cannot be
+    distinguished. The remainders of all terms must be different.
+
+    Only the turns of one period of the probe are solved, which is 2 pi / q for a probe with the symmetry order q. In
+    each further period, the directions d - r must be the same except for half turns, which do not change the film.
+    During one period, d - r increases by pi s / q - 2 pi / q = pi (s - 2) / q. The difference s - 2 must therefore be a
+    multiple of q.
 
     Args:
-        harmonics: Pairs (m, k), shape (n_term, 2).
-        symmetry_order: Order of the rotational symmetry of the probe.
+        term_orders: Pairs (m, k) of the terms, shape (n_term, 2).
+        symmetry_order: Order q of the rotational symmetry of the probe.
 
     Returns:
-        Number of turns, which is a multiple of the symmetry order, and step.
+        Number n of turns, which is a multiple of the symmetry order, and step s.
     """
-    # There must be at least as many turns as harmonics. The search ends, because a lattice with sufficiently many turns
-    # separates all harmonics.
-    period_count = math.ceil(len(harmonics) / symmetry_order)
-    while True:
-        n_turn = symmetry_order * period_count
-        for step in range(2 % symmetry_order, n_turn, symmetry_order):
-            remainders = (harmonics @ (step, 1)) % n_turn  # of m s + k
-            all_remainders_differ = len(set(remainders.tolist())) == len(harmonics)
-            if all_remainders_differ:
+    n_term = len(term_orders)
+    smallest_step = 2 % symmetry_order  # s - 2 is a multiple of the symmetry order
+    n_turn = symmetry_order * math.ceil(n_term / symmetry_order)  # different remainders need at least n_term turns
+    while True:  # ends, because all remainders are different if there are sufficiently many turns
+        for step in range(smallest_step, n_turn, symmetry_order):  # larger steps have the same remainders
+            remainders = (term_orders @ (step, 1)) % n_turn  # of m s + k
+            if len(set(remainders.tolist())) == n_term:
                 return n_turn, step
-        period_count += 1
+        n_turn += symmetry_order

@@ -80,10 +80,13 @@ def cross_product(first: Complexes, second: Complexes) -> Array:
 def area_in_disk(corners: Complexes, centre: complex, radius: Array | float) -> Array:
     """Compute the area that a polygon has in common with each of several concentric disks.
 
-    Each edge of the polygon forms a triangle with the centre of the disk. The signed areas that the triangles and the
-    disk have in common add up to the common area of the polygon and the disk. Between the centre and the part of an
-    edge inside the circle, the common area is a triangle. Between the centre and each part of an edge outside the
-    circle, it is a circular sector.
+    Each edge of the polygon forms a triangle with the centre of the disk. The area of a triangle counts as positive if
+    its edge runs anticlockwise around the centre, and as negative otherwise. The sum of these areas is the area of the
+    polygon. In the same way, the sum of the areas that the triangles and the disk have in common is the common area of
+    the polygon and the disk.
+
+    The part of an edge inside the circle is a chord. Between the centre and the chord, the common area is a triangle.
+    Between the centre and a part of an edge outside the circle, before or after the chord, it is a circular sector.
 
     Args:
         corners: Corners x + iy, anticlockwise, shape (n,).
@@ -100,10 +103,10 @@ def area_in_disk(corners: Complexes, centre: complex, radius: Array | float) -> 
     direction = (end - start) / np.abs(end - start)  # unit vector x + iy
     start_along = (start * np.conj(direction)).real
     end_along = (end * np.conj(direction)).real
-    across = cross_product(direction, start)  # negative if the centre lies on the left of the edge
+    across = cross_product(direction, start)  # of the edge; negative if the centre lies on its left
 
-    # The chord is the part of the edge within the circle. If the edge does not meet the circle, the length of the chord
-    # is zero.
+    # Compute the chords. If the edge does not meet the circle, the length of the chord is zero, and the edge is outside
+    # the circle before and after this point.
     squared_radius = np.asarray(radius)[..., None] ** 2  # shape (..., 1)
     half_chord = np.sqrt(np.maximum(squared_radius - across**2, 0.0))
     chord_start_along = np.clip(start_along, -half_chord, half_chord)
@@ -111,7 +114,8 @@ def area_in_disk(corners: Complexes, centre: complex, radius: Array | float) -> 
     chord_start = (chord_start_along + 1j * across) * direction
     chord_end = (chord_end_along + 1j * across) * direction
 
-    # Signed areas of the triangle between the centre and the chord, and of the sectors before and after the chord
+    # Compute the signed areas of the triangle between the centre and the chord, and of both sectors. The area of the
+    # triangle is half of the length of the chord times the signed distance -across of the centre from the edge.
     triangle_area = -0.5 * across * (chord_end_along - chord_start_along)
     angle_before_chord = np.angle(chord_start * np.conj(start))
     angle_after_chord = np.angle(end * np.conj(chord_end))
