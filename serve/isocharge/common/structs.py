@@ -262,17 +262,24 @@ def _item_types(value: Any, expected_type: Any) -> dict[str | int, Any]:
     if isinstance(value, Mapping):
         types |= _field_types(value, structs)
     for member in members:  # the items of dictionaries, lists and tuples
-        arguments = get_args(member)  # for example (str, float) for dict[str, float]
+        arguments = get_args(member)
         if isinstance(value, Mapping) and get_origin(member) is dict:
-            types |= dict.fromkeys(value, arguments[1])
+            _key_type, item_type = arguments
+            types |= dict.fromkeys(value, item_type)
         elif isinstance(value, list | tuple) and get_origin(member) in (list, tuple):
+            # All items of list[float] and of tuple[float, ...] have the same type. Each item of tuple[str, float] has a
+            # type of its own.
             is_uniform = len(arguments) == 1 or Ellipsis in arguments
-            types |= enumerate(arguments[:1] * len(value) if is_uniform else arguments)
+            item_types = arguments[:1] * len(value) if is_uniform else arguments
+            types.update(enumerate(item_types))
     return types
 
 
 def _field_types(table: Mapping[str, Any], structs: list[Any]) -> dict[str | int, Any]:
     """Return the types of the keys that a table may have, if the keys are declared by structs.
+
+    A struct declares the keys of the table if it has no tag, or if the table contains its tag. The tag key may have the
+    tag of any of the structs.
 
     Args:
         table: Table from TOML or JSON.
@@ -282,9 +289,10 @@ def _field_types(table: Mapping[str, Any], structs: list[Any]) -> dict[str | int
     types: dict[str | int, Any] = {}
     for struct in structs:
         config = struct.__struct_config__
-        if config.tag_field is not None:
-            types[config.tag_field] = Literal[tags]
-        if table.get(config.tag_field) == config.tag:  # both are None if the struct has no tag
+        tag_key = config.tag_field  # None if the struct has no tag
+        if tag_key is not None:
+            types[tag_key] = Literal[tags]
+        if tag_key is None or table.get(tag_key) == config.tag:
             types |= {field.encode_name: field.type for field in msgspec.structs.fields(struct)}
     return types
 
@@ -328,16 +336,18 @@ def _describe_schema(schema: Mapping[str, Any]) -> str:
             return str(description)
         case {"enum": values}:
             return f"one of {', '.join(map(str, values))}"
-        case {"anyOf": members} if "discriminator" not in schema:  # with a discriminator, all members are tables
+        # A union. If it has a discriminator, which is the tag key, all members are tables, and the last line applies.
+        case {"anyOf": members} if "discriminator" not in schema:
             descriptions = [_describe_schema(member) for member in members if member.get("type") != "null"]
             return " or ".join(dict.fromkeys(descriptions))  # `fromkeys` removes repeated descriptions
-        case {"prefixItems": [item, *_]} | {"items": item}:  # all items have the same type
+        # A tuple has a schema for each item in `prefixItems`, but its items are of one kind. A list has one schema.
+        case {"prefixItems": [item, *_]} | {"items": item}:
             items = f"{_noun(item)}s"
             minimum = schema.get("minItems", 0)
             if minimum == schema.get("maxItems"):
                 return f"a list of {minimum} {items}"
             return f"a list of {items}, {minimum} or more" if minimum else f"a list of {items}"
-        case {"maxLength": length}:
+        case {"maxLength": length}:  # a text, which must not be empty; see `Text`
             return f"a text of 1 to {length} characters"
         case {"type": "number" | "integer"}:
             return _describe_number(_noun(schema), schema)
@@ -371,10 +381,15 @@ def _describe_number(noun: str, schema: Mapping[str, Any]) -> str:
         schema: JSON schema that contains the bounds.
     """
     words = {"exclusiveMinimum": "above", "minimum": "from", "maximum": "to", "exclusiveMaximum": "to below"}
-    # The bounds +-`MAX_FLOAT` exclude only infinity, and are not mentioned. A missing bound is treated like these.
-    bounds = {word: schema[key] for key, word in words.items() if abs(schema.get(key, MAX_FLOAT)) != MAX_FLOAT}
+    bounds = {}
+    for key, word in words.items():
+        # The bounds +-`MAX_FLOAT` exclude only infinity, and are not mentioned. A missing bound is treated like these.
+        bound = schema.get(key, MAX_FLOAT)
+        if abs(bound) != MAX_FLOAT:
+            bounds[word] = bound
     if bounds == {"above": 0}:
         return f"a positive {noun}"
     if not bounds and noun == "number":
         return "a finite number"
-    return " ".join([f"a {noun}", *(f"{word} {bound:.16g}" for word, bound in bounds.items())])
+    phrases = [f"{word} {bound:.16g}" for word, bound in bounds.items()]
+    return " ".join([f"a {noun}", *phrases])

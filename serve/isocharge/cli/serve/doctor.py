@@ -173,11 +173,14 @@ def _check_wiring(examination: Examination) -> ElectrodeCheck:
     """
     table = dict(examination.device)
     if examination.unit != "pC":
-        table.pop("gain", None)  # without the charge of one unit, it is incomplete
+        # The charge of one unit is unknown. A section `[gain]` with only the offsets would be refused.
+        table.pop("gain", None)
     device = device_from_table(table, "board")
+    # Without a section `[channels]`, each electrode has the channel that the port check has found by names or order.
     channels = device.channels or {channel.electrode: channel.name for channel in examination.channels}
+    # Largest minus smallest charge of a channel at rest, in the unit of the board. An unknown span counts as 0.
+    rest_span = max(channel.span_pC or 0.0 for channel in examination.channels)
     with Port(examination.url, baud=examination.baud, request=device.request) as port:
-        rest_span = max(channel.span_pC or 0.0 for channel in examination.channels)
         return check_electrodes(port, device, channels, say, examination.unit, rest_span)
 
 

@@ -120,13 +120,17 @@ def _value_text(value: Any, separator: str = ", ") -> str:
     """
     if value is None:
         return "-"
-    if isinstance(value, float):  # with five significant digits, but without an exponent below 1e9
-        return f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.5g}"
+    if isinstance(value, float):
+        # A number has five significant digits. From 1e5 on, the format `.5g` would write an exponent, so numbers of at
+        # least five digits before the decimal point are rounded to whole numbers, up to 1e9.
+        is_large = 1e4 <= abs(value) < 1e9
+        return f"{value:.0f}" if is_large else f"{value:.5g}"
     if isinstance(value, dict):
         return separator.join(f"{key} {_value_text(item)}" for key, item in value.items())
     if isinstance(value, list):
-        has_texts = value and isinstance(value[0], str)
-        return (separator if has_texts else ", ").join(map(_value_text, value)) or "none"
+        has_texts = value and isinstance(value[0], str)  # all items have the type of the first one
+        item_separator = separator if has_texts else ", "
+        return item_separator.join(map(_value_text, value)) or "none"
     return printable(str(value))
 
 

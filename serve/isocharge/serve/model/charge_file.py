@@ -28,7 +28,7 @@ from isocharge.common.arrays import npz_arrays
 from isocharge.common.contact_domain import Domain
 from isocharge.common.errors import ModelError, cut
 from isocharge.common.files import read_needed
-from isocharge.serve.model.charge_series import ChargeSeries
+from isocharge.serve.model.charge_series import NO_DIRECTIONS, ChargeSeries
 
 FILE = "charges.npz"
 """Name of the file in a version folder."""
@@ -92,8 +92,7 @@ def read_charge_map(version_folder: Path, electrodes: tuple[str, ...]) -> Charge
             electrodes=electrodes,
             coefficients=coefficients.astype(float),
             node_MPa=arrays["node_MPa"],
-            # If the file contains no directions, their number K is 0, which is the size of the fifth axis.
-            directions=arrays.get("directions", np.zeros((1, 1, 1, 2, 0, 1))).astype(float),
+            directions=arrays.get("directions", NO_DIRECTIONS).astype(float),
             log_size=arrays.get("log_size"),
             is_folded=bool(arrays["is_folded"]),
             **{name: float(arrays[name]) for name in NUMBERS},

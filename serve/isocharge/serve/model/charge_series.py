@@ -159,6 +159,9 @@ def _derivative(coefficients: Array, axis: int) -> Array:
     return np.asarray(chebyshev.chebder(np.pad(coefficients, padding), axis=axis))
 
 
+NO_DIRECTIONS = np.zeros((1, 1, 1, 2, 0, 1))
+"""Coefficients of the directions of a map without directions: the axis of the K directions has the length 0."""
+
 MAX_VALUE = 100.0
 """Largest magnitude of v and of ln S in the domain. The logarithms of charges in pC are between -5 and 12."""
 
@@ -192,7 +195,7 @@ class ChargeSeries:
     electrodes: tuple[str, ...]
     coefficients: Array
     node_MPa: Array = field(default_factory=lambda: np.zeros(1))
-    directions: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 2, 0, 1)))
+    directions: Array = field(default_factory=lambda: NO_DIRECTIONS)
     log_size: Array | None = None
     is_folded: bool = False
     charge_std: float = 0.0
@@ -235,6 +238,9 @@ class ChargeSeries:
     def in_state(self, contact: Array, state: Array) -> ModelValues:
         """Compute the charges of contacts for any state of the film, and the derivatives of the charges.
 
+        The symbols are those at the beginning of this module. The value v is interpolated between its values at the
+        nodes of the pretension. Each direction k then adds z_k (d_k + t d'_k) to it. The charges follow from v.
+
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
             state: State (t, z_1, ..., z_K) of the film, shape (1 + K,), or one state for each contact, shape
@@ -245,10 +251,10 @@ class ChargeSeries:
         """
         n_contact = len(contact)
         n_electrode = len(self.electrodes)
-        nearest, excess = self._nearest_in_domain(contact)
+        nearest, excess = self._nearest_in_domain(contact)  # contacts outside the domain are extrapolated by the excess
         states = np.broadcast_to(state, (n_contact, 1 + self.direction_count))
         pretension = states[:, 0]  # t of each contact, shape (n,)
-        directions = states[:, 1:]  # z of each contact, shape (n, K)
+        directions = states[:, 1:]  # z_1 to z_K of each contact, shape (n, K)
 
         # Evaluate v at the nodes, and d and d' of each direction. The axis of length 4 contains the value and its
         # derivatives with respect to the three coordinates of the contact.
@@ -270,8 +276,10 @@ class ChargeSeries:
         value_per_direction = total_change[:, 0].swapaxes(0, 1)  # shape (K, n, n_electrode)
         value_per_state = np.stack([value_per_MPa, *value_per_direction], axis=2)
 
+        # Convert v to charges, and apply the chain rule to the derivatives with respect to the state.
         charge_pC, charge_per_value, by_contact = self._charges(value, nearest, excess)
-        return ModelValues(charge_pC + self.offset_pC, by_contact, charge_per_value[:, :, None] * value_per_state)
+        by_state = charge_per_value[:, :, None] * value_per_state  # shape (n, n_electrode, 1 + K)
+        return ModelValues(charge_pC + self.offset_pC, by_contact, by_state)
 
     @cached_property
     def _calibrated(self) -> Series:

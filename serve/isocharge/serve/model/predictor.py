@@ -259,16 +259,19 @@ class Predictor:
             The ten numbers of each contact, shape (n, 10). Changes of x, mm, y, mm, and the force, N, by the noise of
             each electrode, shape (electrodes, n, 3).
         """
+        # The step k changes only the charge k of every press. The axes are the step, the press and the charge.
         n_press, n_electrode = charge_pC.shape
-        steps = extra_std_pC * np.eye(n_electrode)[:, np.newaxis]  # each changes one charge of every press
+        selection = np.eye(n_electrode)[:, np.newaxis]  # shape (electrodes, 1, electrodes)
+        steps = extra_std_pC * selection
         no_step = np.zeros_like(steps[:1])
-        changed_pC = (charge_pC + np.concatenate([no_step, steps, -steps])).astype(np.float32)
 
         # All presses are predicted in one batch: first without a change, then with each charge raised, then lowered.
+        changed_pC = (charge_pC + np.concatenate([no_step, steps, -steps])).astype(np.float32)
         rows = self.predict_rows(changed_pC.reshape(-1, n_electrode))
-        contacts, *changed = rows.reshape(1 + 2 * n_electrode, n_press, 10)
-        raised, lowered = np.split(np.array(changed, float)[..., :3], 2)
-        return contacts, 0.5 * (raised - lowered)
+        results = rows.reshape(1 + 2 * n_electrode, n_press, 10)
+        changed_contacts = results[1:, :, COLUMNS["contact"]].astype(float)  # x, y and the force after each step
+        raised, lowered = np.split(changed_contacts, 2)
+        return results[0], 0.5 * (raised - lowered)
 
     def predict_rows(self, charges: Singles) -> Singles:
         """Compute the contacts of n presses, with the standard deviations for the noise of the training.

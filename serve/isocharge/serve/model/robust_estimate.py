@@ -220,10 +220,15 @@ class RobustProblem:
     def _normal_equations(
         self, point: RobustPoint, contact_shift: Array, contact_by_state: Array
     ) -> tuple[Array, Array]:
-        """Compute the normal equations of a step of the state, from which the contacts are eliminated.
+        """Compute the normal equations N ds = g of a step ds of the state, from which the contacts are eliminated.
 
-        The normal matrix and the right side are sums over the presses. Each term is multiplied by the weight of its
-        press, which is small if the residuals are large.
+        After the step, the whitened residuals of press i are r_i - C_i du_i - S_i ds, with the symbols and the shifts
+        du_i = a_i - B_i ds of the method `_contact_shifts`. With these shifts, they become
+        (r_i - C_i a_i) - (S_i - C_i B_i) ds. The step sets the derivative of the minimised function with respect to the
+        state to zero. With the prior (mean s0, precision P) and the weight w_i of each press, which is small if the
+        residuals of the press are large, this condition gives
+
+            N = P + sum_i w_i S_i' (S_i - C_i B_i),        g = P (s0 - s) + sum_i w_i S_i' (r_i - C_i a_i).
 
         Args:
             point: State and contacts.
@@ -231,17 +236,17 @@ class RobustProblem:
             contact_by_state: Matrices B_i, as `_contact_shifts` returns them, shape (n, 3, p).
 
         Returns:
-            Normal matrix, shape (p, p), and right side, shape (p,), of the state.
+            Normal matrix N, shape (p, p), and right side g, shape (p,).
         """
-        # Schur complement: the parts of the derivatives and of the residuals that no change of the contacts explains
+        # The rows of these arrays are all charges of all presses, so that a matrix product sums over the presses, too.
         n_state = point.state.size
-        remaining_slopes = (point.by_state - point.by_contact @ contact_by_state).reshape(-1, n_state)
-        remaining_residual = point.residual - (point.by_contact @ contact_shift[:, :, None])[:, :, 0]
-        weighted_slopes = (point.weights[:, None, None] * point.by_state).reshape(-1, n_state)
+        remaining_slopes = (point.by_state - point.by_contact @ contact_by_state).reshape(-1, n_state)  # S_i - C_i B_i
+        remaining_residual = point.residual - (point.by_contact @ contact_shift[:, :, None])[:, :, 0]  # r_i - C_i a_i
+        weighted_slopes = (point.weights[:, None, None] * point.by_state).reshape(-1, n_state)  # w_i S_i
         normal_matrix = self._precision + weighted_slopes.T @ remaining_slopes
         prior_side = self._precision @ (self._prior_mean - point.state)
         right_side = prior_side + weighted_slopes.T @ remaining_residual.ravel()
-        symmetric_matrix = 0.5 * (normal_matrix + normal_matrix.T)  # despite rounding errors
+        symmetric_matrix = 0.5 * (normal_matrix + normal_matrix.T)  # N is symmetric except for rounding errors
         return symmetric_matrix, right_side
 
     def _contact_shifts(self, point: RobustPoint, damping: float) -> tuple[Array, Array]:

@@ -159,19 +159,24 @@ class BoundPress:
             n_electrode: Number of electrodes.
         """
         charges = np.zeros((1, n_electrode), dtype=np.float32)
-        values = np.zeros(sum(OUTPUTS.values()), dtype=np.float32)
-        # The session stores only the addresses of the arrays. The views in `write` and `read` keep the arrays alive.
+        values = np.zeros(sum(OUTPUTS.values()), dtype=np.float32)  # the ten values of a `Contact`
+
+        # Bind the charges, and each output to its columns of the values. The session stores only the addresses of the
+        # arrays. The memoryviews below keep the arrays alive.
         binding = session.io_binding()
         binding.bind_input(INPUT, "cpu", 0, np.float32, charges.shape, charges.ctypes.data)
         for name, columns in COLUMNS.items():
-            output = values[np.newaxis, columns]
+            output = values[np.newaxis, columns]  # a view of shape (1, number of columns), not a copy
             binding.bind_output(name, "cpu", 0, np.float32, output.shape, output.ctypes.data)
         self.run: Callable[[], None] = partial(session.run_with_iobinding, binding)
 
-        # Functions that write float32 numbers into the memory of the charges, and read the numbers of the outputs
+        # Functions that write float32 numbers into the memory of the charges, and read the numbers of the outputs. This
+        # memory is passed as a memoryview of bytes.
         self.write = partial(struct.Struct(f"={n_electrode}f").pack_into, charges.data.cast("B"), 0)  # from byte 0 on
         self.read = partial(struct.Struct(f"={values.size}f").unpack, values.data.cast("B"))
-        # The type is Any because the type hints of memoryview cover only bytes.
+
+        # Memoryviews of the same arrays for `run_into`, which copies whole arrays. The type is Any, because the type
+        # hints of memoryview cover only bytes.
         self._charge_view: Any = charges[0].data
         self._value_view: Any = values.data
 

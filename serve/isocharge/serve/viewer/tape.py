@@ -54,8 +54,10 @@ def sample_values(record: PredictionRecord, electrodes: tuple[str, ...]) -> tupl
         record: The record.
         electrodes: Names of the electrodes, in the order of the charges.
     """
-    # The tracked contact, if there is one, has only some of the numbers.
-    values = [getattr(record.tracked, name, getattr(record, name)) for name in RECORD_NUMBERS]
+    # If there is a tracked contact, its numbers replace those of the record. It has only some of the numbers: the
+    # position and the force, for example, but not the time. The others are those of the record.
+    contact = record.tracked or record
+    values = [getattr(contact, name, getattr(record, name)) for name in RECORD_NUMBERS]
     other_position = (None, None) if record.other is None else (record.other.x_mm, record.other.y_mm)
     flags = sum(FLAG_BITS.get(flag, 0) for flag in record.flags)
     record_count = 1  # `coalesce` adds the counts of the samples that it replaces by a single sample
