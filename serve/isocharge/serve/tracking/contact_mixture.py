@@ -248,7 +248,10 @@ class ContactMixture:
         return Components(mean, covariance, equal_log_weights)
 
     def _update(self, prior: Components, charge_pC: Array, variance_pC2: Array, iterations: int) -> None:
-        """Update components with charges, and store them with their contacts if the charges are explained.
+        """Update components with charges, and store the result if a component explains the charges.
+
+        The result consists of the components (`_components`), the contacts that they represent (`_hypotheses`), and the
+        misfit of the most probable component (`_misfit`). Otherwise, these attributes remain unchanged.
 
         Args:
             prior: Predicted components. Those that are updated to states beyond `MAX_RELATIVE_RADIUS` are removed.
@@ -256,26 +259,28 @@ class ContactMixture:
             variance_pC2: Variances of the charges, shape (n_electrode,), pC^2.
             iterations: Number of iterations of the Kalman filter.
         """
+        # Update the components, and remove those that are no longer on the film.
         updated = update_components(self._charges, prior, charge_pC, variance_pC2, iterations)
         components = updated.components
-        distance_mm = np.hypot(*components.mean[:, POSITION].T)
+        distance_mm = np.hypot(*components.mean[:, POSITION].T)  # from the centre
         is_outside = distance_mm > MAX_RELATIVE_RADIUS * self._charges.domain.radius
         components.log_weight[is_outside] = -np.inf
         best = components.log_weight.argmax()
-        if is_outside[best] or updated.squared_distance[best] > SQUARED_GATE:
+        if is_outside[best] or updated.squared_distance[best] > SQUARED_GATE:  # no component explains the charges
             return
         self._misfit = math.sqrt(updated.squared_misfit[best])
-        components = prune_components(components)
+        components = prune_components(components)  # the most probable component is now the first one
 
         # Search for folds between the components, and between the most probable component and two states that lie at
-        # the distance `CLEAR_DISTANCE` on its longest axis.
+        # the distance `CLEAR_DISTANCE` on both sides of it on its longest axis.
         axis = _longest_axis(components.covariance[0])
         distant_states = components.mean[0] + CLEAR_DISTANCE * np.array([axis, -axis])
         is_across_fold = self._is_across_fold(np.vstack([distant_states, components.mean]))
-        best_row = 2  # the first component follows the two distant states
-        self._hypotheses = _hypotheses_of(components, is_across_fold[best_row:, best_row:])
-        has_fold_within_best = is_across_fold[best_row, :best_row].any()
-        if has_fold_within_best:  # a Gaussian component describes only the contacts on one side of a fold
+        best_row = 2  # the two distant states have the rows 0 and 1, and all components follow, the most probable first
+        is_between_components = is_across_fold[best_row:, best_row:]
+        is_between_best_and_distant = is_across_fold[best_row, :best_row]
+        self._hypotheses = _hypotheses_of(components, is_between_components)
+        if is_between_best_and_distant.any():  # a Gaussian component describes only the contacts on one side of a fold
             components = split_first_component(components, axis, SPLIT_DISTANCE)
         self._components = components
 

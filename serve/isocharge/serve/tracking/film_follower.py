@@ -89,9 +89,9 @@ class TouchPeak:
             charge_pC: Touch charges of the frame, shape (n_electrode,), pC.
             flags: Flags of the frame.
         """
-        if not HARMLESS_FLAGS.issuperset(flags):
+        if set(flags) - HARMLESS_FLAGS:
             self._is_reliable = False
-        if not UNUSED_FRAME_FLAGS.isdisjoint(flags):
+        if UNUSED_FRAME_FLAGS.intersection(flags):
             return
         reference = self._reference_contact
         if is_close(contact, reference):

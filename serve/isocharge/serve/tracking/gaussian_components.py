@@ -98,23 +98,29 @@ def predict_components(components: Components, dt_s: float) -> Components:
             which is the most probable.
         dt_s: Time since the previous step, s.
     """
-    # Add the component, which has the index -1. Its rates are independent of its other values.
+    # Add the component as the last one. Its rates are unknown, and independent of its other values: in its covariance,
+    # the rows and the columns of the rates are zero except for the variances of the rates.
     present = components.with_copies_of_first(1)
     present.mean[-1, RATES] = 0.0
     present.covariance[-1, RATES] = 0.0
     present.covariance[-1, :, RATES] = 0.0
     present.covariance[-1, RATES, RATES] = np.diag(INITIAL_RATE_STD**2)
-    present.log_weight[-1] += math.log(dt_s / MEAN_MODE_TIME_s)  # the rates change once in the mean mode time
+    # The rates change once in the mean mode time, so the ratio is the probability that they have changed meanwhile.
+    present.log_weight[-1] += math.log(dt_s / MEAN_MODE_TIME_s)
 
-    # Predict all components: the values change by the rates, and the accelerations increase the covariances.
+    # Predict the mean of each component: the values change by their rates times the time.
     transition = np.eye(present.mean.shape[1])
     transition[VALUES, RATES] = dt_s * np.eye(3)
+    mean = present.mean @ transition.T
+
+    # Predict the covariance of each component. Random accelerations increase it, more so for a faster contact.
     covariance = transition @ present.covariance @ transition.T
     squared_speed = (present.mean[:, VELOCITY] ** 2).sum(axis=1, keepdims=True)
-    density = ACCELERATION_DENSITY + squared_speed * SPEED_CHANGE_RATE
-    density[:, [2, 5]] = FORCE_ACCELERATION_DENSITY  # of ln F and its rate
+    density = ACCELERATION_DENSITY + squared_speed * SPEED_CHANGE_RATE  # one for each entry of MOTION
+    log_force_and_rate = [2, 5]  # indices in MOTION
+    density[:, log_force_and_rate] = FORCE_ACCELERATION_DENSITY
     covariance[:, MOTION, MOTION] += density[:, None] * UNIT_NOISE * dt_s**TIME_EXPONENT
-    return present._replace(mean=present.mean @ transition.T, covariance=covariance)
+    return present._replace(mean=mean, covariance=covariance)
 
 
 def update_components(
@@ -214,8 +220,9 @@ def prune_components(components: Components, max_count: int = 8, merge_distance:
 def split_first_component(components: Components, axis: Array, distance: float) -> Components:
     """Add two narrow components, one at each end of an axis through the first component.
 
-    The weight of an added component is the density of the first component at this end. Its variance along the axis is a
-    quarter of that of the first component.
+    The weight of an added component is the weight of the first component, multiplied by the density of the first
+    component at this end relative to its maximum. Its variance along the axis is a quarter of that of the first
+    component.
 
     Args:
         components: The components.
@@ -223,7 +230,9 @@ def split_first_component(components: Components, axis: Array, distance: float) 
         distance: Distance of the ends from the first component, in standard deviations.
     """
     split = components.with_copies_of_first(2)
-    split.mean[-2:] += distance * np.array([axis, -axis])
-    split.covariance[-2:] -= 0.75 * np.outer(axis, axis)
-    split.log_weight[-2:] -= 0.5 * distance**2
+    added = slice(-2, None)  # the two copies, which are the last components
+    split.mean[added] += distance * np.array([axis, -axis])
+    # The outer product is the part of the covariance that belongs to this axis, of which a quarter remains.
+    split.covariance[added] -= 0.75 * np.outer(axis, axis)
+    split.log_weight[added] -= 0.5 * distance**2  # a normal distribution has the relative density exp(-distance^2 / 2)
     return split

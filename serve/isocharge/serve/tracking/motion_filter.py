@@ -40,8 +40,8 @@ MOVING_POSITION = slice(2, 4)
 _IS_MOVING = np.tile([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0], [1.0, 1.0, 1.0]], 2)
 """Whether x, y and ln F change (1) or are held (0) in each of the four modes, and the same for their rates, (4, 6)."""
 
-_MODE_DIFFERENCE = np.array([[0.0, 1.0, 1.0, 2.0], [1.0, 0.0, 2.0, 1.0], [1.0, 2.0, 0.0, 1.0], [2.0, 1.0, 1.0, 0.0]])
-"""Number of the two quantities (position and force) that one mode changes and another mode holds, shape (4, 4)."""
+_CHANGE_COUNT = np.array([[0.0, 1.0, 1.0, 2.0], [1.0, 0.0, 2.0, 1.0], [1.0, 2.0, 0.0, 1.0], [2.0, 1.0, 1.0, 0.0]])
+"""Number of quantities (position and force) that start or stop to change between two modes, 0 to 2, shape (4, 4)."""
 
 MEAN_MODE_TIME_s = 0.7
 """Mean time after which a position or a force that is held starts to change, or the reverse, s."""
@@ -49,10 +49,10 @@ MEAN_MODE_TIME_s = 0.7
 INITIAL_RATE_STD = np.array([60.0, 60.0, 100.0])
 """Standard deviations of the rates at the beginning of a movement, mm/s, mm/s and 1/s."""
 
-_HAS_EFFECT = np.maximum(_IS_MOVING, [1.0, 1.0, 1.0, 0.0, 0.0, 0.0])[:, None]
+_PREDICTION_FACTOR = np.maximum(_IS_MOVING, [1.0, 1.0, 1.0, 0.0, 0.0, 0.0])[:, None]
 """Factor of each value and rate in the prediction of the next state: 0 for rates of held values, else 1; (4, 1, 6)."""
 
-_HELD_RATE_COVARIANCE = np.eye(6) * (1.0 - _HAS_EFFECT) * np.tile(INITIAL_RATE_STD, 2) ** 2
+_HELD_RATE_COVARIANCE = np.eye(6) * (1.0 - _PREDICTION_FACTOR) * np.tile(INITIAL_RATE_STD, 2) ** 2
 """Variances of the rates of held values, shape (4, 6, 6). A held value may begin to change at any time."""
 
 _IDENTITY = np.eye(6)
@@ -201,11 +201,18 @@ class MotionFilter:
         return self._update(measured, covariance)
 
     def _predict(self, dt_s: float) -> None:
-        """Replace the modes by their prediction a time `dt_s` later, s. The mode may change within this time."""
-        # Mix the states of the previous modes (columns) for each new mode (row). The position and the force start or
-        # stop to change independently, so the probability of a change of both is the product of the two probabilities.
-        change = min(dt_s / MEAN_MODE_TIME_s, 0.5)  # probability of a change of the position, or of the force
-        mode_transition = change**_MODE_DIFFERENCE * (1.0 - change) ** (2.0 - _MODE_DIFFERENCE)  # shape (4, 4)
+        """Replace the modes by their prediction a time `dt_s` later, s. The mode may change within this time.
+
+        First, the state of each new mode is mixed from the states of the previous modes from which it may come. Then
+        the mixed state is extrapolated by the motion of the new mode.
+        """
+        # Compute the probability of each new mode (row) for each previous mode (column). The position and the force
+        # start or stop to change independently of each other, so the probabilities of the two quantities are
+        # multiplied. After a long time, a quantity has changed its mode with the probability 0.5.
+        change = min(dt_s / MEAN_MODE_TIME_s, 0.5)  # probability that one quantity starts or stops to change
+        mode_transition = change**_CHANGE_COUNT * (1.0 - change) ** (2.0 - _CHANGE_COUNT)  # shape (4, 4)
+
+        # Mix the states of the previous modes for each new mode.
         joint_probability = mode_transition * self.probability
         self.probability = joint_probability.sum(axis=1)
         weights = joint_probability / self.probability[:, None]
@@ -223,9 +230,9 @@ class MotionFilter:
         noise = density[:, None] * UNIT_NOISE * dt_s**TIME_EXPONENT
         noise += _HELD_RATE_COVARIANCE + dt_s * HELD_DRIFT_DENSITY
 
-        # Predict the states. A value changes by its rate times the time. The rate of a held value is that of a movement
-        # that would begin now: zero on average.
-        transition = (_IDENTITY + dt_s * _INTEGRATION) * _HAS_EFFECT
+        # Predict the states. A value changes by its rate times the time. The rate of a held value has no effect, and is
+        # replaced by that of a movement that would begin now: zero on average.
+        transition = (_IDENTITY + dt_s * _INTEGRATION) * _PREDICTION_FACTOR  # shape (4, 6, 6)
         self.mean = (transition @ mean[:, :, None])[:, :, 0]
         self.covariance = transition @ mixed_covariance @ transition.swapaxes(1, 2) + noise
 

@@ -118,13 +118,18 @@ class Tracker(Stage):
         Raises:
             ModelError: If the file `charges.npz` of the model is damaged.
         """
+        # By default, each touch gets a filter of the predicted contacts. `lasting` is a ratio of standard deviations.
         rule = setup.device.rule(TrackRule) or TrackRule()
-        self._new_filter: Callable[[], ContactFilter | ContactMixture] = partial(ContactFilter, rule.lasting**2)
+        constant_variance_share = rule.lasting**2
+        self._new_filter: Callable[[], ContactFilter | ContactMixture] = partial(ContactFilter, constant_variance_share)
+
+        # If the film is not followed, and different contacts have the same charges, each touch gets a mixture instead.
         predictor = setup.predictor
         if predictor is not None and setup.device.rule(FollowRule) is None:
             charges = read_charge_map(predictor.folder, predictor.metadata.electrodes)  # None without the file
             if charges is not None and charges.is_folded:
-                # A contact of the mixture is valid in the whole area for which the file describes the charges.
+                # The mixture does not use the predicted contacts. Its contacts are therefore valid wherever the file
+                # describes the charges, and not only in the working area of the model.
                 validity = replace(predictor.validity, corners_mm=disk_corners(charges.domain.radius))
                 self._new_filter = partial(ContactMixture, charges, predictor.noise, validity)
         self._time_s = 0.0  # time of the latest valid frame on a clock that is never set back
@@ -143,13 +148,15 @@ class Tracker(Stage):
     def step(self, frame: Frame) -> None:
         """Update the tracked contact with a frame, and add the tracked contact and its event to the frame.
 
+        If another contact explains the charges as well, it is also added to the frame, as the attribute `other`.
+
         The previous tracked contact is used again if the frame is invalid, or if the filter returns no contact. After a
         time without a contact of more than `MAX_GAP_s`, a new filter begins. If the clock was set back, the touch
         continues, because the time between the two frames counts as 0.
         """
         if frame.is_valid:
             self._time_s += frame.dt_s
-        if frame.contact is not None:
+        if frame.contact is not None:  # the touch begins or continues
             if self._filter is None or self._time_s - self._filter.time_s > MAX_GAP_s:
                 self._filter = self._new_filter()
             tracked = self._filter.step(frame, self._time_s)
@@ -161,11 +168,10 @@ class Tracker(Stage):
                     frame.event = "press"
                 else:
                     frame.event = self._events.step(tracked, self._time_s)
-        elif frame.is_valid:  # an invalid frame does not show whether the touch has ended
+        elif frame.is_valid:  # the touch, if there was one, has ended; an invalid frame does not show this
             if self._events is not None:
                 frame.event = self._events.end(self._time_s)
                 self._events = None
-            if self._filter is not None:
-                self.reset()
+            self.reset()
         frame.tracked = self._tracked
         frame.other = self._other

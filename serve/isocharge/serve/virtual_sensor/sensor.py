@@ -178,11 +178,11 @@ class VirtualSensor:
         self.port_path = ""
 
     def _reset_counters(self) -> None:
-        """Set all counters to zero."""
-        self.withheld = 0
-        self.lost = 0
-        self.corrupted = 0
+        """Set the counters of frames, and the time by which frames were postponed, to zero."""
         self.sent = 0
+        self.withheld = 0  # did not fit into the buffer of the port
+        self.lost = 0  # not sent because of a fault
+        self.corrupted = 0  # damaged by a fault
         self.paused_s = 0.0
 
     @property
