@@ -163,10 +163,9 @@ class Measurement:
         if amplifier.pyro_mismatch:
             self.pyro_charge_per_K *= 1.0 + amplifier.pyro_mismatch * rng.standard_normal(electrodes)
 
-        # Draw correlated temperatures of the air and the film. The film follows the air as a low-pass filter, so the
-        # standard deviation of the film is smaller than that of the air. The ratio of both standard deviations is also
-        # the correlation of both temperatures. The film must have the standard deviation `temperature_rms`, so the air
-        # has the standard deviation `temperature_rms / correlation`.
+        # Draw the temperatures of the film and of the air. The film follows the air as a low-pass filter, so both are
+        # correlated. If the correlation is c, the standard deviation of the film is also c times that of the air. The
+        # film must have the standard deviation `temperature_rms`, so the air has `temperature_rms / c`.
         common_part, independent_part = amplifier.temperature_rms * rng.standard_normal(2)
         variance_ratio = self._variance_ratio  # variance of the film divided by the variance of the air
         correlation = math.sqrt(variance_ratio)

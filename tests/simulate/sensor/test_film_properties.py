@@ -67,7 +67,7 @@ def test_all_moduli_change_with_the_modulus_of_the_film():
 def test_even_film_keeps_the_axis_of_its_shear_modulus():
     orthotropic = with_film(SENSOR, young_ratio=1.5, axis=0.6, shear=700.0)
     prior = FilmPrior(orthotropic, PROBE)
-    even = prior.film(prior.even(prior.mean))[0].film
+    even = prior.film(prior.without_imperfections(prior.mean))[0].film
     assert (even.young_ratio, even.axis, even.shear) == (1.0, 0.6, 700.0)
 
 

@@ -40,8 +40,11 @@ class BackPressure:
         """Compute the energy of the static pressure and of the trapped air for the meshed part of the film.
 
         The energy of the whole film is the energy of the trapped air minus the work of the static pressure. The energy
-        of the meshed part is the energy of the whole film divided by the number of copies of the mesh that cover the
-        film.
+        of the trapped air is p0 V0 (-ln(1 - x) - x), where p0 is the pressure of the atmosphere, V0 is the volume of
+        the air, and x is the share of this volume that the film displaces. The first term is the work that compresses
+        the air at constant temperature. The second term is the work of the atmosphere on the front of the film. The
+        energy of the meshed part is the energy of the whole film divided by the number of copies of the mesh that cover
+        the film.
 
         Args:
             deflection: Scaled deflection W at the nodes, shape (n_node,).
@@ -55,8 +58,8 @@ class BackPressure:
             displaced_share = self._displaced_share(deflection)
             if displaced_share >= 1.0:
                 return np.inf
-            # The energy of the air is divided by p0 V0. In scaled units, the volume V0 of the air is 1 / compression.
-            energy_unit = self.groups.ambient_pressure / self.groups.compression
+            # In scaled units, the volume V0 of the air is 1 / compression. The function log1p(-x) is ln(1 - x).
+            energy_unit = self.groups.ambient_pressure / self.groups.compression  # p0 V0
             energy += energy_unit * (-np.log1p(-displaced_share) - displaced_share)
         return float(energy / self._copies)
 

@@ -221,7 +221,8 @@ class Membrane:
         """Compute the stretching energy of a field: the integral of the energy densities of elasticity and pretension.
 
         The elastic energy density is E' : C : E' / 2, where E' is the scaled strain and C is the elasticity matrix. The
-        energy density of the pretension T is T : (E' - sym grad U), where U is the in-plane displacement.
+        energy density of the pretension T is T : (E' - sym grad U), where U is the in-plane displacement. The colon is
+        the sum of the products of corresponding components.
 
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
@@ -235,9 +236,9 @@ class Membrane:
         scaled_stress = scaled_strain @ self.groups.elasticity
         elastic_density = 0.5 * np.sum(scaled_strain * scaled_stress, axis=-1)
 
-        # The difference E' - sym grad U contains only products of two slopes of the same displacement component. The
-        # density is the sum of T_ab U_i,a U_i,b weight_i / 2 over the coordinates a and b and the components i, with W
-        # as the third component U_3.
+        # The linear part of E' is sym grad U. The remainder is the sum of weight_i U_i,a U_i,b / 2 over the
+        # displacement components i, where U_3 = W, and U_i,a is the slope of U_i along the coordinate a. The energy
+        # density of the pretension is therefore the sum of weight_i U_i,a T_ab U_i,b / 2 over a, b and i.
         products_by_component = slopes * (self._pretension_matrix @ slopes)
         pretension_density = 0.5 * np.sum(products_by_component @ self._slope_weights, axis=-1)
         return float(np.sum((elastic_density + pretension_density) * self.mesh.weights))
@@ -297,20 +298,21 @@ class Membrane:
         stiffness = self._material_stiffness(self._deformation_gradient(slopes))  # (n_element, n_point, 2, 3, 2, 3)
         weighted_stiffness = stiffness * mesh.weights[..., None, None, None, None]
 
-        # Compute one block of the matrix for each pair (i, j) of displacement components. The matrix is symmetric, so
-        # the blocks below the diagonal are transposed copies of the blocks above the diagonal.
+        # Compute one block G' S G of the matrix for each pair (i, j) of displacement components. The matrix is
+        # symmetric, so the blocks below the diagonal are transposed copies of the blocks above the diagonal. In G', the
+        # points and the two coordinates share the last axis, shape (n_element, n_local, n_point * 2).
         gradient = mesh.gauss_gradient  # G, shape (n_element, n_point, 2, n_local)
-        transposed_gradient = np.ascontiguousarray(mesh.stacked_gradient.transpose(0, 2, 1))  # G', all points in a row
+        transposed_gradient = np.ascontiguousarray(mesh.stacked_gradient.transpose(0, 2, 1))  # G'
         n_element, _, _, n_local = gradient.shape
         matrix = np.zeros((n_element, unknowns_per_node, n_local, unknowns_per_node, n_local))
         for i, j in combinations_with_replacement(range(3), 2):
             # S for the slopes of the components i and j, shape (n_element, n_point, 2, 2). The stress contributes only
-            # if both components are the same.
+            # if i = j, because the strain contains no products of slopes of different components.
             slope_stiffness = weighted_stiffness[..., i, :, j].copy()
             if i == j:
                 slope_stiffness += self._slope_weights[i] * weighted_stress
 
-            # The product of G' and the stacked S G also sums over the points and over the two slopes at each point.
+            # In S G, the points and the coordinates are stacked like in G'. The product with G' sums over all of them.
             stacked_product = (slope_stiffness @ gradient).reshape(n_element, -1, n_local)
             np.matmul(transposed_gradient, stacked_product, out=matrix[:, i, :, j])
             if i != j:
@@ -398,11 +400,11 @@ class Bending:
         self._mass = mesh.gather(mesh.node_weights)  # diagonal of M, shape (n_node,)
 
     @cached_property
-    def _blocks(self) -> tuple[Array, Array, Array]:
-        """Blocks (W, W), (W, mu) and (mu, mu) of the linear solves, each of shape (n_element, n_local, n_local).
+    def _system_blocks(self) -> tuple[Array, Array, Array]:
+        """Blocks (W, W), (W, mu) and (mu, mu) of the linear system, each of shape (n_element, n_local, n_local).
 
-        The unknowns mu of interior nodes are eliminated: their coupling becomes zero, and their Schur complement is
-        added to the block of W.
+        The class describes the linear system. The unknowns mu of interior nodes are eliminated: the Schur complement of
+        their equations is added to the block (W, W), and their coupling becomes zero.
         """
         mesh = self.mesh
         mass = np.eye(mesh.template.xi.size) * mesh.node_weights[:, None]  # M
@@ -410,7 +412,8 @@ class Bending:
         shifted_laplace = 2.0 * BENDING_SHIFT * self._laplace - BENDING_SHIFT**2 * mass  # 2 s L - s^2 M
         deflection_block = self.stiffness * shifted_laplace
 
-        # Eliminate the unknowns mu of interior nodes. Their block -M is diagonal.
+        # Eliminate the unknowns mu of interior nodes. With their block -M, which is diagonal, and their coupling B, the
+        # Schur complement is -B' (-M)^-1 B = B' M^-1 B.
         interior = mesh.template.is_interior
         interior_coupling = coupling[:, interior]  # shape (n_element, n_interior, n_local)
         interior_mass = mesh.node_weights[:, interior, None]
@@ -470,16 +473,16 @@ class Bending:
             [ sqrt(beta) (L - s M)        -M                     ] [mu] = [0],
 
         where r is the right-hand side for W, beta is the bending stiffness, L is the matrix of the weak Laplacian, and
-        M is the diagonal mass matrix. The solution W does not depend on the constant s, which is `BENDING_SHIFT`. The
-        value of s is chosen so that the matrix can be factorised without pivoting. The unknowns mu of the interior
-        nodes of each element have been eliminated from the blocks that this method adds.
+        M is the diagonal mass matrix. If mu is eliminated, K + beta L^T M^-1 L remains for W. The solution W therefore
+        does not depend on s, which is `BENDING_SHIFT`. With this s, the matrix can be factorised without pivoting. The
+        unknowns mu of the interior nodes have already been eliminated from the blocks that this method adds.
 
         Args:
             tangent: Matrices for (U1, U2, W, mu), shape (n_element, 4, n_local, 4, n_local). The entries of mu are
                 zero.
         """
         # The indices of the unknowns of a node are 0 for U1, 1 for U2, 2 for W and 3 for mu.
-        deflection_block, coupling, auxiliary_block = self._blocks
+        deflection_block, coupling, auxiliary_block = self._system_blocks
         tangent[:, 2, :, 2] += deflection_block
         tangent[:, 2, :, 3] = coupling
         tangent[:, 3, :, 2] = coupling.transpose(0, 2, 1)

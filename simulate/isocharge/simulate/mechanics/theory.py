@@ -102,7 +102,14 @@ def elasticity(film: Film, angle: float) -> Array:
 
     The product of a strain (E11, E22, 2 E12) and the matrix is the stress (S11, S22, S12) in units of E, without the
     pretension. The moduli along the two axes of the film are E1 = E r and E2 = E / r, where r is the square root of
-    E1 / E2.
+    E1 / E2. Poisson's ratio nu is the geometric mean of the ratios along both axes. In the axes of the film, divided by
+    E, the matrix is
+
+        [ r    nu     0                     ]
+        [ nu   1 / r  0                     ] / (1 - nu^2),
+        [ 0    0      (1 - nu^2) shear / E  ]
+
+    where the shear modulus is E / (2 + 2 nu) unless the film has another shear modulus.
 
     Args:
         film: The film.
@@ -118,16 +125,17 @@ def elasticity(film: Film, angle: float) -> Array:
         [[plane_modulus, coupling, 0.0], [coupling, plane_modulus, 0.0], [0.0, 0.0, shear_modulus]]
     )
 
-    # Difference from an isotropic film in the axes of the film. If no shear modulus is given, the film has the shear
-    # modulus of an isotropic film.
+    # Compute the difference from an isotropic film in the axes of the film. The coupling is the same in both films.
     root_of_ratio = np.sqrt(film.young_ratio)  # r
     difference_11 = plane_modulus * (root_of_ratio - 1.0)
     difference_22 = plane_modulus * (1.0 / root_of_ratio - 1.0)
     difference_12 = 0.0 if film.shear is None else film.shear / film.young - shear_modulus
     difference = np.diag([difference_11, difference_22, difference_12])
 
-    # Only the difference is rotated, so that the matrix of an isotropic film has no rounding errors.
-    rotation = rotate_stress(np.eye(3), film.axis - angle).T  # matrix for the stress components (s11, s22, s12)
+    # Rotate the difference from the axes of the film into the axes of the strain. The matrix of an isotropic film is
+    # not rotated, so that it has no rounding errors. `rotate_stress` rotates the rows of the unit matrix, which become
+    # the columns of the rotation matrix of a stress.
+    rotation = rotate_stress(np.eye(3), film.axis - angle).T
     return isotropic_elasticity + rotation @ difference @ rotation.T
 
 

@@ -278,9 +278,10 @@ def check_range(what: str, value: float, allowed: tuple[float, float], unit: str
 
 
 def add_axial(size: float, axis: float, addition: complex) -> tuple[float, float]:
-    """Add to a property of a film that has a size and an axis, such as an oval clamp.
+    """Change a property of a film that has a size and an axis, such as the shape of an oval clamp.
 
-    The property is the complex number size * exp(2 i axis), because it is the same after half a turn.
+    Half a turn maps an axis onto itself. Such properties are therefore added as complex numbers size * exp(2 i axis),
+    which do not change after half a turn.
 
     Args:
         size: Size of the property.
@@ -288,8 +289,9 @@ def add_axial(size: float, axis: float, addition: complex) -> tuple[float, float
         addition: Complex number that is added to the property.
 
     Returns:
-        New size and new axis (rad). The axis does not change if the addition is zero, or if the new size is zero within
-        the rounding errors. Unless the addition is zero, the new size is not negative.
+        New size and new axis (rad). If the addition is zero, both are unchanged. Otherwise, the new size is not
+        negative, because a negative size is the same as a positive size with a perpendicular axis. If the new size is
+        zero except for rounding errors, it has no axis, and the given axis is returned.
     """
     if addition == 0.0:
         return size, axis

@@ -326,11 +326,12 @@ class FilmPrior:
             changes.append(sensor.film != mean_sensor.film or probe != mean_probe)
         return np.array(changes)
 
-    def even(self, values: Array) -> Array:
+    def without_imperfections(self, values: Array) -> Array:
         """Return the values of a film with the same properties, but without imperfections.
 
-        A value of an imperfection is its deviation from the sensor file. The returned values therefore cancel the
-        imperfections that the sensor file describes. A described shear modulus remains.
+        The sensor file may describe a film with imperfections. The value of an imperfection is its deviation from the
+        sensor file, so a value of zero leaves the described imperfection unchanged. The returned values are the
+        opposites of the described imperfections, and cancel them. A described shear modulus remains.
 
         Args:
             values: Values of the properties, shape (n_property,).
@@ -353,7 +354,7 @@ class FilmPrior:
         if pretension > 0.0:  # uneven tensions are shares of the mean pretension
             described |= dict(zip(UNEVEN_TENSIONS, np.divide(film.deviator, pretension), strict=True))
 
-        # A deviation of the opposite size cancels an imperfection.
+        # The values of all other properties are kept.
         cancelling_values = [-described.get(name, 0.0) for name in self.names]
         return np.where(self.is_imperfection, cancelling_values, values)
 

@@ -70,7 +70,8 @@ class Assembly:
         self.free = _free_unknowns(mesh, unknowns_per_node, odd)
 
         # Compute the local indices of the unknowns on the sides of an element and in its interior. Within an element,
-        # the unknowns are numbered component by component. The interior nodes have only the components U1, U2 and W,
+        # the unknowns are numbered component by component: first U1 of all nodes, then U2, and so on. The index of an
+        # unknown is therefore component * n_local + node. The interior nodes have only the components U1, U2 and W,
         # because `mechanics.energy.Bending` has eliminated their auxiliary unknown.
         component = np.arange(unknowns_per_node)[:, None]
         displacement_component = component[:3]
@@ -78,7 +79,8 @@ class Assembly:
         self._side_indices = (component * n_local + np.flatnonzero(~mesh.is_interior)).ravel()
         self._interior_indices = (displacement_component * n_local + np.flatnonzero(mesh.is_interior)).ravel()
 
-        # Compute the global indices of the unknowns of each element. Globally, the unknowns are numbered node by node.
+        # Compute the global indices of the unknowns of each element. Globally, the unknowns are numbered node by node:
+        # the index of an unknown is unknowns_per_node * node + component.
         unknown = (unknowns_per_node * mesh.nodes[:, None] + component).reshape(len(mesh.nodes), -1)
         self.interior_unknowns = unknown[:, self._interior_indices]
         self.side_unknowns = unknown[:, self._side_indices]
@@ -89,7 +91,8 @@ class Assembly:
         self.skeleton = np.flatnonzero(is_in_skeleton & self.free.ravel())
         self._compute_sparsity_pattern()
 
-        # Sort the skeleton unknowns, and compute the pattern of the sorted unknowns.
+        # Sort the skeleton unknowns in the order of elimination, which is determined from the pattern of the unsorted
+        # unknowns. Then compute the pattern of the sorted unknowns.
         self.skeleton = self.skeleton[self._elimination_order()]
         self._compute_sparsity_pattern()
 
@@ -112,10 +115,13 @@ class Assembly:
         """Determine which entries of the skeleton matrix may be nonzero, and where the element matrices are added.
 
         The skeleton matrix is the matrix of the unknowns in `skeleton`, and is the sum of the matrices of all elements.
-        Only its nonzero entries are stored, in an array that is ordered column by column (compressed sparse column
-        format). The method sets three attributes. `_entry_positions` contains the position of each entry of each
-        element matrix in this array. Entries that belong to a fixed unknown get the position after the last nonzero
-        entry. `_indices` and `_indptr` contain the rows of the nonzero entries and the starts of the columns.
+        Only the entries that may be nonzero are stored, in an array that is ordered column by column, and within a
+        column by rows (compressed sparse column format). The method sets three attributes:
+
+        - `_entry_positions`: Position in this array to which each entry of each element matrix is added. Entries of
+          fixed unknowns do not belong to the skeleton matrix. Their position is behind the last nonzero entry.
+        - `_indices`: Row of each nonzero entry.
+        - `_indptr`: Position at which each column begins, followed by the number of nonzero entries.
         """
         # Number the unknowns of the skeleton matrix. Fixed unknowns have the number -1.
         n_skeleton = self.skeleton.size
@@ -130,16 +136,18 @@ class Assembly:
         column = np.broadcast_to(side_numbers[:, None, :], shape)
         is_free = (row >= 0) & (column >= 0)
 
-        # Combine the row and the column of each entry into one code. In the compressed sparse column format, the
-        # entries are ordered by their columns and then by their rows, which is the order of the codes.
-        entry_codes = column[is_free] * n_skeleton + row[is_free]
-        pattern_codes, pattern_position = np.unique(entry_codes, return_inverse=True)
-        positions = np.full(shape, pattern_codes.size, dtype=np.intp)
-        positions[is_free] = pattern_position
+        # Compute the index that each entry would have if all entries of the skeleton matrix, with the zeros, were
+        # stored column by column. The sorted different indices belong to the nonzero entries, in the order in which
+        # these are stored. Several entries of element matrices may belong to the same nonzero entry, to which they are
+        # added.
+        dense_index = column[is_free] * n_skeleton + row[is_free]
+        nonzero_index, stored_position = np.unique(dense_index, return_inverse=True)
+        positions = np.full(shape, nonzero_index.size, dtype=np.intp)  # the position of the entries of fixed unknowns
+        positions[is_free] = stored_position
         self._entry_positions = positions.ravel()
 
         # Compute the row of each nonzero entry, and the position of the first nonzero entry of each column.
-        pattern_column, pattern_row = np.divmod(pattern_codes, n_skeleton)
+        pattern_column, pattern_row = np.divmod(nonzero_index, n_skeleton)
         entries_per_column = np.bincount(pattern_column, minlength=n_skeleton)
         self._indices = pattern_row.astype(np.int32)
         self._indptr = np.append(0, np.cumsum(entries_per_column)).astype(np.int32)

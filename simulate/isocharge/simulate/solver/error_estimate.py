@@ -65,23 +65,24 @@ def highest_mode_share(mesh: PlacedMesh, slope: Array) -> float:
     Returns:
         Mean of the shares in all elements, weighted with the areas of the elements and the squares of the slopes.
     """
-    # Convert the values on the square grid of nodes into coefficients of products of Legendre polynomials in eta and
-    # xi. The last two axes are the nodes or the degrees in eta and in xi, of which there are `nodes_per_side`.
+    # Arrange the nodes of each element in a square grid, whose rows belong to eta and whose columns belong to xi.
+    # Convert the values along both axes into the coefficients of the Legendre polynomials of degree 0 to `order`.
     nodes_per_side = mesh.resolution.order + 1
     nodes_to_modes = modal_matrix(mesh.resolution.order)
     slope_by_component = slope.transpose(0, 2, 1)  # shape (n_element, 2, n_local)
     nodal_slope = slope_by_component.reshape(len(slope), 2, nodes_per_side, nodes_per_side)
-    coefficients = nodes_to_modes @ nodal_slope @ nodes_to_modes.T
+    coefficients = nodes_to_modes @ nodal_slope @ nodes_to_modes.T  # shape (n_element, 2, n_degree, n_degree)
 
-    # The power of a mode is the sum of its mean squares in both slopes. The mean square of the Legendre polynomial of
-    # degree n is 1 / (2 n + 1).
+    # The power of a mode is its mean square over the element, summed over both slopes. The mean square of the Legendre
+    # polynomial of degree n is 1 / (2 n + 1).
     mean_square = 1.0 / (2.0 * np.arange(nodes_per_side) + 1.0)
-    power = (coefficients**2 * np.outer(mean_square, mean_square)).sum(axis=1)  # one power for each pair of degrees
+    power = (coefficients**2 * np.outer(mean_square, mean_square)).sum(axis=1)  # shape (n_element, n_degree, n_degree)
     total_power = power.sum(axis=(1, 2))
-    lower_power = power[:, :-1, :-1].sum(axis=(1, 2))  # of modes without the highest degree in xi and in eta
-    highest_power = np.maximum(total_power - lower_power, 0.0)
+    lower_power = power[:, :-1, :-1].sum(axis=(1, 2))  # of the modes with a lower degree in both xi and eta
+    highest_power = np.maximum(total_power - lower_power, 0.0)  # rounding errors could make it negative
 
-    # The share of an element is sqrt(highest power / total power), and its weight is area * total power.
+    # The share of an element is sqrt(highest power / total power), and its weight is area * total power. The product
+    # area * sqrt(highest power * total power) avoids a division by zero in a flat element.
     area = mesh.weights.sum(axis=1)
     weighted_share = area * np.sqrt(highest_power * total_power)
     total_weight = max(np.sum(area * total_power), 1e-300)  # the limit avoids a division by zero
@@ -112,11 +113,13 @@ def mesh_error(equilibrium: Equilibrium) -> float:
 def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> float:
     """Estimate the relative error that omitted bending causes in a charge.
 
-    The error has two parts. The part of the clamp is proportional to the bending length at the clamp. The part of the
-    footprint is proportional to the squared ratio of the bending length at the footprint to the reach R of the
-    footprint, and is larger if most of the tension at the footprint is pretension. The slope w' of the film at the
-    footprint follows from the vertical force 2 pi R h S w' = F and the induced stress S = E w'^2 / 2, so that
-    w'^3 = F / (pi R h E).
+    The error has two parts. The error that arises at the clamp is proportional to the bending length there. The error
+    that arises at the footprint is proportional to the square of b / R, where b is the bending length at the footprint,
+    and R is the reach of the footprint. This error is larger if most of the tension at the footprint is pretension.
+
+    The slope w' of the film at the edge of the footprint follows from two equations. The vertical component of the
+    stress S along the edge carries the force: 2 pi R h S w' = F. The slope stretches the film: S = E w'^2 / 2.
+    Together, w'^3 = F / (pi R h E).
 
     Args:
         film: The film, with Young's modulus E and thickness h.
@@ -134,12 +137,13 @@ def modelling_error(film: Film, probe: Probe, force: float, theory: Theory) -> f
         return np.inf
     clamp_error = BENDING_WEIGHT * clamp_length
 
-    # Stresses at the footprint, divided by Young's modulus
+    # Compute the stresses at the footprint, divided by Young's modulus. The tension is the pretension plus S.
     slope = np.cbrt(force / (np.pi * probe.reach * film.thickness * film.young))
     pretension = max(film.pretension, 0.0) / film.young
     tension = pretension + 0.5 * slope**2
 
-    # The squared bending length at the footprint, in film radii, is the bending stiffness divided by the tension.
+    # The squared bending length b^2, in film radii, is the bending stiffness divided by the tension. The ratio of the
+    # radii converts it to the unit R.
     squared_length_ratio = bending_stiffness(film) / tension * (film.radius / probe.reach) ** 2
     footprint_weight = 0.5 + 5.0 * pretension / tension  # empirical, for an electrode beside the footprint
     return float(clamp_error + footprint_weight * squared_length_ratio)

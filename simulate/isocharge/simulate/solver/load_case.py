@@ -178,8 +178,9 @@ def _check_position(film: Film, probe: Probe, at: tuple[float, float]) -> None:
 def farthest_distance(film: Film, probe: Probe, at: tuple[float, float]) -> float:
     """Compute the distance from the centre of the film to the farthest point of the footprint, mm.
 
-    On an oval film, the distance is measured on the circular film that is deformed into the oval film. The footprint
-    lies on the film if the distance is less than the radius of the film.
+    The mesh of an oval film is the deformed mesh of a circular film. On an oval film, the press is therefore moved to
+    the place on the circular film from which the deformation displaces it to its actual place, and the distance is
+    measured there. On every film, the footprint lies on the film if the distance is less than the radius of the film.
 
     Args:
         film: The film.
@@ -190,11 +191,12 @@ def farthest_distance(film: Film, probe: Probe, at: tuple[float, float]) -> floa
     direction = math.atan2(y, x)
     oval = film_oval(film, direction)
     with np.errstate(all="ignore"):  # the caller refuses a huge distance or NaN
-        centroid_distance = circular_distance(np.hypot(x, y) / film.radius, oval, probe.reach / film.radius)
+        distance = np.hypot(x, y) / film.radius
+        distance_on_circular_film = circular_distance(distance, oval, probe.reach / film.radius)
 
     # Rotate the press onto the positive x axis.
     rotated_probe = probe.rotated(-direction)
-    return rotated_probe.farthest_distance((film.radius * float(centroid_distance), 0.0))
+    return rotated_probe.farthest_distance((film.radius * float(distance_on_circular_film), 0.0))
 
 
 def layer_for(film: Film, force: float) -> float:
@@ -396,22 +398,26 @@ def _needs_more_sectors(case: LoadCase) -> bool:
 def _thin_ring_count(placement: Placement, total_width: float) -> int:
     """Compute the number of thin rings at the rim of the mesh.
 
-    At the clamped rim, the film bends within a narrow strip. The mesh is created in a unit disk, the template plane,
-    and a conformal map maps the disk onto the film. In the template plane, the strip is widest next to the probe, and
-    narrowest on the opposite side of the film. Each thin ring is a third as wide as the previous one. The number of
-    rings increases with the logarithm of the ratio of both widths, so that the rings resolve the strip on all sides.
+    At the clamped rim, the film bends within a narrow strip, which the thin rings resolve. The mesh is created in a
+    unit disk, the template plane, and a conformal map maps the disk onto the film. In the template plane, the strip is
+    therefore widest next to the probe, and narrowest on the opposite side of the film. All thin rings together are as
+    wide as the widest strip. Each ring is a third as wide as the previous ring, up to the rim. The number of rings is
+    chosen such that the last rings are thin enough for the narrowest strip: it increases by `THIN_RINGS_PER_FACTOR`
+    for each factor of three between both widths of the strip.
 
     Args:
         placement: Placement of the mesh under the press.
         total_width: Width of the strip on the film, in film radii.
     """
-    # Widths of the strip in the template plane. On the opposite side, a strip that is wider than 0.2 film radii is
-    # resolved like a strip of this width.
+    # Compute the largest and the smallest width of the strip in the template plane. Next to the probe, the conformal
+    # map multiplies lengths by 1 / stretch, and on the opposite side by `stretch`. On the opposite side, a strip that
+    # is wider than 0.2 film radii is resolved like a strip of 0.2 film radii.
     stretch = float(map_stretch(placement.map_parameter, 1.0))
     width_next_to_probe = total_width * stretch
     opposite_width = min(total_width, 0.2) / stretch
 
-    # Divide the widths by the range of ln(r) that all rings cover. The upper limit keeps the thin rings near the rim.
+    # Divide the widths by the range of ln(r) that all rings cover, where r is the distance from the origin. At the rim,
+    # r is 1, and a small width is also a difference of ln(r). The upper limit keeps the thin rings near the rim.
     log_range = -math.log(placement.template_radius)
     max_share = 1.0 / 8.0
     largest_share = min(width_next_to_probe / log_range, max_share)

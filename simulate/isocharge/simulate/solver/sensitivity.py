@@ -187,8 +187,8 @@ def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
 
     The properties are those of `FILM_FIELDS`. The film is rotated such that the press lies on the positive x axis. The
     stress is compared at fixed points of the rotated film. An even change of the film is symmetric about the x axis,
-    and an odd change is antisymmetric. A change of the tension is in units of E A^2 + T, where E is Young's modulus, A
-    is the amplitude of the press, and T is the mean pretension.
+    and an odd change is antisymmetric. The unit of a change of the tension is E A^2 + T, the order of magnitude of the
+    tension under the press, where E is Young's modulus, A is the amplitude of the press, and T is the mean pretension.
 
     Args:
         solved: Press with a circular probe.
@@ -210,8 +210,9 @@ def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
         elastic = solved.elastic
         solve_even = factor_tangent(elastic, solved.field)
         solve_odd = factor_tangent(elastic, solved.field, odd=True)
+
         # In an odd change, the two halves of the film displace opposite amounts of air, so the pressure of trapped air
-        # remains constant.
+        # remains constant. The trapped air is therefore replaced by a static pressure of the same size.
         solved_for_odd = solved
         if elastic.back_pressure is not None:
             groups = elastic.back_pressure.at_constant_pressure(solved.field[:, 2])

@@ -64,7 +64,7 @@ class FilmCharges:
             SceneError: If some presses of the domain cannot exist.
             SolveError: If a press has no equilibrium.
         """
-        even_values = prior.even(values)
+        even_values = prior.without_imperfections(values)
         sensor, probe = prior.film(even_values)
         # The sensor file itself may describe a film without axial symmetry.
         film = replace(sensor.film, deviator=(0.0, 0.0), young_ratio=1.0, shear=None, oval=0.0)
