@@ -211,6 +211,7 @@ def as_charges(charge_pC: ArrayLike, electrodes: tuple[str, ...], *, is_batch: b
     # Numbers are floats, signed or unsigned integers. The array has lost the mask of a masked array.
     if charges.dtype.kind not in "fiu" or np.ma.is_masked(charge_pC):
         raise ChargeError(f"expected {expected} as numbers (pC), got {charge_pC!r:.200}")
+    # The charges of one press have one axis, those of a batch have two.
     if charges.ndim != 1 + is_batch or charges.shape[-1] != n_electrode:
         raise ChargeError(f"expected {expected}, got an array of shape {charges.shape}")
     return as_float32(charges.reshape(-1, n_electrode), electrodes)

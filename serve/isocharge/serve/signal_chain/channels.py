@@ -380,7 +380,10 @@ class Saturation(Stage):
         self._is_saturated = False
 
     def step(self, frame: Frame) -> None:
-        """Add the flag to a frame, unless the frame is invalid."""
+        """Add the flag `saturated` to a frame in which an amplifier is, or has been in this press, at its limit.
+
+        An invalid frame is not changed.
+        """
         if not frame.is_valid:
             return
         largest_pC = max(map(abs, frame.raw_pC.tolist()))
