@@ -171,6 +171,10 @@ BAD = {
     "too many": (changed(shape=[10**12, 3]), "at most 4096 presses in one request, got 1000000000000"),
     "ragged": (changed(shape=[2, 3], data=[[1, 2, 3], [1, 2]]), r"expected 6 numbers for the shape \[2, 3\]"),
     "yes": (changed(data=[1, 2, True]), r"data\[2\]: expected a finite number or .*, got True"),
+    "too many outputs": (  # repeated outputs of a batch could fill the memory
+        orjson.dumps(infer_request(outputs=[{"name": "contact"}] * 6)),
+        "outputs: expected a list of at most 5 outputs, got",
+    ),
     "other output": (
         orjson.dumps(infer_request(outputs=[{"name": "z"}])),
         "one of contact, contact_correlation, contact_std",

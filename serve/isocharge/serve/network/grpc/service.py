@@ -27,7 +27,7 @@ from google.protobuf.message_factory import GetMessageClass
 from isocharge.common.errors import ModelError, RequestError
 from isocharge.common.structs import convert
 from isocharge.serve.network.protocol.handler import Handler
-from isocharge.serve.network.protocol.inference import InferBody, Json, infer, take_binary_tensor
+from isocharge.serve.network.protocol.inference import InferBody, Json, infer
 from isocharge.serve.network.protocol.response import refusal
 from isocharge.serve.network.protocol.routes import ROUTES, Request
 
@@ -73,21 +73,20 @@ def read_request(message: Any) -> tuple[InferBody, bytes]:
             for tensor in message.inputs
         ],
         "outputs": [{"name": output.name} for output in message.outputs],
+        "parameters": {"binary_data_output": bool(raw_contents)},  # raw contents are answered by raw contents
     }
     return convert(content, InferBody, "", RequestError), b"".join(raw_contents)
 
 
-def write_response(content: Json, *, is_raw: bool) -> Any:
+def write_response(content: Json, raw_contents: list[bytes]) -> Any:
     """Convert the content of an HTTP response to a ModelInferResponse.
 
     Args:
-        content: Content of the HTTP response, whose outputs contain their values.
-        is_raw: Whether the values become raw contents instead of lists of numbers or texts.
+        content: Content of the HTTP response.
+        raw_contents: Binary tensors of all outputs. It is empty if the content itself contains their values.
     """
-    raw_contents = []
     for tensor in content["outputs"]:
-        if is_raw:
-            raw_contents.append(take_binary_tensor(tensor))
+        if raw_contents:
             del tensor["parameters"]  # the raw contents themselves have a length
         elif tensor["datatype"] == "BYTES":
             tensor["contents"] = {"bytes_contents": [text.encode() for text in tensor.pop("data")]}
@@ -261,8 +260,8 @@ class Service:
         """Run a model on the charges of a ModelInferRequest, and return the ModelInferResponse."""
         loaded = self._handler.store.get(request.model_name, request.model_version)
         with loaded.statistics.refused.count_exceptions(), loaded.statistics.latency.time():
-            content = infer(loaded, *read_request(request))
-            return write_response(content, is_raw=len(request.raw_input_contents) > 0)
+            content, raw_contents = infer(loaded, *read_request(request))
+            return write_response(content, raw_contents)
 
     def _limit_open_calls(self) -> None:
         """If there are too many open calls, end the call that has waited longest for a message.

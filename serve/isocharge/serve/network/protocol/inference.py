@@ -51,7 +51,7 @@ class InferBody(Struct, frozen=True):
 
     inputs: Annotated[list[InputTensor], Meta(min_length=1, max_length=1, description="a list with one tensor")]
     id: str | None = None
-    outputs: list[OutputTensor] | None = None
+    outputs: Annotated[list[OutputTensor], Meta(max_length=5, description="a list of at most 5 outputs")] | None = None
     parameters: Parameters = None
 
 
@@ -70,6 +70,9 @@ FLAGS = "flags"
 
 This output is only computed if the client requests it.
 """
+
+MODEL_OUTPUTS = [OutputTensor(name) for name in OUTPUTS]  # type: ignore[arg-type]
+"""Outputs of a request that lists no outputs."""
 
 
 def read_infer(body: bytes, header_length: bytes | None) -> tuple[InferBody, bytes]:
@@ -97,11 +100,6 @@ def read_infer(body: bytes, header_length: bytes | None) -> tuple[InferBody, byt
             )
         json_length = int(header_length)
     return parse_json(body[:json_length], "", RequestError, InferBody), body[json_length:]
-
-
-def requested_outputs(body: InferBody) -> list[OutputTensor]:
-    """Return the outputs that a client requests. If the request lists no outputs, it requests those of the model."""
-    return body.outputs or [OutputTensor(name) for name in OUTPUTS]  # type: ignore[arg-type]
 
 
 def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...]) -> Singles:
@@ -142,48 +140,51 @@ def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...
     return as_float32(charges.reshape(shape), electrodes)
 
 
-def infer(loaded: LoadedVersion, body: InferBody, binary: bytes) -> Json:
+def infer(loaded: LoadedVersion, body: InferBody, binary: bytes) -> tuple[Json, list[bytes]]:
     """Run a model on the presses of a request, and count the presses.
 
     Args:
         loaded: Version of the model that is run.
-        body: Content of the request.
+        body: Content of the request. If it lists no outputs, the outputs of the model are returned.
         binary: Binary tensor with the charges, which is empty if the content contains the charges.
 
     Returns:
-        The content of the response, in the form of the JSON object of an HTTP response. The values of each output are
-        under the key `data`: an array of numbers, or a list of texts for the output `flags`.
+        The content of the response, in the form of the JSON object of an HTTP response, and the binary tensors of the
+        response. Each output has its values either in a binary tensor, or under the key `data`: an array of numbers,
+        or a list of texts for the output `flags`.
 
     Raises:
         IsochargeError: If the request does not fit the model, or if the model fails.
     """
     charge_pC = _read_charges(body.inputs[0], binary, loaded.metadata.electrodes)
     contacts = loaded.predict_rows(charge_pC)
-    outputs: Json = {name: contacts[:, columns].ravel() for name, columns in COLUMNS.items()}
-    alarm_count = np.count_nonzero(~(outputs["misfit"] <= loaded.validity.misfit_limit))  # also NaN
+    misfits = contacts[:, COLUMNS["misfit"]]
+    alarm_count = np.count_nonzero(~(misfits <= loaded.validity.misfit_limit))  # also NaN
     loaded.statistics.presses.inc(len(charge_pC))
     loaded.statistics.alarms.inc(float(alarm_count))
 
-    names = [output.name for output in requested_outputs(body)]
-    if FLAGS in names:
-        flags_of_presses = loaded.validity.batch_flags(Contacts(*contacts.T))
-        outputs[FLAGS] = [",".join(flags) for flags in flags_of_presses]
     content: Json = {"model_name": loaded.metadata.name, "model_version": loaded.version}
     if body.id:
         content["id"] = body.id
-    content["outputs"] = [
-        {
-            "name": name,
-            "datatype": "BYTES" if name == FLAGS else "FP32",
-            "shape": [len(charge_pC), OUTPUTS.get(name, 1)],  # the output `flags` has one column
-            "data": outputs[name],
-        }
-        for name in names
-    ]
-    return content
+    content["outputs"] = []
+    binary_tensors = []
+    is_binary_by_default = (body.parameters or {}).get("binary_data_output")
+    for output in body.outputs or MODEL_OUTPUTS:
+        name = output.name
+        tensor = {"name": name, "datatype": "FP32", "shape": [len(charge_pC), OUTPUTS.get(name, 1)]}
+        if name == FLAGS:
+            flags_of_presses = loaded.validity.batch_flags(Contacts(*contacts.T))
+            tensor["datatype"] = "BYTES"
+            tensor["data"] = [",".join(flags) for flags in flags_of_presses]
+        else:
+            tensor["data"] = contacts[:, COLUMNS[name]].ravel()
+        if (output.parameters or {}).get("binary_data", is_binary_by_default):
+            binary_tensors.append(_take_binary_tensor(tensor))
+        content["outputs"].append(tensor)
+    return content, binary_tensors
 
 
-def take_binary_tensor(tensor: Json) -> bytes:
+def _take_binary_tensor(tensor: Json) -> bytes:
     """Replace the values in the object that describes an output by their size, and return them as a binary tensor.
 
     In a binary tensor, numbers are little-endian float32. Each text is preceded by its length in bytes, a 32-bit

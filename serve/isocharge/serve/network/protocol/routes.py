@@ -21,8 +21,6 @@ from isocharge.serve.network.protocol.inference import (
     RepositoryBody,
     infer,
     read_infer,
-    requested_outputs,
-    take_binary_tensor,
 )
 from isocharge.serve.network.protocol.response import Response, json_response, response_of
 
@@ -190,13 +188,7 @@ def _infer(request: Request) -> Response:
     header_length = request.headers.get(b"inference-header-content-length")  # length of the JSON text, bytes
     with loaded.statistics.refused.count_exceptions(), loaded.statistics.latency.time():
         body, binary = read_infer(request.body, header_length)
-        content = infer(loaded, body, binary)
-        is_binary = (body.parameters or {}).get("binary_data_output")
-        binary_tensors = [
-            take_binary_tensor(tensor)
-            for output, tensor in zip(requested_outputs(body), content["outputs"], strict=True)
-            if (output.parameters or {}).get("binary_data", is_binary)
-        ]
+        content, binary_tensors = infer(loaded, body, binary)
         response = json_response(content)
     if not binary_tensors:
         return response
