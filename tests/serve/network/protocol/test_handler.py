@@ -60,7 +60,13 @@ def refusal(answer):
     return status, content["error"]
 
 
-ROUTES = [(route.method, path.format(model="linear", version="1")) for route in routes.ROUTES for path in route.paths]
+ROUTES = sorted(
+    {
+        (route.method, route.path.format(model="linear", version=version))
+        for route in routes.ROUTES
+        for version in ("", "/versions/1")
+    }
+)
 
 
 @pytest.mark.parametrize(("method", "path"), ROUTES)
@@ -228,7 +234,11 @@ def test_output_that_is_not_finite_is_null(ask):
 
 def test_openapi_describes_each_route(ask):
     document = orjson.loads(ask("GET", "/openapi.json")[2])
-    existing = {(route.method, path) for route in routes.ROUTES for path in route.paths} - {("GET", "/openapi.json")}
+    existing = {
+        (route.method, route.path.format(model="{model}", version=version))
+        for route in routes.ROUTES
+        for version in ("", "/versions/{version}")
+    } - {("GET", "/openapi.json")}
     assert existing == {
         (method.upper(), path) for path, item in document["paths"].items() for method in item.keys() - {"parameters"}
     }

@@ -158,11 +158,10 @@ def check_method(path: str, method: str, allowed: str) -> None:
 
 
 _PATTERNS = [
-    (re.compile(template.format(model="(?P<name>[^/]*)", version="(?P<version>[^/]+)")), route)
+    (re.compile(route.path.format(model="(?P<name>[^/]*)", version="(/versions/(?P<version>[^/]+))?")), route)
     for route in ROUTES
-    for template in route.paths
 ]
-"""Regular expressions of the paths of each route. Templates of paths contain no special characters but the point."""
+"""Regular expression of the path of each route. Templates of paths contain no special characters but the point."""
 
 
 @lru_cache
@@ -173,7 +172,7 @@ def match_path(path: str) -> tuple[Route, dict[str, str]]:
     """
     for pattern, route in _PATTERNS:
         if path_match := pattern.fullmatch(path):
-            return route, path_match.groupdict()
+            return route, path_match.groupdict(default="")
     return UNKNOWN, {}
 
 
@@ -206,9 +205,9 @@ class Handler(Application):
         self.traffic.registry.register(store)
 
     def _route_name(self, path: str) -> str:
-        """Return the first path of the route of a request, under which all paths of the route are counted."""
+        """Return the path of the route of a request. Requests with and without a version have the same name."""
         route, _ = match_path(path)
-        return route.paths[0]
+        return route.path.replace("{version}", "")
 
     def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
         """Check a request, and answer it with the function of its route."""

@@ -64,11 +64,12 @@ class Request(NamedTuple):
 
 
 class Route(NamedTuple):
-    """Route of the servers, which combines a method, several paths and a function that answers requests.
+    """Route of the servers, which combines a method, a path and a function that answers requests.
 
     Attributes:
         method: HTTP method. A route with the method GET also answers HEAD requests, without a body.
-        paths: Templates of the paths. Requests are logged and counted under the first template.
+        path: Template of the path. `{model}` stands for the name of a model, and `{version}` for the part
+            `/versions/NUMBER`, which may be missing.
         respond: Function that answers a request by a response, or by the content of a JSON response.
         rpcs: Names of the gRPC methods that give the same answer.
         needs_token: Whether requests must contain the token of the server. Health checks need no token, because the
@@ -76,7 +77,7 @@ class Route(NamedTuple):
     """
 
     method: str
-    paths: tuple[str, ...]
+    path: str
     respond: Callable[[Request], Any]
     rpcs: tuple[str, ...] = ()
     needs_token: bool = True
@@ -196,33 +197,23 @@ def _infer(request: Request) -> Response:
     return response_of(200, b"application/octet-stream", b"".join([response.body, *binary_tensors]), json_length)
 
 
-def _model_paths(ending: str = "") -> tuple[str, str]:
-    """Return the templates of the two paths for requests to a model.
-
-    The first path contains only the name of the model. The second path contains the name and the version of the model.
-
-    Args:
-        ending: End of both paths, such as `/infer`.
-    """
-    return f"/v2/models/{{model}}{ending}", f"/v2/models/{{model}}/versions/{{version}}{ending}"
-
-
 ROUTES = (
-    Route("GET", ("/openapi.json",), _show_openapi),
-    Route("GET", ("/v2/health/live",), lambda _: {"live": True}, ("ServerLive",), needs_token=False),
-    Route("GET", ("/v2/health/ready",), _is_ready, ("ServerReady",), needs_token=False),
-    Route("GET", ("/metrics",), _show_metrics),
-    Route("GET", ("/v2",), _show_server, ("ServerMetadata",)),
-    Route("GET", ("/v2/models/stats", *_model_paths("/stats")), _show_statistics, ("ModelStatistics",)),
-    Route("POST", ("/v2/repository/index",), _show_index, ("RepositoryIndex",)),
-    Route("POST", ("/v2/repository/models/{model}/load",), _load, ("RepositoryModelLoad",)),
-    Route("POST", ("/v2/repository/models/{model}/unload",), _unload, ("RepositoryModelUnload",)),
-    Route("GET", _model_paths(), _show_model, ("ModelMetadata",)),
-    Route("GET", _model_paths("/ready"), lambda request: {"ready": bool(request.loaded)}, ("ModelReady",)),
-    Route("GET", _model_paths("/config"), _show_config, ("ModelConfig",)),
-    Route("POST", _model_paths("/infer"), _infer, ("ModelInfer", "ModelStreamInfer")),
+    Route("GET", "/openapi.json", _show_openapi),
+    Route("GET", "/v2/health/live", lambda _: {"live": True}, ("ServerLive",), needs_token=False),
+    Route("GET", "/v2/health/ready", _is_ready, ("ServerReady",), needs_token=False),
+    Route("GET", "/metrics", _show_metrics),
+    Route("GET", "/v2", _show_server, ("ServerMetadata",)),
+    Route("GET", "/v2/models/stats", _show_statistics, ("ModelStatistics",)),
+    Route("GET", "/v2/models/{model}{version}/stats", _show_statistics),
+    Route("POST", "/v2/repository/index", _show_index, ("RepositoryIndex",)),
+    Route("POST", "/v2/repository/models/{model}/load", _load, ("RepositoryModelLoad",)),
+    Route("POST", "/v2/repository/models/{model}/unload", _unload, ("RepositoryModelUnload",)),
+    Route("GET", "/v2/models/{model}{version}", _show_model, ("ModelMetadata",)),
+    Route("GET", "/v2/models/{model}{version}/ready", lambda request: {"ready": bool(request.loaded)}, ("ModelReady",)),
+    Route("GET", "/v2/models/{model}{version}/config", _show_config, ("ModelConfig",)),
+    Route("POST", "/v2/models/{model}{version}/infer", _infer, ("ModelInfer", "ModelStreamInfer")),
 )
 """All routes of the HTTP server. If several templates match a path, the first of them is used."""
 
-UNKNOWN = Route("", ("unknown",), _show_server)
+UNKNOWN = Route("", "unknown", _show_server)
 """Route under which requests with unknown paths are counted. Such requests are refused."""
