@@ -12,8 +12,6 @@ import json
 import logging
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from typing import Any, NamedTuple
@@ -95,19 +93,6 @@ Client = tuple[str, int] | None
 """Address and port of a client. None if the client has connected through a Unix socket."""
 
 
-@dataclass
-class Exchange:
-    """Properties of a request and of its response, for the counters and the log.
-
-    Attributes:
-        route: Name of the route, or "none" if the request could not be read.
-        status: HTTP status, or name of the gRPC status. "CANCELLED" if the client has ended a call of gRPC.
-    """
-
-    route: str = "none"
-    status: int | str = "CANCELLED"
-
-
 class RequestLog(logging.Handler):
     """Log that contains one line of JSON for each request and for each message of the module `logging`.
 
@@ -172,29 +157,24 @@ class Traffic:
             "isocharge_log_lines_lost", "Lines of the log that could not be written.", registry=registry
         )
 
-    @contextmanager
-    def exchange(self, transport: str, client: Client | str = None) -> Iterator[Exchange]:
-        """At the end of the `with` block, count the request that it answers or refuses, and log it if there is a log.
+    def count(self, transport: str, route: str, status: int | str, client: Client | str, start_ns: int) -> None:
+        """Count a request that has been answered or refused, and log it if there is a log.
 
         Args:
             transport: Transport of the request, which is "http" or "grpc".
+            route: Name of the route, or "none" if the request could not be read.
+            status: HTTP status, or name of the gRPC status.
             client: Address and port of the client, or a text that contains both.
-
-        Yields:
-            Properties of the request and of the response, which the block sets.
+            start_ns: Time at which the request began, ns, on the clock of `time.perf_counter_ns`.
         """
-        start_ns = time.perf_counter_ns()
-        exchange = Exchange()
-        try:
-            yield exchange
-        finally:
-            self._requests(transport, exchange.route, exchange.status).inc()
-            if self.log is not None:
-                self.log.write_line(
-                    level="error" if exchange.status in (500, "INTERNAL") else "info",  # errors of the server itself
-                    event="request",
-                    transport=transport,
-                    **vars(exchange),
-                    duration_us=(time.perf_counter_ns() - start_ns) / 1000,
-                    client="%s:%d" % client if isinstance(client, tuple) else client,  # noqa: UP031 - fast
-                )
+        self._requests(transport, route, status).inc()
+        if self.log is not None:
+            self.log.write_line(
+                level="error" if status in (500, "INTERNAL") else "info",  # errors of the server itself
+                event="request",
+                transport=transport,
+                route=route,
+                status=status,
+                duration_us=(time.perf_counter_ns() - start_ns) / 1000,
+                client="%s:%d" % client if isinstance(client, tuple) else client,  # noqa: UP031 - fast
+            )

@@ -13,6 +13,7 @@ All other messages are converted from and to the JSON objects of the HTTP routes
 """
 
 import asyncio
+import time
 from importlib.resources import files
 from typing import Any
 
@@ -150,26 +151,25 @@ class Service:
         Raises:
             CancelledError: If the client has ended the call.
         """
+        start_ns = time.perf_counter_ns()
+        status = "CANCELLED"  # until the call is answered or refused
         error_message = ""
         self._open_count += 1
-        # At the end of the `with` block, the call is counted and logged with the status that the block has set. The
-        # status is "CANCELLED" until it is set.
-        with self._handler.traffic.exchange("grpc", context.peer()) as call:
-            call.route = name
-            try:
-                self._limit_open_calls()
-                await self._answer(name, context)
-                call.status = "OK"
-            except grpc.aio.InternalError as error:  # the client ended the call while a message was read or sent
-                raise asyncio.CancelledError from error
-            except Exception as error:  # every error is sent to the client
-                reported_error = RequestError(TIMEOUT_MESSAGE, 408) if isinstance(error, TimeoutError) else error
-                http_status, error_message = refusal(reported_error)
-                call.status = GRPC_STATUSES[http_status]
-            finally:
-                self._open_count -= 1
+        try:
+            self._limit_open_calls()
+            await self._answer(name, context)
+            status = "OK"
+        except grpc.aio.InternalError as error:  # the client ended the call while a message was read or sent
+            raise asyncio.CancelledError from error
+        except Exception as error:  # every error is sent to the client
+            reported_error = RequestError(TIMEOUT_MESSAGE, 408) if isinstance(error, TimeoutError) else error
+            http_status, error_message = refusal(reported_error)
+            status = GRPC_STATUSES[http_status]
+        finally:
+            self._open_count -= 1
+            self._handler.traffic.count("grpc", name, status, context.peer(), start_ns)
         if error_message:
-            await context.abort(grpc.StatusCode[str(call.status)], error_message)
+            await context.abort(grpc.StatusCode[status], error_message)
 
     async def _answer(self, name: str, context: grpc.aio.ServicerContext) -> None:
         """Check the token, and answer the messages of a call.
@@ -241,10 +241,10 @@ class Service:
         Raises:
             IsochargeError: If the request is refused.
         """
-        # The name and the version of the model are called `model_name` and `model_version` in some messages of the
-        # protocol, and `name` and `version` in other messages. Messages about the server contain none of these fields.
+        # The name of the model is called `model_name` in the messages that load and unload a model, and `name` in other
+        # messages. Messages about the server contain none of these fields.
         model_name = getattr(request, "model_name", "") or getattr(request, "name", "")
-        model_version = getattr(request, "model_version", "") or getattr(request, "version", "")
+        model_version = getattr(request, "version", "")
         # The body of the equivalent HTTP request has the same fields as the message.
         body = MessageToJson(request, preserving_proto_field_name=True).encode()
         equivalent = Request(self._handler.store, self._handler.traffic, {}, body, model_name, model_version)

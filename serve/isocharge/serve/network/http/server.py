@@ -10,6 +10,7 @@ import asyncio
 import math
 import resource
 import socket
+import time
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, nullcontext, suppress
 from dataclasses import replace
 from functools import partial
@@ -203,8 +204,7 @@ class Connection(HttpToolsProtocol):
             return
         body = orjson.dumps({"error": message})
         head = b"content-type: application/json\r\ncontent-length: %d\r\nconnection: close\r\n\r\n" % len(body)
-        with self._traffic.exchange("http", self.client) as exchange:
-            exchange.status = status
+        self._traffic.count("http", "none", status, self.client, time.perf_counter_ns())
         self.transport.write(STATUS_LINE[status] + head + body)
         self.transport.close()
         self._allow(self._limits.header_seconds)  # the time in which the client must have received the refusal

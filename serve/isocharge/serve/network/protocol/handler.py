@@ -13,6 +13,7 @@ request and the name of its counter.
 
 import asyncio
 import re
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
 from functools import lru_cache
@@ -114,16 +115,15 @@ class Application(ABC):
         Returns:
             The response. If an error occurs, it is not raised, but the response contains its status and its message.
         """
+        start_ns = time.perf_counter_ns()
         limit = self.limits.body_bytes
-        with self.traffic.exchange("http", client) as exchange:
-            try:
-                if len(body) > limit:
-                    raise RequestError(f"expected a body of at most {limit} bytes, got more; send smaller batches", 413)
-                response = self._check_and_answer(method, path, header_values(headers), body)
-            except Exception as error:  # every error is sent to the client
-                response = error_response(error)
-            exchange.status = response.status
-            exchange.route = self._route_name(path)
+        try:
+            if len(body) > limit:
+                raise RequestError(f"expected a body of at most {limit} bytes, got more; send smaller batches", 413)
+            response = self._check_and_answer(method, path, header_values(headers), body)
+        except Exception as error:  # every error is sent to the client
+            response = error_response(error)
+        self.traffic.count("http", self._route_name(path), response.status, client, start_ns)
         return response
 
     def _route_name(self, path: str) -> str:  # noqa: ARG002
