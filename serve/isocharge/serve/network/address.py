@@ -125,7 +125,8 @@ class ServerLimits:
         idle_seconds: Longest time between two requests of a connection, s.
         grace_seconds: Longest time to wait, when a server stops, until the requests that have begun are finished, s.
         connections: Largest number of open connections.
-        queued_requests: Largest number of requests of a connection that wait for the response to an earlier request.
+        connection_requests: Largest number of requests of a connection that wait for the response to an earlier request
+            (HTTP), and of open calls of a connection (gRPC). HTTP/2 recommends at least 100.
     """
 
     body_bytes: int = 1 << 20
@@ -135,7 +136,7 @@ class ServerLimits:
     idle_seconds: float = 75.0
     grace_seconds: float = 10.0
     connections: int = 1024
-    queued_requests: int = 100
+    connection_requests: int = 100
 
 
 def url_host(host: str) -> str:

@@ -16,12 +16,6 @@ from isocharge.serve.network.address import Tls, url_host
 from isocharge.serve.network.grpc.service import METHODS, SERVICE, Service
 from isocharge.serve.network.protocol.handler import Handler
 
-MAX_CALLS_PER_CONNECTION = 100
-"""Largest number of open calls on one connection. HTTP/2 recommends at least this number.
-
-If a client begins further calls on the connection, they wait in the client.
-"""
-
 MIN_PING_MS = 5000
 """Shortest time between two keep-alive pings of a client, ms. A client that pings more often is disconnected."""
 
@@ -50,7 +44,7 @@ async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = 
     address = f"{url_host(host)}:{port}"
     options = [
         ("grpc.max_receive_message_length", limits.body_bytes),
-        ("grpc.max_concurrent_streams", MAX_CALLS_PER_CONNECTION),
+        ("grpc.max_concurrent_streams", limits.connection_requests),  # further calls wait in the client
         ("grpc.max_allowed_incoming_connections", limits.connections),
         ("grpc.server_handshake_timeout_ms", round(1e3 * limits.header_seconds)),
         ("grpc.max_connection_idle_ms", round(1e3 * limits.idle_seconds)),

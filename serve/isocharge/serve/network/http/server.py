@@ -106,7 +106,7 @@ class Connection(HttpToolsProtocol):
 
     def on_message_begin(self) -> None:
         """Begin a request, and refuse it if too many requests wait for the response to an earlier request."""
-        if len(self.pipeline) >= self._limits.queued_requests:
+        if len(self.pipeline) >= self._limits.connection_requests:
             raise httptools.HttpParserError  # uvicorn calls `send_400_response`; the parser ignores all later data
         self._is_reading = True
         self._allow(self._limits.header_seconds)
@@ -267,7 +267,7 @@ class HttpServer(uvicorn.Server):
             proxy_headers=False,
             server_header=False,
             date_header=False,
-            timeout_keep_alive=math.ceil(limits.idle_seconds),
+            timeout_keep_alive=86_400,  # `close_if_overdue` ends idle connections earlier
             timeout_graceful_shutdown=math.ceil(limits.grace_seconds),
             ssl_context_factory=(lambda *_: tls_context) if tls_context else None,
         )
@@ -306,13 +306,13 @@ class HttpServer(uvicorn.Server):
         self._socket.close()
         self._address.release()
 
-    async def on_tick(self, counter: int) -> bool:
-        """End overdue connections. uvicorn calls this method ten times per second until the server is stopped."""
+    async def on_tick(self, counter: int) -> bool:  # noqa: ARG002
+        """End overdue connections, and return whether to stop the server. uvicorn calls this method every 0.1 s."""
         now = asyncio.get_running_loop().time()
         connections: Any = list(self.server_state.connections)
         for connection in connections:
             connection.close_if_overdue(now)
-        return await super().on_tick(counter)
+        return self.should_exit
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Finish the open requests within the grace period, and then cancel the remaining requests.
