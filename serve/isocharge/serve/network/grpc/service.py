@@ -152,6 +152,7 @@ class Service:
             CancelledError: If the client has ended the call.
         """
         start_ns = time.perf_counter_ns()
+        client = context.peer()  # would be empty at the end, if the client has disconnected meanwhile
         status = "CANCELLED"  # until the call is answered or refused
         error_message = ""
         self._open_count += 1
@@ -167,7 +168,7 @@ class Service:
             status = GRPC_STATUSES[http_status]
         finally:
             self._open_count -= 1
-            self._handler.traffic.count("grpc", name, status, context.peer(), start_ns)
+            self._handler.traffic.count("grpc", name, status, client, start_ns)
         if error_message:
             await context.abort(grpc.StatusCode[status], error_message)
 
