@@ -69,9 +69,8 @@ class Address:
         """
         if self.uds:
             return f"unix:{self.uds}"
-        scheme = "https" if secure else "http"
         _, port, *_ = listening.getsockname()  # the actual port, even if the system has chosen it
-        return f"{scheme}://{url_host(self.host)}:{port}"
+        return f"{'https' if secure else 'http'}://{url_host(self.host)}:{port}"
 
 
 @dataclass(frozen=True)
@@ -92,17 +91,16 @@ class Tls:
         Raises:
             InputError: If a file cannot be read, or if the certificate and the key do not belong together.
         """
-        paths = dict.fromkeys([self.certificate, self.key])  # a single path if both are in one file
         context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         try:
-            for path in paths:
+            for path in (self.certificate, self.key):
                 read_whole(path)  # raises an error if the path is a pipe, from which load_cert_chain might wait forever
             # With the empty password, an encrypted key causes an error. Without a password, OpenSSL would ask the user.
             context.load_cert_chain(self.certificate, self.key, password=lambda: "")
         except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
             raise InputError(
-                f"{' and '.join(map(str, paths))}: not a certificate and its unencrypted private key in PEM files that "
-                f"can be read ({error})"
+                f"{self.certificate}: not a certificate whose unencrypted private key is in {self.key}, both in PEM "
+                f"files that can be read ({error})"
             ) from error
         return context
 

@@ -39,11 +39,10 @@ _COMPILED_PROTOCOL = files(__package__).joinpath("inference.binpb").read_bytes()
 (_PROTOCOL,) = FileDescriptorSet.FromString(_COMPILED_PROTOCOL).file
 _POOL = DescriptorPool()
 _POOL.Add(_PROTOCOL)
-_DESCRIPTOR = _POOL.FindServiceByName(SERVICE)
 
 METHODS = {
     method.name: (GetMessageClass(method.input_type), GetMessageClass(method.output_type))
-    for method in _DESCRIPTOR.methods
+    for method in _POOL.FindServiceByName(SERVICE).methods
 }
 """Class of the request and class of the response, by the name of the method."""
 
@@ -189,8 +188,8 @@ class Service:
             IsochargeError: If the call is refused.
         """
         if ROUTE_OF_METHOD[name].needs_token:
-            metadata = dict(context.invocation_metadata() or ())
-            authorization = str(metadata.get("authorization", ""))
+            metadata = dict(context.invocation_metadata())
+            authorization = metadata.get("authorization", "")
             self._handler.access.check_token(authorization.encode())
         timeout_s = self._handler.limits.header_seconds
         while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:

@@ -171,7 +171,7 @@ def infer(loaded: LoadedVersion, body: InferBody, binary: bytes) -> tuple[Json, 
     is_binary_by_default = (body.parameters or {}).get("binary_data_output")
     for output in body.outputs or MODEL_OUTPUTS:
         name = output.name
-        tensor = {"name": name, "datatype": "FP32", "shape": [len(charge_pC), OUTPUTS.get(name, 1)]}
+        tensor: Json = {"name": name, "datatype": "FP32", "shape": [len(charge_pC), OUTPUTS.get(name, 1)]}
         if name == FLAGS:
             flags_of_presses = loaded.validity.batch_flags(Contacts(*contacts.T))
             tensor["datatype"] = "BYTES"
