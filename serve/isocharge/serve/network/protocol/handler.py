@@ -25,7 +25,7 @@ from isocharge.serve.network.address import ServerLimits
 from isocharge.serve.network.browser_check import AccessCheck, header_values
 from isocharge.serve.network.metrics import Client, Traffic
 from isocharge.serve.network.model_store import ModelStore
-from isocharge.serve.network.protocol.response import Header, Response, decompress, error_response, json_response
+from isocharge.serve.network.protocol.response import Header, Response, decompress, json_response, refusal
 from isocharge.serve.network.protocol.routes import ROUTES, UNKNOWN, Request, Route
 
 Message = MutableMapping[str, Any]
@@ -122,7 +122,8 @@ class Application(ABC):
                 raise RequestError(f"expected a body of at most {limit} bytes, got more; send smaller batches", 413)
             response = self._check_and_answer(method, path, header_values(headers), body)
         except Exception as error:  # every error is sent to the client
-            response = error_response(error)
+            status, message = refusal(error)
+            response = json_response({"error": message}, status, *getattr(error, "headers", ()))
         self.traffic.count("http", self._route_name(path), response.status, client, start_ns)
         return response
 

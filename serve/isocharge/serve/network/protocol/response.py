@@ -58,12 +58,6 @@ def json_response(content: Any, status: int = 200, *headers: Header) -> Response
     return response_of(status, b"application/json", orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY), *headers)
 
 
-def error_response(error: Exception) -> Response:
-    """Return the response to a request that could not be answered because of an error, with the message as its body."""
-    status, message = refusal(error)
-    return json_response({"error": message}, status, *getattr(error, "headers", ()))
-
-
 def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
     """Decompress the body of a request.
 
