@@ -154,6 +154,16 @@ def test_body_above_the_limit_is_refused(limited):
         assert refused(exchange(server, head))[0] in (400, 408)
 
 
+@pytest.mark.parametrize("rest", [b"", b"no chunk\r\n"])
+def test_request_that_is_answered_before_its_end_gets_no_second_response(limited, rest):
+    head = b"POST /v2/repository/index HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
+    with connect(limited(body_bytes=1000, body_seconds=0.3)) as connection:
+        connection.sendall(head + b"800\r\n" + bytes(2048) + b"\r\n")
+        answer = connection.recv(1000)
+        connection.sendall(rest)
+        assert statuses(answer + everything(connection)) == [413]
+
+
 @pytest.mark.parametrize(
     ("sent", "limits", "status"),
     [

@@ -132,6 +132,7 @@ class Connection(HttpToolsProtocol):
         self._pending_bytes = 0
         self.deadline = math.inf
         super().on_message_complete()
+        self.cycle.more_body = False  # uvicorn omits this if the request was already answered
 
     def close_if_overdue(self, now: float) -> None:
         """End the connection if a deadline has passed. If a request has begun, the client receives the reason.
@@ -194,13 +195,16 @@ class Connection(HttpToolsProtocol):
         """Send a refusal as the last response of the connection, and count it.
 
         If earlier, complete requests are not answered yet, the connection is closed after their responses, and the
-        refusal is neither sent nor counted.
+        refusal is neither sent nor counted. The same holds for the rest of a request that is already answered.
 
         Args:
             status: HTTP status.
             message: Reason of the refusal.
         """
         if self.transport.is_closing() or self._close_after_responses():
+            return
+        if self.cycle is not None and self.cycle.more_body and self.cycle.response_complete:
+            self.transport.close()
             return
         body = orjson.dumps({"error": message})
         head = b"content-type: application/json\r\ncontent-length: %d\r\nconnection: close\r\n\r\n" % len(body)
