@@ -23,12 +23,15 @@ therefore checks only the header `Host`.
 
 import hmac
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import lru_cache
 from urllib.parse import urlsplit
 
 from isocharge.common.errors import InputError, RequestError, shown
 from isocharge.serve.network.address import ip_address
+
+Headers = dict[bytes, bytes]
+"""Value of each header of a request by the name of the header in lower case."""
 
 _TOKEN_PATTERN = re.compile(r"(?! )[ -$&-~]+(?<! )")
 """Accepted token: printable ASCII characters without blanks at the ends and without the percent sign."""
@@ -71,12 +74,12 @@ class AccessCheck:
         self._token = None if token is None else token.encode()
         self._any_host = any_host or token is not None
 
-    def check(self, method: str, headers: Mapping[bytes, bytes], *, needs_token: bool = True) -> None:
+    def check(self, method: str, headers: Headers, *, needs_token: bool = True) -> None:
         """Check the headers of a request, and raise an error if the request is refused.
 
         Args:
             method: Method in capitals.
-            headers: Value of each header by the name of the header in lower case.
+            headers: Headers of the request.
             needs_token: Whether the request must contain the token, if the server has one.
 
         Raises:
@@ -166,7 +169,7 @@ class AccessCheck:
         return page_name in self._allowed_names and (page_name != _name_in(host) or is_port_removed)
 
 
-def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
+def header_values(headers: Iterable[tuple[bytes, bytes]]) -> Headers:
     """Return the value of each header by its name. If a header is repeated, its last value is returned.
 
     Args:
@@ -175,7 +178,7 @@ def header_values(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
     Raises:
         RequestError: If `Host` (RFC 9112, 3.2) or `Origin` is repeated. A proxy could have checked the other value.
     """
-    values: dict[bytes, bytes] = {}
+    values: Headers = {}
     for name, value in headers:
         if name in values and name in (b"host", b"origin"):
             raise RequestError(f"{name.decode()}: expected one header, got {shown(values[name])} and {shown(value)}")

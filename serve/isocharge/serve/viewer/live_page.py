@@ -12,7 +12,7 @@ messages for a slow browser exists.
 
 import secrets
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from threading import Lock, Thread
@@ -24,7 +24,7 @@ from isocharge.common.errors import RequestError, is_printable
 from isocharge.common.structs import Finite, WrongKey, parse_json
 from isocharge.serve.flags import MEANINGS
 from isocharge.serve.network.address import Address, ServerLimits, Tls
-from isocharge.serve.network.browser_check import AccessCheck
+from isocharge.serve.network.browser_check import AccessCheck, Headers
 from isocharge.serve.network.http.server import HttpServer
 from isocharge.serve.network.metrics import Traffic
 from isocharge.serve.network.protocol.handler import Application, check_method
@@ -167,7 +167,7 @@ class LivePage(Application):
         earlier_markers = self._state.get("markers", [])
         self.update(markers=[*earlier_markers, tuple(marker)][-MAX_MARKERS:])  # JSON accepts no named tuple
 
-    def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
+    def _check_and_answer(self, method: str, path: str, headers: Headers, body: bytes) -> Response:
         """Check whether a request is allowed, and return the response. The files of the page need no token.
 
         Raises:

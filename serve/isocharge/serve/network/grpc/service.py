@@ -18,12 +18,12 @@ from importlib.resources import files
 from typing import Any
 
 import grpc
-import grpc.aio
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.json_format import MessageToJson, ParseDict
 from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
+from grpc.aio import EOF, InternalError, ServicerContext
 
 from isocharge.common.errors import ModelError, RequestError
 from isocharge.common.structs import convert
@@ -137,7 +137,7 @@ class Service:
         self._waiting: dict[asyncio.Timeout, None] = {}
         handler.traffic.open.labels("grpc").set_function(lambda: self._open_count)
 
-    async def handle(self, name: str, _messages: object, context: grpc.aio.ServicerContext) -> None:
+    async def handle(self, name: str, _messages: object, context: ServicerContext) -> None:
         """Answer a call of a client, count the call by its status, and log the call if there is a log.
 
         If an error occurs, the client receives its status and its message.
@@ -159,7 +159,7 @@ class Service:
             self._limit_open_calls()
             await self._answer(name, context)
             status = "OK"
-        except grpc.aio.InternalError as error:  # the client ended the call while a message was read or sent
+        except InternalError as error:  # the client ended the call while a message was read or sent
             raise asyncio.CancelledError from error
         except Exception as error:  # every error is sent to the client
             reported_error = RequestError(TIMEOUT_MESSAGE, 408) if isinstance(error, TimeoutError) else error
@@ -171,7 +171,7 @@ class Service:
         if error_message:
             await context.abort(grpc.StatusCode[status], error_message)
 
-    async def _answer(self, name: str, context: grpc.aio.ServicerContext) -> None:
+    async def _answer(self, name: str, context: ServicerContext) -> None:
         """Check the token, and answer the messages of a call.
 
         A call of the method `STREAM_METHOD` may contain any number of messages, and every other call contains one
@@ -192,7 +192,7 @@ class Service:
             authorization = metadata.get("authorization", "")
             self._handler.access.check_token(authorization.encode())
         timeout_s = self._handler.limits.header_seconds
-        while (data := await self._next_message(context, timeout_s)) is not grpc.aio.EOF:
+        while (data := await self._next_message(context, timeout_s)) is not EOF:
             if name.startswith("RepositoryModel"):  # loading a model takes a long time
                 response = await asyncio.to_thread(self._respond, name, data)
             else:
@@ -289,7 +289,7 @@ class Service:
         for timeout in self._waiting:
             timeout.reschedule(deadline)
 
-    async def _next_message(self, context: grpc.aio.ServicerContext, timeout_s: float) -> Any:
+    async def _next_message(self, context: ServicerContext, timeout_s: float) -> Any:
         """Wait for the next message of a call.
 
         While a call waits for a message, the service may end the call to make room for a new call.
@@ -299,7 +299,7 @@ class Service:
             timeout_s: Longest time to wait, s.
 
         Returns:
-            The serialized message, or `grpc.aio.EOF` if the client has ended the call.
+            The serialized message, or `EOF` if the client has ended the call.
 
         Raises:
             TimeoutError: If the message does not arrive in time, or if the service ends this call because of a new

@@ -15,14 +15,14 @@ import asyncio
 import re
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
+from collections.abc import Awaitable, Callable, Iterable, MutableMapping
 from functools import lru_cache
 from typing import Any
 
 from isocharge.common.errors import RequestError
 from isocharge.common.files import StrPath
 from isocharge.serve.network.address import ServerLimits
-from isocharge.serve.network.browser_check import AccessCheck, header_values
+from isocharge.serve.network.browser_check import AccessCheck, Headers, header_values
 from isocharge.serve.network.metrics import Client, Traffic
 from isocharge.serve.network.model_store import ModelStore
 from isocharge.serve.network.protocol.response import Header, Response, decompress, json_response, refusal
@@ -132,7 +132,7 @@ class Application(ABC):
         return "page"
 
     @abstractmethod
-    def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
+    def _check_and_answer(self, method: str, path: str, headers: Headers, body: bytes) -> Response:
         """Check whether a request is allowed, answer the request, and return the response.
 
         Args:
@@ -210,7 +210,7 @@ class Handler(Application):
         route, _ = match_path(path)
         return route.path.replace("{version}", "")
 
-    def _check_and_answer(self, method: str, path: str, headers: Mapping[bytes, bytes], body: bytes) -> Response:
+    def _check_and_answer(self, method: str, path: str, headers: Headers, body: bytes) -> Response:
         """Check a request, and answer it with the function of its route."""
         route, model = match_path(path)
         # The token is checked before unknown paths are refused. A client without the token therefore cannot find out

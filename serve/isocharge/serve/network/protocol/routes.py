@@ -4,7 +4,7 @@ The servers use `ROUTES` to find the function for a request. The file `openapi.j
 messages of the gRPC service have the same fields as the JSON objects that the functions return.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from importlib.resources import files
 from typing import Any, NamedTuple
 
@@ -14,6 +14,7 @@ from isocharge.common.defaults import MAX_BATCH
 from isocharge.common.errors import ModelError, RequestError, package_version
 from isocharge.common.structs import parse_json
 from isocharge.serve.model.session import INPUT, OUTPUTS
+from isocharge.serve.network.browser_check import Headers
 from isocharge.serve.network.metrics import CONTENT_TYPE, Traffic
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol.inference import (
@@ -52,7 +53,7 @@ class Request(NamedTuple):
 
     store: ModelStore
     traffic: Traffic
-    headers: Mapping[bytes, bytes]
+    headers: Headers
     body: bytes
     name: str = ""
     version: str = ""
