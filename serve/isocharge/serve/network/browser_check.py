@@ -71,7 +71,7 @@ class AccessCheck:
                 "token: expected printable ASCII characters without blanks at the ends, and no %, which has another "
                 "meaning in the address of a page; choose another one"
             )
-        self._token = None if token is None else token.encode()
+        self._token = token
         self._any_host = any_host or token is not None
 
     def check(self, method: str, headers: Headers, *, needs_token: bool = True) -> None:
@@ -135,7 +135,7 @@ class AccessCheck:
         scheme, _, token = authorization.partition(b" ")
         # The duration of this comparison does not depend on the number of correct characters. A client therefore cannot
         # use it to guess the token character by character.
-        is_correct = hmac.compare_digest(token.lstrip(b" "), self._token)
+        is_correct = hmac.compare_digest(token.lstrip(b" "), self._token.encode())
         if scheme.lower() != b"bearer" or not is_correct:
             received = "a wrong one" if authorization else "none"
             raise RequestError(

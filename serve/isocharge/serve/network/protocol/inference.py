@@ -75,13 +75,12 @@ MODEL_OUTPUTS = [OutputTensor(name) for name in OUTPUTS]  # type: ignore[arg-typ
 """Outputs of a request that lists no outputs."""
 
 
-def read_infer(body: bytes, header_length: bytes | None) -> tuple[InferBody, bytes]:
+def read_infer(body: bytes, header_length: bytes) -> tuple[InferBody, bytes]:
     """Read a request for an inference from the body of an HTTP request.
 
     Args:
         body: The body, after it was decompressed.
         header_length: Value of the header Inference-Header-Content-Length, which is the length of the JSON text, bytes.
-            None if the request has no such header, because no binary tensor follows.
 
     Returns:
         The content of the JSON text, and the bytes that follow the text.
@@ -89,16 +88,14 @@ def read_infer(body: bytes, header_length: bytes | None) -> tuple[InferBody, byt
     Raises:
         RequestError: If the body is not a request for an inference.
     """
-    json_length = len(body)
-    if header_length is not None:
-        # The characters are checked before the conversion, because int() also accepts signs, blanks and underscores,
-        # and is slow for long texts.
-        if not header_length.isdigit() or len(header_length) > len(str(len(body))):
-            raise RequestError(
-                f"Inference-Header-Content-Length: expected a whole number up to {len(body)}, the bytes of the body, "
-                f"got {header_length.decode('latin-1')!r:.50}"
-            )
-        json_length = int(header_length)
+    # The characters are checked before the conversion, because int() also accepts signs, blanks and underscores, and is
+    # slow for long texts.
+    if not header_length.isdigit() or len(header_length) > len(str(len(body))):
+        raise RequestError(
+            f"Inference-Header-Content-Length: expected a whole number up to {len(body)}, the bytes of the body, "
+            f"got {header_length.decode('latin-1')!r:.50}"
+        )
+    json_length = int(header_length)
     return parse_json(body[:json_length], "", RequestError, InferBody), body[json_length:]
 
 

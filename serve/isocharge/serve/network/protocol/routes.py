@@ -187,7 +187,8 @@ def _infer(request: Request) -> Response:
     loaded = request.loaded
     if not request.body and b"upgrade" in request.headers:  # uvicorn discards the body of a request for an upgrade
         raise RequestError("Upgrade: this server reads no body after this header; set the client to HTTP/1.1")
-    header_length = request.headers.get(b"inference-header-content-length")  # length of the JSON text, bytes
+    # Without this header, no binary tensor follows the JSON text.
+    header_length = request.headers.get(b"inference-header-content-length", b"%d" % len(request.body))
     with loaded.statistics.refused.count_exceptions(), loaded.statistics.latency.time():
         body, binary = read_infer(request.body, header_length)
         content, binary_tensors = infer(loaded, body, binary)
