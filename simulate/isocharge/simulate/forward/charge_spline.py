@@ -221,7 +221,8 @@ def _scaled_charges(forward_map: ForwardMap, force: Array, position: Array) -> A
 def _fit_disk(forward_map: ForwardMap, force: Array, spacing: float) -> "scipy.interpolate.NdBSpline":
     """Fit a cubic spline to the scaled charges of all electrodes over the disk.
 
-    The fit is by least squares with a penalty on the third differences of the coefficients.
+    The fit is by least squares, with a penalty on the third differences of the coefficients. The spline is defined on
+    the square around the disk. The penalty determines the coefficients in its corners, where there are no positions.
 
     Args:
         forward_map: Forward map that computes the charges.
@@ -231,11 +232,13 @@ def _fit_disk(forward_map: ForwardMap, force: Array, spacing: float) -> "scipy.i
     Returns:
         Spline in x and y that returns scaled charges, shape (n_force, n_electrode), pC.
     """
-    # The ends of the interval occur four times among the knots, so that the spline is defined on the whole interval. A
-    # cubic spline has 4 coefficients fewer than knots along each axis.
+    # The knots along both axes are the edges of the cells. A cubic spline is only defined on the whole interval if the
+    # first and the last edge occur four times, so each of them is repeated three times. There are always four fewer
+    # coefficients than knots.
     radius = forward_map.domain.radius
     cells = int(np.clip(np.ceil(2.0 * radius / spacing), 8, MAX_CELLS))  # at least 8 on a small domain
-    line_knots = np.concatenate([[-radius] * 3, np.linspace(-radius, radius, cells + 1), [radius] * 3])
+    cell_edges = np.linspace(-radius, radius, cells + 1)
+    line_knots = np.pad(cell_edges, 3, mode="edge")
     knots = (line_knots, line_knots)
     axis_count = line_knots.size - 4  # number of coefficients along an axis
     position = radius * _fit_positions(cells)
@@ -248,10 +251,12 @@ def _fit_disk(forward_map: ForwardMap, force: Array, spacing: float) -> "scipy.i
     design = csr_array((entries.data, entries.indices, entries.indptr), shape=(len(position), axis_count**2))
     penalty = SMOOTHING * _third_differences(axis_count)
 
-    # Solve the normal equations. Their matrix is positive definite, so the factorisation needs no pivoting.
+    # Solve the normal equations, with one column for each force and electrode. Their matrix is positive definite, so
+    # the factorisation needs no pivoting. The unknowns are eliminated in the order of minimum degree (MMD), which keeps
+    # the factors sparse.
     normal_matrix = (design.T @ design + penalty.T @ penalty).tocsc()
     right_side = np.ascontiguousarray(design.T @ scaled_charge.reshape(len(position), -1))
-    solution = factorise(normal_matrix, "MMD_AT_PLUS_A").solve(right_side)  # one column for each force and electrode
+    solution = factorise(normal_matrix, "MMD_AT_PLUS_A").solve(right_side)
     coefficients = solution.reshape(axis_count, axis_count, *scaled_charge.shape[1:])
     return scipy.interpolate.NdBSpline(knots, coefficients, cubic_degree)
 

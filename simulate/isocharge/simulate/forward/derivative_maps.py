@@ -133,10 +133,11 @@ class FilmSlopes:
         tension_unit = film.young * amplitude_squared(film, contact[:, 2]) + film.pretension
         field_charge[:, TENSION_FIELDS] /= tension_unit[:, None, None]
 
-        # After the fields without a direction, even and odd fields alternate. The axes of an even field are along and
-        # across the direction of the press, at the angle t from the x axis. The axes of an odd field are rotated by 45
-        # degrees from them. Rotate both to the axes x and y.
-        directed_charge = field_charge[:, SCALAR_FIELDS:]  # a view, through which `field_charge` is changed
+        # After the fields without a direction, there are pairs of an even and an odd field. The fields of a pair are
+        # the changes by an imperfection with the axis along the press, at the angle t from the x axis, and at 45
+        # degrees from it. An imperfection is the complex number size * exp(2 i axis), because half a turn does not
+        # change it. The factor exp(2 i t) therefore rotates the pair into the axes x and y.
+        directed_charge = field_charge[:, SCALAR_FIELDS:]  # a view, so that changes also change `field_charge`
         even = directed_charge[:, ::2]
         odd = directed_charge[:, 1::2]
         direction = np.arctan2(contact[:, 1], contact[:, 0])[:, None, None]  # t

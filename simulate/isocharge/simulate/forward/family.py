@@ -157,14 +157,17 @@ class Family:
         n_force = count.forces if max_log_force > min_log_force else 1
         force = np.exp(chebyshev_nodes(n_force, min_log_force, max_log_force))
 
-        # Choose the directions of the presses and the rotations of the probe. The period is the smallest rotation after
-        # which the stress repeats. If the probe keeps its orientation on the film, film and probe rotate together. The
-        # film is the same after half a turn, so both are the same after half a turn or only after a full turn.
+        # Find the period, which is the smallest rotation of the probe relative to the press after which the stress
+        # repeats. If the orientation of the probe on the film may change, this is the period of the probe. If the probe
+        # keeps its orientation on the film, the film rotates together with the probe. Half a turn does not change the
+        # film. It does not change the probe either if the number of its periods in a full turn is even.
         period = probe.period
         is_oriented = orientation == "fixed" and not film.is_axisymmetric and not probe.is_axisymmetric
         if is_oriented:
-            symmetry_order = round(math.tau / period)  # of the probe
-            period = math.tau / math.gcd(symmetry_order, 2)
+            symmetry_order = round(math.tau / period)
+            period = math.pi if symmetry_order % 2 == 0 else math.tau
+
+        # Choose the directions of the presses and the rotations of the probe.
         has_directions = not film.is_axisymmetric and not is_oriented
         turns = Turns.spread(count.largest_harmonics, period, has_directions=has_directions)
         return cls(domain, film.radius, distance, force, turns, is_oriented)

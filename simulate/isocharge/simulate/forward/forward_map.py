@@ -35,12 +35,7 @@ from isocharge.simulate.forward.family import (
     relative_error,
     spread_check_presses,
 )
-from isocharge.simulate.forward.readout import (
-    STRESS_WEIGHTS,
-    ChargeDensity,
-    ElectrodePieces,
-    contact_charges,
-)
+from isocharge.simulate.forward.readout import STRESS_WEIGHTS, ChargeDensity, ElectrodePieces, contact_charges
 from isocharge.simulate.mechanics.theory import Theory, amplitude_squared, rotate_stress
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.oval import film_oval
@@ -337,13 +332,14 @@ class ForwardMap:
         Returns:
             Charges, shape (n_selected_force, n, n_electrode, n_field), pC.
         """
-        # The integration points depend on the mesh, and not on the force. Create a map with a single force, whose
-        # fields at each node are those of the first selected force, followed by those of the other selected forces.
+        # The integration points depend on the mesh, and not on the force. To locate them only once, treat the fields of
+        # different forces like different fields of one force: create a map with the first selected force, whose fields
+        # at each node are those of all selected forces. Its table has one row for each distance and turn.
         family = self.family
         force = family.force[forces]
         n_field = is_odd.size
         press_shape = (family.distance.size, family.force.size, family.turns.rotation.size)
-        table = self.table.reshape(*press_shape, -1, n_field * 3)[:, forces]
+        table = self.table.reshape(*press_shape, -1, n_field * 3)[:, forces]  # the fourth axis is the node
         fields = np.moveaxis(table, 1, 3)  # shape (n_distance, n_turn, n_node, n_selected_force, n_field * 3)
         single_force_map = replace(
             self,
@@ -354,7 +350,7 @@ class ForwardMap:
         charge = single_force_map.field_charges(contacts_at(position, force[0]), np.tile(is_odd, force.size))
         charge_by_force = charge.reshape(*charge.shape[:2], force.size, n_field)
 
-        # The map multiplies all fields by the squared amplitude of its single force. Correct the other fields.
+        # The map multiplies all fields by the squared amplitude of its own force. Replace it by that of each force.
         squared_amplitude = amplitude_squared(self.sensor.film, force)
         charge_by_force *= (squared_amplitude / squared_amplitude[0])[:, None]
         return np.moveaxis(charge_by_force, 2, 0)  # from (n, n_electrode, n_force, n_field)
@@ -454,23 +450,26 @@ class ForwardMap:
         Returns:
             Charge per area at the nodes of the mesh under each press.
         """
+        # Place the mesh under each press, after the press was rotated onto the x axis. In this position, the probe has
+        # a further rotation, which is the orientation minus the direction. It has no effect if the probe is
+        # axisymmetric.
         film = self.sensor.film
         n_field = is_odd.size
         direction = np.angle(position)  # from the centre of the film to the press, rad
-        # The frame of the mesh rotates with the probe or, under an axisymmetric probe, with the press.
         rotation = np.zeros_like(direction) if self.probe.is_axisymmetric else orientation - direction
         template = template_for(self.resolution, self.probe.topology, not film.is_axisymmetric)
         oval = film_oval(film, direction)
         placement = Placement.of(template, self.probe, np.abs(position), film.radius, self.layer, rotation, oval)
 
-        # Interpolate the stress in the precision of the table, and multiply by the unit of the scaled stress.
+        # Interpolate the stress in the precision of the table, and multiply by the unit of the scaled stress. A row of
+        # the table contains the stress of all fields at one node, then those at the next node.
         stress_unit = film.young * amplitude_squared(film, force)
         weights = self.family.weights(position, force, rotation) * stress_unit[:, None]
         interpolated = weights.astype(self.table.dtype) @ self.table  # one row for each press
         stress = interpolated.reshape(position.size, -1, n_field, 3).swapaxes(1, 2)  # shape (n, n_field, n_node, 3)
 
-        # Convert the components of the stress, which refer to the frame of the mesh, into charge per area. If only half
-        # of the film is meshed, there is a second sign for the reflection of the mesh.
+        # Convert the stress, whose components refer to a frame that rotates with the probe, into charge per area. If
+        # only half of the film is meshed, there is a second sign for the reflection of the mesh.
         frame_angle = direction + rotation + self.probe.angle
         charge_per_frame_stress = rotate_stress(np.eye(3), frame_angle[:, None]) @ charge_per_stress.T  # (n, 3, n_kind)
         signs = _reflection_signs(is_odd) if template.half else np.ones((n_field, 3, 1))

@@ -315,9 +315,9 @@ def _area_pieces(electrode: Electrode) -> Iterator[Piece]:
 def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[Piece]:
     """Yield the lines of the edge readout (Mirbagheri et al., 2007, equation 3).
 
-    The stress s11 is averaged over the left and right edges of the rotated electrode, and the stress s22 over its lower
-    and upper edges. A line has a fixed number of integration points. Each edge is divided into two lines, so that it
-    has twice as many.
+    The charge is the area of the electrode times d31 mean(s11) + d32 mean(s22). The stress s11 is averaged over the
+    left and right edges of the rotated electrode, and the stress s22 over its lower and upper edges. Each edge is
+    divided into two lines, because a line has a fixed number of integration points, which would be too few for an edge.
 
     Args:
         electrode: A square electrode.
@@ -327,13 +327,13 @@ def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[Piece]:
         A line as a quadrilateral without width. Its corners are the first end, twice the last end, and the first end
         again.
     """
-    line_area = 0.25 * electrode.area  # each mean is over two edges, which are four lines
+    line_area = 0.25 * electrode.area  # each mean is over two edges, so four lines represent the whole area
     corners = np.array(electrode.corners)
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         middle = 0.5 * (start + end)
         rotated_edge = complex(*(end - start)) * cmath.rect(1.0, rotation)
         is_horizontal = abs(rotated_edge.real) > abs(rotated_edge.imag)
-        kind = 1 if is_horizontal else 0  # row of `STRESS_WEIGHTS`: s22 for the lower and upper edges, otherwise s11
+        kind = 1 if is_horizontal else 0  # row of `STRESS_WEIGHTS`: 0 for s11, 1 for s22
         for first, last in ((start, middle), (middle, end)):
             yield Piece(np.array([first, last, last, first]), line_area, kind)
 
@@ -383,22 +383,25 @@ class ChargeDensity:
         # A rule contains the integration points and their areas, shape (n_pair, n_point), of some pairs of a press and
         # a piece. In each pair, `press` and `piece` are the indices of the two.
         for rule in pieces.rules(self.probe, self.position):
-            press = rule.press[:, None]  # one row for each pair, and one column for all of its points
+            press = rule.press[:, None]  # shape (n_pair, 1): the same press for all points of a pair
             piece = rule.piece[:, None]
 
-            # For each point, find its element, and select the charge per area at the nodes of the element.
+            # Find the element of each point. All four arrays have the shape (n_pair, n_point).
             points = rule.points * rotation_and_scale[press]
             element, xi, eta, is_reflected = locate_points(self.placement[rule.press], self.template, points)
-            reflection = is_reflected.astype(np.intp)  # index on the first axis of `values`: 0 or 1
-            nodal_density = self.values[reflection, pieces.kind[piece], press, element]
-            nodal_density = nodal_density.reshape(len(press), -1, n_field)  # shape (n_pair, n_point * n_local, n_field)
+
+            # Select the charge per area at the nodes of the element of each point. The arrays of indices are broadcast
+            # with each other, so the selection has the shape (n_pair, n_point, n_local, n_field).
+            sign = is_reflected.astype(np.intp)  # index on the first axis of `values`: 0 or 1
+            nodal_density = self.values[sign, pieces.kind[piece], press, element]
 
             # The weight of a node in the integral is the area of the point times the basis function of the node.
             basis_values = tensor_values(self.template.resolution.order, xi.ravel(), eta.ravel())
             node_weights = rule.area.reshape(-1, 1) * basis_values  # shape (n_pair * n_point, n_local)
 
-            # For each pair, sum over its points and over the nodes of their elements. Then add the charge of the piece
-            # to that of its electrode.
+            # For each pair, sum over its points and over the nodes of their elements, which are combined in one axis.
+            # Then add the charge of the piece to that of its electrode.
+            nodal_density = nodal_density.reshape(len(press), -1, n_field)  # shape (n_pair, n_point * n_local, n_field)
             pair_weights = node_weights.reshape(len(press), 1, -1).astype(nodal_density.dtype)
             pair_charge = pair_weights @ nodal_density  # shape (n_pair, 1, n_field)
             np.add.at(charge, (rule.press, pieces.electrode[rule.piece]), pair_charge[:, 0])

@@ -126,17 +126,22 @@ def _starting_points(rings: Rings, precision: Array) -> tuple[Array, Array]:
     Returns:
         Positions (x, y), shape (n, 2), mm, and the distance of each from its farthest neighbour, shape (n,), mm.
     """
-    # A position is chosen if none of its eight neighbours has a smaller precision.
-    is_chosen = precision == scipy.ndimage.minimum_filter(precision, 3, mode=("nearest", "wrap"))
+    # A position is chosen if none of its eight neighbours has a smaller precision. The neighbours are on the same ring,
+    # which is closed ("wrap"), and on the two adjacent rings. The first and the last ring take the place of the
+    # adjacent ring that they do not have ("nearest").
+    smallest_around = scipy.ndimage.minimum_filter(precision, 3, mode=("nearest", "wrap"))
+    is_chosen = precision == smallest_around
 
-    # Along a fold line, the precision has a kink: it decreases to zero and increases again. A position is therefore
-    # also chosen if its precision is at most a third of the sum of both neighbours along the ring, or of both
-    # neighbours on the adjacent rings. Where the precision is smooth, it is about half of these sums.
+    # Along a fold line, the precision has a kink: it decreases to zero and increases again. There may be no minimum at
+    # the position nearest to the fold, because the precision also changes along the fold line. Two opposite neighbours
+    # are therefore compared. Where the precision is smooth, it is about half of their sum. If it is at most a third of
+    # the sum, it has a kink, and the position is also chosen.
     sum_along_ring = np.roll(precision, 1, axis=1) + np.roll(precision, -1, axis=1)
     is_chosen |= 3.0 * precision <= sum_along_ring
     sum_across_rings = precision[:-2] + precision[2:]
     is_chosen[1:-1] |= 3.0 * precision[1:-1] <= sum_across_rings
 
+    # Compute the distance of the farther neighbour, which is on the same ring or on the adjacent ring.
     ring_of_chosen, _ = np.nonzero(is_chosen)
     spacing_between_rings = rings.distance[0]
     spacing_on_ring = rings.distance * math.tau / precision.shape[1]

@@ -161,11 +161,12 @@ def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
             columns.append((_stress_in_film_axes(increased, surface) - stress) / step)
             continue
 
-        # A step in x or y near the centre changes the direction of the press by a large angle, and the mesh turns with
-        # it. Therefore both stresses are read at the nodes of the original mesh.
+        # The mesh turns with the direction of the press. Near the centre, this is a large angle: half a turn if a step
+        # in x crosses the centre, and more than 0.1 rad if the distance is less than ten steps in y.
         decreased = _changed_press(solved, -changes)
-        smallest_distance = {"x": 1.0, "y": 10.0}.get(column, 0.0) * step  # in x, only a step across the centre turns
-        if distance < smallest_distance:
+        distance_in_steps = {"x": 1.0, "y": 10.0}.get(column, 0.0)  # below which the angle is large; 0 for other steps
+        if distance < distance_in_steps * step:
+            # Both stresses are read at the nodes of the original mesh.
             change = _change_at_fixed_points(solved, decreased, increased, surface)
         else:
             # The nodes move with the press. Subtract the change of the stress that their movement causes.
