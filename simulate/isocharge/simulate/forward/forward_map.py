@@ -152,7 +152,8 @@ class ForwardMap:
         count_index = 0
         while not error <= INTERPOLATION_ERROR:  # also if the error is NaN
             may_next_suffice = error <= SKIP_RATIO * INTERPOLATION_ERROR
-            count_index += 1 if may_next_suffice or count_index + 2 == len(counts) else 2
+            is_next_last = count_index + 2 == len(counts)
+            count_index += 1 if may_next_suffice or is_next_last else 2
             if count_index >= len(counts):
                 raise SolveError(
                     f"the forward map of {sensor.name} up to {radius:g} mm and {force_range[1]:g} N interpolates to "
@@ -450,9 +451,8 @@ class ForwardMap:
         Returns:
             Charge per area at the nodes of the mesh under each press.
         """
-        # Place the mesh under each press, after the press was rotated onto the x axis. In this position, the probe has
-        # a further rotation, which is the orientation minus the direction. It has no effect if the probe is
-        # axisymmetric.
+        # Place the mesh under each press, after the press was rotated onto the x axis. The probe has a rotation
+        # relative to the direction of the press, which has no effect if the probe is axisymmetric.
         film = self.sensor.film
         n_field = is_odd.size
         direction = np.angle(position)  # from the centre of the film to the press, rad

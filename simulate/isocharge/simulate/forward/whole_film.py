@@ -75,7 +75,7 @@ def whole_film_map(
     settings = SolveSettings(resolution=COARSE_RESOLUTION)
     min_force, max_force = force_range
     domain = Domain(outermost_distance(sensor.film, probe.under(max_force)), force_range)
-    n_force = 2 + math.ceil(math.log(max_force / min_force))  # a taut film needs more than one for each factor of e
+    n_force = 2 + math.ceil(math.log(max_force / min_force))  # for a taut film, one for each factor of e is too few
     count = NodeCount(COARSE_DISTANCES, n_force)
     forward_map = ForwardMap.build_unchecked(sensor, probe, domain, count, settings, executor=executor)
     return replace(forward_map, error=COARSE_ERROR)

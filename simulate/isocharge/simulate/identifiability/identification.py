@@ -82,9 +82,10 @@ class LimitMap:
 
         The weight of a position is the area that it represents. Errors of the force are in percent of the force.
         """
-        # The area that a position represents is proportional to its distance from the centre, and therefore to the
-        # number of its ring. The outermost ring represents half as much, because it is the edge of the disk. In the
-        # median, an error is repeated according to its area, so the areas are integers in an arbitrary unit.
+        # Each position represents a part of a strip around its ring. All strips are as wide as the distance between the
+        # rings, so their areas are proportional to the radii and to the numbers 1, 2, ... of the rings. Half of the
+        # strip of the outermost ring lies outside the disk. In the median, an error is repeated according to its area,
+        # so the areas are integers in an arbitrary unit: twice the number of the ring, and once for the outermost ring.
         n_ring, n_angle = self.position.shape
         ring_area = np.append(2 * np.arange(1, n_ring), n_ring)
         area = np.repeat(ring_area, n_angle)  # of each position, shape (n_ring * n_angle,)
@@ -147,7 +148,8 @@ class Identification:
         """
         charges = ChargeSpline.of(forward_map)
 
-        # The limits are computed for the smallest and the largest force, and for 1 N if 1 N lies between both.
+        # The limits are computed for the smallest and the largest force, and for 1 N if 1 N lies between both. If it
+        # does not, the middle force equals one of the other forces, which the set contains only once.
         min_force, max_force = charges.domain.force_range
         middle_force = min(max(min_force, 1.0), max_force)
         forces = sorted({min_force, middle_force, max_force})

@@ -339,8 +339,9 @@ def _unit_candidates(count: int) -> tuple[Array, Booleans]:
     """
     radius_sample, angle_sample, force_sample = scipy.stats.qmc.Sobol(3, scramble=False).random(count).T
     radius = np.sqrt(radius_sample)  # uniform over the area of the disk
-    # The first quarter of the sequence is evenly distributed. In contrast, every fourth point has a small radius.
-    radius[: count // 4] = 1.0  # on the edge
+    # Move the first quarter of the points onto the edge. The beginning of a Sobol sequence is itself evenly
+    # distributed, so the points on the edge have evenly distributed angles and forces.
+    radius[: count // 4] = 1.0
     angle = math.tau * angle_sample
     position = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
     log_force = 2.0 * force_sample - 1.0  # from the interval [0, 1] to [-1, 1]

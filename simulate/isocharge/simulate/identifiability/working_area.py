@@ -96,7 +96,8 @@ def _reverses_orientation(charge_map: ChargeMap, pairs: Array, force: float, noi
     """Return whether a charge map reverses its orientation between the two positions of each pair.
 
     Let J1 and J2 be the derivatives of the charges at the two positions, divided by the noise of the charges. The
-    orientation is reversed if det(J1' J2) is negative.
+    orientation is reversed if det(J1' J2) is negative. With three electrodes, this is the product of both determinants,
+    which have different signs. With more electrodes, J1 and J2 are not square and have no determinants.
 
     Args:
         charge_map: Map that computes the charges of contacts.

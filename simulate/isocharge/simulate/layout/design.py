@@ -90,9 +90,12 @@ def random_layouts(case: DesignCase) -> list[Array]:
     Raises:
         InputError: If the squares do not fit.
     """
+    # Squares far outside the presses are of little use. They are only allowed if the squares do not fit otherwise.
     useful_radius = case.radius + EXTENT * case.sensor.film.radius
     allowed_radius = case.sensor.film.inner_radius - RIM_DISTANCE - 0.5 * case.square_side
-    layouts = _layouts_within(min(useful_radius, allowed_radius), case) or _layouts_within(allowed_radius, case)
+    layouts = _layouts_within(min(useful_radius, allowed_radius), case)
+    if not layouts:
+        layouts = _layouts_within(allowed_radius, case)
     if not layouts:
         raise InputError(
             f"found no layout of {case.new_count} new squares of {case.square_side:g} mm within "
@@ -196,10 +199,12 @@ class Search:
         if self.case.goal != "worst":
             return Layout(best_positions, math.sqrt(np.mean(best_errors**2)))
         for round_number in range(1, ROUNDS + 1):
-            # Minimise the errors of the search presses, and of as many presses with the largest errors.
+            # Minimise the errors of the search presses, and of as many presses with the largest errors. The power mean
+            # of the errors approaches the largest error if the power increases from round to round.
             worst = np.argsort(-best_errors)[: len(self.case.search_presses)]
             presses = np.concatenate([self.case.search_presses, self.case.fine_presses[worst]])
-            positions = self.minimise(presses, best_positions, POWER * 2.0**round_number).positions
+            power = POWER * 2.0**round_number
+            positions = self.minimise(presses, best_positions, power).positions
             errors = self.errors(positions)
             if errors.max() < best_errors.max():
                 best_positions = positions

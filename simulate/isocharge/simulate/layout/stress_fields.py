@@ -126,7 +126,9 @@ def electrode_charges(density: ChargeDensity, electrodes: Sequence[Electrode]) -
     if not electrodes:
         return np.empty((density.position.size, 0, len(COLUMNS)))
     charges = density.integrate(ElectrodePieces.covering(electrodes))
-    # Rotate the derivatives along and across the direction of each press into derivatives with respect to x and y.
+
+    # In the frame of the press, the columns x and y contain the derivatives along and across the direction of the
+    # press. Rotate these two components of the gradient, as complex numbers, into the axes of the film.
     x_column = COLUMNS.index("x")
     y_column = COLUMNS.index("y")
     along_and_across = charges[..., x_column] + 1j * charges[..., y_column]

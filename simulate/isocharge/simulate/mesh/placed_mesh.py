@@ -156,8 +156,9 @@ class PlacedMesh:
         if is_folded:
             return np.inf
 
-        # The rim of the film lies at the distance 1 + e cos(angle) from the centre, where e is the magnitude of `oval`.
-        # The areas are in squared film radii.
+        # In film radii, the rim lies at the distance 1 + e cos(2 t) from the centre, where e is the magnitude of
+        # `oval`, and t is the angle from its longer axis. The area is the integral of half of the squared distance over
+        # all angles, which is pi (1 + e^2 / 2), because the mean of cos(2 t)^2 is one half.
         film_area = np.pi * (1.0 + 0.5 * abs(self.placement.oval) ** 2)
         mesh_area = self.template.copies * self.weights.sum()
         return math.sqrt(abs(mesh_area / film_area - 1.0))

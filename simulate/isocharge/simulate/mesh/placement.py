@@ -266,7 +266,10 @@ class Placement:
             Points x + iy of the circular film, shape (n_inner, (order + 1)^2), in film radii.
         """
         radial, angular = _unit_coordinates(blocks)
-        placement_of_element = self[None][np.zeros(blocks.n_inner, dtype=np.intp)]  # this placement for each element
+
+        # `sides` expects one placement for each element. Add an axis of length one to this placement, and select its
+        # only entry, which has the index 0, once for each element.
+        placement_of_element = self[None][np.zeros(blocks.n_inner, dtype=np.intp)]
         inner, outer = placement_of_element.sides(blocks, np.arange(blocks.n_inner), angular[None])
         points: Complexes = _interpolate(inner, outer, radial)
         return points

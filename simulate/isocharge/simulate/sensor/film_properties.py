@@ -138,60 +138,61 @@ def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> t
     Raises:
         SensorError: If no such sensor can exist, for example because an electrode lies over the rim.
     """
-    # A missing value is 0, which changes nothing.
-    value = defaultdict(float, {PRETENSION.name: sensor.film.pretension, **values})
-    film = _changed_mechanics(sensor.film, value)
+    # Use the value 0, which changes nothing, for properties without a value, and keep the pretension if it has no
+    # value.
+    value_of = defaultdict(float, {PRETENSION.name: sensor.film.pretension, **values})
+    film = _changed_mechanics(sensor.film, value_of)
     piezo = replace(
         sensor.piezo,
-        d31=sensor.piezo.d31 * math.exp(value["d31"]),
-        d32=sensor.piezo.d32 * math.exp(value["d32"]),
-        d12=sensor.piezo.d12 + value["d12"],
+        d31=sensor.piezo.d31 * math.exp(value_of["d31"]),
+        d32=sensor.piezo.d32 * math.exp(value_of["d32"]),
+        d12=sensor.piezo.d12 + value_of["d12"],
     )
 
     # Change the gains and the positions of the electrodes.
     described = sensor.calibration
     gain = dict(described.gain)
     for name in sensor.electrode_names:
-        log_factor = value[f"gain {name}"]
+        log_factor = value_of[f"gain {name}"]
         if log_factor:
             gain[name] = gain.get(name, 1.0) * math.exp(log_factor)
     shift_x, shift_y = described.shift
     calibration = Calibration(
         gain=gain,
-        shift=(shift_x + value["shift_x"], shift_y + value["shift_y"]),
-        rotation=described.rotation + value["rotation"],
-        crosstalk=described.crosstalk + value["crosstalk"],
+        shift=(shift_x + value_of["shift_x"], shift_y + value_of["shift_y"]),
+        rotation=described.rotation + value_of["rotation"],
+        crosstalk=described.crosstalk + value_of["crosstalk"],
     )
     changed_sensor = replace(sensor, film=film, piezo=piezo, calibration=calibration)
     if isinstance(probe, Circle):
-        probe = replace(probe, radius=probe.radius + value["probe_radius"])
+        probe = replace(probe, radius=probe.radius + value_of["probe_radius"])
     return changed_sensor, probe
 
 
-def _changed_mechanics(film: Film, value: Mapping[str, float]) -> Film:
+def _changed_mechanics(film: Film, value_of: Mapping[str, float]) -> Film:
     """Return a film with changed mechanical properties.
 
     Args:
         film: Film that is changed.
-        value: Value of each property by its name. The value of the pretension is the new pretension. Any other value is
-            a change: a number that is added, or the logarithm of a factor.
+        value_of: Value of each property by its name. The value of the pretension is the new pretension. Any other value
+            is a change: a number that is added, or the logarithm of a factor.
     """
-    pretension = value[PRETENSION.name]
+    pretension = value_of[PRETENSION.name]
     difference, shear = film.deviator
-    stiffness_change = complex(value["stiffness_x"], value["stiffness_xy"])
+    stiffness_change = complex(value_of["stiffness_x"], value_of["stiffness_xy"])
     log_ratio, axis = add_axial(math.log(film.young_ratio), film.axis, stiffness_change)
-    oval_change = complex(value["oval_x"], value["oval_xy"])
+    oval_change = complex(value_of["oval_x"], value_of["oval_xy"])
     oval, oval_axis = add_axial(film.oval, film.oval_axis, oval_change)
     return replace(
         film,
         pretension=pretension,
-        young=film.young * math.exp(value["young"]),
-        thickness=film.thickness * math.exp(value["thickness"]),
+        young=film.young * math.exp(value_of["young"]),
+        thickness=film.thickness * math.exp(value_of["thickness"]),
         deviator=(
-            difference + value["tension_difference"] * pretension,
-            shear + value["tension_shear"] * pretension,
+            difference + value_of["tension_difference"] * pretension,
+            shear + value_of["tension_shear"] * pretension,
         ),
-        shear=None if film.shear is None else film.shear * math.exp(value["young"]),
+        shear=None if film.shear is None else film.shear * math.exp(value_of["young"]),
         young_ratio=math.exp(log_ratio),
         axis=axis,
         oval=oval,
