@@ -242,11 +242,11 @@ def _largest_deviation(estimation: Estimation) -> float:
 def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
     """Return whether first-order changes of a solved film give the charges of a film with given properties accurately.
 
-    The solved film may lack imperfections, and its probe may be round although the real probe is not. First-order
-    changes are accurate enough if the second-order effects of the missing imperfections on the charges are small. The
-    second-order effect is about the square of the first-order effect. An uneven tension has a further second-order
-    effect, although its first-order effect is small: if u is its ratio to the mean tension, the film behaves as if the
-    mean tension were smaller by up to u^2 / 2 of itself.
+    The solved film may lack imperfections, of which only the first-order effects on the charges are then known. They
+    are accurate enough if the second-order effects are small. A second-order effect is about the square of the
+    first-order effect. An uneven tension has a further second-order effect, although its first-order effect is small:
+    if u is its ratio to the mean tension, the film behaves as if the mean tension were smaller by up to u^2 / 2 of
+    itself. If the solved probe or the solved material lacks a property, even the first-order effect is unknown.
 
     Args:
         charges: The solved film, with its charges and their derivatives.
@@ -254,18 +254,22 @@ def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
         contact: Contacts at which the effects are computed, shape (n, 3).
     """
     solved, prior = charges.film, charges.prior
-    if solved.probe.is_axisymmetric != prior.probe.is_axisymmetric:
+    if solved.probe.is_axisymmetric != prior.probe.is_axisymmetric:  # a circle was solved instead of the real probe
         return False
-    if solved.sensor.film.shear != prior.sensor.film.shear:
+    if solved.sensor.film.shear != prior.sensor.film.shear:  # a film without the described shear modulus was solved
         return False
+
+    # Compute the first-order effect of the imperfections that the solved film lacks, relative to the charges. Only
+    # imperfections that change the stress can be missing. The effects of all other imperfections are exact.
     charge, _, jacobian = charges.linearised(values, contact)
     charge_size = np.linalg.norm(charge)
-    # Imperfections that change the stress may be missing in the solved film. The effects of all others are exact.
-    may_be_missing = prior.is_imperfection & prior.changes_stress
-    missing = np.where(may_be_missing, values - charges.values, 0.0)  # by how much each property is missing
+    can_be_missing = prior.is_imperfection & prior.changes_stress
+    missing = np.where(can_be_missing, values - charges.values, 0.0)  # missing part of each property
     first_order_effect = np.linalg.norm(jacobian @ missing) / charge_size
+
+    # Compute the further effect of an uneven tension: that of the decrease of the mean tension by u^2 / 2 of itself.
     tension_index = prior.index(PRETENSION.name)
-    missing_tensions = missing[np.isin(prior.names, UNEVEN_TENSIONS)]  # relative to the mean tension
+    missing_tensions = missing[np.isin(prior.names, UNEVEN_TENSIONS)]  # components of u
     lost_tension_MPa = 0.5 * values[tension_index] * (missing_tensions**2).sum()
     tension_effect = lost_tension_MPa * np.linalg.norm(jacobian[:, :, tension_index]) / charge_size
     return bool(first_order_effect**2 + tension_effect < MAX_NEGLECTED_EFFECT)

@@ -66,7 +66,10 @@ SEED = 3
 def compact_charges(
     domain: Domain, charges: FilmCharges, film: FilmEstimate, executor: Executor | None
 ) -> ChargeSeries:
-    """Compute the compact charge map of an estimated film.
+    """Compute the compact charge map of an estimated film: series that are fitted to charges of random contacts.
+
+    The charges of changed films and the effects of the directions take longer to compute, so they are computed only
+    for the first contacts. These also cover the domain, because the contacts are in random order.
 
     Args:
         domain: Contacts for which the map is needed.
@@ -74,8 +77,9 @@ def compact_charges(
         film: The estimate, with the noise of the charges, which decides how many directions are needed.
         executor: Executor that solves the films at the nodes; None for this process.
     """
-    # Solve the films at the nodes. With three electrodes, the charges only determine the contact, so that a change of
-    # the pretension cannot be followed, and the calibrated film is the only node.
+    # Solve the films at the nodes, which differ from the calibrated film in the pretension. Three charges only
+    # determine the contact, and show no change of the pretension. With three electrodes, the calibrated film is the
+    # only node.
     electrodes = charges.prior.sensor.electrode_names
     calibrated = _ChangedFilm(0.0, charges, film.film_values, np.eye(film.film_values.size))
     films = [calibrated]
@@ -83,22 +87,24 @@ def compact_charges(
         films = [calibrated.changed(change_MPa, executor) for change_MPa in _nodes(film)]
     node_MPa = np.array([node_film.change_MPa for node_film in films])
 
-    # Compute the charges of all contacts on the calibrated film, and of the first contacts on the other films.
+    # Compute the charges of all contacts on the calibrated film, and those of the first contacts at all nodes.
     contact = draw_contacts(np.random.default_rng(SEED), domain, SERIES_CONTACTS)
     first_contacts = contact[:CHANGE_CONTACTS]
     node_jobs = [partial(node_film.charge, first_contacts) for node_film in films]
-    film_charge, *changed_charges = in_order(executor, call, [partial(calibrated.charge, contact), *node_jobs])
+    film_charge, *first_charges = in_order(executor, call, [partial(calibrated.charge, contact), *node_jobs])
     discrepancy = discrepancy_jacobian(film_charge, contact, charges.domain) @ film.values[film.layout.coefficients]
     charge = film_charge + discrepancy  # most probable charges without offset, shape (n, n_electrode)
 
-    # Fit series to the charges at the nodes, and to the effects of the directions.
-    node_charge = _node_charges(domain.to_unit(contact), charge[:, None], np.stack(changed_charges, axis=1), node_MPa)
-    series = _fit_followable_nodes(domain, electrodes, contact, node_charge, node_MPa)
+    # Fit series to the charges at the nodes. This may leave out nodes.
+    node_charge = _node_charges(domain.to_unit(contact), charge, np.stack(first_charges, axis=1), node_MPa)
+    series = _fit_accurate_nodes(domain, electrodes, contact, node_charge, node_MPa)
+
+    # Fit series to the effects of the directions, at the remaining nodes.
+    remaining_films = [node_film for node_film in films if node_film.change_MPa in series.node_MPa]
     few_contacts, few_charges = contact[:DIRECTION_CONTACTS], charge[:DIRECTION_CONTACTS]
-    followed_films = [node_film for node_film in films if node_film.change_MPa in series.node_MPa]
     return replace(
         series,
-        directions=_directions(series, film, calibrated, followed_films, few_contacts, few_charges, executor),
+        directions=_directions(series, film, calibrated, remaining_films, few_contacts, few_charges, executor),
         # A film is at most as well described as its charges can be measured.
         charge_std=max(series.charge_std, film.noise.gain),
         offset_pC=film.value("offset"),
@@ -116,20 +122,20 @@ class _ChangedFilm:
         charges: Charges of a solved film and of similar films. For the calibrated film, it is the film that the
             calibration has solved. For a changed film, it is axisymmetric.
         values: Properties of the changed film, shape (n_property,).
-        by_calibrated: Derivatives of the properties with respect to those of the calibrated film, shape (n_property,
-            n_property).
+        value_jacobian: Derivatives of `values` with respect to the properties of the calibrated film, shape
+            (n_property, n_property).
     """
 
     change_MPa: float
     charges: FilmCharges
     values: Array
-    by_calibrated: Array
+    value_jacobian: Array
 
     def changed(self, change_MPa: float, executor: Executor | None) -> "_ChangedFilm":
-        """Solve the axisymmetric film with another pretension than this calibrated film.
+        """Solve the axisymmetric film whose pretension differs from that of this calibrated film.
 
-        Without a change, the axisymmetric film that the calibration has solved is used. Its properties hardly differ
-        from those of the estimate.
+        If the change is zero, nothing is solved: the calibration has already solved an axisymmetric film whose
+        properties hardly differ from those of this film.
 
         Args:
             change_MPa: Change of the pretension, MPa.
@@ -138,25 +144,28 @@ class _ChangedFilm:
         prior = self.charges.prior
         tension_index = prior.index(PRETENSION.name)
         uneven_indices = [prior.index(name) for name in UNEVEN_TENSIONS]
+
+        # The change D increases the mean tension from T to T + D. It does not change the uneven parts of the tension in
+        # MPa. The values contain the uneven parts as shares of the mean tension, so a share s becomes s T / (T + D).
         values = self.values.copy()
         values[tension_index] += change_MPa
-
-        # The values contain the uneven parts of the tension as shares of the mean tension. In MPa, they do not change.
-        # If T is the mean tension before the change D, a share s becomes s T / (T + D). A film without tension has no
-        # shares. The smallest tension then avoids a division by zero.
-        tension_MPa = max(float(values[tension_index]), 1e-9)  # T + D
-        share_ratio = self.values[tension_index] / tension_MPa
+        changed_tension_MPa = max(float(values[tension_index]), 1e-9)  # T + D; positive, to avoid a division by zero
+        share_ratio = self.values[tension_index] / changed_tension_MPa  # T / (T + D)
         values[uneven_indices] *= share_ratio
 
-        # The derivatives of s T / (T + D) are T / (T + D) with respect to s, and s D / (T + D)^2 with respect to T.
-        by_calibrated = np.eye(values.size)
-        by_calibrated[uneven_indices, uneven_indices] = share_ratio
-        by_calibrated[uneven_indices, tension_index] = self.values[uneven_indices] * change_MPa / tension_MPa**2
+        # Each row contains the derivatives of one value. A changed share s T / (T + D) has the derivatives T / (T + D)
+        # with respect to s, and s D / (T + D)^2 with respect to T. The other values have the derivative 1 with respect
+        # to themselves.
+        value_jacobian = np.eye(values.size)
+        value_jacobian[uneven_indices, uneven_indices] = share_ratio
+        value_jacobian[uneven_indices, tension_index] = (
+            self.values[uneven_indices] * change_MPa / changed_tension_MPa**2
+        )
 
         even_charges = self.charges.even
         if change_MPa != 0.0:
             even_charges = FilmCharges.of_even_film(prior, values, self.charges.domain, executor)
-        return _ChangedFilm(change_MPa, even_charges, values, by_calibrated)
+        return _ChangedFilm(change_MPa, even_charges, values, value_jacobian)
 
     def charge(self, contact: Array) -> Array:
         """Compute the charges of contacts on this film, shape (n, n_electrode), pC."""
@@ -174,19 +183,21 @@ class _ChangedFilm:
             Charges, shape (n, n_electrode), pC, and derivatives, shape (n, n_electrode, n_unknown), pC per unit.
         """
         charge, _, by_changed_property = self.charges.linearised(self.values, contact)
-        by_property = by_changed_property @ self.by_calibrated  # chain rule
+        by_property = by_changed_property @ self.value_jacobian  # chain rule
         by_offset = np.ones((*charge.shape, 1))
         by_coefficient = discrepancy_jacobian(charge, contact, self.charges.domain)
         return charge, np.concatenate([by_property, by_offset, by_coefficient], axis=2)
 
 
-def _fit_followable_nodes(
+def _fit_accurate_nodes(
     domain: Domain, electrodes: tuple[str, ...], contact: Array, charge: Array, node_MPa: Array
 ) -> ChargeSeries:
-    """Fit the charges at the nodes, and leave out outermost nodes until the relative error is small enough.
+    """Fit a series to the charges at the nodes, and leave out the nodes at which the charges are not accurate.
 
-    At a distant node, the imperfections may nearly cancel a charge. Their first-order effect is then not accurate. A
-    warning is logged for each change of the nodes.
+    The charges contain the imperfections of the film only to first order. At a node whose pretension differs much from
+    that of the calibrated film, the imperfections may nearly cancel a charge, so that its relative error is large. A
+    smooth series does not fit such charges. If the series has a large error, the nodes with the largest change of the
+    pretension are left out, a warning is logged, and the remaining nodes are fitted again.
 
     Args:
         domain: Contacts for which the series is needed.
@@ -206,7 +217,7 @@ def _fit_followable_nodes(
         remaining_MPa[0],
         remaining_MPa[-1],
     )
-    return _fit_followable_nodes(domain, electrodes, contact, charge[:, is_nearer], remaining_MPa)
+    return _fit_accurate_nodes(domain, electrodes, contact, charge[:, is_nearer], remaining_MPa)
 
 
 def _nodes(film: FilmEstimate) -> Array:
@@ -219,40 +230,46 @@ def _nodes(film: FilmEstimate) -> Array:
     return np.unique(np.maximum(NODES_MPa, lowest_MPa))
 
 
-def _node_charges(unit_contact: Array, charge: Array, changed_charge: Array, node_MPa: Array) -> Array:
+def _node_charges(unit_contact: Array, charge: Array, first_charge: Array, node_MPa: Array) -> Array:
     """Compute the charges of the calibrated film at the nodes from those of axisymmetric films.
 
-    The relative change of the charges from the pretension of the calibration to each node is a smooth function of the
-    contact, and hardly depends on the neglected properties of the film. Only the changes of the first contacts are
-    given. A series that is fitted to them states the changes of the other contacts.
+    The charges of an axisymmetric film change by a certain ratio if its pretension changes from that of the calibration
+    to that of a node. The charges of the calibrated film change by about the same ratio, although this film is not
+    axisymmetric. The ratio is a smooth function of the contact. It is known for the first contacts, and a series that
+    is fitted to them gives the ratios of the other contacts.
 
     If all charges have the same sign, the change is relative to the charge itself. Otherwise, some charges are nearly
     zero, and the change is relative to the root of the sum of the squared charges of all electrodes.
 
     Args:
         unit_contact: Contacts in unit coordinates, shape (n, 3).
-        charge: Their charges on the calibrated film, shape (n, 1, n_electrode), pC.
-        changed_charge: Charges of the first contacts on the axisymmetric films at the nodes, shape (n_first, n_node,
+        charge: Their charges on the calibrated film, shape (n, n_electrode), pC.
+        first_charge: Charges of the first contacts on the axisymmetric films at the nodes, shape (n_first, n_node,
             n_electrode), pC.
         node_MPa: Changes of the pretension, one of which is zero, shape (n_node,), MPa.
 
     Returns:
         Charges, shape (n, n_node, n_electrode), pC.
     """
-    has_one_sign = np.ptp(np.sign(changed_charge)) == 0.0
+    has_one_sign = np.ptp(np.sign(first_charge)) == 0.0
 
     def change_unit(film_charge: Array) -> Array:
-        """Return the charges to which the changes of given charges are relative."""
+        """Return the charges to which the changes of given charges, shape (n, 1, n_electrode), are relative."""
         return film_charge if has_one_sign else np.linalg.norm(film_charge, axis=2, keepdims=True)
 
-    charge_before = changed_charge[:, node_MPa == 0.0]
-    changes = (changed_charge - charge_before) / change_unit(charge_before)  # shape (n_first, n_node, n_electrode)
-    n_first, n_node, n_electrode = changes.shape
+    # Compute the relative changes of the charges of the first contacts, shape (n_first, n_node, n_electrode).
+    first_charge_before = first_charge[:, node_MPa == 0.0]  # shape (n_first, 1, n_electrode)
+    first_changes = (first_charge - first_charge_before) / change_unit(first_charge_before)
+
+    # Fit a series with one value for each node and electrode. Evaluate it for the other contacts, which do not exceed
+    # its range (second argument), and keep the values without the derivatives (index 0).
+    n_first, n_node, n_electrode = first_charge.shape
     first_contact, other_contact = np.split(unit_contact, [n_first])
-    series = Series(fit_series(first_contact, changes.reshape(n_first, n_node * n_electrode), *CHANGE_DEGREES))
+    series = Series(fit_series(first_contact, first_changes.reshape(n_first, -1), *CHANGE_DEGREES))
     other_changes = series.values_and_derivatives(other_contact, np.zeros_like(other_contact))[:, 0]
-    all_changes = np.concatenate([changes, other_changes.reshape(-1, n_node, n_electrode)])
-    return charge + all_changes * change_unit(charge)
+    all_changes = np.concatenate([first_changes, other_changes.reshape(-1, n_node, n_electrode)])
+    charge_before = charge[:, None]  # shape (n, 1, n_electrode)
+    return charge_before + all_changes * change_unit(charge_before)
 
 
 def _directions(
@@ -264,16 +281,15 @@ def _directions(
     charge: Array,
     executor: Executor | None,
 ) -> Array:
-    """Fit polynomials to the effects of the directions in which the charges of the film are uncertain.
+    """Find the directions in which the charges of the film are uncertain, and fit series to their effects.
 
-    A direction is a linear combination of the unknowns. The combinations are chosen so that their effects on the
-    charges are uncorrelated, and those with effects below `MIN_DIRECTION` are left out. The effects are considered at
-    the pretension of the calibration and at the two nodes beside it, because a combination may change the charges only
-    at another pretension.
+    A direction is a linear combination of the unknowns of the film. The directions are chosen so that their effects on
+    the charges are uncorrelated, and directions with effects below `MIN_DIRECTION` are left out. The effects are
+    considered at the pretension of the calibration and at the two nodes beside it, because a direction may change the
+    charges only at another pretension.
 
-    A charge map contains values v instead of charges. If v is the logarithm of the charge, a small change of the charge
-    divided by the charge is the change of v. Otherwise, v is the charge divided by the typical size of the charges at
-    the same force.
+    A charge map contains values v instead of charges Q. If all charges are positive, v is ln Q. Otherwise, v is Q / S,
+    where S is the typical size of the charges at the same force. An effect is a change of v.
 
     Args:
         series: Map of the charges without directions.
@@ -287,15 +303,21 @@ def _directions(
     Returns:
         Coefficients, as in `ChargeSeries.directions`.
     """
-    # The typical size of the charges, shape (n, 1), pC; None if the values are logarithms
     unit_contact = series.domain.to_unit(contact)
-    size = None if series.log_size is None else series_size(series.log_size, unit_contact[:, 2])[0]
+    size = None  # the typical size S of the charges, shape (n, 1), pC; None if the values are ln Q
+    charge_per_value = charge  # dQ / dv = Q for the values ln Q
+    if series.log_size is not None:
+        size, _ = series_size(series.log_size, unit_contact[:, 2])
+        charge_per_value = size  # dQ / dv = S for the values Q / S
 
-    # Compute the changes of the values on the calibrated film, and their derivatives with respect to the pretension
-    # from the nodes beside it. A series with one node has no neighbours.
+    # Find the films at the nodes below and above the calibrated film. At an end of the nodes, there is no neighbour,
+    # and the node of the calibrated film takes its place.
     middle = [node_film.change_MPa for node_film in films].index(0.0)
     lower = films[max(middle - 1, 0)]
     upper = films[min(middle + 1, len(films) - 1)]
+
+    # Compute the changes of the values on the calibrated film, and the derivatives of these changes with respect to the
+    # pretension, which are difference quotients.
     examined_films = [calibrated] if lower is upper else [calibrated, lower, upper]
     changes, *neighbour_changes = _value_changes(examined_films, film, contact, size, executor)
     slopes = np.zeros_like(changes)  # 1/MPa
@@ -303,18 +325,23 @@ def _directions(
         lower_changes, upper_changes = neighbour_changes
         slopes = (upper_changes - lower_changes) / (upper.change_MPa - lower.change_MPa)
 
-    # Rotate the directions so that their effects are uncorrelated in units of the noise, and keep the large ones.
-    noise_stds_per_value = ((charge if size is None else size) / film.noise.sigma(charge))[:, :, None]
+    # Compute the effects of the unknowns on the charges of the three films, in standard deviations of the noise.
+    noise_stds_per_value = (charge_per_value / film.noise.sigma(charge))[:, :, None]
     effects_at_films = [
         noise_stds_per_value * (changes + one.change_MPa * slopes) for one in (lower, calibrated, upper)
     ]
+
+    # Find the directions with uncorrelated effects by a singular value decomposition. There is one row for each film,
+    # contact and electrode. A singular value is the root-mean-square effect of a direction, times the root of the
+    # number of rows.
     *_, n_unknown = changes.shape
     all_effects = np.stack(effects_at_films).reshape(-1, n_unknown)
-    _, singular_values, rotation = np.linalg.svd(all_effects, full_matrices=False)
-    directions = rotation[singular_values > MIN_DIRECTION * np.sqrt(len(all_effects))]  # shape (n_direction, n_unknown)
+    _, singular_values, all_directions = np.linalg.svd(all_effects, full_matrices=False)
+    smallest_singular_value = MIN_DIRECTION * np.sqrt(len(all_effects))
+    directions = all_directions[singular_values > smallest_singular_value]  # shape (n_direction, n_unknown)
 
-    # Fit a series to the change and the slope of each direction. The axes of the effects are the contact, change or
-    # slope, direction and electrode. The series has three axes for the degrees in place of the first one.
+    # Fit a series to the change and to the slope of each direction, which are side by side: shape (n, 2, n_direction,
+    # n_electrode). In the coefficients, three axes for the degrees take the place of the axis of the contacts.
     effects = np.stack([changes @ directions.T, slopes @ directions.T], axis=1).swapaxes(2, 3)
     coefficients = fit_series(unit_contact, effects.reshape(len(contact), -1), *DIRECTION_DEGREES)
     *degree_axes, _ = coefficients.shape
@@ -326,30 +353,32 @@ def _value_changes(
 ) -> list[Array]:
     """Compute the changes of the values v of a charge map that the uncertainty of the unknowns causes.
 
-    The unknowns are replaced by uncorrelated linear combinations of them, with the standard deviation 1. The changes
-    are those by one standard deviation of each combination.
+    The unknowns are correlated. They are replaced by the same number of linear combinations that are uncorrelated and
+    have the standard deviation 1. The function returns the changes by one standard deviation of each combination.
 
     Args:
         films: Films whose charges are changed.
         film: The estimate of the calibrated film, with the covariance of the unknowns.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        size: Charges by which the values are multiplied to get charges, shape (n, 1), pC; None if the values are
-            logarithms.
+        size: Typical size S of the charges if the values are Q / S, shape (n, 1), pC; None if the values are ln Q.
         executor: Executor that computes the charges of the films; None for this process.
 
     Returns:
         Changes for each film, shape (n, n_electrode, n_unknown).
     """
+    # The columns of the root contain the changes of the unknowns by one standard deviation of each combination. The
+    # unknowns are those of `_ChangedFilm.linearised`.
     unknowns = np.r_[film.layout.film, film.layout.index("offset"), film.layout.coefficients]
     eigenvalues, vectors = np.linalg.eigh(film.covariance[np.ix_(unknowns, unknowns)])
     covariance_root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
 
     halves = np.array_split(contact, 2)  # two workers share each film
     jobs = [partial(one.linearised, half) for one in films for half in halves]
-    results = in_order(executor, call, jobs)  # an iterator, from which each step of the loop takes two results
+    results = in_order(executor, call, jobs)  # an iterator over pairs (charges, derivatives)
     changes = []
-    for first, second in zip(results, results, strict=True):  # the two halves of one film follow one another
-        film_charge, jacobian = map(np.concatenate, zip(first, second, strict=True))
-        charge_per_value = np.maximum(film_charge, LOWEST_CHARGE) if size is None else size
+    # The results of the two halves of a film follow one another, and each step takes both from the same iterator.
+    for first_half, second_half in zip(results, results, strict=True):
+        film_charge, jacobian = map(np.concatenate, zip(first_half, second_half, strict=True))
+        charge_per_value = np.maximum(film_charge, LOWEST_CHARGE) if size is None else size  # dQ / dv
         changes.append((jacobian / charge_per_value[:, :, None]) @ covariance_root)
     return changes

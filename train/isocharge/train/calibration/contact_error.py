@@ -86,15 +86,16 @@ class ContactSensitivity:
             charges: Charges of a film and of similar films.
             domain: The working area.
         """
-        # The equations are those of the module, with J and A in standard deviations of the noise, so that W = 1.
+        # Compute the matrices J, A, P and G, which the docstring of the module defines. The derivatives J and A are
+        # divided by the standard deviations of the noise, so that its inverse covariance W is the identity matrix.
         linearised = _linearise_at(film, charges, spread_contacts(domain))
         slopes = linearised.contact_jacobian  # J for each contact, shape (n, n_row, 3)
-        transposed_slopes = slopes.swapaxes(1, 2)
+        transposed_slopes = slopes.swapaxes(1, 2)  # J'
         # A contact that may lie anywhere in the domain has unit coordinates that are uniformly distributed from -1 to
         # 1, with the variance 1/3.
         domain_precision = np.diag(3.0 / domain.scale**2)  # P
         noise_covariance = np.linalg.inv(transposed_slopes @ slopes + domain_precision)
-        film_gain = noise_covariance @ transposed_slopes @ linearised.jacobian  # G
+        film_gain = noise_covariance @ transposed_slopes @ linearised.jacobian  # G; the last matrix is A
         # The charges of a later contact do not depend on the offset of the forces that the load cell stated.
         film_gain[:, :, film.layout.index("force_offset")] = 0.0
         return cls(film_gain, np.asarray(noise_covariance))
@@ -152,8 +153,8 @@ def next_presses(
 ) -> list[ProposedPress]:
     """Propose the presses that reduce the errors of later contacts most.
 
-    The presses are chosen one after the other. Each of them is the candidate that most reduces the sum of the squared
-    errors of later contacts after the presses before it.
+    The errors are those that the uncertainty of the film causes. The presses are chosen one after the other from a list
+    of candidates. Each of them most reduces the sum of the squared errors that remains after the presses before it.
 
     Args:
         problem: The calibration problem.
@@ -170,24 +171,28 @@ def next_presses(
     covariance = film.covariance
     candidates = _candidates(problem)
     contact_std = (position_std_mm, position_std_mm, force_std)
-    # Derivatives H of the residuals of each candidate with respect to the unknowns, shape (n, n_electrode, n_unknown)
+    # Derivatives H of the residuals of each candidate with respect to the unknowns, shape (n, n_electrode, n_unknown).
+    # The residuals have the variance 1.
     _, jacobian = _linearise_at(film, charges, candidates, contact_std).eliminated()
     sensitivity = ContactSensitivity.of(film, charges, problem.domain)
 
-    # Divide the errors of x, y and ln F by those that the noise causes, so that their squares can be added. If the
-    # unknowns have the covariance C, the sum of the squared errors of all contacts is the trace of G C G'. The product
-    # G' G is a sum over the contacts (n) and their coordinates (i), and has two axes of unknowns (j and k).
+    # The gain G contains the changes of x, y and ln F of later contacts by errors of the unknowns. Divide it by the
+    # errors that the noise causes, so that the squares of the three coordinates can be added. If the unknowns have the
+    # covariance C, the sum of the squared errors of all contacts is the trace of G C G', which is that of C G' G. The
+    # product G' G is a sum over the contacts (n) and their coordinates (i), and has two axes of unknowns (j and k).
     noise_std = np.sqrt(np.diagonal(sensitivity.noise_covariance, axis1=1, axis2=2).mean(axis=0))  # shape (3,)
     gain = sensitivity.film_gain / noise_std[:, None]
     squared_gain = np.einsum("nij,nik->jk", gain, gain)  # G' G, shape (n_unknown, n_unknown)
     proposed = []
     for _ in range(count):
-        # A press reduces the covariance by C H' (1 + H C H')^-1 H C (Kalman), and therefore the sum of the squared
-        # errors by the trace of (1 + H C H')^-1 H C G' G C H'.
+        # A press reduces the covariance C by C H' (1 + H C H')^-1 H C (Kalman). It therefore reduces the sum of the
+        # squared errors by the trace of (1 + H C H')^-1 H C G' G C H'. Compute this reduction for all candidates.
         cross_covariance = np.tensordot(jacobian, covariance, 1)  # H C, shape (n, n_electrode, n_unknown)
-        residual_covariance = np.eye(jacobian.shape[1]) + cross_covariance @ jacobian.swapaxes(1, 2)
-        effect = np.tensordot(cross_covariance, squared_gain, 1) @ cross_covariance.swapaxes(1, 2)
+        residual_covariance = np.eye(jacobian.shape[1]) + cross_covariance @ jacobian.swapaxes(1, 2)  # 1 + H C H'
+        effect = np.tensordot(cross_covariance, squared_gain, 1) @ cross_covariance.swapaxes(1, 2)  # H C G' G C H'
         reduction = np.trace(np.linalg.solve(residual_covariance, effect), axis1=1, axis2=2)  # shape (n,)
+
+        # Choose the best candidate, and continue with the covariance after it.
         best = int(reduction.argmax())
         best_rows = cross_covariance[best]
         covariance = covariance - best_rows.T @ np.linalg.solve(residual_covariance[best], best_rows)
@@ -236,7 +241,7 @@ def _linearise_at(
 ) -> Linearised:
     """Compute the derivatives of the residuals of planned presses on a film.
 
-    The measured charges are assumed to be those of the film, so that all residuals are zero.
+    The charges that will be measured are assumed to be those of the film, so that all residuals are zero.
 
     Args:
         film: The film and the noise of the charges.
@@ -244,11 +249,13 @@ def _linearise_at(
         contact: Contacts (x, y, F) of the presses, shape (n, 3), mm and N.
         contact_std: Standard deviations of x and y, mm, and of ln F. By default, the contacts are not measured.
     """
+    # The charges of the film depend only on the contacts and the times of the presses, so the charges and their
+    # standard deviations can be zero until they have been computed.
     log_contact = with_log_force(contact)
-    unknown_charge = np.zeros((len(contact), len(charges.prior.sensor.electrodes)))
+    no_charge = np.zeros((len(contact), len(charges.prior.sensor.electrodes)))
     without_charges = PressData(
-        charge=unknown_charge,
-        charge_std=unknown_charge,
+        charge=no_charge,
+        charge_std=no_charge,
         noise=film.noise,
         contact=log_contact,
         contact_std=np.broadcast_to(contact_std, contact.shape),

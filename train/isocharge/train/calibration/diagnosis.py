@@ -122,8 +122,10 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
     placed = presses[presses.placed]
     film_charges = expected_charges(charges, placed.contact)
-    # The typical charge of a channel may be smaller than that of the others: on some film at the known places of the
-    # presses, or because the presses of unknown places are all far from the electrode.
+    # A ratio is the typical charge of a channel, divided by that of all channels. Find the smallest ratio that a
+    # working channel may have. If all places are unknown, all presses may be far from an electrode. Otherwise, use the
+    # smallest ratio on a few films, but at most 1: a channel does not count as dead because its charges should be
+    # larger.
     smallest_usual_ratio = np.array(UNPLACED_RATIO)
     if len(placed):
         film_ratios = [_charge_ratios(film_charge) for film_charge in film_charges]
@@ -379,6 +381,7 @@ def is_one_place(presses: MeasuredPresses) -> bool:
     is_known = np.isfinite(presses.contact[:, 0])
     if not is_known.any():
         return False
-    largest_range_mm = np.ptp(presses.contact[is_known, :2], axis=0).max()
-    # One press may be much less accurate than the others, so the median of the standard deviations counts.
+    largest_range_mm = np.ptp(presses.contact[is_known, :2], axis=0).max()  # the larger of the ranges of x and y
+    # Nearly all normally distributed errors are within three standard deviations, a range of six. One press may be much
+    # less accurate than the others, so the median of the standard deviations counts.
     return bool(largest_range_mm <= 6.0 * np.median(presses.position_std_mm))

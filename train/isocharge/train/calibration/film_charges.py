@@ -51,8 +51,8 @@ class FilmCharges:
     def of_even_film(cls, prior: FilmPrior, values: Array, domain: Domain, executor: Executor | None) -> "FilmCharges":
         """Solve a film without its imperfections, and return its charges and their derivatives.
 
-        The probe is axisymmetric as well, so that few presses need to be solved. `solved` takes the charges of the film
-        with its imperfections, and keeps these derivatives.
+        The film and the probe are axisymmetric, so that few presses need to be solved. The method `solved` later
+        replaces the charges by those of the film with its imperfections, but keeps these derivatives.
 
         Args:
             prior: Declarations of the properties, with the described sensor and probe.
@@ -66,7 +66,7 @@ class FilmCharges:
         """
         even_values = prior.without_imperfections(values)
         sensor, probe = prior.film(even_values)
-        # The sensor file itself may describe a film without axial symmetry.
+        # The even values do not cancel a shear modulus of the sensor file. Make the film exactly axisymmetric.
         film = replace(sensor.film, deviator=(0.0, 0.0), young_ratio=1.0, shear=None, oval=0.0)
         slopes = FilmSlopes.build(replace(sensor, film=film), round_probe(probe), domain, executor=executor)
         return cls(prior=prior, values=even_values, film=slopes.film, slopes=slopes, even_values=even_values)
@@ -133,32 +133,35 @@ class FilmCharges:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Charges and their derivatives. The derivatives with respect to the contact are those of the solved film. The
-            properties of the film take the place of the state.
+            Charges, pC, and their derivatives with respect to the contact (x, y, ln F) and to the properties, which
+            take the place of the state. The derivatives with respect to the contact are those of the solved film.
         """
         sensor = self._sensor_with_readout(values)
         solved_charge, contact_slopes = _read(self.film, sensor).linearised(contact)
         stress_derivatives = self._stress_derivatives(sensor, contact, solved_charge, contact_slopes[:, :, 2])
         charge, factor = _add_stress_changes(solved_charge, self._property_changes(values), stress_derivatives)
 
-        # Each uneven part of the pretension is the product of a share and the pretension. The derivatives with respect
-        # to the parts become derivatives with respect to the shares, and the pretension also changes the parts.
+        # The derivatives are those of the charges with respect to the uneven parts of the pretension in MPa, but the
+        # values contain them as shares s of the pretension T. Each part is s T. By the chain rule, the derivative with
+        # respect to s is T times that with respect to the part, and s times the latter is added to that for T.
         derivatives = dict(stress_derivatives)
         for name in UNEVEN_TENSIONS:
             share = values[self.prior.index(name)]
             derivatives[PRETENSION.name] = derivatives[PRETENSION.name] + share * derivatives[name]
             derivatives[name] = values[self.prior.index(PRETENSION.name)] * derivatives[name]
 
-        # Properties of the readout: crosstalk adds a share of the charges of all other electrodes, and a gain
-        # multiplies the charge of its own electrode. The other derivatives are difference quotients.
+        # Crosstalk adds a share of the charges of all other electrodes. The values of the gains are logarithms, so the
+        # derivative with respect to a gain is the charge of its own electrode, and 0 for the other electrodes.
         derivatives["crosstalk"] = solved_charge.sum(axis=1, keepdims=True) - solved_charge
         for name, is_own in zip(sensor.electrode_names, np.eye(len(sensor.electrodes)), strict=True):
-            derivatives[f"gain {name}"] = is_own * solved_charge  # `is_own` is 1 for the electrode, and 0 for others
+            derivatives[f"gain {name}"] = is_own * solved_charge
+        # The derivatives with respect to the other properties of the readout are difference quotients.
         for declared in self.prior.properties:
             if declared.name not in derivatives:
                 derivatives[declared.name] = self._readout_derivative(sensor, declared, contact)
 
-        columns = np.stack([derivatives[name] for name in self.prior.names], axis=2)
+        # These are derivatives of the charges of the solved film. The factor makes them those of the changed charges.
+        columns = np.stack([derivatives[name] for name in self.prior.names], axis=2)  # (n, n_electrode, n_property)
         return ModelValues(charge, contact_slopes, factor[:, :, None] * columns)
 
     def _sensor_with_readout(self, values: Array) -> Sensor:
@@ -191,11 +194,10 @@ class FilmCharges:
     ) -> dict[str, Array]:
         """Compute the derivatives of charges with respect to the properties that change the stress.
 
-        The derivatives with respect to the uneven parts of the pretension are those per MPa.
-
-        The stress in units of Young's modulus E depends on E, the thickness h and the force F only through F / (E h)
-        and the tensions divided by E. The small effect of the bending is neglected here, and so is that of the radius
-        of the probe on the charges of the contact pressure (d33).
+        The values of the properties "young" and "thickness" are the logarithms of Young's modulus E and of the
+        thickness h. Their derivatives follow from the other derivatives, because the stress divided by E only depends
+        on F / (E h), where F is the force, and on the tensions divided by E. The small effect of the bending is
+        neglected here, and so is that of the radius of the probe on the charges of the contact pressure (d33).
 
         Args:
             sensor: Sensor with the electrodes and the coefficients.
@@ -204,7 +206,8 @@ class FilmCharges:
             force_slope: Derivatives of these charges with respect to ln F, of the same shape, pC.
 
         Returns:
-            Derivatives by the name of the property, each of shape (n, n_electrode), pC per unit.
+            Derivatives by the name of the property, each of shape (n, n_electrode), pC per unit. The unit of the uneven
+            parts of the pretension is MPa.
         """
         # Use the solved stresses with the electrodes and the coefficients of the given sensor.
         slopes_of_sensor = replace(
@@ -214,8 +217,10 @@ class FilmCharges:
         # The radius of the probe is only a property if the probe is a circle.
         derivatives = {name: slope for name, slope in slopes.items() if name in self.prior.names}
 
-        # Let q be a function of F / (E h) and of the tensions T / E. Then Q = E q, ln h changes Q like -ln F, and ln E
-        # changes Q by Q - dQ/d(ln F) - sum of T dQ/dT.
+        # A charge is proportional to the stress: Q = E q, where q is a function of F / (E h) and of the tensions T / E.
+        # An increase of ln h has the same effect on q as a decrease of ln F, so that dQ/d(ln h) = -dQ/d(ln F). An
+        # increase of ln E also has the effect of a decrease of ln F and of each ln T, and increases the factor E. So
+        # dQ/d(ln E) = Q - dQ/d(ln F) - sum of dQ/d(ln T), where dQ/d(ln T) = T dQ/dT.
         derivatives["thickness"] = -force_slope
         mechanics = self._mechanics(self.values)
         tension_terms = (mechanics[name] * derivatives[name] for name in (PRETENSION.name, *UNEVEN_TENSIONS))
@@ -244,8 +249,10 @@ def _add_stress_changes(
 ) -> tuple[Array, Array]:
     """Return the charges of a film whose properties differ from those of a solved film, to first order.
 
-    Only properties that change the stress count. Their effects are added to the logarithm of the magnitude of a charge,
-    unless their sum is larger than `MAX_LOG_CHANGE` times the charge. It is then added to the charge itself.
+    Only properties that change the stress count. The sum of their effects on a charge is a first-order change. Relative
+    to the charge, it is the change of the logarithm of the charge, so that the charge is multiplied by its exponential.
+    If the sum is not smaller than `MAX_LOG_CHANGE` times the charge, the exponential would be inaccurate, and the sum
+    is added to the charge itself.
 
     Args:
         solved_charge: Charges of the solved film, shape (n, n_electrode), pC.
@@ -254,17 +261,18 @@ def _add_stress_changes(
             stress, by their names, each of shape (n, n_electrode), pC per unit.
 
     Returns:
-        Charges, shape (n, n_electrode), pC, and the factors by which the derivatives of these charges differ from those
+        Charges, shape (n, n_electrode), pC, and the ratios of the derivatives of these charges to those of the charges
         of the solved film, of the same shape.
     """
     addition = np.zeros_like(solved_charge)
     for name, derivative in derivatives.items():
         addition += changes[name] * derivative
-    # The relative addition to a charge of zero is infinite.
+    # The array in `out` contains the results where the condition `where` is False: the relative addition to a charge of
+    # zero is infinite, and the factor is 1 where the sum is added to the charge.
     relative = np.divide(addition, solved_charge, out=np.full_like(addition, np.inf), where=solved_charge != 0.0)
-    is_logarithmic = np.abs(relative) < MAX_LOG_CHANGE
-    factor = np.exp(relative, out=np.ones_like(relative), where=is_logarithmic)  # 1 elsewhere
-    charge = np.where(is_logarithmic, solved_charge * factor, solved_charge + addition)
+    is_small = np.abs(relative) < MAX_LOG_CHANGE
+    factor = np.exp(relative, out=np.ones_like(relative), where=is_small)
+    charge = np.where(is_small, solved_charge * factor, solved_charge + addition)
     return charge, factor
 
 

@@ -293,24 +293,29 @@ class Prior:
         """Terms whose sum is the covariance of the unknowns, shape (4 + n_session, n_unknown, n_unknown).
 
         The first part is the covariance that is the same under all hypotheses. The other parts are the covariances of
-        the uneven tension, of the other imperfections, of the discrepancy, and of each unknown of the session. A
-        hypothesis multiplies each of them by the square of its size; see `Hypothesis.sizes`. After an earlier
-        calibration, the first part is the covariance that it has found, which contains the imperfections. The part of
-        the discrepancy then describes only what the earlier calibration could not show.
+        the uneven tension, of the other imperfections, of the discrepancy, and of each unknown of the session, all of
+        the size 1. A hypothesis multiplies each of them by the square of its size; see `Hypothesis.sizes`.
+
+        After an earlier calibration, the first part is the covariance that it has found, which contains the
+        imperfections. Their own parts are then zero, and the part of the discrepancy describes only what the earlier
+        calibration could not show.
         """
         layout = self.layout
         n_unknown = layout.coefficients.stop
         parts = np.zeros((4 + len(SESSION), n_unknown, n_unknown))
-        fixed, uneven_tension, other_imperfections, discrepancy, *session = parts  # views, which are filled below
-        discrepancy[layout.coefficients, layout.coefficients] = unit_covariance(
-            len(layout.prior.sensor.electrode_names)
-        )
-        for index, part in enumerate(session, layout.session.start):
+        # These matrices are views of `parts`. They are filled below, one after the other.
+        fixed, uneven_tension, other_imperfections, discrepancy, *session = parts
+        n_electrode = len(layout.prior.sensor.electrode_names)
+        discrepancy[layout.coefficients, layout.coefficients] = unit_covariance(n_electrode)
+        for index, part in enumerate(session, layout.session.start):  # index of an unknown of the session, and its part
             part[index, index] = 1.0
         if self.earlier is not None:
             fixed += self.earlier.covariance
             discrepancy *= REMAINING_DISCREPANCY**2
             return parts
+
+        # Distribute the variances of the properties of the film over the first three parts. Each property belongs to
+        # one part, and its variance in the other parts is zero.
         is_imperfection = layout.prior.is_imperfection
         is_tension = np.isin(layout.prior.names, UNEVEN_TENSIONS)
         for part, is_in_part in (

@@ -91,11 +91,15 @@ class CalibrationProblem:
     def solved_domain(self) -> Domain:
         """Contacts for which the film is solved. They extend beyond `domain`, because measured presses have errors."""
         low, high = self.force_range
-        probe = self.probe.under(high * FORCE_MARGIN)
+        largest_force = high * FORCE_MARGIN
+        # The solved presses must keep a distance from the clamp. It depends on the reach of the probe under the largest
+        # force, because a fingertip grows with the force. The probe may be replaced by a circle with another reach.
+        probe = self.probe.under(largest_force)
         reach = max(probe.reach, round_probe(probe).reach)
         largest_radius = self.sensor.film.inner_radius - RIM_MARGIN * reach
+        # A working area that leaves too small a distance is solved without a margin.
         radius = min(self.radius + POSITION_MARGIN_MM, max(self.radius, largest_radius))
-        return Domain(radius, (low / FORCE_MARGIN, high * FORCE_MARGIN))
+        return Domain(radius, (low / FORCE_MARGIN, largest_force))
 
 
 def domain_words(domain: Domain) -> str:

@@ -263,6 +263,7 @@ class PressSession:
         if self.result is None:
             return ()
         error_sentence = self.result.summary[0]
+        # The first press is on line 2 of the file, below the header. It has the number 1 and the index 0.
         bad_sentences = [
             f"Press {line - 1}, {describe_press(self.presses.contact[line - 2])}, does not agree with the others and "
             "is left out. Were its position and its force as stated?"
