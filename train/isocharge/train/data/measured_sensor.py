@@ -92,8 +92,8 @@ class PressedArea(Domain):
         x, y, _ = contact.T
         is_position_known = np.isfinite(x) & np.isfinite(y)
         is_off_area = is_position_known & ~inside_polygon(x, y, np.array(self.corners))
-        any_position = Domain(np.inf, self.force_range)  # compares only the forces
-        return np.asarray(is_off_area | any_position.is_outside(contact))
+        unlimited_area = Domain(np.inf, self.force_range)  # only a force can be outside
+        return np.asarray(is_off_area | unlimited_area.is_outside(contact))
 
 
 def outline(places: Array) -> Array:

@@ -70,7 +70,7 @@ class OutsidePresses:
         train = shuffled[:half_count]
         second_half = shuffled[half_count:]
 
-        # Very weak presses do not count as wrong answers without a flag.
+        # The share of wrong answers without a flag is measured without very weak presses.
         _, max_force = domain.force_range
         test = second_half[second_half.contact[:, 2] >= max_force / FORCE_RATIO]
         if len(test) < N_NEIGHBOURS:
@@ -83,13 +83,14 @@ class OutsidePresses:
         Args:
             is_unnoticed: Whether the answer to each press of `test` is wrong and carries no flag, shape (n,).
         """
-        # The share of a sector is that of the presses nearest to its middle.
-        sector_middles = Rings.between(self.domain.radius, self.outer, N_SECTORS, N_SECTORS)
+        # The area is divided into `N_SECTORS` rings of as many sectors. The share of a sector is that of the presses
+        # nearest to its middle.
+        sector_middles = Rings.between(self.domain.radius, self.outer, rings=N_SECTORS, sectors=N_SECTORS)
         _, nearest_presses = cKDTree(self.test.contact[:, :2]).query(sector_middles.position, N_NEIGHBOURS)
         shares = is_unnoticed[nearest_presses].mean(axis=-1).round(2)  # shape (ring, sector)
 
         min_force, max_force = self.domain.force_range
-        smallest_force = max(min_force, max_force / FORCE_RATIO)
+        smallest_force = max(min_force, max_force / FORCE_RATIO)  # of the presses in `test`
         return UnnoticedPresses(
             from_mm=round(self.domain.radius, 4),
             to_mm=round(self.outer, 4),

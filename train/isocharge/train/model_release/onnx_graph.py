@@ -110,16 +110,18 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     if not (hidden and has_biases):
         raise ValueError("expected hidden layers, and a bias for each column of the weights")
 
-    # Each matrix contains the weights of the contact perceptron in its first rows and columns, and those of the misfit
-    # perceptron in the others. Find the first column of the misfit perceptron in each layer, from the last layer
-    # backwards. The columns of a layer are the rows of the next layer, so the first column of the misfit perceptron is
-    # the first of these rows with a weight for the misfit perceptron.
-    misfit_starts = [ANGLES.stop]  # of the last layer, whose first columns are the answers about the contact
+    # In each layer, the units of the contact perceptron come first, and those of the misfit perceptron follow. Find the
+    # index of the first unit of the misfit perceptron in each layer. In the last layer, the first units are the answers
+    # about the contact. For the layers before, use the weights of the next layer, from the last layer backwards. They
+    # have one row for each unit of the layer, and one column for each unit of the next layer. Only units of the misfit
+    # perceptron have weights for units of the misfit perceptron in the next layer.
+    misfit_starts = [ANGLES.stop]
     for next_layer in (last, *reversed(hidden[1:])):
-        misfit_weights = next_layer.weight[:, misfit_starts[0] :]
-        row_has_weight = misfit_weights.any(axis=1)
-        misfit_starts.insert(0, int(row_has_weight.argmax()))
+        weights_for_misfit_units = next_layer.weight[:, misfit_starts[0] :]
+        is_misfit_unit = weights_for_misfit_units.any(axis=1)
+        misfit_starts.insert(0, int(is_misfit_unit.argmax()))  # the first unit for which this is True
 
+    # Separate the two perceptrons.
     joined = Perceptron(tuple(hidden), last, skip)
     contact = _select_units(joined, [slice(start) for start in misfit_starts])
     misfit = _select_units(joined, [slice(start, None) for start in misfit_starts])

@@ -136,10 +136,11 @@ def refit_covariance(network: InverseNetwork, train: LabelledPresses, noise: Noi
     the larger errors of earlier steps. This function minimises the loss of the covariance on a large sample of presses
     by the method L-BFGS. The loss does not change the mean.
 
-    The hidden units are correlated, and a fit of their weights would take hundreds of iterations. The change of the
-    weights is therefore the product of a fitted matrix and the inverse of the Cholesky factor of the Gram matrix of the
-    hidden units. The entries of the fitted matrix are then the weights of combinations of hidden units that are nearly
-    orthonormal over the presses.
+    The hidden units are correlated, and a fit of their weights would take hundreds of iterations. Instead, the function
+    fits the weights of combinations of the hidden units that are nearly orthonormal over the presses. Let H be the
+    matrix of the hidden units of all presses, and L the Cholesky factor of their Gram matrix H' H. The combinations are
+    the columns of H L'^-1. If M contains the changes of their weights, the weights of the hidden units change by
+    M L^-1. The matrix M is fitted.
 
     Args:
         network: Network that learns the force, with a trained contact perceptron.
@@ -152,13 +153,13 @@ def refit_covariance(network: InverseNetwork, train: LabelledPresses, noise: Noi
     with torch.no_grad():
         inputs = network.inputs(as_tensor(presses.noisy(noise, seed=0)))
         outputs = network.contact(inputs)
-        hidden = network.contact.last_hidden(inputs)
+        hidden = network.contact.last_hidden(inputs)  # H, shape (n, n_hidden)
         gram_matrix = hidden.T @ hidden
         gram_matrix.diagonal().add_(RIDGE)
-        inverse_factor = torch.linalg.inv(torch.linalg.cholesky(gram_matrix))
+        inverse_factor = torch.linalg.inv(torch.linalg.cholesky(gram_matrix))  # L^-1
 
     def loss_and_gradient(entries: Array) -> tuple[float, Array]:
-        """Return the loss and its gradient with respect to the entries of the fitted matrix."""
+        """Return the loss and its gradient with respect to the entries of M, each row after the other."""
         fitted_matrix = as_tensor(entries).view_as(weight).requires_grad_()
         new_outputs = outputs + hidden @ (fitted_matrix @ inverse_factor).T
         posterior = Posterior(*new_outputs.split(3, dim=1))

@@ -42,7 +42,13 @@ class Soap:
     """
 
     def __init__(self, parameter: Tensor) -> None:
-        """Prepare the first step: all averages are zero, and the eigenbases are identity matrices."""
+        """Prepare the first step: all averages are zero, and the eigenbases are identity matrices.
+
+        A matrix has two moments with their eigenbases: one for its rows, and one for its columns. A vector has none.
+
+        Args:
+            parameter: The parameter, a vector or a matrix.
+        """
         self.parameter = parameter
         self.step_count = 0
         self.mean_gradient = torch.zeros_like(parameter)

@@ -212,8 +212,8 @@ class Split:
         """Choose the features of the charges for the training presses.
 
         The features are logarithms of the charges if all charges are positive. If some charges are not positive, the
-        features are inverse hyperbolic sines of charge / typical charge, which are linear for small charges and
-        logarithmic for large charges.
+        features are inverse hyperbolic sines of charge / typical charge. They are nearly linear for charges below the
+        typical charge of the channel, and nearly logarithmic above it.
 
         Args:
             noise: Noise of the charges, which determines the typical charges or the lower limit of the charges.
@@ -223,7 +223,8 @@ class Split:
         if not has_both_signs:
             return logarithmic_features(charge, noise.white)
         channel_noise = ChannelNoise.alike(noise)
-        # The typical charge of a channel is the charge above which the noise would be proportional to the charge if the
-        # white noise were multiplied by `SIGNED_FEATURE_SCALE`.
-        smaller_noise = replace(channel_noise, white=SIGNED_FEATURE_SCALE * channel_noise.white)
-        return signed_features(charge, smaller_noise.transition_charge(charge))
+        # The typical charge is `SIGNED_FEATURE_SCALE` times the transition charge, above which the noise is
+        # proportional to the charge. The transition charge is proportional to the white noise, but has a lower limit.
+        # The white noise is multiplied instead of the transition charge, so that the limit remains.
+        scaled_noise = replace(channel_noise, white=SIGNED_FEATURE_SCALE * channel_noise.white)
+        return signed_features(charge, scaled_noise.transition_charge(charge))
