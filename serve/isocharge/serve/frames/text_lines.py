@@ -52,6 +52,9 @@ _ZONE = r"(?:Z|[-+][0-9]{2}:?[0-9]{2}(?![\w.]))?(?![\w:])"
 _NUMBER = r"(?>[-+]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|(?<!<)(?i:nan|inf(?:inity)?|ovf)(?!\w)))"
 """Regular expression of a decimal number, which also matches `nan`, `inf` and the `ovf` of Arduino."""
 
+_NUMBER_WITH_COMMA = _NUMBER.replace(r"\.[0-9]*", r"(?:\.[0-9]*|,[0-9]+)")
+"""Regular expression of a decimal number, which may have a decimal comma instead of a decimal point."""
+
 _PATTERNS = {
     "coarse_time": rf"(?<![\w.:]){_TIME}(?!{_FRACTION}{_ZONE}){_ZONE}",  # whole seconds, too coarse for a clock
     "time": rf"(?<![\w.:]){_TIME}{_FRACTION}?{_ZONE}",  # some programs omit a fraction that is zero
@@ -82,6 +85,7 @@ _SYMBOLS = {
 
 A mark stands for itself. The symbol of a word or key that is a unit of charge or voltage is u.
 """
+
 
 _NAMES_OF_TIMES = {"time": "t_s", "uptime": "t_ms"}
 """Names of a time of day, in seconds since midnight, and of the time in a log prefix such as `I (1234)`."""
@@ -135,8 +139,8 @@ _SEPARATING_COMMA = (
 )
 """Regular expression of a text that shows that the commas of a line are separators."""
 
-_DECIMAL_COMMA = rf"({_TIME}{_FRACTION}?,?)|(?<=[0-9]),(?=[0-9])"
-"""Regular expression of a time, which is a group, or of a comma between digits that is not part of a time."""
+_DECIMAL_COMMA = rf"(?P<time>{_TIME}{_FRACTION}?,?)|(?<=[0-9]),(?=[0-9])"
+"""Regular expression of a comma between digits, or of a time, in which a comma is no decimal comma."""
 
 _CHARGE_UNITS = {*OTHER_CHARGE_UNITS, "pC"} - {"C"}
 """Units of charge and voltage, except C, which may be the name of an electrode."""
@@ -197,25 +201,27 @@ class Line(NamedTuple):
 
 
 def parse_line(text: str, *, has_header: bool = False, meanings: Mapping[str, str] = MappingProxyType({})) -> Line:
-    """Take the numbers out of a line of text.
+    """Divide a line of text into its numbers and its skeleton, which is the text between the numbers.
 
-    A line with an unclear minus or comma is returned without numbers.
+    A line in which a minus or a comma may have two meanings (see `_UNCLEAR`) is returned without numbers.
 
     Args:
         text: The line, as `clean_text` returns it.
         has_header: Whether a header names the numbers, so that words that alternate with the numbers are not names.
-        meanings: Meanings of names of counters and clocks. Such a name is a name even if no other number has one.
+        meanings: For each name that the board uses for a counter or a clock: its name in isocharge, such as `t_ms`.
+            Such a name is a name even if no other number of the line has one.
 
     Raises:
         ValueError: If the line contains characters that are not printable.
     """
     if not text.replace("\t", " ").isprintable():
         raise ValueError(f"expected printable characters, got {text[:100]!r}")
-    number_pattern = _NUMBER
+    number_pattern = _NUMBER  # of the numbers in the skeleton
     text_with_points = text
     if _has_decimal_commas(text):
-        number_pattern = _NUMBER.replace(r"\.[0-9]*", r"(?:\.[0-9]*|,[0-9]+)")
-        text_with_points = re.sub(_DECIMAL_COMMA, lambda match: match[1] or ".", text)
+        number_pattern = _NUMBER_WITH_COMMA
+        # Replace each decimal comma by a point, and each time by itself. All positions in the text remain the same.
+        text_with_points = re.sub(_DECIMAL_COMMA, lambda match: match["time"] or ".", text)
     parts = _parts(text_with_points)
     counters = {SEQ, *TIMES_US, *meanings}
     names = _alternating_names(parts, has_header=has_header) or _preceding_names(parts, counters)
@@ -226,44 +232,54 @@ def parse_line(text: str, *, has_header: bool = False, meanings: Mapping[str, st
         names=tuple(meanings.get(name, name) for name in names_with_units),
         starts=tuple(part.start for part in parts if part.is_number),
         is_prose=_is_prose(parts),
-        words=tuple(part.name for part in parts if part.symbol in "kquw"),  # keys, quoted texts, units and words
+        words=tuple(part.name for part in parts if part.symbol in "kquw"),  # keys, texts in quotes, units and words
     )
 
 
 def _has_decimal_commas(text: str) -> bool:
     """Return whether the commas between digits are decimal commas, as in `3,1;-2,0` and `A: 3,1 pC, B: -2,0 pC`.
 
-    Commas are separators in a line to which one of these statements applies:
+    Commas are not decimal commas but separators in a line to which one of these statements applies:
 
-    - A number has a decimal point or two commas.
-    - A comma stands before a sign, beside a blank, before a name, or behind a name that ends with a digit.
-    - Nothing else separates two numbers. In `A:4,3`, it is a decimal comma, because a name belongs to one number.
-    - The line has brackets, and not every number has a name with a colon or an equals sign before it.
+    - A number has a decimal point or two commas, or a comma stands before a sign, beside a blank, before a name, or
+      behind a name that ends with a digit. `_SEPARATING_COMMA` describes these cases.
+    - The line contains only two numbers, which only a comma separates, as in `4,3`. In `A:4,3`, however, the comma is a
+      decimal comma, because a name belongs to one number.
+    - The line has brackets, as in `(4,3) (5,2)`. The commas are decimal commas all the same if there are several, and
+      if a colon or an equals sign stands before each number with a comma.
     """
     text = re.sub(f"{_TIME}{_FRACTION}?(?:{_ZONE})?", "", text)
-    number_count = len(re.findall("[0-9]+(?:,[0-9]+)?", text))
+    number_count = len(re.findall("[0-9]+(?:,[0-9]+)?", text))  # `4,3` counts as one number
     comma_count = len(re.findall("[0-9],[0-9]", text))
-    named_count = len(re.findall(r"[:=]\s*[-+]?[0-9]+,[0-9]", text))
+    named_count = len(re.findall(r"[:=]\s*[-+]?[0-9]+,[0-9]", text))  # numbers with a comma and a name, as in `A:4,3`
     if comma_count == 0 or re.search(_SEPARATING_COMMA, text):
         return False
     if number_count == 1:
         return named_count == 1
-    are_named = comma_count > 1 and named_count == comma_count
-    return are_named or re.search(r"[\[({]", text) is None
+    are_all_named = comma_count > 1 and named_count == comma_count
+    return are_all_named or re.search(r"[\[({]", text) is None
 
 
 def _parts(text: str) -> list[_Part]:
-    """Divide a line into its parts; empty for a line with an unclear minus or comma."""
+    """Divide a line into its parts; empty for a line in which a minus or a comma may have two meanings.
+
+    A number that is the index of a channel becomes a key, because it is the name of the number behind it.
+
+    Args:
+        text: The line, with decimal points instead of decimal commas.
+    """
     if re.search(_UNCLEAR, text):
         return []
     parts = []
     for match in _PART.finditer(text.rstrip(_IGNORED_AT_END)):
-        kind = str(match.lastgroup)
+        kind = str(match.lastgroup)  # name of the group that matches
         content = match[0]
+        symbol = _SYMBOLS.get(kind, content[0])  # a mark stands for itself
+        if kind in ("word", "key") and content.strip("[]") in _CHARGE_UNITS:
+            symbol = "u"
         start = match.start()
-        is_unit = kind in ("word", "key") and content.strip("[]") in _CHARGE_UNITS
-        symbol = "u" if is_unit else _SYMBOLS.get(kind, content[0])
-        parts.append(_Part(kind, symbol, content, start, text[start - 1 : start].isspace()))
+        is_after_blank = text[start - 1 : start].isspace()  # false for the first part, which has no text before it
+        parts.append(_Part(kind, symbol, content, start, is_after_blank))
     for position in _index_positions(parts):
         parts[position] = parts[position]._replace(kind="key", symbol="k")
     return parts
@@ -275,39 +291,48 @@ def _shape(parts: list[_Part]) -> str:
 
 
 def _index_positions(parts: list[_Part]) -> list[int]:
-    """Return the positions of the numbers that are not values but indices of channels. An index is the name of a value.
+    """Return the positions of the numbers that are not values but indices of channels.
 
-    If a line ends with pairs of numbers, the first number of each pair is an index in these cases:
+    In `ch 1 = 801 pC`, the number 801 is a value, and the number 1 is the index of its channel. The last numbers of a
+    line are pairs of an index and a value in these cases:
 
-    - A colon or an equals sign follows the number, as in `1:801,2:799` and `ch 1 = 801 pC`. There are several pairs, or
-      no other numbers.
-    - There are several pairs. Their first numbers count up from 0 or 1, and the same word or mark precedes each,
-      as in `pad #1 801 pad #2 799` and `[1] 801 [2] 799`.
+    - A colon or an equals sign stands between the two numbers of each pair, as in `1:801,2:799` and `ch 1 = 801 pC`.
+      There are several pairs, or the line has no other numbers.
+    - There are several pairs. Their first numbers count up from 0 or 1, and the same word or mark stands before each
+      first number, as in `pad #1 801 pad #2 799` and `[1] 801 [2] 799`.
+
+    Args:
+        parts: Parts of the line. A position is an index in this list.
     """
     # The shape of a line has one symbol for each part: 0 for a number, w for a word and u for a unit. Marks stand for
-    # themselves.
+    # themselves. A position in the shape is therefore the position of a part.
     shape = _shape(parts)
-    numbers = [position for position, symbol in enumerate(shape) if symbol == "0"]
+    number_positions = [position for position, symbol in enumerate(shape) if symbol == "0"]
 
     def first_numbers(pair: str) -> list[int]:
-        """Return the position of the first number of each pair at the end of the line.
+        """Return the position of the first number of each pair at the end of the line; empty if there is no pair.
 
         Args:
-            pair: Regular expression of the shape of a pair.
+            pair: Regular expression of the shape of a pair, in which each number is a 0.
         """
-        pairs = re.search(rf"(?:[^0]*{pair})+[^0]*$", shape)
-        return [] if pairs is None else numbers[-pairs[0].count("0") :: 2]
+        # Parts that are not numbers, [^0]*, may stand before each pair and behind the last pair.
+        pairs = re.search(f"(?:[^0]*{pair})+[^0]*$", shape)
+        if pairs is None:
+            return []
+        paired_count = pairs[0].count("0")
+        return number_positions[-paired_count::2]  # every second of the last numbers of the line
 
     indices = first_numbers(r"0[)\]]?[:=]0")  # such as `1:801`
-    if len(indices) > 1 or 2 * len(indices) == len(numbers):
+    has_only_pairs = len(number_positions) == 2 * len(indices)
+    if len(indices) > 1 or has_only_pairs:
         return indices
 
     indices = first_numbers(r"[uw#(\[=]0[)\]>(\[]?0")  # such as `pad 1 801` or `[1] 801`
-    counts = [str(count) for count in range(len(indices) + 1)]
     contents = [parts[position].content for position in indices]
-    counts_up = contents in (counts[:-1], counts[1:])  # from 0 or from 1
-    previous_contents = {parts[position - 1].content for position in indices}
-    return indices if counts_up and len(previous_contents) == 1 < len(indices) else []
+    counts = [str(count) for count in range(len(indices) + 1)]
+    counts_up = contents in (counts[:-1], counts[1:])  # from 0, or from 1
+    labels = {parts[position - 1].content for position in indices}  # the words or marks before the first numbers
+    return indices if len(indices) > 1 and counts_up and len(labels) == 1 else []
 
 
 def _skeleton(parts: list[_Part], names: list[str], number_pattern: str) -> tuple[str, ...]:
@@ -318,15 +343,16 @@ def _skeleton(parts: list[_Part], names: list[str], number_pattern: str) -> tupl
         names: Names of the numbers.
         number_pattern: Regular expression of a decimal number.
     """
-    fixed_words = {*names, *_CHARGE_UNITS}  # a line with another unit has another layout
+    fixed_words = {*names, *_CHARGE_UNITS}  # must be the same in all lines of a layout; other words may change
     patterns = []
     previous_kind = ""
     for part in parts:
         if "mark" in (previous_kind, part.kind):
-            patterns.append(r"\s*+")
+            patterns.append(r"\s*+")  # the number of blanks beside a mark may change, and there may be none
         elif part.is_after_blank:
             patterns.append(r"\s++")
-        is_unit = previous_kind in ("number", "hexadecimal") and not part.is_after_blank  # of the number before it
+        # A word that directly follows a number, as in `3.5mV`, is the unit of the number.
+        is_unit = previous_kind in ("number", "hexadecimal") and not part.is_after_blank
         if part.is_number:
             pattern = number_pattern if part.kind == "number" else _PATTERNS[part.kind]
             patterns.append(f"({pattern})")
@@ -380,16 +406,18 @@ def _alternating_names(parts: list[_Part], *, has_header: bool) -> list[str]:
     words that repeat are units or states. Words of another meaning that alternate with the numbers are taken for names,
     too.
 
+    If a header names the numbers, the words are no names but the contents of other columns. The exception is a line
+    with a single word and a single number, as in `A,3.5`: even below a header, the word is the name of the number.
+
     Args:
         parts: Parts of the line.
         has_header: Whether a header names the numbers.
     """
     # The shape has one symbol for each part: t for a time, u for a unit, w for another word, and 0 for a number. Marks
-    # stand for themselves.
+    # stand for themselves. A time may stand before a single pair, and a unit behind it.
     shape = _shape(parts)
-    # A single word and a single number, as in `A,3.5`, are a name and its value even below a header with two columns.
-    is_pair = re.fullmatch("[t ,;]*[uw][,;|]0[uw]?", shape) is not None
-    if is_pair or (shape.count("0") > 1 and not has_header):
+    is_single_pair = re.fullmatch("[t ,;]*[uw][,;|]0[uw]?", shape) is not None
+    if is_single_pair or (shape.count("0") > 1 and not has_header):
         for pattern in (_WORD_BEFORE, _WORD_BEHIND):
             names = _words(parts, pattern)
             if all(_unique(names)) and _CHARGE_UNITS.isdisjoint(names):
@@ -417,18 +445,18 @@ def _preceding_names(parts: list[_Part], counters: Container[str]) -> list[str]:
     nearest_names = _unique(_words(parts, _NEAREST_NAME))
     second_names = _unique(_words(parts, _SECOND_NAME))
     names = [nearest or second for nearest, second in zip(nearest_names, second_names, strict=True)]
-    words = {part.name for part in parts if part.kind == "word"}
-    channels = [index for index, name in enumerate(names) if name not in TIMES_US]
+    words = {part.name for part in parts if part.kind == "word"}  # without the keys
+    value_indices = [index for index, name in enumerate(names) if name not in TIMES_US]  # of all numbers except clocks
 
     # In the shape of a line, u is a unit and w is another word. Only marks may follow the last word.
     ends_with_word = re.search(r"[uw]\W*$", _shape(parts)) is not None
-    if channels and not names[channels[0]] and ends_with_word:
+    if value_indices and not names[value_indices[0]] and ends_with_word:
         names = ["" if name in words else name for name in names]
 
-    named = [index for index in channels if names[index]]
-    if len(channels) > 1 and len(named) == 1:
-        (index,) = named
-        may_be_label = index == channels[0] or names[index] in words
+    named_indices = [index for index in value_indices if names[index]]
+    if len(value_indices) > 1 and len(named_indices) == 1:
+        (index,) = named_indices
+        may_be_label = index == value_indices[0] or names[index] in words
         if may_be_label and names[index] not in counters:
             names[index] = ""
     return names
@@ -437,8 +465,8 @@ def _preceding_names(parts: list[_Part], counters: Container[str]) -> list[str]:
 def _units(parts: list[_Part], names: list[str]) -> list[str]:
     """Return the unit of charge or voltage of each number; empty for a number without such a unit.
 
-    The unit stands behind the number, or between the name and the number. A unit before the first name, as in
-    `nC: A=3.5 B=4.1`, is the unit of all numbers.
+    The unit stands behind the number, as in `A=3.5 nC`, or between the name and the number, as in `A (nC): 3.5`. A unit
+    before the first name, as in `nC: A=3.5 B=4.1`, is the unit of all numbers that have no unit of their own.
 
     Args:
         parts: Parts of the line.
@@ -446,46 +474,54 @@ def _units(parts: list[_Part], names: list[str]) -> list[str]:
     """
     words_behind = _words(parts, _UNIT_BEHIND)
     words_before = _words(parts, _UNIT_BEFORE)
-    # The word `C` may be the name of an electrode or a degree, but behind several other numbers it is a unit of charge.
-    is_coulomb = words_behind.count("C") > 1 + names.count("C")
+
+    # A `C` behind a number may be the name of an electrode, and one `C` may be the unit of a temperature (degrees
+    # Celsius). If there are more of them, the unit of the charges is C (coulomb).
+    is_coulomb = words_behind.count("C") > names.count("C") + 1
     units = {*_CHARGE_UNITS, "C"} if is_coulomb else _CHARGE_UNITS
+
+    # Find the unit before the first name. The shape has one symbol for each part, and 0 for a number.
     shape_before_numbers, _, _ = _shape(parts).partition("0")
     first_words = [part.name.strip("[]") for part in parts[: len(shape_before_numbers)]]
     words_before_names = takewhile(lambda word: word not in names, first_words)
     common_unit = next((word for word in words_before_names if word in units), "")
-    return [
-        next((word.strip("[]") for word in words if word.strip("[]") in units), common_unit)
-        for words in zip(words_behind, words_before, strict=True)
-    ]
+
+    units_of_numbers = []
+    for words in zip(words_behind, words_before, strict=True):
+        words_without_brackets = [word.strip("[]") for word in words]
+        units_of_numbers.append(next((word for word in words_without_brackets if word in units), common_unit))
+    return units_of_numbers
 
 
 def _with_units(names: list[str], units: list[str], counters: Container[str]) -> list[str]:
     """Add the unit of charge or voltage of each number to its name, as in `A_nC` for `A = 3.5 nC`.
 
     The unit pC is not added, and counters and clocks have no unit of charge. If two numbers follow each of several
-    names, and only the second number has a unit, it has the name, as in `A: 512 (3.5 nC), B: 498 (4.1 nC)`.
+    names, and only the second number has a unit, the name is moved to the second number. For example, the names of
+    `A: 512 (3.5 nC), B: 498 (4.1 nC)` become "", `A_nC`, "" and `B_nC`.
 
     Args:
         names: Name of each number; empty for a number without a name.
         units: Unit of each number; empty for a number without a unit.
         counters: Names of counters and clocks.
     """
-    # Indices of names whose number has no unit, before a number that has a unit and no name
-    movable = [
+    # Find the numbers without a unit that stand before a number with a unit and without a name.
+    movable_indices = [
         index
         for index, name in enumerate(names[:-1])
-        if name not in counters and not (names[index + 1] or units[index]) and units[index + 1]
+        if name not in counters and not units[index] and units[index + 1] and not names[index + 1]
     ]
     moved_names = names.copy()
-    for index in movable if len(movable) > 1 else []:
-        moved_names[index] = ""
-        moved_names[index + 1] = names[index]
+    if len(movable_indices) > 1:
+        for index in movable_indices:
+            moved_names[index] = ""
+            moved_names[index + 1] = names[index]
 
     names_with_units = []
     for number, (name, unit) in enumerate(zip(moved_names, units, strict=True), 1):
         ending = "coulomb" if unit == "C" else unit  # `A_C` would be an electrode with the name C
-        is_added = unit not in ("", "pC") and ending not in names and name not in counters
-        names_with_units.append(f"{name or f'ch{number}'}_{ending}" if is_added else name)
+        is_unit_added = unit not in ("", "pC") and ending not in names and name not in counters
+        names_with_units.append(f"{name or f'ch{number}'}_{ending}" if is_unit_added else name)
     return names_with_units
 
 
@@ -507,8 +543,9 @@ def line_values(pattern: re.Pattern[str], text: str) -> tuple[float, ...] | None
 
 def _value(number: str) -> float:
     """Return the value of a number, or the seconds from midnight to a time of day. The value of `ovf` is NaN."""
-    if ":" in number:  # a time of day, with or without a date and a time zone
+    if ":" in number:  # a time of day, with or without a date and a time zone, as in `12:34:56.789,012`
         ((hours, minutes, seconds, fraction),) = re.findall("([0-9]+):([0-9]+):([0-9]+)[.,]?([0-9,]*)", number)
+        # In the fraction, a comma separates groups of three digits.
         return 3600.0 * int(hours) + 60.0 * int(minutes) + float(f"{seconds}.{fraction.replace(',', '')}")
     if "x" in number.lower():  # a hexadecimal number
         return float(int(number, 16))
@@ -528,10 +565,11 @@ def _separator(text: Container[str]) -> str | None:
 def header_names(header: str, line: Line) -> tuple[str, ...]:
     """Return the names that a header states for the numbers without names in a line.
 
-    The result is empty if the text is no header of the line. A column of the header is a name, which begins with a
-    letter. The mark of a comment, a label before the first column, and columns of the line that contain a text are
-    ignored. If the numbers of the line are separated by commas, for example, then words that are only separated by
-    blanks, such as `the tare is done`, are not a header but a message.
+    The names begin with letters, and differ from each other. The result is empty if the text is no header of the line,
+    because it states no such name for one of the numbers.
+
+    A header may have one name for each number without a name, or one name for each column of the line. The columns of
+    texts and of numbers with names are then ignored, and so are the mark of a comment and a label before the names.
 
     Args:
         header: A line without numbers.
@@ -539,16 +577,18 @@ def header_names(header: str, line: Line) -> tuple[str, ...]:
     """
     starts = [start for start, name in zip(line.starts, line.names, strict=True) if not name]
     header = header.lstrip("#%/ ").rstrip(_IGNORED_AT_END)
-    separator = _separator(header)  # None: blanks
+    separator = _separator(header)  # None for blanks
     line_separator = "\t" if "\t" in line.text else _separator(line.skeleton)
-    if separator is None and line_separator is not None:
+    if separator is None and line_separator is not None:  # the header is a message, such as `the tare is done`
         return ()
     columns = header.split(separator)
-    if len(columns) != len(starts):  # select the columns of the numbers without names
-        indices = [len(line.text[: start + 1].split(line_separator)) - 1 for start in starts]
-        columns = [columns[index] for index in indices if index < len(columns)]
+    if len(columns) != len(starts):
+        # The header has one name for each column of the line. Select the columns that contain the numbers. The text
+        # of the line up to the first character of a number consists of as many columns as the position of the number.
+        column_counts = [len(line.text[: start + 1].split(line_separator)) for start in starts]
+        columns = [columns[count - 1] for count in column_counts if count <= len(columns)]
     # A label with a colon may stand before a name, as in `Data: A, B, C`.
     names = tuple(column.rpartition(":")[2].strip(" \"'") for column in columns)
     are_names = all(re.match(r"[^\W\d]", name) for name in names)
-    are_different = len(names) == len(set(names)) == len(starts)
-    return names if are_names and are_different else ()
+    are_different = len(set(names)) == len(names)
+    return names if are_names and are_different and len(names) == len(starts) else ()

@@ -131,24 +131,31 @@ class PressWatch:
             electrodes: Names of the electrodes, which are used in the reasons why presses are refused.
         """
         self._electrodes = electrodes
-        self._phase = Phase.taring
         self._frames: deque[Frame] = deque()  # the latest frames without touch, or the window of the present press
-        self._begin(-math.inf)
+        self._reset()
 
-    def _begin(self, t_s: float) -> None:
-        """Begin a press.
+    def _reset(self) -> None:
+        """Discard the present press and all stored frames, and wait for the tare.
+
+        The latest press counts as infinitely long ago, so that all later frames without touch are frames at rest.
+        """
+        self._begin_press(-math.inf)
+        self._phase = Phase.taring
+
+    def _begin_press(self, begin_s: float) -> None:
+        """Begin a press: measure the charges at rest before the press, and begin an empty window.
 
         Args:
-            t_s: Time of its first frame, s.
+            begin_s: Time of the first frame of the press, s.
         """
-        self._begin_s = t_s
-        self._end_s = t_s  # time of the latest frame of the press
-        rest_charges_pC = [frame.charge_pC for frame in self._frames if frame.clock_s <= t_s - self.EDGE_S]
+        self._begin_s = begin_s
+        self._end_s = begin_s  # time of the latest frame of the press
+        rest_charges_pC = [frame.charge_pC for frame in self._frames if frame.clock_s <= begin_s - self.EDGE_S]
         self._rest_pC: Array | None = None  # mean charges just before the touch; None without enough frames
         if len(rest_charges_pC) >= self.MIN_REST_FRAMES:
             self._rest_pC = np.array(rest_charges_pC).mean(axis=0)
         self._frames.clear()
-        self._last_check_s = t_s  # time at which the window was last examined
+        self._last_check_s = begin_s  # time at which the window was last examined
         self._reason = ""  # why the press is not steady yet; empty before the first examined window
         self._min_scatter_pC = math.inf  # smallest scatter of all windows
 
@@ -164,6 +171,9 @@ class PressWatch:
         `waiting` follows until a touch begins. The phase `settling` follows until the press is accepted or refused. The
         phase `lift` follows until the finger leaves the film. The phase `waiting` then begins again.
 
+        The result for the reading with which a press is accepted or refused has the phase `taken` or `refused`. The
+        phase of the watch itself is then already the next one, because the reading after this one continues with it.
+
         The charges at rest before a press are measured in a period of the length `REST_S`, which ends `EDGE_S` before
         the touch is detected.
 
@@ -175,24 +185,25 @@ class PressWatch:
             only for the reading with which the press was accepted.
         """
         if RECONNECTED in frame.flags or RESTART in frame.flags:
-            # The charges and times before the interruption cannot be compared with later ones.
-            self._begin(-math.inf)
-            self._phase = Phase.taring
+            # The charges and times before the interruption cannot be compared with later ones. A press is refused, and
+            # the watch waits for a new tare.
+            self._reset()
             return WatchResult(Phase.refused, PORT_LOST)
         if frame.charge_pC is None:  # there is no tare yet, or the frame is invalid
             if TARE in frame.flags:  # the tare is being measured
                 self._phase = Phase.taring
-        elif not frame.is_contact:
+            return WatchResult(self._phase)
+        if not frame.is_contact:
             return self._process_rest(frame)
-        elif self._phase is not Phase.lift:
-            if self._phase is not Phase.settling:
-                self._begin(frame.clock_s)
-                self._phase = Phase.settling
-            result = self._process_press(frame)
-            if result.phase is not Phase.settling:
-                self._phase = Phase.lift
-            return result
-        return WatchResult(self._phase)
+        if self._phase is Phase.lift:  # the press of this touch was accepted or refused before
+            return WatchResult(Phase.lift)
+        if self._phase is not Phase.settling:  # the touch begins with this frame
+            self._begin_press(frame.clock_s)
+            self._phase = Phase.settling
+        result = self._process_press(frame)
+        if result.phase is not Phase.settling:
+            self._phase = Phase.lift
+        return result
 
     def _process_press(self, frame: Frame) -> WatchResult:
         """Add the next frame to the window, and accept or refuse the press if this can be decided.
@@ -240,7 +251,7 @@ class PressWatch:
 
         # The line is fitted by least squares. Its value at the mean time of the frames is the mean charge.
         centred_s = times_s - times_s.mean()
-        square_sum_s2 = max(centred_s @ centred_s, 1e-30)  # avoids a division by 0 if all times are equal
+        square_sum_s2 = max(centred_s @ centred_s, 1e-30)  # not 0, by which the next line divides, for equal times
         slope_pC_per_s = centred_s @ charge_pC / square_sum_s2
         mean_pC = charge_pC.mean(axis=0)
         scatter_pC = (charge_pC - mean_pC - np.outer(centred_s, slope_pC_per_s)).std(axis=0)
@@ -260,6 +271,7 @@ class PressWatch:
         max_scatter_pC = self.MAX_SCATTER_SIGMAS * np.hypot(noise_pC, hand_noise_pC)
         relative_scatter = scatter_pC / max_scatter_pC
 
+        # If a charge exceeds a limit, state the reason why the press is not steady. Otherwise, return the press.
         scattering = relative_scatter.argmax()  # index of the charge with the largest relative scatter
         drifting = relative_drift.argmax()  # index of the charge with the largest relative drift
         if relative_scatter[scattering] > 1.0:
@@ -273,6 +285,8 @@ class PressWatch:
         else:
             flags = flags_in_order(flag for frame in self._frames for flag in frame.flags)
             return SteadyPress(mean_pC, self._end_s - self._begin_s, flags)
+
+        # Store the reason, but keep that of an earlier window with a smaller scatter.
         if scatter_pC.max() <= self._min_scatter_pC:
             self._min_scatter_pC = scatter_pC.max()
             self._reason = reason

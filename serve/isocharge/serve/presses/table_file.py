@@ -86,18 +86,18 @@ class CsvTable:
         self._names = names
         self._error_class = error_class
         self._expected = expected
-        self._mark = ""  # decimal mark; empty until it is known
-        self._is_mark_certain = False  # whether a number has shown that the mark does not separate thousands
+        self._mark = ""  # point or comma in the numbers of the file; empty until a number has one
+        self._is_mark_decimal = False  # whether a number has shown that the mark does not separate thousands
 
-        # Search the header among the first lines. If the header is a comment, `header_line` does not have its mark.
+        # Search the header among the first lines. If the header is a comment, `header_line` is without the # before it.
         line_iterator = self._checked_lines(lines)
         first_lines = list(islice(line_iterator, _MAX_LINES_TO_HEADER))
         lines_above, self._separator, header_line = _find_header(first_lines or [""], names)
 
-        # Read the rows of the header and of all lines below it, as they are needed.
+        # The rows are divided into cells only when they are needed: the header now, and the rows below it later.
         first_lines_below = first_lines[lines_above + 1 :]
         self._rows = self._numbered_rows(chain([header_line], first_lines_below, line_iterator), lines_above)
-        _line_number, header_cells = next(self._rows, (0, []))  # no cells if there is no row
+        _line_number, header_cells = next(self._rows, (0, []))  # no cells if the file contains only blank lines
         if not header_cells:
             raise self.error(f": empty; expected {expected}")
         if len(header_cells) > MAX_COLUMNS:
@@ -156,14 +156,17 @@ class CsvTable:
         Raises:
             InputError: If a column has such a name. The message lists all such columns.
         """
+        # Collect the spellings of each missing name. A column with one of these spellings is probably this column.
         missing_name_of_spelling: dict[str, str] = {}
         for name in names:
             if name not in self.header:
                 # Without the second set, the column `ApC` would not be similar to the electrode `A`.
                 spellings = _spellings(name) | _spellings(f"{name}_pC")
-                if name == "force_N":  # the symbol of the force with a unit; `F` alone may be an electrode
+                if name == "force_N":  # F (N), F (mN) and F (g) are forces, but `F` without a unit may be an electrode
                     spellings |= {"fn", "fmn", "fg"}
                 missing_name_of_spelling |= dict.fromkeys(spellings, name)
+
+        # Find the missing name for which each column was probably meant.
         name_of_column = {
             column: missing_name_of_spelling[spelling]
             for column in columns
@@ -208,20 +211,20 @@ class CsvTable:
                         f"{shown(cell)}{self._cell_advice(cell)}"
                     )
                 numbers.append(number)
-            # A fraction in any other column of the row also determines the meaning of the mark.
-            self._is_mark_certain = self._is_mark_certain or self._has_fraction(cells)
+            # The columns that are not read may show, too, that the mark of the numbers is a decimal mark.
+            self._is_mark_decimal = self._is_mark_decimal or self._has_fraction(cells)
         self._check_mark()
         rows = np.asarray(numbers, dtype=np.float64).reshape(len(line_numbers), len(column_indices))
         values = dict(zip(column_indices, rows.T, strict=True))
         return NumberColumns(values, line_numbers)
 
     def _check_mark(self) -> None:
-        """Check that the numbers of the file have shown whether their mark is a decimal mark.
+        """Check that a number of the file has shown that the mark of the numbers is a decimal mark.
 
         Raises:
             InputError: If the mark may also be a separator of thousands.
         """
-        if self._mark and not self._is_mark_certain:
+        if self._mark and not self._is_mark_decimal:
             raise self.error(
                 f": every number with the mark {self._mark!r} may have a decimal mark or a separator of thousands; "
                 "write commas between the columns, decimal points and no separators of thousands"
@@ -244,8 +247,12 @@ class CsvTable:
     def _number(self, text: str) -> float | None:
         """Return the number in a cell: NaN for an empty cell, and None for a cell without a finite number.
 
-        The first number with a mark determines the decimal mark of the file, which is stored. It is also stored whether
-        the mark is certain, because a number has shown that the mark cannot be a separator of thousands.
+        The point or the comma in a number is called its mark. All numbers of a file must have the same mark. It may be
+        a decimal mark, or a separator of thousands as in `1,064`. Some numbers show that the mark is a decimal mark:
+        `0,5`, `12,34` and `1,064e3` cannot be whole numbers with a separator of thousands.
+
+        The function stores the first mark of the file in `_mark`. As soon as a number has shown that it is a decimal
+        mark, `_is_mark_decimal` becomes true.
 
         Args:
             text: The cell, without blanks at its ends.
@@ -255,14 +262,16 @@ class CsvTable:
         match = _NUMBER.fullmatch(text)
         if match is None:
             return None
-        mark = match[1] or match[2]  # the groups of a mark after a digit, and of a mark at the beginning
+        mark = match[1] or match[2]  # the first group matches the mark in `3.5`, the second group the mark in `.5`
         if mark:
             self._mark = self._mark or mark
             if mark != self._mark:
                 return None
-            if not self._is_mark_certain:
-                is_point_between_commas = self._separator == "," and mark == "."
-                self._is_mark_certain = is_point_between_commas or _THOUSANDS.fullmatch(text) is None
+            if not self._is_mark_decimal:
+                # In countries where points separate thousands, commas do not separate the columns of a CSV file.
+                is_decimal_point = self._separator == "," and mark == "."
+                may_separate_thousands = _THOUSANDS.fullmatch(text) is not None
+                self._is_mark_decimal = is_decimal_point or not may_separate_thousands
         number = float(text.replace(",", "."))
         return number if math.isfinite(number) else None
 

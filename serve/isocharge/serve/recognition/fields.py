@@ -37,8 +37,8 @@ def possible_meanings(steps: Array, frame_rate_Hz: float, tolerance: float = 0.0
     """Yield the fields that the values of consecutive frames may belong to: the frame counter, then a clock.
 
     A counter increases by 1. A clock has one of the usual tick rates of boards. At about 1000 frames per second, a
-    clock in ms also increases by 1, but it repeats some of its values. A step is only used if it is close to the median
-    step.
+    clock in ms also increases by 1, but it repeats some of its values. Nothing is yielded if the values are constant,
+    or if too many steps differ much from the median step.
 
     Args:
         steps: Differences of the values of consecutive frames, shape (n,).
@@ -50,6 +50,8 @@ def possible_meanings(steps: Array, frame_rate_Hz: float, tolerance: float = 0.0
         The name of the field, which is `seq`, `t_s`, `t_ms` or `t_us`, and the value of one tick in the unit of this
         name.
     """
+    # A step is regular if it differs from the median step by at most 70 %, or by at most 1 (a slow clock repeats some of
+    # its values). Steps over lost or damaged frames are not regular.
     median_step = np.median(steps)
     regular_steps = steps[np.abs(steps - median_step) <= max(1.0, 0.7 * median_step)]
     is_regular = len(regular_steps) >= INTACT_SHARE * len(steps) and regular_steps.min() >= 0.0
@@ -57,10 +59,11 @@ def possible_meanings(steps: Array, frame_rate_Hz: float, tolerance: float = 0.0
     if not is_regular or is_constant:
         return
 
-    # If the high bytes of a number are a counter, and its low bytes belong to the channel behind the counter, the
-    # number increases by a power of 256. These rates are listed, so that they are not taken for the rate of a clock.
-    shifted_counter_rates_Hz = [frame_rate_Hz * 256.0**byte_count for byte_count in (1, 2, 3)]
+    # If only the high bytes of a number are a counter, and its low bytes belong to the channel beside the counter, the
+    # number increases by a power of 256 from frame to frame. A number that increases at the rate of such a shifted
+    # counter is not a clock.
     tick_rate_Hz = float(regular_steps.mean()) * frame_rate_Hz
+    shifted_counter_rates_Hz = [frame_rate_Hz * 256.0**byte_count for byte_count in (1, 2, 3)]
     known_rates_Hz = (*CLOCKS, *shifted_counter_rates_Hz)
     deviation, nearest_rate_Hz = min((abs(tick_rate_Hz / known_Hz - 1.0), known_Hz) for known_Hz in known_rates_Hz)
     is_clock = nearest_rate_Hz in CLOCKS and deviation < tolerance
@@ -192,8 +195,9 @@ def _number_parts(
     if type_name[0] == "f":
         if not 1e-7 < magnitude < 1e10:  # a Unix time is the largest of the usual numbers
             return
-        # A floating-point number of n bytes has digits in n * `Weights.fraction` bytes, and therefore represents steps
-        # of its magnitude divided by 256 to this power. Low bytes that are always 0 contain no digits.
+        # The significant digits of a floating-point number of `size` bytes are in about `Weights.fraction` * `size` of
+        # its bytes. Low bytes that are always 0 contain no digits. The smallest step of a number with n bytes of digits
+        # is its magnitude divided by 256**n.
         low_zero_byte_count = np.argmax(constant_bytes != 0)
         unit = magnitude * 256.0 ** (low_zero_byte_count - Weights.fraction * size)
 
@@ -202,8 +206,8 @@ def _number_parts(
         yield counter_or_clock
     if type_name == "i64":  # times only
         return
-    # The magnitude is added to the steps, so that a type has a lower score if its values are close to 0 or, for an
-    # unsigned type, close to the middle of its range.
+    # The magnitude is counted as one more step, the step from 0 to the first value. A type therefore has a lower score
+    # if its values are close to 0 or, for an unsigned type, close to the middle of its range (see `_values`).
     yield Part(CHANNEL, type_name, size, Weights.channel + _bits(np.append(steps, magnitude), unit, size))
 
 
@@ -211,6 +215,11 @@ def _counter_or_clock(
     steps: Array, constant_bytes: NDArray[np.int64], type_name: FieldType, unit: float, frame_rate_Hz: float
 ) -> Part | None:
     """Return the part of a frame whose number is the frame counter or a clock, or None if the number can be neither.
+
+    The score of the part, in bits, is lower for a more probable part. It is the mean number of bits that are needed to
+    encode a value if the previous value is known. Because a counter increases by 1 in every frame, its value follows
+    from the previous value, so that the score of a counter is 0. The score of a clock grows with the deviations of its
+    steps from the median step. In addition, unusual sizes and types are made more or less probable.
 
     Args:
         steps: Differences of the values of consecutive frames, shape (n,).
@@ -220,24 +229,27 @@ def _counter_or_clock(
         frame_rate_Hz: Number of frames per second, Hz.
     """
     size = len(constant_bytes)
-    if type_name[0] == "u":  # a counter that overflows restarts at 0: remove the large steps back
+    if type_name[0] == "u":
+        # An unsigned number wraps: after its largest value, it continues at 0. The modulo replaces the large step back
+        # from the largest value to 0 by the small step forwards that it stands for.
         half_range = 1 << (8 * size - 1)
         steps = (steps + half_range) % (2 * half_range) - half_range
-    name, tick = next(possible_meanings(steps, frame_rate_Hz), ("", 1.0))
-    has_usual_size = size < 8 or tick in (1.0, 1e-3)  # 8 bytes count s, ms, us or ns
-    # If upper bytes do not change while the number wraps, they do not belong to it.
+    name, tick = next(possible_meanings(steps, frame_rate_Hz), ("", 1.0))  # "" if it is neither a counter nor a clock
+    has_usual_size = size < 8 or tick in (1.0, 1e-3)  # only clocks in s, ms, us or ns have 8 bytes
+    # The modulo has removed the wraps at the end of the range. A number that wraps all the same has a smaller range,
+    # which its low bytes fill. The other bytes are not bytes of the number, but belong to another field.
     has_foreign_bytes = count_wraps(steps) > 0
     if not name or not has_usual_size or has_foreign_bytes:
         return None
 
     score = 0.0
-    if size == 3:
+    if size == 3:  # rare: a constant byte that is not 0 is more probably another field behind a number of 2 bytes
         score += Weights.constant_high * np.count_nonzero(constant_bytes > 0)
-    if name != SEQ:  # the values of a counter need no bits
+    if name != SEQ:
         score += _bits(steps - np.median(steps), unit, size)
         if size == 8:
-            # Without this bonus, an `f64` with few digits could have a lower score. It would consist of the high bytes
-            # of the clock and of the first bytes behind them.
+            # Without this reduction, an `f64` with few digits could have a lower score. It would consist of the high
+            # bytes of the clock and of the first bytes behind them.
             score -= Weights.noise
     return Part(name, type_name, size, score, scale=tick)
 
@@ -299,7 +311,8 @@ def split_frame(
 def _values(number_bytes: Bytes, type_name: str) -> Array:
     """Decode one number in all frames, and return its values, shape (n,).
 
-    Unsigned values are counted from the middle of their range, which does not change the differences between values.
+    Half of the range is subtracted from unsigned values, so that they have the same range as signed values. The
+    differences between the values remain the same.
 
     Args:
         number_bytes: Bytes of the number, the lowest first, shape (n, size).
@@ -308,11 +321,13 @@ def _values(number_bytes: Bytes, type_name: str) -> Array:
     size = number_bytes.shape[1]
     if type_name[0] == "f":
         return number_bytes.view(f"<f{size}")[:, 0].astype(float)
-    # The bytes become the high bytes of a signed number of 64 bits.
-    highest_bytes = np.pad(number_bytes, [(0, 0), (8 - size, 0)])
+    # Integers may have any size from 1 to 8 bytes. They are read as signed numbers of 8 bytes, in which low bytes of 0
+    # were added. Each added byte multiplies the number by 256.
+    added_count = 8 - size
+    eight_bytes = np.pad(number_bytes, [(0, 0), (added_count, 0)])
     if type_name[0] == "u":
-        highest_bytes[:, -1] ^= 0x80  # subtracts half of the range
-    values: Array = highest_bytes.view(np.int64)[:, 0] / 256.0 ** (8 - size)
+        eight_bytes[:, -1] ^= 0x80  # to invert the highest bit is to subtract half of the range
+    values: Array = eight_bytes.view(np.int64)[:, 0] / 256.0**added_count
     return values
 
 

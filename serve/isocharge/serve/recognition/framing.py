@@ -193,23 +193,26 @@ def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDiv
     single_bytes = stream.astype(int)
     pairs = 256 * single_bytes[:-1] + single_bytes[1:]
 
-    # A code is the number of a byte or of a pair. For each length of a frame, frames begin at the positions at which
-    # the same code follows at this distance. The code with the most positions is chosen. If a pair and a byte have
-    # equally many, the pair is chosen.
+    # A code is the number of a byte or of a pair. For each length of a frame, frames may begin at all positions of one
+    # code at which the same code follows at the distance of this length. The code with the most such positions is
+    # chosen. If a pair and a single byte have equally many positions, the pair is chosen.
     best_division: dict[int, FrameDivision] = {}
     for codes in (pairs, single_bytes):
-        positions = np.argsort(codes, kind="stable")  # first all positions of the smallest code, then of the next
+        # All positions of the smallest code in ascending order, then those of the next code, and so on. The difference
+        # of two adjacent positions is the distance between two occurrences of a code, unless the codes differ.
+        positions = np.argsort(codes, kind="stable")
         has_same_code = np.diff(codes[positions]) == 0
-        distances = np.where(has_same_code, np.diff(positions), 0)  # from each position to the next of the same code
+        distances = np.where(has_same_code, np.diff(positions), 0)
         for length in range(MIN_FRAME_BYTES, MAX_FRAME_BYTES + 1):
-            starts = positions[:-1][distances == length]
-            best_code = np.bincount(codes[starts], minlength=1).argmax()
+            starts = positions[:-1][distances == length]  # the last position has no distance to a next one
+            best_code = np.bincount(codes[starts], minlength=1).argmax()  # 0 if there are no positions
             division = FrameDivision(SYNC, stream, starts[codes[starts] == best_code], length)
-            best_division[length] = max(
-                best_division.get(length, division), division, key=lambda division: division.covered_share
-            )
+            earlier_division = best_division.get(length)
+            if earlier_division is None or division.covered_share > earlier_division.covered_share:
+                best_division[length] = division
 
-    # The shares are rounded to 0.1, so that of two lengths with about equal shares the shorter length comes first.
+    # The largest shares come first. They are rounded to 0.1, so that of two lengths with about equal shares the shorter
+    # length comes first.
     frequent = [division for division in best_division.values() if division.covered_share > COVERED_SHARE]
     yield from sorted(frequent, key=lambda division: (-round(division.covered_share, 1), division.length))[:max_lengths]
 

@@ -58,6 +58,7 @@ def described_frames_section(
         seconds: Time in which the bytes arrived, s. The unit of a clock is derived from this time.
         are_datagrams: Whether each chunk is a datagram.
     """
+    # If only the first bytes are examined, they have arrived in a part of the time.
     byte_count = sum(map(len, chunks))
     examined_seconds = seconds * min(1.0, MAX_EXAMINED_BYTES / max(1, byte_count))
     for divisions in possible_divisions(chunks, are_datagrams=are_datagrams):
@@ -86,7 +87,8 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
     if len(division.rows()) < MIN_FRAMES:
         return
 
-    # The frames may begin at several distances from `division.starts`. Find the checksums that fit at each distance.
+    # It is not known which of the constant bytes is the first byte of a frame, so that the frames may begin at several
+    # distances from `division.starts`. Find the checksums that fit at each distance.
     has_sync = division.framing == SYNC
     distances = _possible_distances(division) if has_sync else [0]
     rows_at = {distance: division.rows(distance) for distance in distances}
@@ -101,7 +103,8 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
 
     # For each byte order and each checksum, find the division of the frame into parts with the lowest score.
     for order, (distance, check) in product(ORDERS, checks):
-        # A frame that begins at the distance has the same parts, from the distance to the end, then from the beginning.
+        # The bytes between `starts` and the beginning of a frame are the last bytes of the previous frame. Their parts
+        # are therefore moved to the end of the list.
         parts = parts_of_order[order]
         parts_at_each_byte = parts[distance:] + parts[:distance]
         rows = rows_at[distance]
@@ -169,11 +172,15 @@ def _fields(parts: Sequence[Part]) -> tuple[Field, ...]:
     for part in parts:
         name = f"ch{next(channel_numbers)}" if part.name == CHANNEL else part.name
         if name and name not in [field.name for field in fields]:
-            field = Field(name=name, type_name=part.type_name)  # a device file states no scale of 1
-            fields.append(field if part.scale == 1.0 else structs.replace(field, scale=part.scale))
+            field = Field(name=name, type_name=part.type_name)
+            if part.scale != 1.0:  # a device file states no scale of 1
+                field = structs.replace(field, scale=part.scale)
+            fields.append(field)
         else:
-            adjacent_padding = fields.pop().count if fields and fields[-1].type_name == PADDING else 0
-            fields.append(Field(type_name=PADDING, count=adjacent_padding + part.size))
+            padding_size = part.size
+            if fields and fields[-1].type_name == PADDING:  # join the padding with that before it
+                padding_size += fields.pop().count
+            fields.append(Field(type_name=PADDING, count=padding_size))
     return tuple(fields)
 
 
@@ -181,7 +188,7 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
     """Recognise the format of a board, and return the section `[frames]` that describes this format in a device file.
 
     The function first tries the binary frames of isocharge and lines of text, and then other frames of fixed length.
-    Bytes that are printable characters are never taken for binary frames.
+    Bytes that are mostly printable characters are never taken for other frames.
 
     Args:
         chunks: Received bytes, divided as they arrived.
@@ -208,7 +215,8 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
     if _is_text(data) or (section and is_covered):
         return section
 
-    # If most of the bytes are not lines of one layout, the board may send binary frames that resemble text in places.
+    # The parser has found no frames, or has dropped most of the bytes. The board may send other frames, of which a few
+    # resemble text or frames of isocharge. If no other frames are recognised either, the result of the parser is used.
     return described_frames_section(chunks, seconds, are_datagrams=are_datagrams) or section
 
 
@@ -231,7 +239,7 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
     A counter increases by 1 from frame to frame, and a clock increases at one of the usual rates. The milliseconds of a
     time whose seconds are in another column are no clock, because they return to 0 every second. A clock in ms that
     increases by about 1 could also be a counter. Its name, or values that occur twice, show that it is a clock. If the
-    parser has already recognised a counter or a clock, the function does not search for another one.
+    lines already have a column with the name of a counter or of a clock, the function does not search for another one.
 
     For values with names in each line, the keys `seq`, `t_us`, `t_ms` and `t_s` state the names that the board uses for
     its counter and its clock. For the other values, the key `columns` lists the names, which are copied from a header,
@@ -246,21 +254,26 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
     names = list(layout.names)
     keys: dict[str, Any] = {}
     steps = np.diff([frame.values for frame in frames], axis=0)  # shape (n - 1, channels)
-    for (column, _), channel_steps in zip(layout.columns.channels, steps.T, strict=True):
+    for (column, _scale), channel_steps in zip(layout.columns.channels, steps.T, strict=True):
         name = names[column]
-        meanings = [*possible_meanings(channel_steps, frame_rate_Hz)]
+        meanings = list(possible_meanings(channel_steps, frame_rate_Hz))  # the counter comes before a clock
         if any(word in name.lower() for word in ("ms", "milli", "time")):
-            meanings = meanings[-1:]  # the clock, if the values may be those of a clock
+            meanings = meanings[-1:]  # do not take the column for a counter if it may be a clock
         for meaning, tick in meanings:
-            is_new = SEQ not in names if meaning == SEQ else TIMES_US.keys().isdisjoint(names)
-            # A device file for lines of text cannot state another duration of a tick. A usual clock wraps at most once.
-            if is_new and tick == 1.0 and (meaning == SEQ or count_wraps(channel_steps) < 2):
+            is_possible = SEQ not in names
+            if meaning != SEQ:
+                # The ticks must be those of the name, because a device file for lines of text cannot state their
+                # duration. The milliseconds of a time wrap every second, but a clock wraps at most once.
+                has_no_clock = TIMES_US.keys().isdisjoint(names)
+                is_possible = has_no_clock and tick == 1.0 and count_wraps(channel_steps) < 2
+            if is_possible:
                 names[column] = meaning
-                if column not in layout.unnamed:
+                if column not in layout.unnamed:  # the board sends a name with each value
                     keys[meaning] = name
                 break
 
-    # Number the channels without names. Without names from a header, a counter or a clock, the columns need no names.
+    # For the values without a name in each line, list the names from a header, and of the counter and the clock. Other
+    # channels are numbered. If no such name is known, the columns need no names.
     if any(names[column] for column in layout.unnamed):
         channel_numbers = count(1)
         keys["columns"] = [names[column] or f"ch{next(channel_numbers)}" for column in layout.unnamed]
