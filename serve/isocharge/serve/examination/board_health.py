@@ -138,6 +138,8 @@ def transmission_sentences(capture: Capture) -> Iterator[str]:
     """
     received = capture.received
     unread_line = shown(capture.parser.unread_line) if capture.parser.unread_line else ""
+
+    # State at most one of these faults: no bytes, no frames, or damaged frames.
     advice = "check the cable, and whether the baud rate of the board is exact"
     if not has_speed(received.url):
         advice = (
@@ -161,7 +163,7 @@ def transmission_sentences(capture: Capture) -> Iterator[str]:
             "rate with --baud, end each line of text with a line feed, or describe the format in a device file "
             f"(--device); {advice}; a board without noise shows its channels only while the film is touched"
         )
-    elif capture.intact_share + 1.0 / len(capture.frames) < CLEAN_SHARE:  # the first frame may be incomplete
+    elif capture.intact_share + 1.0 / len(capture.frames) < CLEAN_SHARE:  # without the first frame, often incomplete
         damaged = f"{1.0 - capture.intact_share:.1%} of the bytes do not belong to good frames"
         if unread_line:
             damaged += (
@@ -169,6 +171,8 @@ def transmission_sentences(capture: Capture) -> Iterator[str]:
                 "value; if the line is damaged"
             )
         yield f"{damaged}: {advice}"
+
+    # Compare the clock of the board with the arrival times, unless the frames come from a file.
     has_clock = capture.frames and all(frame.t_us is not None for frame in capture.frames)
     if has_clock and received.span_s > LIVE_TIME_s:
         clock_span_s = float(elapsed_times(capture.frames)[-1])
@@ -191,6 +195,9 @@ def channel_count_sentences(
     sentence names the difference. The channels are not compared with the model if there is none, or if the device file
     assigns a channel to every electrode.
 
+    The channels are searched for as in a stream, by two methods of `Channels`. Their results are not used, but if they
+    raise an error, the message of the error is the sentence.
+
     Args:
         capture: The frames, at least one.
         device: Settings of the board.
@@ -200,7 +207,7 @@ def channel_count_sentences(
     try:
         if device.channels:
             Channels(Setup(tuple(device.channels), device)).channel_indices(capture.frames[-1])
-        if set(electrodes) <= set(device.channels):  # also without a model
+        if set(electrodes) <= set(device.channels):  # always true without a model, which means without electrodes
             return
         Channels(Setup(electrodes, reader="the model"), any_unit=True).indices_by_name_or_order(capture.frames[-1])
     except ChargeError as error:

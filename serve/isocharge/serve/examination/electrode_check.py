@@ -221,9 +221,9 @@ def _charges_of_press(frames: Iterator[Frame], electrode: str, ask: Callable[[st
             if not charges:
                 begin_s = frame.clock_s
             charges.append(frame.charge_pC)
-        elif charges and frame.clock_s - begin_s >= PressWatch.MIN_HELD_S:  # damaged frames are shorter
+        elif charges and frame.clock_s - begin_s >= PressWatch.MIN_HELD_S:  # the press has ended
             return np.asarray(np.mean(charges, axis=0))
-        else:
+        else:  # there was no touch, or only a short one, as damaged frames cause it
             charges = []
     raise PressCheckError(
         f"electrode {electrode}: no press began and ended within {timeout_s:g} s; take the finger away after each "

@@ -51,12 +51,15 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress:
     Returns:
         The press; the default values if no such press is found.
     """
+    # Find the first touch. An element behind the last block makes the search end there if no block is touched, or if
+    # the film is touched until the end.
     block_times_s, levels, is_touched = touched_blocks(values, times_s)
     begin = int(np.argmax([*is_touched, True]))  # first block of the touch
     end = begin + int(np.argmin([*is_touched[begin:], False]))  # first block after the touch
 
     # Choose the blocks in which the film is at rest before the press, and those in which the force is constant. The
-    # force may have begun to rise in the block before the touch, and to fall in the last block of the touch.
+    # force may have begun to rise in the block before the touch, rises for up to `CHANGE_BLOCKS`, and may have begun to
+    # fall in the last block of the touch.
     rest = slice(max(begin - 1, 0))
     held = slice(begin + CHANGE_BLOCKS, max(end - 1, 0))
     rest_times_s = block_times_s[rest]
@@ -65,7 +68,8 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress:
     if not has_levels or block_times_s[end - 1] - held_times_s[0] < MIN_HELD_S:
         return HeldPress()
 
-    # Project the levels onto the step. One unit is the charge at the beginning of the press.
+    # Reduce the levels of all channels to one charge, which is their component along the change that the press causes.
+    # It has the value 1 at the beginning of the press.
     step = levels[held][0] - levels[rest][-1]
     projected_levels = levels @ step / (step @ step)  # shape (blocks,)
     charge = projected_levels[held] - projected_levels[rest].mean()

@@ -250,15 +250,19 @@ def electrodes_by_position(capture: Capture, device: Device, electrodes: tuple[s
         position_of_electrode = {name: channel_index(channel, last_frame) for name, channel in device.channels.items()}
         return {position: name for name, position in position_of_electrode.items() if position is not None}
 
-    # A setting of the gain is one number for all electrodes, or a dictionary with a number for each electrode.
+    # Without a model, use the names in the section [gain]. Each of its settings is one number for all electrodes, or a
+    # dictionary with a number for each electrode.
     names = electrodes
     rule = device.rule(GainRule)
     if rule is not None and not names:
         dictionaries = [setting for setting in (rule.offset, rule.pC_per_unit) if isinstance(setting, dict)]
         names = tuple(dictionaries[0]) if dictionaries else ()
+
+    # Find the channels by name or by order. There is no result if no names are known, if there are more or fewer
+    # channels than names, or if the names of the channels are not clear.
     with suppress(ChargeError):  # a stream reports this error when it begins
         positions = Channels(Setup(names), any_unit=True).indices_by_name_or_order(last_frame)
-        if positions:  # empty without names, and None if the numbers of channels and names differ
+        if positions:
             return dict(zip(positions, names, strict=True))
     return dict(enumerate(capture.names))
 

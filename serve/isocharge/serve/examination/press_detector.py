@@ -59,9 +59,9 @@ BLOCK_RULE = TouchRule(sigmas=26.0, floor_pC=0.0)
 def _detect_touches(levels: Array, noise: Array) -> Booleans:
     """Return whether something touches the film in each block, shape (blocks,).
 
-    The stage `Touch` of a stream detects the touches. The charges of this stage are the differences from the levels
-    `CHANGE_BLOCKS` earlier, so that a slow change is no touch. During a touch, they are the differences from the levels
-    before the touch.
+    The stage `Touch` of a stream detects the touches. The charges of this stage are the differences between the levels
+    and the rest levels. Before a touch, the rest levels are those `CHANGE_BLOCKS` earlier, so that a slow change is no
+    touch. During a touch, the rest levels remain the same.
 
     Args:
         levels: Levels of the channels, shape (blocks, channels), in any unit.
@@ -73,8 +73,8 @@ def _detect_touches(levels: Array, noise: Array) -> Booleans:
     for number, level in enumerate(levels):
         was_touched = number > 0 and is_touched[number - 1]
         if not was_touched:
-            rest = levels[max(number - CHANGE_BLOCKS, 0)]
-        frame = Frame(seq=None, t_us=None, values=(), dt_s=BLOCK_S, charge_pC=level - rest)
+            rest_level = levels[max(number - CHANGE_BLOCKS, 0)]
+        frame = Frame(seq=None, t_us=None, values=(), dt_s=BLOCK_S, charge_pC=level - rest_level)
         frame.noise_pC = noise
         detector.step(frame)
         is_touched[number] = frame.is_contact

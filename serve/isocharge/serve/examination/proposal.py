@@ -111,20 +111,20 @@ def _choose_channels(
 
     If there are channels with the names of the electrodes, or as many channels as electrodes, the channels are chosen
     as in a stream. Otherwise, the electrodes are assigned, in their order, to the channels whose values vary. If more
-    channels vary than there are electrodes, the adjacent channels with the most similar noise are chosen. Without a
-    model, each varying channel is an electrode.
+    channels vary than there are electrodes, the adjacent channels with the most similar noise are chosen. If no
+    electrodes are given, each varying channel is an electrode, with the name A, B, C and so on.
 
     Args:
         capture: The frames.
         values: Values of all channels, shape (n, channels).
-        electrodes: Electrodes of the model; empty for any model.
+        electrodes: Names of the electrodes of the model; empty without a model.
         min_noise_share: Smallest noise of a channel that is connected to an electrode, relative to the median noise.
 
     Returns:
         Position of the channel in the frame by the name of the electrode; empty if there are too few channels.
     """
-    # A channel is left out if its values vary much less than the others, or are mostly not finite. If no channel
-    # varies, all channels are candidates.
+    # Find the channels that may belong to electrodes, the candidates. A channel is left out if its values vary much
+    # less than the others, or are mostly not finite. If no channel varies, all channels are candidates.
     noise = estimate_noise(values)  # standard deviation of each channel
     is_mostly_finite = 2 * np.isfinite(values).sum(axis=0) > len(values)
     noise[~is_mostly_finite] = 0.0
@@ -132,6 +132,8 @@ def _choose_channels(
     candidates = np.flatnonzero(noise >= min_noise_share * usual_noise).tolist()
     if not electrodes:
         electrodes = tuple(ELECTRODES[: len(candidates)])  # A, B, C, ...
+
+    # Choose the channels as in a stream, if this is possible.
     try:
         # Units in the names are ignored here. If a unit requires a gain that is missing, the gain is requested later.
         positions = Channels(Setup(electrodes), any_unit=True).indices_by_name_or_order(capture.frames[-1])
@@ -141,8 +143,10 @@ def _choose_channels(
         return dict(zip(electrodes, positions, strict=True))
     if len(candidates) < len(electrodes):
         return {}
-    # Choose the group of adjacent channels in which the ratio of the largest to the smallest noise is smallest. The
-    # ratios are compared by their powers of ten, and the first of equal groups is chosen.
+
+    # Choose the group of adjacent candidates in which the ratio of the largest to the smallest noise is smallest. The
+    # ratios are rounded to powers of ten, so that small differences do not matter, and the first of the groups with the
+    # smallest ratio is chosen.
     log_noise = np.log10(np.maximum(noise[candidates], np.finfo(float).tiny))
     groups = np.lib.stride_tricks.sliding_window_view(log_noise, len(electrodes))  # shape (groups, electrodes)
     log_ratios = np.round(np.ptp(groups, axis=1))

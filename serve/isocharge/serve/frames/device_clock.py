@@ -78,7 +78,7 @@ class DeviceClock:
         """Start without a reading."""
         self.rate = 1.0
         self._latest_chunk: Chunk | None = None  # latest chunk with the end of a frame
-        self._monotonic_s: float | None = None  # time of the latest chunk of frames without a clock
+        self._monotonic_s: float | None = None  # `clock_s` of the latest frame without a clock; never decreases
         self.reset()
 
     def reset(self) -> None:
@@ -108,14 +108,14 @@ class DeviceClock:
             frames: The frames, which are changed in place.
             modulus: Time at which the clock wraps to 0, us.
         """
-        if not frames:  # the next chunk with the end of a frame shares its time among its frames
+        if not frames:  # the time since the previous frames is divided when the next frame has ended
             return
-        previous_chunk = self._latest_chunk or chunk
+        previous_chunk = self._latest_chunk or chunk  # the interval before the first chunk is 0
         self._latest_chunk = chunk
         interval_s = elapsed_s(previous_chunk, chunk)
 
-        # All chunks of a file have the same arrival time, to which no clock can be fitted. After the first chunk, it is
-        # not known whether the chunks belong to a file.
+        # The clock is fitted only to arrival times that differ from the previous one, because all chunks of a file have
+        # the same arrival time. It is not fitted to the first arrival, after which the chunks may be those of a file.
         self._is_new_arrival = self._latest_arrival_s not in (None, chunk.timestamp)
 
         if frames[0].t_us is None:
@@ -135,9 +135,9 @@ class DeviceClock:
         """Write times into frames without a clock. If later frames of the chunk have a clock, it replaces their times.
 
         The time since the previous chunk is divided evenly among the frames of the chunk, and the last frame has the
-        arrival time of the chunk. This time is unknown in the first chunk of a port and in all chunks of a file, which
-        arrive at the same time. In `dt_s` and `clock_s`, the interval between the frames is then assumed to be
-        `FILE_INTERVAL_s`.
+        arrival time of the chunk. The time since the previous chunk is unknown for the first chunk of a connection and
+        for all chunks of a file, which arrive at the same time. All frames of such a chunk have the same `host_s`. In
+        `dt_s` and `clock_s`, the interval between them is assumed to be `FILE_INTERVAL_s`.
 
         Args:
             interval_s: Time since the previous chunk, s; 0 if it is unknown.
@@ -148,11 +148,12 @@ class DeviceClock:
             self._monotonic_s = arrival_s
         else:
             self._monotonic_s += interval_s or len(frames) * self.FILE_INTERVAL_s
+        # After a reset, the interval contains the outage of the port, and is not divided among the frames.
         share_s = 0.0 if self._latest_arrival_s is None else interval_s / len(frames)
-        for n_later, frame in enumerate(reversed(frames)):
-            frame.host_s = arrival_s - n_later * share_s
+        for later_count, frame in enumerate(reversed(frames)):  # number of frames after the frame in the chunk
+            frame.host_s = arrival_s - later_count * share_s
             frame.dt_s = share_s or self.FILE_INTERVAL_s
-            frame.clock_s = self._monotonic_s - n_later * frame.dt_s
+            frame.clock_s = self._monotonic_s - later_count * frame.dt_s
 
     def _stamp_with_device(self, frame: Frame, t_us: int, modulus: int, arrival_s: float) -> None:
         """Compute the time of a frame from the clock of the device, and write it into the frame.
@@ -161,9 +162,11 @@ class DeviceClock:
         of earlier readings. A new fit begins if there is none, if the device has restarted, or if the predicted time is
         far after the arrival.
 
-        If the clock went back by at most `MAX_DELAY_s`, the reading arrived late: for example, another datagram has
-        overtaken it. If the clock went back by more, the device has restarted. However, if the clock went back by at
-        least half of its range, it is assumed to have wrapped.
+        The clock may be lower than at the previous reading for three reasons, which the difference distinguishes:
+
+        - At most `MAX_DELAY_s`: the reading arrived late, for example because another datagram has overtaken it.
+        - At least half of the range of the clock: the clock has wrapped to 0.
+        - Any other difference: the device has restarted.
 
         Args:
             frame: The frame, which is changed in place.
@@ -171,13 +174,13 @@ class DeviceClock:
             modulus: Time at which the clock wraps to 0, us.
             arrival_s: Arrival of the chunk that contains the reading, unix seconds.
         """
-        step_us = 0  # time since the previous reading
+        step_us = 0  # time since the previous reading, which is negative if the clock is lower without a wrap
         if self._has_fit:
-            # The modulo makes the step correct even if the clock has wrapped between the readings.
+            # The modulo gives the step that is nearest to 0. If the clock has wrapped, this is a step forwards.
             half_range_us = modulus // 2
             step_us = (t_us - self._device_us + half_range_us) % modulus - half_range_us
         frame.is_clock_reset = step_us < -MAX_DELAY_s * 1e6
-        is_before_zero = self._device_us + step_us < 0  # the device had not been started
+        is_before_zero = self._device_us + step_us < 0  # before the device was started, which is not possible
         if not self._has_fit or frame.is_clock_reset or is_before_zero:
             step_us = 0
             self._begin_fit(t_us, arrival_s)
@@ -187,8 +190,8 @@ class DeviceClock:
         self._predicted_s = self._fitted_host_s + self.rate * (self._device_us - self._fitted_us) * 1e-6
 
         if self._is_predicted_after(arrival_s):
-            # A clock that advances is never smaller than its step. If it is, the clock went back, which was taken for a
-            # wrap. Since the prediction is wrong, the device has restarted instead.
+            # If the clock is smaller than its step, it has passed 0 since the previous reading, which was taken for a
+            # wrap. Because the prediction is wrong, the device has restarted instead.
             has_restarted = t_us < step_us
             if has_restarted:
                 frame.is_clock_reset = True
@@ -251,7 +254,8 @@ class DeviceClock:
         delay_s = arrival_s - self._predicted_s  # positive if the chunk arrived later than predicted
         step_s = (self._device_us - self._fitted_us) * 1e-6  # since the previous correction of the fit
         self._fitted_us = self._device_us
-        # Readings that a board stored before the connection may have moved the host time far ahead of the arrival.
+        # If a board sends readings that it stored before the connection, their clock advances faster than time passes,
+        # and moves the host time far ahead of the arrivals. The lead is therefore limited.
         self._latest_host_s = min(self._latest_host_s, arrival_s + MAX_LEAD_s)
 
         # A provisional fit relies on the arrival of only one chunk. A fit that begins at this arrival replaces it.

@@ -331,19 +331,21 @@ class Parser(ABC):
         if increase == 0:
             self.counts.repeated += 1
             return (REPEAT,)
-        # A small increase means that frames were lost. If the counter is lower than before, it may have wrapped, but a
-        # large increase across the end of its range is more probably a restart. The counter has not wrapped if the
-        # clock was reset at the same time, or if the counter had exceeded the modulus.
-        increase_limit = self.seq_modulus // 2
+        # An increase below `gap_limit` means that frames were lost. If the counter is lower than before, it may have
+        # wrapped. A large increase across the end of its range is more probably a restart, so the limit is then lower.
+        # The counter has not wrapped, so that no increase counts as a gap, if the clock was reset at the same time, or
+        # if the counter had exceeded the modulus.
+        gap_limit = self.seq_modulus // 2
         if seq < previous_seq:
             cannot_wrap = is_clock_reset or previous_seq >= self.seq_modulus
-            increase_limit = 0 if cannot_wrap else min(increase_limit, SMALLEST_RESTART)
-        if increase < increase_limit:
+            gap_limit = 0 if cannot_wrap else min(gap_limit, SMALLEST_RESTART)
+        if increase < gap_limit:
             self.counts.lost += increase - 1
             return (GAP,)
-        # A late frame was overtaken by a few others. A device that has restarted counts from 0 or 1.
+        # A late frame was overtaken by a few others, and was counted as lost. Its counter is a little lower than the
+        # previous one. The first frames after a restart, which have low counters, are never taken for late frames.
         decrease = (previous_seq - seq) % self.seq_modulus
-        if decrease <= MAX_LATE_FRAMES < seq and not is_clock_reset:
+        if decrease <= MAX_LATE_FRAMES and seq > MAX_LATE_FRAMES and not is_clock_reset:
             self._previous_seq = previous_seq
             self.counts.lost = max(0, self.counts.lost - 1)
             return (GAP,)

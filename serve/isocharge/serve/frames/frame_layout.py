@@ -285,7 +285,8 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         checksum_start = self.length - self.selected_checksum.size
         if self.compute_checksum(data[:checksum_start]) != data[checksum_start:]:
             raise ChecksumError("the checksum is wrong")
-        numbers = [  # `struct` unpacks fields of three bytes as bytes
+        # Integers of three bytes are converted here, because `struct` can only return their bytes.
+        numbers = [
             int.from_bytes(number, self.byte_order, signed=field.type_name == "i24")
             if isinstance(number, bytes)
             else number
@@ -320,7 +321,8 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
                 2 * self.length + 2,
                 lambda stuffed_frame: self.decode(stuffing.decode(stuffed_frame)),
             )
-        parser.seq_modulus = self.fields[self.columns.seq_column or 0].modulus  # ignored without a counter
+        # Without a counter, this is the modulus of the first field, which is never used.
+        parser.seq_modulus = self.fields[self.columns.seq_column or 0].modulus
         parser.t_us_modulus = self.t_us_modulus
         return parser
 

@@ -44,32 +44,39 @@ def clean_text(text: str) -> str:
         text = re.sub("[^\\S\t]|\ufeff", " ", text)
         text = re.sub("[\u2010-\u2015\u2212]", "-", text)
 
-    # Join each sign with its number, as in `A: - 3.5`.
+    # Join a sign with the number behind it, as in `A: - 3.5`, unless the sign may be a minus between two numbers.
     text = re.sub(r"(^|[:=,;(\[] *)([-+]) +(?=[.0-9])", r"\1\2", text.strip())
 
-    # Separate numbers from each other, or names from numbers, if nothing is between them.
+    # Separate numbers from each other, as in `+3.5-3.4`.
     if re.fullmatch(_SIGNED_NUMBERS, text):
         text = re.sub(r"(?<=[0-9])(?=[-+])", " ", text)
+
+    # Separate names from numbers, as in `A+3.5B-3.4`. A line in which a name occurs twice is a header (`ch-1, ch-2`).
     if re.fullmatch(f"(?:{_NAMED_NUMBER}){{2,}}", text):
         named_numbers = re.findall(_NAMED_NUMBER, text)
-        if len(dict(named_numbers)) == len(named_numbers):  # not a header such as `ch-1, ch-2`
+        if len(dict(named_numbers)) == len(named_numbers):
             text = " ".join(f"{name}={number}" for name, number in named_numbers)
 
+    # Remove quotes around numbers, and then the notation of Teleplot, of NMEA sentences and of comments.
     if '"' in text or "'" in text:
         text = re.sub(_QUOTED_NUMBER, r"\2", text)
     if text[:1] == ">":
         return _teleplot_content(text)
     if text[:1] == "$" and "*" in text:
         return _sentence_content(text)
-    text = re.sub(r"\*[0-9A-Fa-f]{2}$", "", text)  # a checksum like that of a sentence, whose rule is not known
+    text = re.sub(r"\*[0-9A-Fa-f]{2}$", "", text)  # a checksum that cannot be checked, because its rule is not known
     return "" if text[:1] == "#" else text
 
 
 def _teleplot_content(text: str) -> str:
-    """Return the latest value of a line of Teleplot; empty for a text or a point in a plane.
+    """Convert a line of the program Teleplot to text with a name before each number.
 
-    A Teleplot line has the form `>name:time:value;time:value§unit|flags`. The result has the form
-    `t_ms:1000;"name":801.2§unit`. A line that is no Teleplot line is returned unchanged.
+    A Teleplot line contains a name and one or more values, as in `>A:1000:800.9;1010:801.2§pC|g`. Before each value,
+    there may be its time in ms. A unit and flags may follow the last value. The result contains only the latest value
+    and its time, as in `t_ms:1010;"A":801.2§pC`.
+
+    The result is empty if the flags state that the value is a text (t) or a point in a plane (xy). A line that is no
+    Teleplot line is returned unchanged.
     """
     flags = text.rpartition("|")[2].split(",")
     if "t" in flags or "xy" in flags:
@@ -77,9 +84,9 @@ def _teleplot_content(text: str) -> str:
     teleplot = re.fullmatch(_TELEPLOT, text)
     if teleplot is None:
         return text
-    name, time, value = teleplot.groups()
+    name, time, value_with_unit = teleplot.groups()  # the time is None if the line has no times
     named_time = f"t_ms:{time};" if time else ""
-    return f'{named_time}"{name}":{value}'
+    return f'{named_time}"{name}":{value_with_unit}'
 
 
 def _sentence_content(text: str) -> str:

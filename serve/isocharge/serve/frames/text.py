@@ -161,8 +161,9 @@ class TextParser(DelimitedParser):
             if not text:
                 self._store_comment(line)
                 return []
-            # The beginning of the first line may be missing. For example, "801.2" may have become the number "1.2".
-            if is_first_line and parse_line(text).starts[:1] == (0,):
+            # The beginning of the first line may be missing, so that "1.2" may be the end of "801.2". The first line is
+            # therefore rejected if a number begins at its first character.
+            if is_first_line and 0 in parse_line(text).starts:
                 return self._reject(size)
             return self._read_line(text, size)
         except ValueError:
@@ -248,7 +249,8 @@ class TextParser(DelimitedParser):
         """Infer from the next value of the frame counter the value `seq_modulus` at which the counter wraps to 0.
 
         If the counter decreases from 99, 255, 999, 9999 or 65535, it has wrapped, and the modulus is the next number,
-        such as 100. If the counter reaches the modulus that was assumed, a larger modulus is assumed: 256 or 65536.
+        such as 100. If the counter reaches the present modulus, this modulus is wrong: a counter stays below its
+        modulus. A counter below 256 is then assumed to have 8 bits, and any other counter 16 bits.
 
         Args:
             seq: Next value of the frame counter.
@@ -278,8 +280,10 @@ class TextParser(DelimitedParser):
         self.unread_line = text
         if not line.names:
             self._headers.append(text)
-            return self._reject(size) if len(self._headers) == MAX_CYCLE_LINES else []
-        if self._headers:
+            if len(self._headers) == MAX_CYCLE_LINES:
+                return self._reject(size)
+            return []
+        if self._headers:  # words between the numbers are not names of numbers that a header names
             line_below_header = parse_line(text, has_header=True, meanings=self._meanings)
             if any(header_names(header, line_below_header) for header in self._headers):
                 line = line_below_header
@@ -306,13 +310,15 @@ class TextParser(DelimitedParser):
         Args:
             lines: The lines since the beginning.
         """
-        frame_lines = _frame_lines(lines, MESSAGE_REPEATS if lines[-1].is_prose else RECOGNITION_REPEATS)
+        repeats = MESSAGE_REPEATS if lines[-1].is_prose else RECOGNITION_REPEATS
+        frame_lines = _frame_lines(lines, repeats)
         if not frame_lines:
             return None
+        # Name the values that have no names. The device file has priority, and then the latest header.
         unnamed_count = frame_lines[0].names.count("")  # in a cycle of several lines, all values have names
-        headers = [header_names(header, frame_lines[0]) for header in reversed(self._headers)]
-        name_sources = (self._columns, *headers)
-        new_names = next((names for names in name_sources if len(names) == unnamed_count), ())
+        names_in_headers = [header_names(header, frame_lines[0]) for header in reversed(self._headers)]
+        possible_names = (self._columns, *names_in_headers)
+        new_names = next((names for names in possible_names if len(names) == unnamed_count), ())
         layout = Layout(frame_lines, new_names, self._meanings)
         has_wrong_column_count = self._columns and "" in layout.names
         if has_wrong_column_count or _has_hexadecimal_digits(layout, lines) or _has_channel_number(layout, lines):
@@ -322,8 +328,9 @@ class TextParser(DelimitedParser):
     def _set_layout(self, layout: Layout) -> None:
         """Set the layout, the attribute `format`, which describes the layout, and the modulus of the clock."""
         self.layout = layout
+        # A clock in s is assumed to be a time of day, which wraps after 86400 s. Other clocks wrap after 2^32 counts.
         unit_us = round(layout.columns.clock_unit_us)
-        is_time_of_day = unit_us == TIMES_US["t_s"]  # a day has 86400 s; other clocks count ms or us
+        is_time_of_day = unit_us == TIMES_US["t_s"]
         self.t_us_modulus = (86_400 if is_time_of_day else T_US_MODULUS) * unit_us
         names = [name for name in layout.names if name]
         unnamed_count = layout.names.count("")
@@ -362,6 +369,7 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
         lines: The lines since the beginning.
         repeats: Number of equal cycles that are needed.
     """
+    # Find the length of the cycle, which is the distance from the last line back to its previous occurrence.
     skeletons = [line.skeleton for line in lines]
     *earlier_skeletons, last_skeleton = skeletons
     if last_skeleton not in earlier_skeletons:
@@ -371,17 +379,19 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
     if skeletons[-repeats * cycle_length :] != repeats * last_cycle:
         return []
 
-    lines = lines[-repeats * cycle_length :]
-    cycle = lines[:cycle_length]
+    repeated_lines = lines[-repeats * cycle_length :]
+    cycle = repeated_lines[:cycle_length]
     has_equal_lines = len(set(last_cycle)) < cycle_length
     if has_equal_lines or cycle_length == 1:  # for example, three frames and then a temperature
         most_frequent_line = max(cycle, key=lambda line: skeletons.count(line.skeleton))
         return [most_frequent_line]
-    if all(all(line.names) for line in cycle):
-        first = _first_line(lines, cycle_length)
-        return lines[first : first + cycle_length]
-    # Some value has no name. The frame is the line of the cycle whose text varies, if there is exactly one such line.
-    texts = [{line.text for line in lines[position::cycle_length]} for position in range(cycle_length)]
+    has_only_named_values = all(all(line.names) for line in cycle)
+    if has_only_named_values:
+        first = _first_line(repeated_lines, cycle_length)
+        return repeated_lines[first : first + cycle_length]
+    # Collect the texts of the line at each position in the cycle. The frame is the line whose text varies, if there is
+    # exactly one such line.
+    texts = [{line.text for line in repeated_lines[position::cycle_length]} for position in range(cycle_length)]
     varying = [line for line, texts_of_line in zip(cycle, texts, strict=True) if len(texts_of_line) > 1]
     return varying if len(varying) == 1 else []
 
@@ -411,10 +421,11 @@ def _has_channel_number(layout: Layout, lines: Sequence[Line]) -> bool:
       below 100.
     - At least half of the steps from line to line lead to the next number. Other steps may be due to missing lines.
     - The column does not have the name of a frame counter or of an electrode, such as A.
-    - The other columns cannot be the charges of a film: fewer than three of the other columns sometimes decrease. Three
-      or more columns that are all constant may be charges, too.
+    - The other columns cannot be the charges of a film, because fewer than three of them sometimes decrease. A film has
+      at least three charges, which increase and decrease, while counters and clocks only increase. However, if all of
+      three or more other columns are constant, they may be the charges of an untouched film.
 
-    The result is also true for a frame counter without a name in its first eight lines.
+    A frame counter without a name also fulfils these conditions in its first eight lines.
 
     Args:
         layout: Layout of a frame with its names.
@@ -427,7 +438,7 @@ def _has_channel_number(layout: Layout, lines: Sequence[Line]) -> bool:
     columns = np.array([values for values in values_of_lines if values]).T  # shape (n_column, n_line)
 
     n_varying = np.sum(np.ptp(columns, axis=1) > 0.0)
-    if n_varying == 1 and len(columns) > 3:  # the other columns, at least three, are constant charges
+    if n_varying == 1 and len(columns) > 3:  # the other columns, at least three, may be constant charges
         return False
 
     decreases = np.any(columns != np.sort(columns), axis=1)  # whether each column decreases at least once
@@ -457,9 +468,10 @@ def _counts_up_repeatedly(column: Array) -> bool:
 def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
     """Return the index of the line with which a frame begins in repeated cycles of lines.
 
-    If every line has a clock, the first line is chosen so that the clocks of a frame differ least. If some line has no
-    clock, the first line is the one that begins with the counter. Without a counter, it is the line that only contains
-    the clock. Without both, it is the line whose first name comes first in alphabetical order.
+    Reading may start within a cycle. If every line has a clock, the first line is chosen so that the clocks of a frame
+    differ least. If some line has no clock, the first line is the one that begins with the counter. Without a counter,
+    it is the line that only contains the clock. Without both, it is the line whose first name comes first in
+    alphabetical order.
 
     Args:
         lines: Lines of whole cycles, in which every value has a name.
@@ -470,7 +482,11 @@ def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
     ]
 
     def sort_key(first: int) -> tuple[float, bool, str]:
-        """Return the sort key of the line with index `first`. A frame begins with the line with the smallest key."""
+        """Return the sort key of the line with index `first`. A frame begins with the line with the smallest key.
+
+        The key consists of the time from the first to the last line of a frame that would begin with this line (0 if
+        some line has no clock), whether the line begins without a counter, and the first name in the line.
+        """
         frame = fields_of_lines[first : first + cycle_length]
         clocks = [fields[name] for fields in frame for name in TIMES_US if name in fields]
         duration = clocks[-1] - clocks[0] if len(clocks) == cycle_length else 0.0

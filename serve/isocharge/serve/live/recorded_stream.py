@@ -174,10 +174,10 @@ class RecordedStream:
         if not self._preamble:
             return chunk
         preamble = chunk._replace(data=self._preamble, outage_s=0.0)
-        deque(self._stream.feed(preamble), maxlen=0)
+        deque(self._stream.feed(preamble), maxlen=0)  # processes the chunk, and discards the records
         if self.recorder is not None:  # the recording may have been ended before this chunk
             self.recorder.chunk(preamble, [])
-        return chunk._replace(outage_s=max(chunk.outage_s, 1e-6))
+        return chunk._replace(outage_s=max(chunk.outage_s, 1e-6))  # any outage above 0 has the same effect
 
     def _end_recording(self) -> None:
         """End the present recording, and close its recorder unless the caller has opened the recorder."""
@@ -235,7 +235,7 @@ def replay(
     """Compute the records of a recording again from its chunks, and yield the records.
 
     The replay also executes the recorded requests, such as a new tare. For each chunk, it yields the same number of
-    records as the recorded stream.
+    records as the recorded stream. A line with a record therefore only means that the replay yields its next record.
 
     Args:
         recording: Recording whose chunks are processed.
@@ -251,17 +251,18 @@ def replay(
         ModelError: If a model of the recording cannot be loaded.
     """
     previous_chunk: Chunk | None = None
-    due_s = 0.0  # monotonic time at which the replay of the next chunk begins
+    due_s = 0.0  # monotonic time at which the replay of the latest chunk begins
     records: Iterator[PredictionRecord] = iter(())  # records of the previous chunk that were not yielded yet
     for event in recording.events():
-        if event.latency_us is not None:  # the recorded stream has yielded the next record of the chunk
+        if event.latency_us is not None:  # the line is a record, which the recorded stream has yielded
             record = next(records, None)
             if record is not None:
                 yield structs.replace(record, latency_us=event.latency_us)
             continue
 
-        # If the recording program ended within the chunk, its last records were not recorded. The stream processes the
-        # whole chunk all the same, but the remaining records are discarded.
+        # The line is no record, so that all recorded records of the previous chunk were yielded. If the recording
+        # program ended within that chunk, its last records are missing in the recording. The stream processes the whole
+        # chunk all the same, but `deque` discards the remaining records.
         deque(records, maxlen=0)
         chunk = event.chunk
         if event.marker is not None:

@@ -124,14 +124,16 @@ class ReadingStream:
         if not frames:
             self._check_recognised()
             return frames
-        parser = self.parser.recognised or self.parser
+        parser = self.parser.recognised or self.parser  # the parser that has recognised the format continues alone
         self.parser = parser
         self._dropped_at_frame = parser.counts.bytes_dropped
         self.clock.stamp(chunk, frames, parser.t_us_modulus)
         for frame in frames:
+            # The number of intervals since the previous frame is 1, and larger by the number of lost frames between
+            # them. It is 0 for a late frame, because this frame was counted as lost before, and for a repeated frame.
             lost_before = parser.counts.lost
             sequence_flags = parser.sequence_flags(frame.seq, is_clock_reset=frame.is_clock_reset)
-            frame.intervals = 1 + parser.counts.lost - lost_before  # 0 for a late frame, which was counted as lost
+            frame.intervals = 1 + parser.counts.lost - lost_before
             if REPEAT in sequence_flags and frame.values == self._previous_values:
                 frame.intervals = 0
             self._previous_values = frame.values
@@ -236,10 +238,12 @@ class TouchStream(ReadingStream):
         Raises:
             ModelError: If a stage cannot use the model. The present stages and their model then remain in use.
         """
+        # The contact stages are created with a copy of the setup. If one of them raises an error, the setup is
+        # unchanged.
         new_setup = replace(self._setup)
         new_setup.use(predictor)
         contact_stages = create_stages(new_setup, needs_contact=True)
-        self._setup.use(new_setup.model)
+        self._setup.use(predictor)
         charge_stages = [stage for stage in self._stages if not stage.needs_contact]
         self._stages = charge_stages + contact_stages
         self.sections = tuple(stage.section for stage in contact_stages)

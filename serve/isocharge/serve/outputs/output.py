@@ -157,7 +157,8 @@ class WriterQueue(Generic[T]):
             earlier_count = self._written_count
             self._thread.join(CLOSE_TIMEOUT_s)
 
-        # End the thread. If it has not taken the final None, the item that it took last is lost, too.
+        # End the thread. If it ends at the final None, the queue is empty. Otherwise, the queue contains the lost items
+        # and the None, which counts for one more lost item: the item that the thread had taken but not written.
         self._is_abandoned = True
         self._thread.join(CLOSE_TIMEOUT_s)
         self.lost += self._items.qsize()

@@ -172,18 +172,20 @@ class Outputs:
                 self._handle_error(target, error)
 
     def _handle_error(self, target: str, error: Exception) -> None:
-        """Raise the error of an output, or continue a live stream without this output, unless it is standard output.
+        """Raise the error of an output, or write it to the log and write no further records to the output.
 
-        The first error of an output is written to the log, and its later errors are ignored.
+        The error is raised in a replay, and if the output is standard output. A live stream continues without any other
+        output that has failed. Only the first error of an output is written to the log.
 
         Raises:
             Exception: The error, with its cause and the target.
         """
-        reason = output_error(error, target)
+        complete_error = output_error(error, target)
         if not self._context.is_live or self._kinds[target].is_standard_output:
-            raise reason
-        if self._writers.pop(target, None) is not None:
-            log.error("%s: stopped (%s); the records after that are missing", target, reason)
+            raise complete_error
+        is_first_error = self._writers.pop(target, None) is not None  # the output has no writer after an error
+        if is_first_error:
+            log.error("%s: stopped (%s); the records after that are missing", target, complete_error)
         self.not_written[target] = None  # the number is unknown
 
     def close(self) -> None:
@@ -195,11 +197,11 @@ class Outputs:
         self._stack.close()
 
     def _close_or_discard(self, target: str, output: Output, queue: WriterQueue[PredictionRecord] | None) -> None:
-        """Close an output, or discard it.
+        """Close an output if it contains all records, and otherwise discard it.
 
-        An incomplete output is discarded: a replay was stopped, another output could not be opened, or this output has
-        failed. An error while an output is discarded is written to the log, because the error that has ended the
-        command is more important.
+        An output is incomplete in three cases: a replay was stopped, another output could not be opened (in both cases,
+        all outputs are discarded, `_is_discarded`), or this output has failed. An error while all outputs are discarded
+        is only written to the log, because the error that has ended the command is more important.
 
         Args:
             target: Target of the output, by which messages name it.
@@ -214,12 +216,12 @@ class Outputs:
                 self._close_queue(target, queue)
                 if queue.is_stuck:  # the thread is still in `write` of the output, which therefore cannot be closed
                     return
-            has_failed = target not in self._writers
+            has_failed = target not in self._writers  # `_handle_error` removes the writer of an output that fails
             if self._is_discarded or has_failed:
                 self._discard(output)
             else:
                 output.close()
-        except KeyboardInterrupt:  # in a replay, the command then removes the file
+        except KeyboardInterrupt:  # the output may be incomplete; a replay then removes the file
             self.not_written[target] = None
             raise
         except Exception as error:

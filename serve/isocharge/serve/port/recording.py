@@ -78,13 +78,15 @@ class Recorder:
             name: Name of the film in the records; None for the name of the sensor of the model.
 
         Raises:
-            RecordingError: If the first line of the recording could not be read.
+            RecordingError: If a reader would refuse the first line of the recording, for example because of the name.
         """
         self.path = Path(path)
         self.failed = False
-        header = {KIND: VERSION, "model": model, "device": dict(device)} | ({"name": name} if name else {})
+        header: dict[str, Any] = {KIND: VERSION, "model": model, "device": dict(device)}
+        if name:
+            header["name"] = name
         self._first_line = json.dumps(header)
-        parse_json(self._first_line, "recording", RecordingError, _Header)
+        parse_json(self._first_line, "recording", RecordingError, _Header)  # checks the line as a reader does
         self._latest_chunk: Chunk | None = None  # chunk of the latest call of `chunk`
         self._latest_start = 0  # size of the file before the latest chunk was written, bytes
 

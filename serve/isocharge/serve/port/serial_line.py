@@ -337,10 +337,11 @@ class UdpSocket:
         self._socket.close()
 
     def _with_line_feed(self, data: bytes) -> bytes:
-        """Return a datagram of text with a line feed at its end.
+        """Add a line feed to a datagram of text if the board does not end its lines with line feeds.
 
-        If this datagram or one of the latest datagrams of the board ends with a line feed, the board itself ends its
-        lines, and the datagram is returned unchanged. A datagram that is no text is also returned unchanged.
+        A board ends its lines itself if a datagram ends with a line feed. Because a serial bridge may divide a line
+        over several datagrams, the next datagrams need not contain a line feed. After more than `MAX_LINE_DATAGRAMS`
+        datagrams without one, the board no longer ends its lines. A datagram that is no text is returned unchanged.
 
         Args:
             data: The datagram.

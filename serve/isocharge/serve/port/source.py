@@ -178,13 +178,14 @@ class Port:
     def __iter__(self) -> Iterator[Chunk]:
         """Yield chunks as they arrive. If the port is lost and `reconnect` is true, open the port again.
 
+        The port counts as lost if no byte arrives within `start_up_s` after it was opened, or later within `silence_s`.
         After two chunks of the largest size in succession, a warning is logged once, because bytes wait to be read.
 
         Raises:
             PortLost: If the port disappears or stays silent for too long, and `reconnect` is false.
             PortError: If the port is not open.
         """
-        full_chunk_count = 0  # in succession
+        full_chunk_count = 0  # number of chunks of the largest size in succession; remains 2 after the warning
         while True:
             wait_start_s = time.monotonic()
             try:
@@ -200,7 +201,7 @@ class Port:
                     raise
                 log.warning("%s; trying again until it is back", error)
                 chunk = self._read_after_reconnecting()._replace(outage_s=time.monotonic() - wait_start_s)
-            self._max_silence_s = self._silence_s
+            self._max_silence_s = self._silence_s  # the board has started
             if full_chunk_count < 2:
                 full_chunk_count = full_chunk_count + 1 if len(chunk.data) >= MAX_READ_BYTES else 0
                 if full_chunk_count == 2:

@@ -192,7 +192,10 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     is_selected = is_compared & ~is_bad
     selected_count = int(is_selected.sum())
     agreement = Agreement.from_errors(errors, is_selected)
-    # Each array has the columns x, y (mm) and F (relative), shape (n_selected, 3). `FORCE` is the index of the last.
+
+    # Summarise the errors of the positions and those of the forces, together with the standard deviations that noise
+    # and rig cause. Each array has the columns x, y (mm) and force (relative), shape (n_selected, 3). `FORCE` is the
+    # index of the column of the force.
     selected = (errors.error[is_selected], errors.noise_std[is_selected], errors.rig_std[is_selected])
     position_mm = ErrorSummary.from_errors(*[columns[:, :FORCE] for columns in selected])
     force_percent = ErrorSummary.from_errors(*[100.0 * columns[:, FORCE:] for columns in selected])
@@ -202,7 +205,8 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     if selected_count >= MIN_PRESSES:
         fits = agreement.acceptable and not misfit_text
 
-    std_factor = None  # remains None if too few presses are compared for a guarantee, which needs bad presses, too
+    # The guarantee holds for all presses, so that the factor is computed from the bad presses, too.
+    std_factor = None  # remains None if too few presses are compared for a guarantee
     if np.count_nonzero(is_compared) >= FEWEST_HELD_OUT:
         std_factor = StdFactor.from_errors(errors.error[is_compared], errors.noise_std[is_compared])
 
@@ -338,17 +342,21 @@ def _remedies(
         force: Errors of the forces; None if no force is known.
         misfit_text: Statement that too many presses have a large misfit; empty if this is not the case.
     """
+    # Attribute the part of the errors that nothing explains, `beyond`, to the rig.
     larger_rig_std = np.full_like(errors.rig_std, np.nan)  # of x, y and the force
     options = []
     if position is not None:
         distance_std = math.hypot(position.rig, position.beyond)
-        coordinate_std = distance_std / math.sqrt(2.0)
+        coordinate_std = distance_std / math.sqrt(2.0)  # x and y contribute equally to the distance
         larger_rig_std[:, :FORCE] = coordinate_std
         options.append(f"--position-std {coordinate_std:.2g}")
     if force is not None:
         force_std = 0.01 * math.hypot(force.rig, force.beyond)  # from percent
         larger_rig_std[:, FORCE] = force_std
         options.append(f"--force-std {force_std:.2g}")
+
+    # State the options only if the program accepts this standard deviation of the force, and if the larger standard
+    # deviations explain the errors.
     is_possible = not PRESS_RULES["force_std"].violations(larger_rig_std[:, FORCE]).any()
     is_explained = Agreement.from_errors(replace(errors, rig_std=larger_rig_std), is_selected).acceptable
     if is_possible and is_explained and not misfit_text:

@@ -79,8 +79,10 @@ class PressErrors:
         The covariance of the errors is that of the noise, with the correlations that the model states, plus that of the
         rig, whose errors are independent. Unknown errors do not count.
         """
+        # Only the noise is correlated. In the correlation of two errors, the correlation of the noise is therefore
+        # multiplied by the share of noise in the standard deviation of each error. The diagonal elements are 1.
         std = np.sqrt(self.variance)
-        noise_share = self.noise_std / std  # part of the standard deviation that noise causes
+        noise_share = self.noise_std / std  # shape (n, 3)
         noise_correlation = correlation_matrices(self.predicted) * noise_share[:, :, None] * noise_share[:, None, :]
         correlation = np.nan_to_num(noise_correlation)  # an unknown error has no correlations
         correlation[:, range(3), range(3)] = 1.0

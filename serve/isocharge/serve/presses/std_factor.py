@@ -50,11 +50,13 @@ class StdFactor(NamedTuple):
         """Compute the factor from the errors of held-out presses.
 
         The score of a press is the factor with which its 95 % region just contains the measured values. The region is
-        an ellipsoid with axes along x, y and the force, without the correlations that the model states.
+        an ellipsoid with axes along x, y and the force, without the correlations that the model states. The result is
+        the smallest score that is large enough for the share `COVERAGE` of all future presses with the probability
+        `CONFIDENCE`.
 
         Args:
-            error: Errors of x, y and the force, shape (n, 3); NaN if unknown. At least one value of
-                `FEWEST_HELD_OUT` rows must be known.
+            error: Errors of x, y and the force, shape (n, 3); NaN if unknown. A press without a known error is left
+                out. At least `FEWEST_HELD_OUT` presses must have a known error.
             std: Standard deviations that the model states, in the units of `error`, shape (n, 3).
 
         Returns:
@@ -66,9 +68,9 @@ class StdFactor(NamedTuple):
         region_chi_squared = np.take(REGION_QUANTILES, known_count[is_known] - 1)  # on the surface of the region
         scores = np.sort(np.sqrt(chi_squared / region_chi_squared))
 
-        # The score at index k is at least the quantile `COVERAGE` of all future scores if at most k of the n scores lie
-        # below this quantile. The scores are independent, so the number below it has a binomial distribution. The index
-        # is the first for which this probability reaches `CONFIDENCE`.
+        # Each score lies below the quantile `COVERAGE` of all future scores with the probability `COVERAGE`, so that
+        # the number of scores below this quantile has a binomial distribution. If this number is at most k, the score
+        # at index k is not below the quantile. Choose the smallest k for which this has the probability `CONFIDENCE`.
         index = np.argmax(binomial_distribution(len(scores), COVERAGE) >= CONFIDENCE)
         return cls(float(scores[index]), len(scores))
 

@@ -50,8 +50,8 @@ def possible_meanings(steps: Array, frame_rate_Hz: float, tolerance: float = 0.0
         The name of the field, which is `seq`, `t_s`, `t_ms` or `t_us`, and the value of one tick in the unit of this
         name.
     """
-    # A step is regular if it differs from the median step by at most 70 %, or by at most 1 (a slow clock repeats some of
-    # its values). Steps over lost or damaged frames are not regular.
+    # A step is regular if it differs from the median step by at most 70 %, or by at most 1, because a slow clock may
+    # repeat some of its values. Steps over lost or damaged frames are not regular.
     median_step = np.median(steps)
     regular_steps = steps[np.abs(steps - median_step) <= max(1.0, 0.7 * median_step)]
     is_regular = len(regular_steps) >= INTACT_SHARE * len(steps) and regular_steps.min() >= 0.0

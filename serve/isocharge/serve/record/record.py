@@ -167,7 +167,8 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
     def to_json(self) -> str:
         """Return the record as one line of strictly valid JSON, in which numbers are rounded to six decimals.
 
-        The line is computed only once, and is then stored in the record.
+        The line is computed only once. It is then stored in the `__dict__` of the record, because a record is immutable
+        and has no field for the line.
 
         Raises:
             ValueError: If a number is not finite.
