@@ -310,8 +310,7 @@ class TextParser(DelimitedParser):
         Args:
             lines: The lines since the beginning.
         """
-        repeats = MESSAGE_REPEATS if lines[-1].is_prose else RECOGNITION_REPEATS
-        frame_lines = _frame_lines(lines, repeats)
+        frame_lines = _frame_lines(lines, MESSAGE_REPEATS if lines[-1].is_prose else RECOGNITION_REPEATS)
         if not frame_lines:
             return None
         # Name the values that have no names. The device file has priority, and then the latest header.
@@ -385,8 +384,7 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
     if has_equal_lines or cycle_length == 1:  # for example, three frames and then a temperature
         most_frequent_line = max(cycle, key=lambda line: skeletons.count(line.skeleton))
         return [most_frequent_line]
-    has_only_named_values = all(all(line.names) for line in cycle)
-    if has_only_named_values:
+    if all(all(line.names) for line in cycle):  # every value has a name
         first = _first_line(repeated_lines, cycle_length)
         return repeated_lines[first : first + cycle_length]
     # Collect the texts of the line at each position in the cycle. The frame is the line whose text varies, if there is

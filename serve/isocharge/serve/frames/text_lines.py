@@ -323,8 +323,7 @@ def _index_positions(parts: list[_Part]) -> list[int]:
         return number_positions[-paired_count::2]  # every second of the last numbers of the line
 
     indices = first_numbers(r"0[)\]]?[:=]0")  # such as `1:801`
-    has_only_pairs = len(number_positions) == 2 * len(indices)
-    if len(indices) > 1 or has_only_pairs:
+    if len(indices) > 1 or len(number_positions) == 2 * len(indices):  # or the line has no other numbers
         return indices
 
     indices = first_numbers(r"[uw#(\[=]0[)\]>(\[]?0")  # such as `pad 1 801` or `[1] 801`
@@ -486,11 +485,11 @@ def _units(parts: list[_Part], names: list[str]) -> list[str]:
     words_before_names = takewhile(lambda word: word not in names, first_words)
     common_unit = next((word for word in words_before_names if word in units), "")
 
-    units_of_numbers = []
-    for words in zip(words_behind, words_before, strict=True):
-        words_without_brackets = [word.strip("[]") for word in words]
-        units_of_numbers.append(next((word for word in words_without_brackets if word in units), common_unit))
-    return units_of_numbers
+    # Take the word behind each number if it is a unit, else the word before it, else the common unit.
+    return [
+        next((word for word in (behind.strip("[]"), before.strip("[]")) if word in units), common_unit)
+        for behind, before in zip(words_behind, words_before, strict=True)
+    ]
 
 
 def _with_units(names: list[str], units: list[str], counters: Container[str]) -> list[str]:
@@ -590,5 +589,5 @@ def header_names(header: str, line: Line) -> tuple[str, ...]:
     # A label with a colon may stand before a name, as in `Data: A, B, C`.
     names = tuple(column.rpartition(":")[2].strip(" \"'") for column in columns)
     are_names = all(re.match(r"[^\W\d]", name) for name in names)
-    are_different = len(set(names)) == len(names)
-    return names if are_names and are_different and len(names) == len(starts) else ()
+    are_different = len(set(names)) == len(starts)  # false, too, if there are fewer names than numbers
+    return names if are_names and are_different else ()

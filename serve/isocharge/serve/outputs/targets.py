@@ -183,8 +183,7 @@ class Outputs:
         complete_error = output_error(error, target)
         if not self._context.is_live or self._kinds[target].is_standard_output:
             raise complete_error
-        is_first_error = self._writers.pop(target, None) is not None  # the output has no writer after an error
-        if is_first_error:
+        if self._writers.pop(target, None) is not None:  # this is the first error, after which there is no writer
             log.error("%s: stopped (%s); the records after that are missing", target, complete_error)
         self.not_written[target] = None  # the number is unknown
 

@@ -268,10 +268,9 @@ class CsvTable:
             if mark != self._mark:
                 return None
             if not self._is_mark_decimal:
-                # In countries where points separate thousands, commas do not separate the columns of a CSV file.
+                # Where points separate thousands, commas are decimal marks and do not separate the columns of a file.
                 is_decimal_point = self._separator == "," and mark == "."
-                may_separate_thousands = _THOUSANDS.fullmatch(text) is not None
-                self._is_mark_decimal = is_decimal_point or not may_separate_thousands
+                self._is_mark_decimal = is_decimal_point or _THOUSANDS.fullmatch(text) is None
         number = float(text.replace(",", "."))
         return number if math.isfinite(number) else None
 

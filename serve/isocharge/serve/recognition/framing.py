@@ -207,9 +207,8 @@ def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDiv
             starts = positions[:-1][distances == length]  # the last position has no distance to a next one
             best_code = np.bincount(codes[starts], minlength=1).argmax()  # 0 if there are no positions
             division = FrameDivision(SYNC, stream, starts[codes[starts] == best_code], length)
-            earlier_division = best_division.get(length)
-            if earlier_division is None or division.covered_share > earlier_division.covered_share:
-                best_division[length] = division
+            division_of_pairs = best_division.get(length, division)  # none while the pairs are examined
+            best_division[length] = max(division_of_pairs, division, key=lambda division: division.covered_share)
 
     # The largest shares come first. They are rounded to 0.1, so that of two lengths with about equal shares the shorter
     # length comes first.
