@@ -273,7 +273,8 @@ class Measurement:
         decays = np.exp(-1.0 / (self.rate * self.leak_time))
         inputs *= 0.5 * (1.0 + decays)
         channels = zip(decays.tolist(), inputs.T, self._output.tolist(), strict=True)
-        output = np.stack([_decaying_sum(*channel) for channel in channels], axis=1)
+        outputs = [_decaying_sum(decay, channel_inputs, previous) for decay, channel_inputs, previous in channels]
+        output = np.stack(outputs, axis=1)
         self._output = output[-1]
         return output
 

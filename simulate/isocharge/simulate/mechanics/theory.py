@@ -236,7 +236,8 @@ class DimensionlessGroups:
             angle: Direction of the press from the centre of the film, rad.
             side_force: Force (Fx, Fy) of the probe on the film in the plane of the film, N.
         """
-        # The unit of the force is E h a A^3, and the unit of the pressure is E h A^3 / a.
+        # With Young's modulus E, the thickness h, the radius a and the amplitude A, the unit of the side force is
+        # E h a A^2, the unit of the force is E h a A^3, and the unit of the pressure is E h A^3 / a.
         squared_amplitude = float(amplitude_squared(film, force))
         side_unit = side_force_unit(film, squared_amplitude)
         force_unit = side_unit * squared_amplitude**0.5

@@ -112,6 +112,8 @@ class PlacedMesh:
         nodal_points = self.points[template.footprint]
         quadrature_points = nodal_points @ rule.values.T
         centroid = placement.corners[-1] + placement.footprint_displacement  # of the footprint on the film
+        # The factor `rotation_and_scale` converts points of the footprint, in mm, into points on the film, so the
+        # division converts them back.
         points_from_centroid_mm = (quadrature_points - centroid) / placement.rotation_and_scale
         pressure = placement.probe.pressure(points_from_centroid_mm)  # divided by the mean pressure
 

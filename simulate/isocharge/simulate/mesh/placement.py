@@ -217,6 +217,7 @@ class Placement:
         Returns:
             Points of the circular film, shape (..., n), in film radii.
         """
+        # If the clamp is circular, there is no displacement. Otherwise, the points are a first approximation.
         circular_points = points - self.footprint_displacement[..., None]
         if not self.oval.any():
             return circular_points

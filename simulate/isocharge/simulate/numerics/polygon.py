@@ -103,7 +103,7 @@ def area_in_disk(corners: Complexes, centre: complex, radius: Array | float) -> 
     direction = (end - start) / np.abs(end - start)  # unit vector x + iy
     start_along = (start * np.conj(direction)).real
     end_along = (end * np.conj(direction)).real
-    across = cross_product(direction, start)  # of the edge; negative if the centre lies on its left
+    across = cross_product(direction, start)  # negative if the centre lies on the left of the edge
 
     # Compute the chords. If the edge does not meet the circle, the length of the chord is zero, and the edge is outside
     # the circle before and after this point.

@@ -55,19 +55,19 @@ class Assembly:
         skeleton: Indices of the free unknowns on sides, in the order of elimination, shape (n_skeleton,).
     """
 
-    def __init__(self, mesh: Template, unknowns_per_node: int, odd: bool) -> None:
+    def __init__(self, template: Template, unknowns_per_node: int, odd: bool) -> None:
         """Number the unknowns, and compute the sparsity pattern of the skeleton matrix.
 
         The skeleton consists of the unknowns on the sides of the elements. The unknowns in the interior of an element
         are eliminated before the system is solved, so the matrix of the system contains only the skeleton unknowns.
 
         Args:
-            mesh: Template of the mesh.
+            template: Template of the mesh.
             unknowns_per_node: Number of unknowns per node.
             odd: Whether the fields are odd about the line of symmetry.
         """
         self.unknowns_per_node = unknowns_per_node
-        self.free = _free_unknowns(mesh, unknowns_per_node, odd)
+        self.free = _free_unknowns(template, unknowns_per_node, odd)
 
         # Compute the local indices of the unknowns on the sides of an element and in its interior. Within an element,
         # the unknowns are numbered component by component: first U1 of all nodes, then U2, and so on. The index of an
@@ -75,13 +75,13 @@ class Assembly:
         # because `mechanics.energy.Bending` has eliminated their auxiliary unknown.
         component = np.arange(unknowns_per_node)[:, None]
         displacement_component = component[:3]
-        n_local = mesh.is_interior.size
-        self._side_indices = (component * n_local + np.flatnonzero(~mesh.is_interior)).ravel()
-        self._interior_indices = (displacement_component * n_local + np.flatnonzero(mesh.is_interior)).ravel()
+        n_local = template.is_interior.size
+        self._side_indices = (component * n_local + np.flatnonzero(~template.is_interior)).ravel()
+        self._interior_indices = (displacement_component * n_local + np.flatnonzero(template.is_interior)).ravel()
 
         # Compute the global indices of the unknowns of each element. Globally, the unknowns are numbered node by node:
         # the index of an unknown is unknowns_per_node * node + component.
-        unknown = (unknowns_per_node * mesh.nodes[:, None] + component).reshape(len(mesh.nodes), -1)
+        unknown = (unknowns_per_node * template.nodes[:, None] + component).reshape(len(template.nodes), -1)
         self.interior_unknowns = unknown[:, self._interior_indices]
         self.side_unknowns = unknown[:, self._side_indices]
 
@@ -247,14 +247,14 @@ def factorise(matrix: csc_matrix, column_order: str) -> SuperLU:
     return splu(matrix, permc_spec=column_order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
-def _free_unknowns(mesh: Template, unknowns_per_node: int, odd: bool) -> np.ndarray:
+def _free_unknowns(template: Template, unknowns_per_node: int, odd: bool) -> np.ndarray:
     """Return which unknowns are free. All other unknowns are fixed at zero.
 
     The clamp fixes U1, U2 and W on the rim. On the line of symmetry, U2 is fixed if the field is even, and all unknowns
     except U2 are fixed if the field is odd.
 
     Args:
-        mesh: Template of the mesh.
+        template: Template of the mesh.
         unknowns_per_node: Number of unknowns per node.
         odd: Whether the fields are odd about the line of symmetry.
 
@@ -266,9 +266,9 @@ def _free_unknowns(mesh: Template, unknowns_per_node: int, odd: bool) -> np.ndar
     is_u2 = component == 1
     is_fixed_on_axis = ~is_u2 if odd else is_u2
 
-    free = np.ones((mesh.n_node, unknowns_per_node), dtype=bool)
-    free[np.ix_(mesh.on_rim, is_displacement)] = False
-    free[np.ix_(mesh.on_axis, is_fixed_on_axis)] = False
+    free = np.ones((template.n_node, unknowns_per_node), dtype=bool)
+    free[np.ix_(template.on_rim, is_displacement)] = False
+    free[np.ix_(template.on_axis, is_fixed_on_axis)] = False
     return free
 
 
