@@ -9,9 +9,10 @@ import pytest
 
 from drawn_contacts import draw_contacts
 from isocharge.common.errors import ChargeError
-from isocharge.serve import Frame, Predictor, device_from_table
+from isocharge.serve import Frame, Predictor, TouchStream, device_from_table
 from isocharge.serve.live.device import create_stages
 from isocharge.serve.signal_chain.stage import Setup
+from isocharge.serve.signal_chain.thermal import Warming
 from isocharge.simulate import Circle, ForwardMap, NoiseModel, load_sensor
 from kept import kept
 
@@ -88,6 +89,13 @@ def test_noise_of_a_device_file_and_at_rest_widens_the_contacts_of_a_stream_and_
     board.write_text("[noise]\ngain = 0.015\n")
     _, out, _ = command("serve", "predict", NAME, presses, "--json", "--device", board)
     assert json.loads(out)["x_std_mm"] == pytest.approx(expected.x_std_mm, rel=1e-5)
+
+
+def test_warming_is_estimated_with_the_noise_of_the_device_file(released):
+    stream = TouchStream(released, device_from_table({"noise": {"gain": 0.015}, "common_mode": {}}, "b"))
+    stream.use(released)
+    (warming,) = [stage for stage in stream._stages if isinstance(stage, Warming)]
+    assert warming._setup.model.noise.gain == 0.015
 
 
 @pytest.mark.parametrize("noise", [(-1.0, 0.0), (1.0, np.inf), ([1.0] * 3, 0.0)])

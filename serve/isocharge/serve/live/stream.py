@@ -238,12 +238,13 @@ class TouchStream(ReadingStream):
         Raises:
             ModelError: If a stage cannot use the model. The present stages and their model then remain in use.
         """
-        # The contact stages are created with a copy of the setup. If one of them raises an error, the setup is
-        # unchanged.
+        # The contact stages are created with a copy of the setup. If a stage raises an error, the present setup is
+        # unchanged. The first stage stores in the copy the model with the noise of the board, which then replaces the
+        # present model for all stages.
         new_setup = replace(self._setup)
         new_setup.use(predictor)
         contact_stages = create_stages(new_setup, needs_contact=True)
-        self._setup.use(predictor)
+        self._setup.use(new_setup.model)
         charge_stages = [stage for stage in self._stages if not stage.needs_contact]
         self._stages = charge_stages + contact_stages
         self.sections = tuple(stage.section for stage in contact_stages)
