@@ -113,11 +113,11 @@ def _fit_drift_and_hum(
     """
     is_long = times_s[-1] > min_hum_time_s
     fitted_Hz = [hum_Hz for hum_Hz in MAINS_HZ if is_long and rate_Hz > min_samples_per_period * hum_Hz]
-    phases = 2.0 * np.pi * np.outer(times_s, fitted_Hz)
+    phases = 2.0 * np.pi * np.outer(times_s, fitted_Hz)  # shape (n, frequencies)
     design_matrix = np.column_stack([np.ones_like(times_s), times_s, np.cos(phases), np.sin(phases)])
     coefficients = np.linalg.lstsq(design_matrix, charge_pC, rcond=None)[0]
     _constant, drift_pC_per_s, *amplitudes = coefficients.tolist()
-    cosines, sines = np.reshape(amplitudes, (2, -1))
+    cosines, sines = np.reshape(amplitudes, (2, -1))  # each of shape (frequencies,)
     hum_pC = dict(zip(fitted_Hz, np.hypot(cosines, sines).tolist(), strict=True))
     noise_pC = float((charge_pC - design_matrix @ coefficients).std())
     return drift_pC_per_s, (hum_pC.get(50.0), hum_pC.get(60.0)), noise_pC

@@ -118,6 +118,7 @@ def _cause_of_change(held_s: Reals, charge: Reals, min_residual_ratio: float = 9
         The time constant of the leak with two significant digits, s, or None if the cause is not a leak, and the cause
         with advice to the user, as a part of a sentence.
     """
+    # The charge of a leak decays exponentially with the time, and that of creep as a power of the time.
     leak_slope_per_s, leak_residual = _fit_line(held_s, np.log(charge))
     creep_slope, creep_residual = _fit_line(np.log(held_s), np.log(charge))
     if leak_slope_per_s < 0.0 and creep_residual > min_residual_ratio * leak_residual:

@@ -180,6 +180,7 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     if isinstance(frames, Mapping):  # `convert` adds a missing section, and reports an error if it is not a mapping
         complete_table["frames"] = {"format": "auto", **frames}
     sections: Any = convert(complete_table, DeviceSections, where, DeviceError)
+    # The other sections contain the settings (rules) of the stages. Each stage finds its settings by their class.
     values = structs.asdict(sections).values()
     rules = {type(value): value for value in values if isinstance(value, Rule) and value.on}
     return Device(sections.name, sections.front_end, sections.frames, sections.channels, rules, table, where)

@@ -241,7 +241,7 @@ class Outputs:
         if queue.error is not None:
             self._handle_error(target, queue.error)
         if queue.lost > 0:
-            self.not_written.setdefault(target, queue.lost)
+            self.not_written.setdefault(target, queue.lost)  # keeps None, which `_handle_error` has set
 
     def _discard(self, output: Output) -> None:
         """Discard an output or, if it has no method `discard`, close it. Remove a file without records."""

@@ -221,7 +221,11 @@ class Requester:
         return max(0.0, self._due_s - time.monotonic())
 
     def next_request(self) -> bytes:
-        """Return the bytes of the next request, which the caller must send now."""
+        """Return the bytes of the next request, which the caller must send now.
+
+        If the board does not answer, the request is due again after `REPEAT_TIME_s`, but not earlier than the limit of
+        the rate allows.
+        """
         now_s = time.monotonic()
         self._earliest_s = now_s + 1.0 / self._request.rate_Hz
         self._due_s = max(self._earliest_s, now_s + REPEAT_TIME_s)
@@ -241,7 +245,7 @@ class Requester:
         if self._expects_echo:
             self._kept_bytes += received
             request = self._request.data
-            if request != self._kept_bytes and request.startswith(self._kept_bytes):
+            if request != self._kept_bytes and request.startswith(self._kept_bytes):  # an incomplete echo
                 return b""
             self._expects_echo = False
             received = self._kept_bytes.removeprefix(request)

@@ -300,7 +300,8 @@ def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> context
     scheme, separator, _address = url.partition("://")
     is_path = not separator
     if not is_path:
-        for entry_point in entry_points(group=ENTRY_POINTS, name=scheme):  # another package may add a source
+        # If another package has added a source for the scheme, the first such source is used.
+        for entry_point in entry_points(group=ENTRY_POINTS, name=scheme):
             added_source: contextlib.AbstractContextManager[Source] = entry_point.load()(url)
             return added_source
 

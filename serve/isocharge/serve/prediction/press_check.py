@@ -253,7 +253,7 @@ def _bad_presses(errors: PressErrors) -> Booleans:
     is_compared = errors.is_compared
     compared_count = is_compared.sum()
     degrees = np.maximum(np.count_nonzero(~np.isnan(errors.error), axis=1), 1)
-    deviate = chi_squared_deviate(errors.chi_squared, degrees)
+    deviate = chi_squared_deviate(errors.chi_squared, degrees)  # has a standard normal distribution for good presses
     limit = NormalDist().inv_cdf(1.0 - TEST_SIGNIFICANCE / max(1, compared_count))
     is_improbable = is_compared & (deviate > limit)
 

@@ -429,6 +429,7 @@ def _header_score(line: str, names: Collection[str], separator: str) -> tuple[in
         cells = {cell.strip() for cell in next(csv.reader([line], delimiter=separator))}
     except csv.Error:  # is raised again when the table is read
         return 0, 0
+    # A name of a column may look like a number.
     has_number = any(map(_NUMBER.fullmatch, cells.difference(names)))
     return 0 if has_number else len(cells.intersection(names)), len(cells)
 

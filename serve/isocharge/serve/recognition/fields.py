@@ -163,7 +163,7 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[
             if all(is_constant[position:end]):
                 parts.append(Part(CHANNEL, type_name, end - position, Weights.constant, is_constant=True))
                 continue
-            lowest_first = range(position, end)[::byte_step]
+            lowest_first = range(position, end)[::byte_step]  # positions of the bytes, that of the lowest byte first
             number_bytes = np.ascontiguousarray(rows[:, lowest_first])
             parts += _number_parts(number_bytes, constant_bytes[lowest_first], type_name, frame_rate_Hz)
         parts_at_each_byte.append(parts)
@@ -294,7 +294,7 @@ def split_frame(
         divisions = []
         for part in parts_at_each_byte[position]:
             end = position + part.size
-            if end > len(parts_at_each_byte) or position < checksum_start < end:
+            if end > len(parts_at_each_byte) or position < checksum_start < end:  # the checksum covers only its end
                 continue
             channel_type = part.type_name if part.name == CHANNEL else ""
             begins_group = channel_type not in ("", previous_channel_type)
@@ -305,6 +305,7 @@ def split_frame(
             divisions.append((part.score + rest_score + group_score, (part, *rest_parts)))
         return min(divisions, key=itemgetter(0))  # of equal scores, the first division
 
+    # The best division begins at the first byte behind the sync pattern. The element with the index 0 is the score.
     return min(((*best_division(length, ""), length) for length in sync_lengths), key=itemgetter(0))
 
 

@@ -264,7 +264,8 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
     for size in (4, 3, 2, 1):  # in bytes
         if is_constant[-size:].all():  # a checksum would differ from frame to frame
             continue
-        # The first covered byte is at most the first byte that is not constant. A checksum covers at least two bytes.
+        # The first covered byte may be each of the constant bytes at the beginning of the frame, or the first byte that
+        # is not constant. A checksum covers at least two bytes.
         last_start = min(count_leading(is_constant), len(is_constant) - size - 2)
         names = [name for name, checksum in CHECKSUMS.items() if checksum.size == size]
         orders = ORDERS if size > 1 else ORDERS[:1]  # a single byte has no byte order
