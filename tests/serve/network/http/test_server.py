@@ -264,6 +264,16 @@ def test_upgrade_of_a_request_without_body_is_ignored(server, protocol):
     assert b"set the client to HTTP/1.1" in answer
 
 
+def test_body_after_an_ignored_upgrade_is_not_read_as_a_request(server):
+    """Behind a proxy that forwards upgrades, a client could otherwise send requests that the proxy forbids."""
+    upgrade = b"Connection: Upgrade\r\nUpgrade: websocket\r\n"
+    with connect(server) as connection:
+        connection.sendall(infer(upgrade, LOAD).removesuffix(LOAD))
+        answer = connection.recv(1000)
+        send(connection, LOAD)
+        assert statuses(answer + everything(connection)) == [400]
+
+
 @pytest.mark.parametrize("requests", [[LOAD], [infer()], [LOAD, infer(), LOAD], [infer()] * 90])
 def test_half_closed_connection_receives_its_responses(server, requests):
     with connect(server) as connection, ThreadPoolExecutor(1) as threads:

@@ -118,6 +118,8 @@ class Connection(HttpToolsProtocol):
         self._allow(self._limits.body_seconds)
         super().on_headers_complete()
         self.headers = []  # uvicorn adds trailers to this list, which the request no longer uses
+        if self.parser.should_upgrade():  # the parser ignores this body, and would read a later part as a request
+            self.cycle.keep_alive = False
         if self._is_stopping:
             self.shutdown()
 
