@@ -113,15 +113,17 @@ class Connection(HttpToolsProtocol):
         super().on_message_begin()
 
     def on_headers_complete(self) -> None:
-        """Set the deadline of the body, and discard the trailers that may follow the body (RFC 9110, 6.5.1)."""
+        """Set the deadline of the body, and discard the trailers that may follow the body (RFC 9110, 6.5.1).
+
+        The response closes the connection if the server stops, or if the client requests an upgrade.
+        """
         self._pending_bytes = 0
         self._allow(self._limits.body_seconds)
         super().on_headers_complete()
         self.headers = []  # uvicorn adds trailers to this list, which the request no longer uses
-        if self.parser.should_upgrade():  # the parser ignores this body, and would read a later part as a request
+        # If the client requests an upgrade, the parser ignores the body, and would read a later part of it as a request.
+        if self._is_stopping or self.parser.should_upgrade():
             self.cycle.keep_alive = False
-        if self._is_stopping:
-            self.shutdown()
 
     def on_body(self, body: bytes) -> None:
         """Pass a part of the body to the application, which limits the size of the body."""
