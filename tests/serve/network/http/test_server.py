@@ -334,6 +334,28 @@ def test_loading_a_model_delays_no_other_request(server, slow_load):
         assert statuses(connection.recv(1000)) == [200]
 
 
+@pytest.mark.parametrize("rest", [b"", b"no chunk\r\n"])
+def test_incomplete_request_does_not_take_the_response_to_an_earlier_one(store, start_http, slow_load, rest):
+    """The body of the second request is late, or cannot be read, while the first request is answered."""
+    _, go_on = slow_load
+    head = b"POST /v2/repository/index HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
+    with connect(start_http(Handler(store, ServerLimits(body_seconds=0.3)))) as connection:
+        connection.sendall(LOAD + head + rest)
+        time.sleep(1.0)
+        go_on.set()
+        assert statuses(everything(connection)) == [200]
+
+
+def test_connection_that_is_half_closed_within_a_request_receives_its_earlier_response(server, slow_load):
+    _, go_on = slow_load
+    with connect(server) as connection:
+        connection.sendall(LOAD + infer()[:-5])
+        connection.shutdown(socket.SHUT_WR)
+        time.sleep(0.3)
+        go_on.set()
+        assert statuses(everything(connection)) == [200]
+
+
 def ask_until_closed(server):
     """Send requests on one connection until a response closes it. Without a response, an exception is raised."""
     client = http.client.HTTPConnection(server.url.removeprefix("http://"), timeout=60)

@@ -47,6 +47,7 @@ class Connection(HttpToolsProtocol):
         self._write_deadline = self.loop.time() + limits.body_seconds  # for reading the responses, s
         self._limits = limits
         self._traffic = traffic
+        self._previous_cycle: Any = None  # the request before the latest one whose headers are complete
         self._is_reading = False  # whether a request has begun and is not complete
         self._is_stopping = False  # whether the next response closes the connection, because the server stops
         self._pending_bytes = 0  # bytes since the latest complete head, part of a body, or complete request
@@ -119,9 +120,10 @@ class Connection(HttpToolsProtocol):
         """
         self._pending_bytes = 0
         self._allow(self._limits.body_seconds)
+        self._previous_cycle = self.cycle
         super().on_headers_complete()
         self.headers = []  # uvicorn adds trailers to this list, which the request no longer uses
-        # If the client requests an upgrade, the parser ignores the body, and would read a later part of it as a request.
+        # If the client requests an upgrade, the parser ignores the body, and would read its later parts as a request.
         if self._is_stopping or self.parser.should_upgrade():
             self.cycle.keep_alive = False
 
@@ -184,8 +186,9 @@ class Connection(HttpToolsProtocol):
         Returns:
             Whether a complete request is not answered yet.
         """
-        cycle = self.cycle
-        is_owed = cycle is not None and not (cycle.response_complete or cycle.more_body)
+        is_incomplete = self.cycle is not None and self.cycle.more_body
+        cycle = self._previous_cycle if is_incomplete else self.cycle
+        is_owed = cycle is not None and not cycle.response_complete
         if is_owed:
             cycle.keep_alive = False
             self.deadline = math.inf
