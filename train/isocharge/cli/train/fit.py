@@ -141,10 +141,10 @@ def _refuse_options(context: typer.Context, source: str, *used_options: str) -> 
     Raises:
         InputError: If an option is given that has no effect.
     """
-    unused = {"probe", "radius", "position_std_mm", "force_std"} - {*used_options}
+    without_effect = {"probe", "radius", "position_std_mm", "force_std"} - {*used_options}
     for parameter in context.command.params:
-        origin = context.get_parameter_source(parameter.name or "")
-        if parameter.name in unused and origin is not None and origin.name == "COMMANDLINE":
+        origin = context.get_parameter_source(parameter.name or "")  # whether the value was typed, or is the default
+        if parameter.name in without_effect and origin is not None and origin.name == "COMMANDLINE":
             raise InputError(f"{parameter.opts[0]}: has no effect on {source}; leave the option out")
 
 
@@ -184,8 +184,8 @@ def _release(fitted: Fitted, model_folder: Path, version: int) -> Release:
     try:
         return write(model_folder)
     except (OutputExists, OutputError, ModelError) as error:
-        kept = write(Path(mkdtemp(prefix="isocharge-"), model_folder.resolve().name))
-        raise type(error)(f"{error}. The trained model is kept in {kept.folder}") from error
+        temporary = write(Path(mkdtemp(prefix="isocharge-"), model_folder.resolve().name))
+        raise type(error)(f"{error}. The trained model is kept in {temporary.folder}") from error
 
 
 def _fit_simulated_presses(sensor: Sensor, notations: Sequence[str], radius: str, config: FitConfig) -> Fitted:

@@ -66,10 +66,13 @@ SEED = 3
 def compact_charges(
     domain: Domain, charges: FilmCharges, film: FilmEstimate, executor: Executor | None
 ) -> ChargeSeries:
-    """Compute the compact charge map of an estimated film: series that are fitted to charges of random contacts.
+    """Compute the compact charge map of an estimated film.
 
-    The charges of changed films and the effects of the directions take longer to compute, so they are computed only
-    for the first contacts. These also cover the domain, because the contacts are in random order.
+    The map contains the charges at the nodes, which are films with other pretensions, and the effects of the
+    directions, which are the linear combinations of the unknowns of the film that change the charges. Both are series
+    that are fitted to the charges of random contacts. The charges at the nodes and the effects of the directions take
+    long to compute, and are computed only for the first contacts. These also cover the domain, because the order is
+    random.
 
     Args:
         domain: Contacts for which the map is needed.
@@ -101,7 +104,8 @@ def compact_charges(
 
     # Fit series to the effects of the directions, at the remaining nodes.
     remaining_films = [node_film for node_film in films if node_film.change_MPa in series.node_MPa]
-    few_contacts, few_charges = contact[:DIRECTION_CONTACTS], charge[:DIRECTION_CONTACTS]
+    few_contacts = contact[:DIRECTION_CONTACTS]
+    few_charges = charge[:DIRECTION_CONTACTS]
     return replace(
         series,
         directions=_directions(series, film, calibrated, remaining_films, few_contacts, few_charges, executor),
@@ -377,8 +381,9 @@ def _value_changes(
     results = in_order(executor, call, jobs)  # an iterator over pairs (charges, derivatives)
     changes = []
     # The results of the two halves of a film follow one another, and each step takes both from the same iterator.
-    for first_half, second_half in zip(results, results, strict=True):
-        film_charge, jacobian = map(np.concatenate, zip(first_half, second_half, strict=True))
+    for (first_charge, first_jacobian), (second_charge, second_jacobian) in zip(results, results, strict=True):
+        film_charge = np.concatenate([first_charge, second_charge])
+        jacobian = np.concatenate([first_jacobian, second_jacobian])
         charge_per_value = np.maximum(film_charge, LOWEST_CHARGE) if size is None else size  # dQ / dv
         changes.append((jacobian / charge_per_value[:, :, None]) @ covariance_root)
     return changes

@@ -428,7 +428,7 @@ class _HypothesisGroup:
             group: Hypotheses with the given errors.
         """
         linearised = Linearised.of(model, data, contact)
-        eliminated, eliminated_jacobian = linearised.eliminated()
+        eliminated, eliminated_jacobian = linearised.eliminated()  # (n, n_electrode) and (n, n_electrode, n_unknown)
         is_changed = eliminated_jacobian.any(axis=2)  # by any unknown; False for a coordinate that was not measured
         basis, jacobian = np.linalg.qr(eliminated_jacobian[is_changed])
         residual = basis.T @ eliminated[is_changed]
@@ -485,7 +485,8 @@ class _HypothesisGroup:
         # Multiply (J P)' by S^-1 J P. The product is summed over the hypotheses and over the residuals.
         weighted_gain = weight[is_used, None, None] * gain
         summed_axes = (0, 1)
-        return means, np.tensordot(cross_covariance, weighted_gain, (summed_axes, summed_axes))
+        reduction = np.tensordot(cross_covariance, weighted_gain, (summed_axes, summed_axes))
+        return means, reduction
 
     @property
     def _squared_sizes(self) -> Array:

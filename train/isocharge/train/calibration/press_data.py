@@ -133,7 +133,8 @@ class Linearised:
         """
         weight = 1.0 / data.measured_std
         residual = np.column_stack([model.charge_pC - data.charge, contact - data.contact])
-        # The unknowns do not change the contact, and each coordinate of the contact only changes itself.
+        # The first rows of a press belong to its charges, and the last three to its contact. The unknowns do not change
+        # the contact (rows of zeros), and each coordinate of the contact only changes itself (identity matrix).
         jacobian = np.pad(model.by_state, ((0, 0), (0, 3), (0, 0)))
         contact_rows = np.tile(np.eye(3), (len(data), 1, 1))
         contact_jacobian = np.concatenate([model.by_contact, contact_rows], axis=1)

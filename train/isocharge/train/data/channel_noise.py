@@ -111,13 +111,14 @@ class ChannelNoise(GaussianNoise):
         # not show its noise.
         charges_of_contacts = np.unique(estimated_charge, axis=0)  # one row for each repeated contact
         contact_counts = np.count_nonzero(charges_of_contacts, axis=0)  # shape (n_electrode,)
-        if contact_counts.min() < MIN_REPEATED_CONTACTS:
+        if contact_counts.min() < MIN_REPEATED_CONTACTS:  # estimate the charges at all contacts by quadratic functions
             planes = LocalPlanes.fit(contact, noisy_charge)
             estimated_charge = planes.value
             residual = planes.residual
 
         # Fit the noise of each channel.
-        white_std, gain_std = np.transpose(list(map(_fit_noise, estimated_charge.T, residual.T)))
+        channels = zip(estimated_charge.T, residual.T, strict=True)
+        white_std, gain_std = np.transpose([_fit_noise(*channel) for channel in channels])
         gain = np.maximum(gain_std, MIN_GAIN_NOISE)
         smallest_white = MIN_WHITE_RATIO * gain * median_magnitude(noisy_charge)
         return cls(np.maximum(white_std, smallest_white), gain)
@@ -298,13 +299,15 @@ def _average_repeated(unit_contact: Array, values: Array) -> tuple[Array, Array,
 def _repeated_residuals(unit_contact: Array, charge: Array) -> tuple[Array, Array]:
     """Compute the residuals of presses whose contact is repeated: the differences from the mean charges of the contact.
 
+    The residuals are scaled so that they have the variance of the noise.
+
     Args:
         unit_contact: Contacts in unit coordinates, shape (n, 3).
         charge: Measured charges, shape (n, n_electrode), pC.
 
     Returns:
         The mean charges of the contact, and the residuals, both of shape (m, n_electrode), pC, for the m presses whose
-        contact is repeated. The residuals have the variance of the noise.
+        contact is repeated.
     """
     _, mean_charge, press_count, contact_of_press = _average_repeated(unit_contact, charge)
     is_repeated = press_count[contact_of_press] > 1

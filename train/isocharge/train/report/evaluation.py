@@ -229,11 +229,13 @@ def evaluate_dataset(dataset: Dataset, model_folder: Path, settings: Settings) -
     predictor = Predictor(model_folder)
     model = predictor.metadata
     check_same_sensor(model, dataset)
-    covered = _covered_presses(dataset, model)
-    presses, test = split_presses(covered, model_folder, model)
-    domain = LabelledPresses.of(covered.samples).domain
+    covered_dataset = _covered_presses(dataset, model)
+    presses, test = split_presses(covered_dataset, model_folder, model)
+    domain = LabelledPresses.of(covered_dataset.samples).domain
     measured = is_measured(dataset)
-    noise = noise_of(model)  # it also weights the charges of measured presses
+    # The noise determines the weights of the charges in a fit. It is added only to simulated presses, because the
+    # charges of measured presses already contain noise.
+    noise = noise_of(model)
     if not measured:
         repeated_test = test.repeated(settings.presses)
         test = replace(repeated_test, charge=repeated_test.noisy(noise, SEED))
@@ -250,7 +252,7 @@ def evaluate_dataset(dataset: Dataset, model_folder: Path, settings: Settings) -
 
         # Compute the Cramér-Rao limit from the derivatives of the series. The noise of measured presses is unknown.
         series_error_pC = charge_map.charges(validation.contact) - validation.charge
-        is_series_accurate = rms(series_error_pC / noise.sigma(validation.charge)) < 1.0
+        is_series_accurate = rms(series_error_pC / noise.sigma(validation.charge)) < 1.0  # smaller than the noise
         if is_series_accurate and not measured:
             cramer_rao = limits_at(charge_map, test.contact, noise)
             limits = {
@@ -267,7 +269,7 @@ def evaluate_dataset(dataset: Dataset, model_folder: Path, settings: Settings) -
     return Section(
         sensor=dataset.sensor.name,
         measured=measured,
-        probes=list(covered.samples.probes),
+        probes=list(covered_dataset.samples.probes),
         radius_mm=domain.radius,
         force_N=domain.force_range,
         noise=None if measured else noise.name,
