@@ -45,7 +45,7 @@ def touched_blocks(values: Array, times_s: Array, min_noise: float = 0.0) -> tup
     block_times_s = medians[:, 0]
     levels = np.nan_to_num(medians[:, 1:])
     # Whole numbers have a rounding error between -0.5 and 0.5, whose standard deviation is 12**-0.5.
-    are_whole_numbers = ((values == np.round(values)) | ~np.isfinite(values)).all(axis=0)  # of each channel
+    are_whole_numbers = ((values == np.round(values)) | ~np.isfinite(values)).all(axis=0)  # shape (channels,)
     rounding_noise = np.where(are_whole_numbers, 12.0**-0.5, 0.0)
     noise = np.maximum(estimate_noise(values), rounding_noise)
     is_touched = _detect_touches(levels, np.maximum(noise, min_noise))

@@ -319,19 +319,22 @@ def _index_positions(parts: list[_Part]) -> list[int]:
         pairs = re.search(f"(?:[^0]*{pair})+[^0]*$", shape)
         if pairs is None:
             return []
-        paired_count = pairs[0].count("0")
-        return number_positions[-paired_count::2]  # every second of the last numbers of the line
+        paired_count = pairs[0].count("0")  # the pairs consist of this many numbers, which are the last of the line
+        return number_positions[-paired_count::2]
 
-    indices = first_numbers(r"0[)\]]?[:=]0")  # such as `1:801`
-    if len(indices) > 1 or len(number_positions) == 2 * len(indices):  # or the line has no other numbers
-        return indices
+    # Find pairs such as `1:801`. A closing bracket may follow the first number.
+    positions = first_numbers(r"0[)\]]?[:=]0")
+    has_only_pairs = len(number_positions) == 2 * len(positions)
+    if len(positions) > 1 or has_only_pairs:
+        return positions
 
-    indices = first_numbers(r"[uw#(\[=]0[)\]>(\[]?0")  # such as `pad 1 801` or `[1] 801`
-    contents = [parts[position].content for position in indices]
-    counts = [str(count) for count in range(len(indices) + 1)]
-    counts_up = contents in (counts[:-1], counts[1:])  # from 0, or from 1
-    labels = {parts[position - 1].content for position in indices}  # the words or marks before the first numbers
-    return indices if len(indices) > 1 and counts_up and len(labels) == 1 else []
+    # Find pairs such as `pad 1 801` and `[1] 801`, in which a word or a mark stands before the first number.
+    positions = first_numbers(r"[uw#(\[=]0[)\]>(\[]?0")
+    first_contents = [parts[position].content for position in positions]
+    numerals = [str(number) for number in range(len(positions) + 1)]
+    counts_up = first_contents in (numerals[:-1], numerals[1:])  # from 0, or from 1
+    labels = {parts[position - 1].content for position in positions}  # the words or marks before the first numbers
+    return positions if len(positions) > 1 and counts_up and len(labels) == 1 else []
 
 
 def _skeleton(parts: list[_Part], names: list[str], number_pattern: str) -> tuple[str, ...]:
@@ -474,8 +477,8 @@ def _units(parts: list[_Part], names: list[str]) -> list[str]:
     words_behind = _words(parts, _UNIT_BEHIND)
     words_before = _words(parts, _UNIT_BEFORE)
 
-    # A `C` behind a number may be the name of an electrode, and one `C` may be the unit of a temperature (degrees
-    # Celsius). If there are more of them, the unit of the charges is C (coulomb).
+    # The word `C` behind a number may be the name of an electrode, as in `7 C, 3 A`, and one `C` may be the unit of a
+    # temperature (degrees Celsius). If the word occurs more often, it is the unit of the charges (coulomb).
     is_coulomb = words_behind.count("C") > names.count("C") + 1
     units = {*_CHARGE_UNITS, "C"} if is_coulomb else _CHARGE_UNITS
 

@@ -101,6 +101,7 @@ class Prediction(Stage):
             return
         if self._touch_predictor is None:
             self._touch_predictor = self._predictor
+            # The tare measures the noise at rest inaccurately. A noise up to 1.5 times that of the model has no effect.
             noise = self._predictor.noise
             if np.any(frame.noise_pC > 1.5 * np.asarray(noise.white_pC)):
                 white_pC = np.maximum(frame.noise_pC, noise.white_pC)

@@ -273,6 +273,8 @@ def replay(
         elif event.tare:
             stream.tare()
         elif chunk is not None:
+            # The first chunk is due at once, and each later chunk as long after the previous one as it arrived after
+            # it.
             due_s = due_s + elapsed_s(previous_chunk, chunk) if previous_chunk else time.monotonic()
             previous_chunk = chunk
             if real_time:

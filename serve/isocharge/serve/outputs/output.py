@@ -166,7 +166,7 @@ class WriterQueue(Generic[T]):
     def _run(self) -> None:
         """Write items until the queue is closed and empty, or until `write` raises an exception."""
         try:
-            for item in iter(self._items.get, None):
+            for item in iter(self._items.get, None):  # ends at the None that `close` appends
                 if self._is_abandoned:
                     return
                 if self._write(item) is False:

@@ -331,7 +331,8 @@ class UdpSocket:
                         *self._senders,
                     )
             if data:
-                is_utf8 = data.decode("utf-8", "replace").encode() == data  # decoding replaces invalid bytes
+                # Decoding replaces invalid bytes. A program in C may send the zero byte at the end of its text.
+                is_utf8 = data.decode("utf-8", "replace").encode() == data
                 self._is_text = is_utf8 and _CONTROL_CHARACTER.search(data.removesuffix(b"\0")) is None
                 return self._with_line_feed(data)
         return b""

@@ -87,6 +87,6 @@ def binomial_distribution(count: int, probability: float) -> Array:
     successes = np.arange(1, count + 1)
     # Ratio of the probability of k successes to the probability of k - 1 successes, for k = 1, ..., count
     ratios = (count + 1 - successes) / successes * (probability / (1.0 - probability))
-    log_no_success = count * math.log1p(-probability)
+    log_no_success = count * math.log1p(-probability)  # logarithm of the probability that no trial succeeds
     log_probabilities = log_no_success + np.append(0.0, np.cumsum(np.log(ratios)))
     return np.cumsum(np.exp(log_probabilities))

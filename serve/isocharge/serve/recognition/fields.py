@@ -219,7 +219,8 @@ def _counter_or_clock(
     The score of the part, in bits, is lower for a more probable part. It is the mean number of bits that are needed to
     encode a value if the previous value is known. Because a counter increases by 1 in every frame, its value follows
     from the previous value, so that the score of a counter is 0. The score of a clock grows with the deviations of its
-    steps from the median step. In addition, unusual sizes and types are made more or less probable.
+    steps from the median step. Two corrections make a number of three bytes less probable, and a clock of eight bytes
+    more probable.
 
     Args:
         steps: Differences of the values of consecutive frames, shape (n,).
