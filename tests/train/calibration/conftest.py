@@ -26,7 +26,7 @@ def never_solved(monkeypatch):
 FEW_VALUES = {
     "IMPERFECTION_SCALES": (((0.1, 0.1), 0.5), ((1.5, 1.5), 0.5)),
     "DISCREPANCY_SIZES": ((0.001, 0.5), (0.01, 0.5)),
-    "FORCE_SCATTERS": ((0.0, 0.9), (0.03, 0.1)),
+    "FORCE_SCATTERS": (((0.0, 0.0), 0.9), ((0.03, 0.0), 0.1)),
     "POSITION_RATIOS": ((1.0, 0.9), (3.0, 0.1)),
     "NOISE_RATIOS": ((1.0, 0.5), (8.0, 0.5)),
 }

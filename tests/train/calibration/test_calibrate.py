@@ -14,6 +14,8 @@ from isocharge.common.errors import PressError, SceneError, SensorError
 from isocharge.simulate import Circle, NoiseModel, load_sensor
 from isocharge.train import CalibrationProblem, calibrate, next_presses
 from isocharge.train.calibration import calibrate as calibrate_module
+from isocharge.train.calibration import estimator
+from isocharge.train.calibration.estimator import FORCE_SCATTERS
 from solved_charges import with_film
 
 pytestmark = pytest.mark.usefixtures("never_solved", "few_hypotheses")
@@ -106,7 +108,19 @@ def test_copies_of_presses_do_not_reduce_the_stated_error(fit, press_film):
 def test_forces_that_scatter_more_than_stated_are_named(fit, press_film):
     presses = press_film(25, seed=14)
     presses.contact[:, 2] *= np.exp(0.04 * np.random.default_rng(0).standard_normal(25))
-    assert "about 3 % more than stated: is the load cell zero" in str(fit(presses).cautions)
+    assert "more than stated, by about 3 % of each force and 0 % of" in str(fit(presses).cautions)
+
+
+def test_noise_of_the_load_cell_is_not_taken_for_an_offset_of_the_forces(fit, press_film, synthetic, monkeypatch):
+    """A noise of 20 mN is up to 40 % of the forces."""
+    monkeypatch.setattr(estimator, "FORCE_SCATTERS", FORCE_SCATTERS)
+    presses = press_film(25, seed=16, values=synthetic.values)
+    noisy_force = presses.contact[:, 2] + 0.02 * np.random.default_rng(0).standard_normal(25)
+    presses.contact[:, 2] = np.maximum(noisy_force, 0.041)  # within the range that a calibration takes
+    result = fit(presses)
+    (caution,) = result.cautions
+    assert "0 % of each force and 8 % of their geometric mean: is the load cell zero" in caution
+    assert result.bad_lines == ()
 
 
 def presses_on_changed_film(problem, press_film, **changes):

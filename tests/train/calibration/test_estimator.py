@@ -119,7 +119,7 @@ def test_estimate_minimises_the_sum_of_squares_of_all_unknowns_and_contacts(prob
 @pytest.mark.usefixtures("few_hypotheses")
 def test_ellipses_of_contacts_contain_95_percent_on_films_of_all_hypotheses(problem, synthetic, monkeypatch):
     """The films are drawn from the hypotheses with their probabilities, with the stated errors of the contacts."""
-    monkeypatch.setattr(estimator, "FORCE_SCATTERS", ((0.0, 1.0),))
+    monkeypatch.setattr(estimator, "FORCE_SCATTERS", (((0.0, 0.0), 1.0),))
     monkeypatch.setattr(estimator, "POSITION_RATIOS", ((1.0, 1.0),))
     within = []
     for seed in range(16):

@@ -320,9 +320,10 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
             f"the positions scatter about {errors.position_ratio:.0f} times as much as stated (--position-std): are "
             "they measured from the centre of the film, and does the probe touch it where the stage says?"
         )
-    if errors.force_scatter > 0.0:
+    if errors.force_scatter + errors.constant_force_scatter > 0.0:
         cautions.append(
-            f"the forces scatter by about {100.0 * errors.force_scatter:.2g} % more than stated: is the load cell zero "
+            f"the forces scatter more than stated, by about {100.0 * errors.force_scatter:.2g} % of each force and "
+            f"{100.0 * errors.constant_force_scatter:.2g} % of their geometric mean: is the load cell zero "
             "without a load, does it lag behind, or do the charges leak between the press and its reading? The "
             "standard deviations of the model do not contain errors that many forces share"
         )

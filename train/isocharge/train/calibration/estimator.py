@@ -47,8 +47,18 @@ The sizes are relative to the prior standard deviations. An uneven tension may b
 DISCREPANCY_SIZES = ((0.001, 0.7), (0.005, 0.2), (0.02, 0.1))
 """Sizes of the discrepancy, relative to the charge, with their prior probabilities."""
 
-FORCE_SCATTERS = ((0.0, 0.8), (0.01, 0.1), (0.03, 0.1))
-"""Random errors of the forces beyond the stated ones, relative to the force, with their prior probabilities."""
+FORCE_SCATTERS = (
+    ((0.0, 0.0), 0.76),
+    ((0.01, 0.0), 0.09),
+    ((0.03, 0.0), 0.09),
+    ((0.0, 0.02), 0.03),
+    ((0.0, 0.08), 0.03),
+)
+"""Random errors of the forces beyond the stated ones, with their prior probabilities.
+
+The two numbers are those of `PressErrors`: an error relative to the force, and an error that is the same for all
+forces.
+"""
 
 POSITION_RATIOS = ((1.0, 0.8), (3.0, 0.1), (8.0, 0.1))
 """Errors of the positions relative to the stated ones, with their prior probabilities."""
@@ -111,7 +121,7 @@ def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
     for combination in product(*lists):
         sizes, probabilities = zip(*combination, strict=True)
         press_noise, position_ratio, force_scatter, imperfections, discrepancy, *session_std = sizes
-        errors = PressErrors(press_noise, position_ratio, force_scatter)
+        errors = PressErrors(press_noise, position_ratio, *force_scatter)
         yield Hypothesis(imperfections, discrepancy, tuple(session_std), errors, float(np.prod(probabilities)))
 
 
@@ -176,11 +186,10 @@ def estimate(charges: FilmCharges, data: PressData, prior: Prior, previous: Esti
     estimation = _estimate_with_errors(charges, data, assumed, prior, all_hypotheses, previous)
     next_assumed = estimation.hypothesis.errors
     if estimation.is_bad.any():
-        # Assume the largest noise, which is that of the last hypothesis, but only the middle size of the errors of the
+        # Assume the errors of the last hypothesis, which are the largest, but only the middle size of the errors of the
         # positions. With the largest size, a press at a wrong place would not be recognised.
-        largest_noise = all_hypotheses[-1].errors.noise
         middle_ratio, _ = POSITION_RATIOS[len(POSITION_RATIOS) // 2]
-        next_assumed = PressErrors(largest_noise, middle_ratio)
+        next_assumed = all_hypotheses[-1].errors._replace(position_ratio=middle_ratio)
     for _ in range(MAX_SEARCHES):
         if next_assumed == assumed:
             break

@@ -24,11 +24,14 @@ class PressErrors(NamedTuple):
         noise: Noise of the charges.
         position_ratio: Standard deviation of the positions, relative to the stated one.
         force_scatter: Standard deviation of a further error of the forces, relative to the force.
+        constant_force_scatter: Standard deviation of a further error that is the same for all forces, relative to their
+            geometric mean. The noise of a load cell is such an error.
     """
 
     noise: NoiseModel
     position_ratio: float = 1.0
     force_scatter: float = 0.0
+    constant_force_scatter: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -96,9 +99,11 @@ class PressData:
 
     def with_errors(self, errors: PressErrors) -> "PressData":
         """Return a copy of these presses whose stated errors are replaced by errors of the given sizes."""
-        noise, position_ratio, force_scatter = errors
+        noise, position_ratio, force_scatter, constant_scatter = errors
         charge_std = np.where(np.isfinite(self.charge_std), noise.sigma(self.charge), UNKNOWN_STD)
-        force_std = np.hypot(self.contact_std[:, 2], force_scatter)  # the sum of two independent errors
+        # The sum of three independent errors. The constant error is divided by each force.
+        relative_constant = constant_scatter * np.exp(self.contact[:, 2].mean() - self.contact[:, 2])
+        force_std = np.hypot(np.hypot(self.contact_std[:, 2], force_scatter), relative_constant)
         contact_std = np.column_stack([position_ratio * self.contact_std[:, :2], force_std])
         return replace(self, charge_std=charge_std, noise=noise, contact_std=contact_std)
 
