@@ -240,6 +240,10 @@ def test_errors_that_are_announced_after_noisy_presses_contain_the_noise(fit, pr
             r"and of .* N \(--radius, --force\); is it",
         ),
         (lambda p: replace(p, contact=p.contact[::-1].copy()), "no film of 'four-25um-biaxial' explains these 12"),
+        (
+            lambda p: replace(p, contact=p.contact + np.where(np.arange(12) < 5, 3.0, 0.0)[:, None] * [0.0, 1.0, 0.0]),
+            r"5 of them do not agree with the others, and the charges .* of the others by \d",
+        ),
     ],
 )
 def test_presses_that_no_film_explains_are_refused(fit, press_film, change, message):

@@ -26,7 +26,7 @@ EXPLAINED = {
     "rotated": (lambda c, q: (c[:, [1, 0, 2]] * [-1.0, 1.0, 1.0], q), "turned by -?90 degrees"),
     "mirrored": (lambda c, q: (c * [-1.0, 1.0, 1.0], q), "x is mirrored"),
     "millinewtons": (lambda c, q: (c / [1.0, 1.0, 1e-3], q), "forces are in mN, not N"),
-    "gain": (lambda c, q: (c, q * [1.0, 1.0, 9.0, 1.0]), "the gain of C is about 6 times"),
+    "gain": (lambda c, q: (c, q * [1.0, 1.0, 9.0, 1.0]), r"the gain of C is about \d\.\d times"),
     "nanocoulombs": (lambda c, q: (c, q / 1e3), "charges are in nC, not pC"),
 }
 """Functions that put a mistake into contacts and charges, and the sentence that names the mistake."""

@@ -179,7 +179,8 @@ def _fit_film(
         raise unexplained_error(
             presses,
             estimation.charges,
-            f"the charges of the best film differ from theirs by {residual:.2g} times the noise",
+            f"{estimation.is_bad.sum()} of them do not agree with the others, and the charges of the best film differ "
+            f"from those of the others by {residual:.2g} times the noise",
         )
     return estimation
 

@@ -37,7 +37,6 @@ UNIT_CORRECTIONS = {
     "the positions are in m, not mm": (1e3, 1.0, 1.0),
     "the positions are in cm, not mm": (10.0, 1.0, 1.0),
     "the positions are in inch, not mm": (25.4, 1.0, 1.0),
-    "the positions are in um, not mm": (1e-3, 1.0, 1.0),
     "the charges are in nC, not pC": (1.0, 1.0, 1e3),
     "the charges are in C, not pC": (1.0, 1.0, 1e12),
     "the charges are in fC, not pC": (1.0, 1.0, 1e-3),
@@ -136,7 +135,7 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
         raise PressError(
             f"electrode {presses.electrodes[channel]!r} is dead: half of its charges are below "
             f"{typical_charge:.3g} pC, {100.0 * ratio[channel]:.2g} % of those of the others; check "
-            "the channel, its cable and its amplifier"
+            "the channel, its unit, its cable and its amplifier"
         )
     _check_signs(placed, film_charges)
 
@@ -312,7 +311,7 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
     for column, gain in enumerate(np.exp(log_gains)):
         corrected_charge = charge.copy()
         corrected_charge[:, column] /= gain
-        sentence = f"the gain of {electrodes[column]} is about {gain:.1g} times that of the sensor file"
+        sentence = f"the gain of {electrodes[column]} is about {gain:.2g} times that of the sensor file"
         yield sentence, contact, corrected_charge
 
     x, y, force = contact.T

@@ -35,6 +35,9 @@ BAD_PROBABILITY = 1e-5
 UNEXPLAINED_CHI2 = 9.0
 """Mean squared residual above which no film explains the presses, in units of the noise variance."""
 
+MAX_BAD_SHARE = 0.3
+"""Share of presses that do not agree with the others, above which no film explains the presses."""
+
 FEW_PRESSES = 3
 """Largest number of presses that counts as few. Among a few presses, a bad press cannot be recognised."""
 
@@ -160,11 +163,12 @@ class Estimation:
 
     @property
     def is_unexplained(self) -> bool:
-        """Whether the residuals are too large for any film."""
+        """Whether the residuals are too large for any film, or too many presses do not agree with the others."""
         if self.redundancy == 0.0:
             return False
         improbable_chi2 = float(chdtri(self.redundancy, BAD_PROBABILITY))
-        return self.chi2 > max(UNEXPLAINED_CHI2 * self.redundancy, improbable_chi2)
+        has_large_residuals = self.chi2 > max(UNEXPLAINED_CHI2 * self.redundancy, improbable_chi2)
+        return has_large_residuals or self.is_bad.mean() > MAX_BAD_SHARE
 
 
 def estimate(charges: FilmCharges, data: PressData, prior: Prior, previous: Estimation | None = None) -> Estimation:
