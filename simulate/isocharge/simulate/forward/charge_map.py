@@ -81,9 +81,7 @@ def within(charge_map: ChargeMap, radius: float) -> ChargeMap:
     return _RestrictedMap(charge_map, charge_map.domain.within(radius))
 
 
-def differences(
-    function: Callable[[Array], Array], contact: Array, steps: ArrayLike = STEPS, variables: slice = slice(None)
-) -> Array:
+def differences(function: Callable[[Array], Array], contact: Array, steps: ArrayLike = STEPS) -> Array:
     """Compute the derivatives of a function of contacts by central differences.
 
     Args:
@@ -91,24 +89,22 @@ def differences(
             function is called once with all stepped contacts, because one call is faster than six.
         contact: Contacts (x, y, F) at which the derivatives are computed, shape (n, 3), mm and N.
         steps: Steps in x and y, mm, and in ln F.
-        variables: Which of x, y and ln F the derivatives refer to, by default all.
 
     Returns:
-        Derivatives with respect to (x, y, ln F), shape (n, k, 3), in the unit of the values per mm, per mm and per 1;
-        fewer along the last axis if `variables` selects fewer.
+        Derivatives with respect to (x, y, ln F), shape (n, k, 3), in the unit of the values per mm, per mm and per 1.
     """
     # Increase and decrease one variable of each contact at a time.
     centre = with_log_force(contact)
-    offsets = np.diag(steps)[variables, None]  # changes of (x, y, ln F) for each variable, shape (n_variable, 1, 3)
-    stepped = np.stack([centre + offsets, centre - offsets])  # shape (2, n_variable, n, 3)
+    offsets = np.diag(steps)[:, None]  # changes of (x, y, ln F) for each variable, shape (3, 1, 3)
+    stepped = np.stack([centre + offsets, centre - offsets])  # shape (2, 3, n, 3)
     stepped[..., 2] = np.exp(stepped[..., 2])  # from ln F to F
 
     stepped_values = function(stepped.reshape(-1, 3))
     n_value = stepped_values.shape[1]
-    increased, decreased = stepped_values.reshape(*stepped.shape[:3], n_value)  # each of shape (n_variable, n, k)
-    distance = 2.0 * np.asarray(steps)[variables, None, None]
+    increased, decreased = stepped_values.reshape(*stepped.shape[:3], n_value)  # each of shape (3, n, k)
+    distance = 2.0 * np.asarray(steps)[:, None, None]
     derivatives = (increased - decreased) / distance
-    return np.moveaxis(derivatives, 0, 2)  # from (n_variable, n, k) to (n, k, n_variable)
+    return np.moveaxis(derivatives, 0, 2)  # from (3, n, k) to (n, k, 3)
 
 
 def check_electrode_count(n_electrode: int) -> None:

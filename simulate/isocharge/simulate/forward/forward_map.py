@@ -258,7 +258,7 @@ class ForwardMap:
         checked_contact = self.domain.check(np.where(has_force, contact, valid_contact), "forward map")
         return np.where(has_force, self._unchecked_charges(checked_contact, orientation), 0.0)
 
-    def derivatives(self, contact: Array, variables: slice = slice(None)) -> Array:
+    def derivatives(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to x, y and ln F by central differences.
 
         The probe has the orientation of its description. At the edge of the domain, the central differences also
@@ -266,11 +266,9 @@ class ForwardMap:
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
-            variables: Which of x, y and ln F the derivatives refer to, by default all.
 
         Returns:
-            Derivatives, shape (n, n_electrode, 3), pC/mm, pC/mm and pC; fewer along the last axis if `variables`
-            selects fewer.
+            Derivatives, shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
 
         Raises:
             SceneError: If a press lies outside the domain, or the domain has a single force, so that the derivative
@@ -289,7 +287,7 @@ class ForwardMap:
         longest_radius_mm = self.probe.under(min_force).reach
         step_scale = min(1.0, longest_radius_mm)
         steps = np.multiply(STEPS, [step_scale, step_scale, 1.0])
-        return differences(self._unchecked_charges, contact, steps, variables)
+        return differences(self._unchecked_charges, contact, steps)
 
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Compute the charges of presses, and their derivatives with respect to x, y and ln F.

@@ -22,9 +22,6 @@ from isocharge.simulate.solver.press import needed_resolution
 DIFFERENCE_STEP = 1.0 / 3.0
 """Step of the difference quotients, in prior standard deviations of the property."""
 
-LOG_FORCE = slice(2, None)
-"""Logarithm of the force among the variables (x, y, ln F) of a contact."""
-
 MAX_LOG_CHANGE = 1.0
 """Largest change of the logarithm of a charge to which a first-order change is applied."""
 
@@ -113,16 +110,9 @@ class FilmCharges:
             Charges, shape (n, n_electrode), pC.
         """
         sensor = self._sensor_with_readout(values)
-        film = _read(self.film, sensor)
-        solved_charge = film.charges(contact)
-        # The derivatives with respect to the force take time. Only the effects of Young's modulus and of the thickness
-        # follow from these derivatives.
-        changes = self._property_changes(values)
-        force_slope = np.zeros_like(solved_charge)
-        if changes["young"] or changes["thickness"]:
-            force_slope = film.derivatives(contact, LOG_FORCE)[:, :, 0]
-        derivatives = self._stress_derivatives(sensor, contact, solved_charge, force_slope)
-        charge, _ = _add_stress_changes(solved_charge, changes, derivatives)
+        solved_charge, contact_slopes = _read(self.film, sensor).linearised(contact)
+        derivatives = self._stress_derivatives(sensor, contact, solved_charge, contact_slopes[:, :, 2])
+        charge, _ = _add_stress_changes(solved_charge, self._property_changes(values), derivatives)
         return charge
 
     def linearised(self, values: Array, contact: Array) -> ModelValues:
