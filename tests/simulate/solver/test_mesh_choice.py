@@ -62,6 +62,11 @@ UNEVEN = with_film(FOUR, pretension=2.4, deviator=(1.2, 0.0))
 AT_THE_RIM = replace(with_film(FOUR, pretension=0.0), electrodes=(Electrode.of_square("E", (42.0, 0.0), 3.0),))
 """An electrode that ends 1.5 mm from the rim, where the film bends."""
 
+OPPOSITE_RIM = replace(
+    with_film(FOUR, pretension=0.0, thickness=0.04), electrodes=(Electrode.of_square("E", (-42.0, 0.0), 3.0),)
+)
+"""An electrode at the rim, where the mesh of a press on the other side of the film is coarse."""
+
 CHOSEN = {
     "long rectangle": (
         with_film(FOUR, pretension=1.0),
@@ -76,6 +81,7 @@ CHOSEN = {
     "thick film": (square_pair(30.0, 0.05, 0.0), PROBE, (6.0, 1.5), 0.05, [252.502, 243.012], 1e-4),
     "surface under the probe": (ON_TOP, PROBE, (8.0, 3.0), 0.05, [8.94119, 12.5244], 2e-4),
     "electrode at the rim": (AT_THE_RIM, PROBE, (0.0, 8.0), 0.5, [194.845], 1e-4),
+    "electrode at the opposite rim": (OPPOSITE_RIM, PROBE, (21.0, 0.0), 0.05, [22.0835], 3e-4),
     "slack film with a closed back": (CLOSED, PROBE, (20.0, 5.0), 0.05, [83.7969, 45.0757, 35.3831, 38.5231], 1e-4),
 }
 """Sensor, probe, position, force, charges with a finer mesh, pC, and the largest error of a charge.
@@ -84,7 +90,7 @@ The finer meshes have at least order 7 and 7 rings; the second one has order 5, 
 """
 
 
-@pytest.mark.first_cases(6)
+@pytest.mark.first_cases(7)
 @pytest.mark.parametrize(("sensor", "probe", "at", "force", "expected", "error"), CHOSEN.values(), ids=CHOSEN)
 def test_charges_equal_those_of_a_finer_mesh(sensor, probe, at, force, expected, error):
     charge = solved_charge(sensor, probe, at, force)

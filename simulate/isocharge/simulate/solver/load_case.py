@@ -61,9 +61,6 @@ MAX_UNEVENNESS = 0.3
 With eight elements, the error of a charge is 1e-4 at a ratio of 0.24, 8e-4 at 0.45, and 4e-3 at 3.5.
 """
 
-THIN_RINGS_PER_FACTOR = 0.8
-"""Number of thin rings at the rim for each factor of three between their largest and their smallest width."""
-
 MAX_SHAPE_ERROR = 0.05
 """Largest allowed relative error of a charge that is predicted for the finest mesh.
 
@@ -423,6 +420,7 @@ def _thin_ring_count(placement: Placement, total_width: float) -> int:
     largest_share = min(width_next_to_probe / log_range, max_share)
     smallest_share = min(opposite_width / log_range, max_share)
 
-    # At least two rings are needed: with a single ring, the error of a charge reaches 0.4 %.
+    # At least two rings are needed: with a single ring, the error of a charge reaches 0.4 %. With fewer rings for each
+    # factor of three, the error of a charge at the rim opposite a press beside the centre reaches 1 %.
     factors_of_three = math.log(largest_share / smallest_share, 3.0)
-    return max(2, 1 + math.floor(THIN_RINGS_PER_FACTOR * factors_of_three))
+    return max(2, 1 + math.ceil(factors_of_three))
