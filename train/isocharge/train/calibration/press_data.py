@@ -63,6 +63,7 @@ class PressData:
             noise: Noise of the charges.
             domain: Contacts that are possible.
         """
+        # Replace unknown values by finite numbers. Their standard deviations are infinite, so they do not count.
         is_charge_known = np.isfinite(presses.charge_pC)
         charge = np.where(is_charge_known, presses.charge_pC, 0.0)
         log_contact = with_log_force(presses.contact)

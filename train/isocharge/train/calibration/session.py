@@ -135,6 +135,7 @@ class PressSession:
             electrodes=problem.electrodes,
             lines=(),
         )
+        # The saved file has the presses on the lines after its header, which is line 1.
         self._fit(replace(presses, lines=tuple(range(2, len(presses) + 2))))
 
     def __len__(self) -> int:

@@ -104,7 +104,8 @@ def fit_charge_series(
         # the charge at which the white noise equals the noise that is proportional to the charge.
         candidate_degrees = SIGNED_CANDIDATE_DEGREES
         log_size = _fit_log_size(unit_contact[:, 2], presses.charge)
-        target = presses.charge / series_size(log_size, unit_contact[:, 2])[0]
+        size, _ = series_size(log_size, unit_contact[:, 2])  # S, shape (n, 1), pC
+        target = presses.charge / size
         error_unit = np.hypot(validation.charge, white_pC / REFERENCE_NOISE.gain)
     else:
         candidate_degrees = CANDIDATE_DEGREES
