@@ -33,9 +33,6 @@ from isocharge.serve.network.address import ip_address
 Headers = dict[bytes, bytes]
 """Value of each header of a request by the name of the header in lower case."""
 
-_TOKEN_PATTERN = re.compile(r"(?! )[ -$&-~]+(?<! )")
-"""Accepted token: printable ASCII characters without blanks at the ends and without the percent sign."""
-
 
 class AccessCheck:
     """Filter that refuses requests from web pages of other sites, and requests without the token of the server.
@@ -66,7 +63,7 @@ class AccessCheck:
         names = [allowed_hosts] if isinstance(allowed_hosts, str) else allowed_hosts
         self._allowed_names = frozenset(map(host_name, names))
         self._host_names = self._allowed_names | {"localhost", host.lower()}
-        if token is not None and not _TOKEN_PATTERN.fullmatch(token):
+        if token is not None and not re.fullmatch(r"(?! )[ -$&-~]+(?<! )", token):
             raise InputError(
                 "token: expected printable ASCII characters without blanks at the ends, and no %, which has another "
                 "meaning in the address of a page; choose another one"
@@ -186,10 +183,6 @@ def header_values(headers: Iterable[tuple[bytes, bytes]]) -> Headers:
     return values
 
 
-_HOST_NAME_PATTERN = re.compile(r"[a-z0-9_-][a-z0-9_.-]*")
-"""Host name, or IPv4 address, in lower case."""
-
-
 def host_name(text: str) -> str:
     """Check a value of --allow-host or `allowed_hosts`, and return the host name in lower case.
 
@@ -201,7 +194,7 @@ def host_name(text: str) -> str:
             port or a path.
     """
     name = text.strip().lower().strip("[]")
-    if not _HOST_NAME_PATTERN.fullmatch(name) and ip_address(name) is None:
+    if not re.fullmatch(r"[a-z0-9_-][a-z0-9_.-]*", name) and ip_address(name) is None:
         raise InputError(
             "--allow-host (allowed_hosts of asgi_app): expected a host name without scheme, port and path, "
             f"got {text!r:.100}"

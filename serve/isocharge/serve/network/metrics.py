@@ -20,15 +20,6 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info
 
 from isocharge.common.errors import package_version
 
-CONTENT_TYPE = b"text/plain; version=0.0.4; charset=utf-8"
-"""Content type of the text format, which every version of Prometheus can read."""
-
-LATENCY_BOUNDS_S = (1e-5, 2e-5, 3e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 2e-2)
-"""Upper bounds of the buckets of the latency histogram, s.
-
-They range from half the latency of a single press to three times the latency of the largest batch.
-"""
-
 
 class Statistics(NamedTuple):
     """Metrics of the inferences of one version of a model since the start of the server, or of all versions.
@@ -60,7 +51,8 @@ class Statistics(NamedTuple):
                 "Time to read, compute and write an inference, without the network.",
                 labels,
                 registry=None,
-                buckets=LATENCY_BOUNDS_S,
+                # Upper bounds, s: from half the latency of a single press to three times that of the largest batch.
+                buckets=(1e-5, 2e-5, 3e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 2e-2),
             ),
         )
 

@@ -276,8 +276,6 @@ class HttpServer(uvicorn.Server):
             log_level="critical",  # errors that a client causes are counted, and are sent to this client
             access_log=False,
             proxy_headers=False,
-            server_header=False,
-            date_header=False,
             timeout_keep_alive=86_400,  # `close_if_overdue` ends idle connections earlier
             timeout_graceful_shutdown=math.ceil(limits.grace_seconds),
             ssl_context_factory=(lambda *_: tls_context) if tls_context else None,
@@ -318,7 +316,10 @@ class HttpServer(uvicorn.Server):
         self._address.release()
 
     async def on_tick(self, counter: int) -> bool:  # noqa: ARG002
-        """End overdue connections, and return whether to stop the server. uvicorn calls this method every 0.1 s."""
+        """End overdue connections, and return whether to stop the server. uvicorn calls this method every 0.1 s.
+
+        The method of the base class also updates the headers `date` and `server`, which the responses do not need.
+        """
         now = asyncio.get_running_loop().time()
         connections: Any = list(self.server_state.connections)
         for connection in connections:

@@ -15,7 +15,7 @@ from isocharge.common.errors import ModelError, RequestError, package_version
 from isocharge.common.structs import parse_json
 from isocharge.serve.model.session import INPUT, OUTPUTS
 from isocharge.serve.network.browser_check import Headers
-from isocharge.serve.network.metrics import CONTENT_TYPE, Traffic
+from isocharge.serve.network.metrics import Traffic
 from isocharge.serve.network.model_store import LoadedVersion, ModelStore
 from isocharge.serve.network.protocol.inference import (
     Json,
@@ -24,16 +24,6 @@ from isocharge.serve.network.protocol.inference import (
     read_infer,
 )
 from isocharge.serve.network.protocol.response import Response, json_response, response_of
-
-EXTENSIONS = [
-    "binary_tensor_data",
-    "model_configuration",
-    "model_repository",
-    "model_repository(unload_dependents)",
-    "parameters",
-    "statistics",
-]
-"""Extensions of the protocol that the servers support."""
 
 PLATFORM = "onnxruntime_onnx"
 """Triton's name for ONNX models."""
@@ -91,12 +81,24 @@ def _show_openapi(_: Request) -> Response:
 
 def _show_server(_: Request) -> Json:
     """Return the name and the version of the server, and the extensions of the protocol that it supports."""
-    return {"name": "isocharge", "version": package_version(), "extensions": EXTENSIONS}
+    return {
+        "name": "isocharge",
+        "version": package_version(),
+        "extensions": [
+            "binary_tensor_data",
+            "model_configuration",
+            "model_repository",
+            "model_repository(unload_dependents)",
+            "parameters",
+            "statistics",
+        ],
+    }
 
 
 def _show_metrics(request: Request) -> Response:
     """Return the metrics of the server and of its models in the text format of Prometheus."""
-    return response_of(200, CONTENT_TYPE, generate_latest(request.traffic.registry))
+    content_type = b"text/plain; version=0.0.4; charset=utf-8"  # every version of Prometheus can read this format
+    return response_of(200, content_type, generate_latest(request.traffic.registry))
 
 
 def _is_ready(request: Request) -> dict[str, bool]:
