@@ -23,11 +23,14 @@ MODELS = Path(__file__).parents[2] / "models"
 PATH = f"/v2/models/{NAME}/infer"
 OUTPUTS = [{"name": "contact", "parameters": {"binary_data": False}}]
 BODY = json.dumps(infer_request([800.5, 700.0, 900.0], id="a", outputs=OUTPUTS)).encode()
-REQUEST = b"POST %s HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: %d\r\n\r\n%s" % (
-    PATH.encode(),
-    len(BODY),
-    BODY,
-)
+
+
+def post(path, body):
+    head = b"POST %s HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: %d\r\n\r\n"
+    return head % (path.encode(), len(body)) + body
+
+
+REQUEST = post(PATH, BODY)
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +109,27 @@ def test_requests_with_faults(server, attack):
 
     attack("wire http", lambda data: check(send(server.http, data)), requests, 30_000)
     assert b"200 OK" in send(server.http, REQUEST)
+
+
+def test_requests_before_a_faulty_one_are_answered_in_their_order(server, attack):
+    """A load is answered in another thread, while the server already reads the requests after it."""
+
+    def numbered(rng, number):
+        if rng.random() < 0.5:
+            return post(f"/v2/repository/models/number{number}/load", b"")
+        return post(PATH, BODY.replace(b'"a"', b'"number%d"' % number))
+
+    def pipelines(rng):
+        count = rng.randrange(1, 8)
+        complete = [numbered(rng, number) for number in range(count)]
+        return count, b"".join(complete) + mutated(rng, rng.choice(REQUESTS))
+
+    def read(case):
+        count, data = case
+        answered = [int(number) for number in re.findall(rb"number(\d)", send(server.http, data))]
+        assert answered == [*range(count)]
+
+    attack("wire pipelines", read, pipelines, 20_000)
 
 
 def test_headers_of_other_sites(attack):
