@@ -105,7 +105,7 @@ class AccessCheck:
         # Without `Origin`, `Sec-Fetch-Site` decides. Browsers send `same-origin` if a page of this server sends the
         # request, and `none` if the user has typed the address. Other programs do not send the header. A link on
         # another site may open a page of this server, because the other site cannot read the response.
-        fetch_site = headers.get(b"sec-fetch-site", b"none").decode("latin-1").lower()
+        fetch_site = headers.get(b"sec-fetch-site", b"none").decode("latin-1")
         is_link = headers.get(b"sec-fetch-dest") == b"document" and method in ("GET", "HEAD")
         if not (origin or is_link or fetch_site in ("same-origin", "none")):
             raise RequestError(

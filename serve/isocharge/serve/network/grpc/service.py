@@ -245,8 +245,8 @@ class Service:
         # messages. Messages about the server contain none of these fields.
         model_name = getattr(request, "model_name", "") or getattr(request, "name", "")
         model_version = getattr(request, "version", "")
-        # The body of the equivalent HTTP request has the same fields as the message.
-        body = MessageToJson(request, preserving_proto_field_name=True).encode()
+        # The body of the equivalent HTTP request has the fields `ready` and `parameters` of the message.
+        body = MessageToJson(request).encode()
         equivalent = Request(self._handler.store, self._handler.traffic, {}, body, model_name, model_version)
         try:
             answer = ROUTE_OF_METHOD[name].respond(equivalent)
