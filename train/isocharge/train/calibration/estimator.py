@@ -54,8 +54,8 @@ FORCE_SCATTERS = (
     ((0.0, 0.0), 0.76),
     ((0.01, 0.0), 0.09),
     ((0.03, 0.0), 0.09),
-    ((0.0, 0.02), 0.03),
-    ((0.0, 0.08), 0.03),
+    ((0.0, 0.03), 0.03),
+    ((0.0, 0.12), 0.03),
 )
 """Random errors of the forces beyond the stated ones, with their prior probabilities.
 

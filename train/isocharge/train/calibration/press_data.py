@@ -12,6 +12,7 @@ from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.simulate import Domain, NoiseModel
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import SESSION, Layout, discrepancy_jacobian
+from isocharge.train.data.presses import PLACE_STEP_mm
 
 UNKNOWN_STD = np.inf
 """Standard deviation of a value that was not measured."""
@@ -58,6 +59,9 @@ class PressData:
     def of(cls, presses: MeasuredPresses, noise: NoiseModel, domain: Domain) -> "PressData":
         """Convert presses, whose electrodes have the order of the sensor.
 
+        Presses at one place share the error of their position, which is hardly reduced by their mean. The standard
+        deviation of the position of each of n such presses is therefore multiplied by the square root of n.
+
         Args:
             presses: The presses; NaN stands for unknown values.
             noise: Noise of the charges.
@@ -68,7 +72,11 @@ class PressData:
         charge = np.where(is_charge_known, presses.charge_pC, 0.0)
         log_contact = with_log_force(presses.contact)
         is_contact_known = np.isfinite(log_contact)
-        measured_std = np.column_stack([presses.position_std_mm, presses.position_std_mm, presses.force_std])
+        position = presses.contact[:, :2]
+        distance_mm = np.linalg.norm(position[:, None] - position, axis=2)
+        same_place_count = (distance_mm <= PLACE_STEP_mm).sum(axis=1)  # of each press, with the press itself
+        position_std = presses.position_std_mm * np.sqrt(same_place_count)
+        measured_std = np.column_stack([position_std, position_std, presses.force_std])
         number = np.arange(len(presses))
         last_number = max(len(presses) - 1, 1)  # at least 1, to avoid a division by 0
         return cls(
