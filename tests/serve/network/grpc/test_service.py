@@ -269,3 +269,9 @@ def test_bytes_that_are_no_message_are_refused(serve, silent_call):
     channel = serve()()
     for name in ("ModelInfer", "ModelStreamInfer"):
         assert refusal(silent_call(channel, name, [b"\xff\xff\xff"])) == "INVALID_ARGUMENT"
+
+
+def test_call_without_a_message_is_refused(serve):
+    """Otherwise, its status would be OK although it has no response."""
+    method = serve()().stream_stream(f"/{SERVICE}/ServerLive")
+    assert refusal(method(iter(()))) == "INVALID_ARGUMENT"

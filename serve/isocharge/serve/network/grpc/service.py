@@ -185,7 +185,7 @@ class Service:
 
         Raises:
             TimeoutError: If the client does not send a message or does not read a response in time.
-            IsochargeError: If the call is refused.
+            IsochargeError: If the call is refused, or if it contains no message.
         """
         if ROUTE_OF_METHOD[name].needs_token:
             metadata = dict(context.invocation_metadata())
@@ -202,6 +202,8 @@ class Service:
             if name != STREAM_METHOD or self._is_stopping:
                 return
             timeout_s = self._handler.limits.idle_seconds
+        if name != STREAM_METHOD:
+            raise RequestError("expected one message, got none")
 
     def _respond(self, name: str, data: bytes) -> Any:
         """Answer one message, and return the response.
