@@ -28,6 +28,7 @@ EXPLAINED = {
     "millinewtons": (lambda c, q: (c / [1.0, 1.0, 1e-3], q), "forces are in mN, not N"),
     "gain": (lambda c, q: (c, q * [1.0, 1.0, 9.0, 1.0]), r"the gain of C is about \d\.\d times"),
     "nanocoulombs": (lambda c, q: (c, q / 1e3), "charges are in nC, not pC"),
+    "microcoulombs": (lambda c, q: (c, q / 1e6), "charges are in uC, not pC"),
 }
 """Functions that put a mistake into contacts and charges, and the sentence that names the mistake."""
 

@@ -38,6 +38,7 @@ UNIT_CORRECTIONS = {
     "the positions are in cm, not mm": (10.0, 1.0, 1.0),
     "the positions are in inch, not mm": (25.4, 1.0, 1.0),
     "the charges are in nC, not pC": (1.0, 1.0, 1e3),
+    "the charges are in uC, not pC": (1.0, 1.0, 1e6),
     "the charges are in C, not pC": (1.0, 1.0, 1e12),
     "the charges are in fC, not pC": (1.0, 1.0, 1e-3),
 }

@@ -122,7 +122,7 @@ SESSION = (
         "offset",
         ((1e-6, 0.9), (30.0, 0.1)),
         lambda _time, charge, _slope: np.ones_like(charge),
-        "all charges of all presses contain an offset of {value:.2g} +- {std:.2g} pC: is the tare right? The model "
+        "all charges of all presses contain an offset of {value:.3g} +- {std:.2g} pC: is the tare right? The model "
         "expects the same offset in later contacts; after a new tare, calibrate again",
     ),
     SessionProperty(
