@@ -59,8 +59,7 @@ FORCE_SCATTERS = (
 )
 """Random errors of the forces beyond the stated ones, with their prior probabilities.
 
-The two numbers are those of `PressErrors`: an error relative to the force, and an error that is the same for all
-forces.
+The two numbers are those of `PressErrors`: one error is relative to the force, the other is the same for all forces.
 """
 
 POSITION_RATIOS = ((1.0, 0.8), (3.0, 0.1), (8.0, 0.1))
@@ -144,8 +143,7 @@ class Estimation:
         film: The estimate, averaged over the hypotheses.
         contact: Most probable contacts (x, y, F), shape (n, 3), mm and N.
         is_bad: Whether each press was left out, shape (n,).
-        press_chi2: Sum of the squared residuals of each press, divided by its redundant measurements, shape (n,); NaN
-            without redundant measurements.
+        press_chi2: Squared residuals of each press per redundant measurement, shape (n,); NaN without redundancy.
         chi2: Sum of the squared residuals of all presses that were not left out, and of the prior, under the most
             probable hypothesis.
         redundancy: Number of redundant measurements of these presses.
@@ -174,10 +172,9 @@ class Estimation:
 def estimate(charges: FilmCharges, data: PressData, prior: Prior, previous: Estimation | None = None) -> Estimation:
     """Estimate a film from presses, with the derivatives of one solved film.
 
-    Each search assumes certain errors of the presses. The first search assumes the stated errors. A further search
-    assumes the errors of the hypothesis that was most probable in the search before it. The searches end when these
-    errors are equal to the assumed errors. If the first search finds a bad press, the press may only seem bad because
-    the true errors are larger than the stated errors. The second search then assumes larger errors.
+    Each search assumes certain errors of the presses: the first search assumes the stated errors, and each further
+    search those of the most probable hypothesis of the search before it, until they do not change. If the first search
+    finds a bad press, the second search assumes larger errors, because the stated errors may be too small.
 
     Args:
         charges: Charges of a solved film and of similar films.
@@ -222,13 +219,12 @@ def _estimate_with_errors(
         previous: Estimate from which the search begins; None for the prior mean and the measured contacts.
     """
     data = stated.with_errors(assumed)
-    found = _most_probable_point(charges, data, prior, previous)
+    found = _probable_point(charges, data, prior, previous)
     is_bad = _find_bad_presses(data.redundancy, found.chi2)
     is_used = ~is_bad
 
-    # Average the estimates of all hypotheses, for which the charges are linearised at the point that was found. Repeat
-    # this once at the first average, which is a better point, with the hypotheses that have a weight. If the evidence
-    # is smaller at the first average, the charges are too nonlinear, and the second average is discarded.
+    # Linearise the charges at the point that was found, and average over the hypotheses. Repeat this at the average. If
+    # the evidence is smaller there, the charges are too nonlinear, and the second average is discarded.
     average_estimates = partial(_average_estimates, charges, stated[is_used], data[is_used], prior)
     average = average_estimates(all_hypotheses, found.state, found.contacts[is_used])
     second_average = average_estimates(average.hypotheses, average.unknowns, average.log_contact)
@@ -271,9 +267,7 @@ def _find_bad_presses(redundancy: Integers, chi2: Array) -> Booleans:
     return np.asarray(is_improbable & can_be_bad)
 
 
-def _most_probable_point(
-    charges: FilmCharges, data: PressData, prior: Prior, previous: Estimation | None
-) -> RobustPoint:
+def _probable_point(charges: FilmCharges, data: PressData, prior: Prior, previous: Estimation | None) -> RobustPoint:
     """Search for the most probable unknowns and contacts (x, y, ln F), with low weights for presses that may be bad.
 
     Args:
@@ -282,8 +276,7 @@ def _most_probable_point(
         prior: Prior distribution of the unknowns.
         previous: Estimate from which the search begins; None for the prior mean and the measured contacts.
     """
-    # The variance of a charge that was not measured is infinite. Replace it by the largest number, because the search
-    # needs finite numbers. The noise of each press has a diagonal covariance.
+    # The search needs finite numbers, so the largest number replaces the infinite variance of an unknown charge.
     charge_variance = np.nan_to_num(data.charge_std**2)  # shape (n, n_electrode)
     charge_covariance = charge_variance[:, None] * np.eye(charge_variance.shape[1])
     problem = RobustProblem(  # its state is the vector of the unknowns
@@ -351,8 +344,7 @@ def _average_estimates(
         unknowns: Unknowns at which the charges are linearised, shape (n_unknown,).
         log_contact: Contacts (x, y, ln F) at which the charges are linearised, shape (n, 3).
     """
-    # Compare the hypotheses. Those with the same errors of the presses share one linearised problem. They follow one
-    # another, so that `groupby` finds them.
+    # Compare the hypotheses. Neighbours in the list with the same errors of the presses share one linearised problem.
     model = model_values(charges, prior.layout, data, unknowns, log_contact)
     groups = [
         _HypothesisGroup.of(model, stated.with_errors(errors), log_contact, unknowns, prior, list(group))
@@ -366,10 +358,9 @@ def _average_estimates(
     weight = all_weights[is_probable]
     probable = list(compress(all_hypotheses, is_probable))
 
-    # Average the means of the unknowns under the probable hypotheses. The weights are split at the ends of the groups,
-    # except that of the last group, which is the end of the weights.
+    # Average the means of the unknowns under the probable hypotheses.
     group_ends = np.cumsum([len(group.hypotheses) for group in groups])
-    weights_of_groups = np.split(all_weights, group_ends[:-1])
+    weights_of_groups = np.split(all_weights, group_ends[:-1])  # no split at the end of the last group
     posteriors = [group.posterior(weights) for group, weights in zip(groups, weights_of_groups, strict=True)]
     means = np.concatenate([mean for mean, _ in posteriors])
     mean = weight @ means
@@ -399,9 +390,8 @@ class _HypothesisGroup:
     """Hypotheses with the same errors of the presses, and the linearised residuals of the presses with these errors.
 
     The residuals r at the prior means, without the effect of the contacts, have the covariance S = 1 + J P J'. The
-    matrix J contains their derivatives with respect to the unknowns, and P is the prior covariance of the unknowns,
-    which depends on the hypothesis. It is a sum of parts, and a hypothesis states by which squared size each part is
-    multiplied.
+    matrix J contains their derivatives with respect to the unknowns. The prior covariance P of the unknowns is a sum of
+    parts, each multiplied by the square of a size, which depends on the hypothesis.
 
     Attributes:
         hypotheses: The hypotheses.
@@ -495,10 +485,9 @@ class _HypothesisGroup:
         cross_covariance = np.tensordot(squared_sizes, jacobian_by_part, 1)  # J P, shape (n, m, n_unknown)
         gain = np.linalg.solve(residual_covariance, cross_covariance)  # S^-1 J P, shape (n, m, n_unknown)
         means = self.prior.mean - self.residual @ gain
-        # Multiply (J P)' by S^-1 J P. The product is summed over the hypotheses and over the residuals.
+        # Multiply (J P)' by S^-1 J P. The product is summed over the hypotheses (axis 0) and the residuals (axis 1).
         weighted_gain = weight[is_used, None, None] * gain
-        summed_axes = (0, 1)
-        reduction = np.tensordot(cross_covariance, weighted_gain, (summed_axes, summed_axes))
+        reduction = np.tensordot(cross_covariance, weighted_gain, axes=((0, 1), (0, 1)))
         return means, reduction
 
     @property
