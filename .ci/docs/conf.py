@@ -99,7 +99,7 @@ def share_navigation(_app: Any, page: str, _template: str, context: dict[str, An
 
 
 def _shared_navigation(compute_navigation: Any, options: tuple[tuple[str, Any], ...]) -> Any:
-    """Return the navigation of the pages of modules. The navigation is computed for the first page only.
+    """Return the navigation bar that all pages of modules show. The navigation is computed for the first page only.
 
     Args:
         compute_navigation: Function of Sphinx that computes the navigation.

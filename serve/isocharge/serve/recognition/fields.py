@@ -334,7 +334,7 @@ def _values(number_bytes: Bytes, type_name: str) -> Array:
 
 
 def _bits(steps: Array, unit: float, size: int) -> float:
-    """Return the mean number of bits that are needed to encode one step of a number.
+    """Return the mean number of bits that are needed to encode the step of a number from one frame to the next.
 
     No step is counted with more bits than the number itself has.
 

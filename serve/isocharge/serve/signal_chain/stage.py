@@ -1,4 +1,4 @@
-"""The protocol of a stage, and what the stages of a stream share.
+"""Interface of the stages of a stream, and types and settings that several stages use.
 
 A frame passes through the stages of a stream in the order of the list `isocharge.serve.live.device.STAGES`. Each stage
 reads and writes attributes of the frame. To add a stage, write a class and add it to the list. The class declares the

@@ -202,9 +202,9 @@ class Touch(Stage):
           direction, a touch begins.
         - If the base is what remains of the latest touch, and the charges are smaller, they become the base.
 
-        While charges of the latest touch may remain, the expected direction is that of the latest touch. Later, it is
-        that of equal positive charges. If touches may have charges of any sign, it is the zero vector, with which every
-        direction is accepted.
+        While charges of the latest touch may remain, the expected direction is that of the latest touch. Later, the
+        expected charges are positive and equal. If touches may have charges of any sign, the expected direction is the
+        zero vector, with which every direction is accepted.
 
         Args:
             frame: The frame.

@@ -444,8 +444,9 @@ class FilmFollower(Stage):
             return contact
         conversion = self._conversion
         if conversion is None or not is_close(contact, conversion.contact):
-            # The conversion is computed at a roughly corrected contact. The same conversion is used again while the
-            # given contact hardly changes.
+            # The conversion to charges of the calibrated film depends on the corrected contact, which is not known yet.
+            # A conversion at the given contact yields this contact roughly. The result is used again while the given
+            # contact hardly changes.
             rough_conversion = self._conversion_at(contact, state)
             corrected = self.predictor.predict(charge_pC + rough_conversion.shift_pC)
             conversion = self._conversion_at(corrected, state)._replace(contact=contact)

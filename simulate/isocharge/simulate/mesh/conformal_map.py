@@ -228,7 +228,7 @@ def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) ->
 
 
 def _max_ray_rotation(inner_points: Complexes) -> Array:
-    """Compute the largest angle by which rays may be rotated from the directions of points on an inner boundary.
+    """Compute the largest angle by which rays through points of an inner boundary may be rotated.
 
     An element folds if a ray meets an edge of the boundary at a small angle and is then rotated too far. The largest
     rotation is therefore 0.2 (1 - |cos(t)|) rad, where t is the smallest angle between an edge and the ray to the

@@ -65,9 +65,9 @@ class Soap:
         by the root mean square of this entry over the past steps. These ratios are rotated back, and give the direction
         of the step.
 
-        The ratios are limited to the range from -1 to 1. Only an update of the eigenvectors can cause larger ratios: if
-        it moves a part of the averaged gradient to an entry whose mean square is nearly zero, the step would be
-        arbitrarily long without the limit.
+        The ratios are limited to the range from -1 to 1. Larger ratios arise only if an update of the eigenvectors
+        moves a part of the averaged gradient to an entry whose mean square is nearly zero. Without the limit, the step
+        would then be arbitrarily long.
 
         Args:
             rate: Learning rate, which is approximately the change of each entry.
