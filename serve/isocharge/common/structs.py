@@ -172,12 +172,9 @@ def convert(value: object, target_type: type[T], where: str, error_class: type[I
         error_class: If the value does not have the type. The message describes the first mistake.
     """
     try:
-        try:
-            return msgspec.convert(value, target_type)
-        except msgspec.ValidationError as cause:
-            raise error_class(_prefix(where) + _describe_mistake(value, target_type, cause)) from cause
-    except RecursionError as cause:
-        raise error_class(f"{_prefix(where)}nested too deeply") from cause
+        return msgspec.convert(value, target_type)
+    except msgspec.ValidationError as cause:
+        raise error_class(_prefix(where) + _describe_mistake(value, target_type, cause)) from cause
 
 
 def plain_values(value: object) -> Any:
