@@ -21,7 +21,6 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
-from isocharge.common.errors import IsochargeError, OutputError
 from isocharge.common.files import AtomicWriter, new_file
 from isocharge.serve.record.formats import csv_header, csv_row
 from isocharge.serve.record.record import PredictionRecord
@@ -211,23 +210,6 @@ class FileOutput:
     def discard(self) -> None:
         """Close the file. In a replay, also remove the file, because it is incomplete."""
         self._stack.__exit__(EOFError, EOFError(), None)  # `new_file` removes the file after an error
-
-
-def output_error(error: BaseException, target: str) -> BaseException:
-    """Return an error of an output as an error that states its cause and the target.
-
-    Args:
-        error: The error. An `IsochargeError` states its cause already. A broken pipe and Ctrl-C are no errors of the
-            output, and are returned unchanged.
-        target: Target of the output.
-    """
-    if isinstance(error, IsochargeError | BrokenPipeError) or not isinstance(error, Exception):
-        return error
-    output_failure = OutputError(f"{target}: the output failed ({type(error).__name__}: {error})")
-    if isinstance(error, OSError):
-        output_failure = OutputError(f"{target} cannot be written: {error.strerror or error}; choose another output")
-    output_failure.__cause__ = error
-    return output_failure
 
 
 def is_file_with(suffix: str) -> Callable[[str], bool]:

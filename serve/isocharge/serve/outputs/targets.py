@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from isocharge.common.errors import InputError, shown
+from isocharge.common.files import output_error
 from isocharge.serve.outputs.output import (
     CSV_FILE,
     JSON_FILE,
@@ -19,7 +20,6 @@ from isocharge.serve.outputs.output import (
     OutputKind,
     WriterQueue,
     is_file_with,
-    output_error,
 )
 from isocharge.serve.outputs.udp import UDP
 from isocharge.serve.record.record import PredictionRecord
