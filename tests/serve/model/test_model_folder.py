@@ -13,7 +13,7 @@ import numpy as np
 import onnx
 import pytest
 
-from isocharge.common.errors import ChargeError, ModelError, OutputExists
+from isocharge.common.errors import ChargeError, ModelError, OutputError, OutputExists
 from isocharge.serve import ModelMetadata, find_labelled_model, find_model, load_model, write_model
 from isocharge.serve.model.model_folder import model_names
 from isocharge.serve.model.session import contact_floors, make_golden
@@ -42,7 +42,7 @@ def test_folder_whose_name_no_model_can_have_is_skipped(film, tmp_path):
 
 def test_file_with_the_name_of_the_model_folder_is_not_overwritten(film, tmp_path):
     (tmp_path / "linear").write_text("mine")
-    with pytest.raises(OutputExists, match="linear: expected a folder or nothing, got a file"):
+    with pytest.raises(OutputError, match="linear is not a writable folder; choose another output"):
         film.write(tmp_path)
 
 

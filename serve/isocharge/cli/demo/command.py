@@ -8,7 +8,7 @@ import typer
 from isocharge.cli.shared.live_page import LiveOption, TokenOption
 from isocharge.cli.shared.terminal import say
 from isocharge.common.errors import InputError, require
-from isocharge.common.files import as_output_errors, check_new_output, write_whole
+from isocharge.common.files import new_file
 
 
 def demo_command(
@@ -47,10 +47,9 @@ def demo_command(
     if playground is not None:
         from isocharge.serve.viewer.playground_page import playground_html  # imported late, because the import is slow
 
-        check_new_output(playground)
-        with as_output_errors(playground):
-            playground.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(playground, playground_html().encode())
+        with new_file(playground) as draft:
+            draft.parent.mkdir(parents=True, exist_ok=True)
+            draft.write_bytes(playground_html().encode())
         say(f"wrote {playground}; open it in a browser")
         return
 

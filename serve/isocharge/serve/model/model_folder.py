@@ -29,7 +29,7 @@ import onnxruntime as ort
 from numpy.typing import ArrayLike
 
 from isocharge.common.defaults import MAX_BATCH
-from isocharge.common.errors import ModelError, OutputExists, error_prefix, shown
+from isocharge.common.errors import ModelError, error_prefix, shown
 from isocharge.common.files import StrPath, check_new_output, new_folder, read_needed, sha256_of, write_whole
 from isocharge.serve.model.contact import as_charges
 from isocharge.serve.model.metadata import LABEL, NAME, VERSION, ModelMetadata
@@ -355,7 +355,7 @@ def write_model(
         The version folder.
 
     Raises:
-        OutputExists: If this version exists already, or a file has the folder's name.
+        OutputExists: If this version exists already.
         OutputError: If the folder cannot be written.
         ChargeError: If the golden charges do not fit the electrodes.
         ModelError: If a reader would refuse the model, or its metadata differ from `metadata`. After any error no file
@@ -399,16 +399,14 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
         electrodes: Names of the electrodes of the model.
 
     Raises:
-        OutputExists: If the version exists already, or a file has the folder's name.
-        OutputError: If the folder cannot be written.
+        OutputExists: If the version exists already.
+        OutputError: If the folder cannot be written, for example because a file has its name.
         ModelError: If the name of the folder is not a valid name of a model, or if the folder contains a model with
             other electrodes or another order of them. Also if the folder contains other files, and is therefore no
             folder of one model: it may be a dataset, one version of a model, or the folder in which several models have
             their folders.
     """
     target = folder / str(version)
-    if folder.exists() and not folder.is_dir():
-        raise OutputExists(f"{folder}: expected a folder or nothing, got a file; choose another place")
     check_new_output(target)
     name = folder.resolve().name
     if not NAME.fullmatch(name):

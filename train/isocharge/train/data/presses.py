@@ -240,8 +240,8 @@ def presses_of(dataset: Dataset, fewest: int = MIN_PRESSES) -> LabelledPresses:
         Contacts and charges of the presses.
 
     Raises:
-        DatasetError: If the dataset has too few presses, positions or electrodes, if a force is not positive, or if the
-            charge of an electrode never varies.
+        DatasetError: If the dataset has too few presses, positions or electrodes, or if the charge of an electrode
+            never varies.
     """
     presses = LabelledPresses.of(dataset.samples)
     n_position = place_count(presses.contact)
@@ -250,10 +250,6 @@ def presses_of(dataset: Dataset, fewest: int = MIN_PRESSES) -> LabelledPresses:
             f"expected at least {fewest} presses at {MIN_PLACES} positions, got {len(presses)} at "
             f"{n_position}; sweep or measure more (of a described film, `isocharge train calibrate` needs only a few)"
         )
-
-    row = presses.contact[:, 2].argmin()
-    if presses.contact[row, 2] <= 0.0:
-        raise DatasetError(f"sample {row}: expected a positive force, got {presses.contact[row, 2]:g} N")
 
     n_electrode = presses.charge.shape[1]
     if n_electrode < 3:

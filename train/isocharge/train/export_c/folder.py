@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from isocharge.common.errors import DeviceError
-from isocharge.common.files import check_new_output, new_folder, write_whole
+from isocharge.common.files import new_folder, write_whole
 from isocharge.serve.live.device import ANY_BOARD, STAGES
 from isocharge.serve.model.model_folder import load_model
 from isocharge.serve.signal_chain.stage import NOT_IN_C, Device, Setup, SUM_TOLERANCE_s
@@ -109,7 +109,6 @@ def export_c(model: Path, output: Path, device: Device = ANY_BOARD, *, command: 
         OutputExists: If the folder exists.
         OutputError: If the file system refuses to write. In this case, no files remain.
     """
-    check_new_output(output)
     files = c_files(model, device, command)
     with new_folder(output) as draft:
         for name, text in files.items():
