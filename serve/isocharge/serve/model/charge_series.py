@@ -372,9 +372,9 @@ def interpolation_weights(nodes: Array, points: Array) -> tuple[Array, Array]:
         Weights of the values at the nodes, and the derivatives of the weights with respect to the points, each of shape
         (n, n_node).
     """
-    scale = max(float(np.abs(nodes).max()), 1e-12)  # of all powers, so that the matrix is well conditioned
+    scale = max(np.abs(nodes).max(), 1e-12)  # of all powers, so that the matrix is well conditioned
     # Each column contains the coefficients of the polynomial that is 1 at one node, and 0 at the others.
     node_polynomials = np.linalg.inv(polynomial.polyvander(nodes / scale, nodes.size - 1))
     weights = polynomial.polyval(points / scale, node_polynomials)
     slopes = polynomial.polyval(points / scale, polynomial.polyder(node_polynomials)) / scale
-    return weights.T, np.asarray(slopes.T, dtype=float)
+    return weights.T, slopes.T

@@ -233,7 +233,7 @@ def as_float32(charges: NDArray[Any], electrodes: tuple[str, ...]) -> Singles:
     is_finite = np.isfinite(converted)
     if is_finite.all():
         return converted
-    row = int(np.argmin(is_finite.all(axis=1)))  # index of the first row that is not finite
+    row = np.argmin(is_finite.all(axis=1))  # index of the first row that is not finite
     bad_columns = np.flatnonzero(~is_finite[row])
     bad_charges = [f"{electrodes[column]!r} ({charges[row, column]})" for column in bad_columns]
     where = f" in row {row} (rows count from 0)" if len(charges) > 1 else ""

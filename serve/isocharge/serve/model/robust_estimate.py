@@ -125,7 +125,7 @@ class RobustProblem:
         n_press, n_electrode = charge_pC.shape
         self._measured = np.nan_to_num(measured_contacts)
         # One over the standard deviations of the measured coordinates; 0 where a coordinate was not measured
-        self._contact_weight = np.broadcast_to(np.nan_to_num(1.0 / np.asarray(contact_std)), (n_press, 3))
+        self._contact_weight = np.broadcast_to(np.nan_to_num(1.0 / contact_std), (n_press, 3))
         # Number of independent residuals of each press: its measurements minus the three unknown coordinates
         measured_count = np.count_nonzero(self._contact_weight, axis=1)
         self._degrees = n_electrode + measured_count - 3.0

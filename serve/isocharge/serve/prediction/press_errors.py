@@ -175,7 +175,7 @@ def misfit_limit(metadata: ModelMetadata) -> float:
     """
     if "misfit_p99" not in metadata.errors:
         return MISFIT_LIMIT
-    return NOISE_ALLOWANCE * float(metadata.errors["misfit_p99"])
+    return NOISE_ALLOWANCE * metadata.errors["misfit_p99"]
 
 
 def _exclusion_reasons(validity: Validity, presses: MeasuredPresses) -> NDArray[np.str_]:
@@ -297,7 +297,7 @@ class Agreement:
         common = common_error(error, errors.variance[is_selected], errors.rig_std[is_selected])
         chi_squared = float(errors.chi_squared[is_selected].sum())
         degrees = int(np.count_nonzero(~np.isnan(error)))
-        common_chi_squared = float(np.nansum(common.significance**2))
+        common_chi_squared = np.nansum(common.significance**2)
         common_degrees = int(np.count_nonzero(~np.isnan(common.mean)))
         return cls(
             chi_squared=chi_squared,

@@ -78,7 +78,7 @@ class NumberColumns:
             return
         row, column_index = positions[0]  # the first violation
         name = list(self.values)[column_index]
-        value = float(self.values[name][row])
+        value = self.values[name][row]
         text = "an empty cell" if np.isnan(value) else f"{value:.15g}"
         raise error_class(
             f"{where}line {self.lines[row]}, column {shown(name)}: expected {rules[name].description}, got {text}"

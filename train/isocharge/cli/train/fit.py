@@ -127,7 +127,7 @@ def fit_command(
     with shown_progress():
         fitted = train(fit_config)
         released = _release(fitted, output, version)
-    show_result({"folder": str(released.folder), "errors": dict(released.metadata.errors)}, json=json)
+    show_result({"folder": str(released.folder), "errors": released.metadata.errors}, json=json)
 
 
 def _refuse_options(context: typer.Context, source: str, *used_options: str) -> None:

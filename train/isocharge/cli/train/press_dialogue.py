@@ -189,7 +189,7 @@ class Dialogue:
         for recorded in self._session.presses.contact:
             is_recorded_row = np.isclose(contacts[finished_count:], recorded, equal_nan=True).all(axis=1)
             if is_recorded_row.any():
-                finished_count += int(is_recorded_row.argmax()) + 1
+                finished_count += is_recorded_row.argmax() + 1
         try:
             # A press before the tare would be lost, and each later press would be assigned to the wrong row.
             self._wait_for(Phase.waiting)

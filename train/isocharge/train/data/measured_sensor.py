@@ -118,7 +118,7 @@ def outline(places: Array) -> Array:
 
     # The nearest place is the place itself, and the second nearest is its nearest neighbour.
     distances, _ = cKDTree(places).query(places, 2)
-    spacing = float(np.median(distances[:, 1]))
+    spacing = np.median(distances[:, 1])
     exterior = shapely.concave_hull(shapely.MultiPoint(places), HULL_RATIO).simplify(0.0)
     enlarged = exterior.buffer(0.5 * spacing, join_style="mitre", mitre_limit=2.0)
     # The corners are clockwise, and the last corner repeats the first. Reverse them, and leave out the repeated corner.
@@ -205,8 +205,8 @@ def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compare
     if not distance.any():  # all values are equal
         return
     # Distances of zero are left out, because the usual distance would otherwise be zero if most values are equal.
-    usual_distance = float(np.quantile(distance[distance > 0.0], USUAL_DISTANCE_QUANTILE))
-    row = int(distance.argmax())
+    usual_distance = np.quantile(distance[distance > 0.0], USUAL_DISTANCE_QUANTILE)
+    row = distance.argmax()
     if distance[row] > MAX_DISTANCE_RATIO * usual_distance:
         raise PressError(
             f"line {presses.lines[row]}, column {shown(name)}: expected a value of the size of the others, whose "

@@ -86,7 +86,7 @@ def simulated_errors(predict: Predict, presses: LabelledPresses, noise: Noise) -
     min_force, max_force = FORCES_NEAR_1_N
     force = presses.contact[:, 2]
     presses_near_1_N = presses[(force >= min_force) & (force <= max_force)]
-    threshold = float(np.percentile(misfits, 99.0))
+    threshold = np.percentile(misfits, 99.0)
     return {
         **contact_errors(contact, std, presses.contact),
         "clean_position_median_mm": rounded(clean_median_mm),

@@ -205,7 +205,7 @@ def check_graph(
     for exact, (name, output) in zip(exact_outputs, run(session, golden_charge).items(), strict=True):
         tolerance = 0.25 * RELATIVE_TOLERANCE * np.maximum(np.abs(exact), all_floors[name])
         is_reproducible &= (np.abs(output - exact) < tolerance).all(axis=1)
-    agreeing_count = int(is_reproducible.sum())
+    agreeing_count = np.count_nonzero(is_reproducible)
     if agreeing_count < N_GOLDEN // 4:
         raise TrainingError(
             f"expected outputs of the exported graph that agree with those of the network within the rounding error of "
@@ -265,7 +265,7 @@ def _check_finite_outputs(session: ort.InferenceSession, n_electrode: int) -> No
     for name, output in run(session, charges).items():
         is_finite = np.isfinite(output).all(axis=1)  # one value for each row of charges
         if not is_finite.all():
-            row = int(np.argmin(is_finite))  # the first row that is not finite
+            row = np.argmin(is_finite)  # the first row that is not finite
             raise TrainingError(
                 f"the network answers {name} = {output[row]} to the charges {charges[row]} pC; expected finite "
                 "numbers for any charges: train with more steps or another seed"

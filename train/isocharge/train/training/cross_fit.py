@@ -246,7 +246,7 @@ def merged_uncertain_places(presses: MeasuredPresses) -> Array:
     Neighbouring positions count as one place if their distance is at most twice the standard deviation of the
     difference between two positions.
     """
-    step_mm = 2.0 * np.sqrt(2.0) * float(np.median(presses.position_std_mm))
+    step_mm = 2.0 * np.sqrt(2.0) * np.median(presses.position_std_mm)
     return merged_places(presses.contact, max(PLACE_STEP_mm, step_mm))
 
 
