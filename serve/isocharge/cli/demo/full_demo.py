@@ -69,7 +69,7 @@ def run_demo(folder: Path) -> None:
         "live_errors": {"position_median_mm": live_median_mm, "position_p95_mm": live_p95_mm},
         "folder": str(folder),
     }
-    show_result(results, json=False)
+    show_result(results)
 
 
 def _follow_live(forward_map: ForwardMap, predictor: Predictor) -> Array:

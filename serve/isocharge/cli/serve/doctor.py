@@ -117,7 +117,7 @@ def doctor_command(
         wait=wait,
     )
     if not json:
-        show_result(brief_report(examination), json=False)
+        show_result(brief_report(examination))
 
     obstacle = ""  # reason why no device file can be written
     if examination.touch:

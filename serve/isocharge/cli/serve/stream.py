@@ -85,7 +85,6 @@ def write_records(records: Iterable[PredictionRecord], writers: Iterable[Callabl
     """
     is_tare_printed = False
     untared_pC: Mapping[str, float | None] | None = None  # latest charges while the tare is measured, otherwise None
-    has_failed = False
     try:
         for record in records:
             for write in writers:
@@ -98,10 +97,10 @@ def write_records(records: Iterable[PredictionRecord], writers: Iterable[Callabl
                 untared_pC = None
                 say(f"tared: {_listed(record.tare_pC)}")
     except Exception:
-        has_failed = True
+        untared_pC = None  # the error states itself why the stream has ended
         raise
     finally:  # also after Ctrl-C
-        if untared_pC and not has_failed:  # an error states itself why the stream has ended
+        if untared_pC:
             say(
                 "caution: no tare, because the stream ended before the film had rested near zero for long enough; the "
                 f"last charges are {_listed(untared_pC)}; leave the film alone longer, or state an offset of the board "

@@ -84,8 +84,6 @@ SecondsOption = Annotated[
     float | None, typer.Option(min=1e-3, max=1e6, help="Time after which to stop, s. (default: at Ctrl-C)")
 ]
 
-SeedOption = Annotated[int, typer.Option(min=0, help="Seed of random numbers. Equal seeds give equal results.")]
-
 BaudOption = Annotated[int, typer.Option(min=1, help="Speed of the port, bits per second; USB ports ignore it.")]
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text. (default: text)")]

@@ -65,7 +65,7 @@ def show_json(value: Any) -> None:
     print(printable(json.dumps(plain_values(value), allow_nan=False)), flush=True)
 
 
-def show_result(result: Mapping[str, Any], *, json: bool) -> None:
+def show_result(result: Mapping[str, Any], *, json: bool = False) -> None:
     """Print a result on stdout, either as one line of JSON, or as text with the same names and values.
 
     In the text, each value, each item of a dictionary and each of several sentences has a line. A list or a dictionary

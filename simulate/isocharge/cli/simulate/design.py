@@ -85,6 +85,6 @@ def design_command(
         write_design(result, output)
     results = result.to_dict()
     del results["case"]
-    show_result(results, json=False)
+    show_result(results)
     caution = "" if result.unambiguous else "caution: "
     say(f"{caution}{result.summary}; files in {output}")

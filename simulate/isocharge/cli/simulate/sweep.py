@@ -9,7 +9,6 @@ from isocharge.cli.shared.options import (
     ForceRangeOption,
     NewFolderOption,
     RadiusOption,
-    SeedOption,
     SensorArgument,
     WorkersOption,
 )
@@ -30,7 +29,7 @@ def sweep_command(
         Literal["fixed", "random"],
         typer.Option(help="Angle of the probe: as given, or random for each press."),
     ] = "fixed",
-    seed: SeedOption = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of random numbers. Equal seeds give equal results.")] = 0,
     workers: WorkersOption = None,
     cluster: Annotated[
         str | None,

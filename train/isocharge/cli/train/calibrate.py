@@ -169,4 +169,4 @@ def calibrate_command(
     if sentences:
         show("\n".join(sentences))
     if rows:
-        show_result({"next": rows}, json=False)
+        show_result({"next": rows})
