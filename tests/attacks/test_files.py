@@ -17,7 +17,6 @@ from isocharge.serve import (
     Recording,
     check_golden,
     device_from_table,
-    find_labelled_model,
     find_model,
     load_device,
     load_model,
@@ -216,25 +215,6 @@ def repository(tmp_path):
 def model(repository):
     """The version folder of the model in the repository."""
     return repository / MODEL / "1"
-
-
-LABEL_PARTS = (MODEL, "1", "outside", "..", ".", "/", "//", "~", "\\", "\n", "\0", "%2e", "")
-
-
-def test_labels_of_recordings_choose_no_path(tmp_path, repository, attack):
-    """Whatever a recording names as its model, a folder outside the repositories is never found."""
-    for outside in ("outside", "outside/outside"):
-        shutil.copytree(repository / MODEL, tmp_path / outside)
-
-    def random_label(rng):
-        parts = [rng.choice(LABEL_PARTS) for _ in range(rng.choice((1, 2, 3, 4)))]
-        return rng.choice(("", "/", f"{tmp_path}/")) + "/".join(parts)
-
-    def find(label):
-        assert find_labelled_model(label, repository).is_relative_to(repository)
-
-    find(f"{MODEL}/1")
-    attack("labels of recordings", find, random_label, 20_000)
 
 
 def test_a_model_with_faults(model, attack):

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from boards import TcpBoard, encoded_frames, interrupt, taps
+from boards import TcpBoard, encoded_frames, taps
 
 
 @pytest.fixture
@@ -69,11 +69,11 @@ def start_stream(start_command, models):
 
 @pytest.fixture
 def board_until(film):
-    """A board that is tapped, and does something after so many frames; by default it ends the command with Ctrl-C."""
+    """A board that is tapped, and does something after 400 frames."""
 
-    def make(count, act=interrupt):
+    def make(act):
         rows = taps(film)
-        return TcpBoard(chain(islice(rows, count), _after(act), rows))
+        return TcpBoard(chain(islice(rows, 400), _after(act), rows))
 
     return make
 

@@ -115,7 +115,7 @@ def test_wrong_options_are_refused_with_the_reason(measured, models, refused, mo
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stream_ends_cleanly_at_sigint_and_sigterm(board_until, stream, number):
-    with board_until(400, lambda: interrupt(number)) as board:
+    with board_until(lambda: interrupt(number)) as board:
         result = stream(board.url)
     assert len(records_of(result.stdout)) > 0
     assert " frames, 0 lost" in result.stderr.splitlines()[-1]

@@ -64,12 +64,6 @@ def piece(body):
     return cobs.encode(body + crc) + b"\0"
 
 
-def test_binary_frame_has_the_documented_layout():
-    """The version, the number, the time, the number of charges, the flags and the charges, without gaps."""
-    frame = Frame(seq=0x1234, t_us=0x89ABCDEF, values=(1.0, -2.5, 848.25), bits=1)
-    assert encode_frame(frame) == piece(struct.pack("<BHIBB3f", 1, frame.seq, frame.t_us, 3, frame.bits, *frame.values))
-
-
 @pytest.mark.parametrize(
     ("data", "counter"),
     [

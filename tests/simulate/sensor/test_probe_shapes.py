@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import shapely
+from tests.simulate.sensor.test_probe import HOUSE
 
 from isocharge.simulate import (
     Circle,
@@ -22,7 +23,6 @@ from solved_charges import solved_charge
 
 SENSOR = load_sensor("three-25um-biaxial")
 MEMBRANE = Theory(bending=False)
-HOUSE = np.array([(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (1.0, 2.0), (0.0, 1.0)])
 
 
 class ShapeCase(NamedTuple):

@@ -261,11 +261,6 @@ def test_the_default_file_states_the_defaults():
     assert load_config(CONFIGS / "default.toml") == FitConfig()
 
 
-def test_keys_left_out_keep_their_defaults(tmp_path):
-    config = load_config(write(tmp_path, "[training]\nsteps = 7\n"))
-    assert config == FitConfig(training=TrainingConfig(steps=7))
-
-
 def test_focused_distance_is_a_mean_with_smaller_weights_for_long_targets(monkeypatch):
     monkeypatch.setattr("isocharge.train.training.misfit_training.FOCUS_LENGTH", 2.0)
     vector = torch.tensor([[1.0, 0.0], [0.0, 2.0]])
