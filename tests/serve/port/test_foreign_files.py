@@ -1,10 +1,10 @@
-"""Recordings, records, tables and MCAP files given as a port, whose messages state the right command."""
+"""Recordings, records, tables and MCAP files given as a port or for a replay: messages state the right command."""
 
 import pytest
 from mcap.writer import Writer
 
 from isocharge.common.errors import InputError
-from isocharge.serve import Port, Recorder, open_source
+from isocharge.serve import Port, Recorder, Recording, open_source
 from isocharge.serve.port.file_source import Chunk, FileSource
 from isocharge.serve.record.formats import csv_header
 
@@ -37,7 +37,7 @@ FOREIGN = {
         "got a table of presses; .*isocharge serve predict MODEL .*--port - <",
     ),
     "semicolons.csv": (table("x_mm;y_mm;force_N;A;B;C\n1;2;0,5;4;5;6\n"), "got a table of presses"),
-    "touch.csv": (table(csv_header("ABC", ("track", "follow")) + "\n"), "got a table of presses"),
+    "touch.csv": (table(csv_header("ABC", ("track", "follow")) + "\n"), "got records of `serve stream`"),
 }
 
 
@@ -47,6 +47,9 @@ def test_foreign_file_as_a_port_is_refused_with_the_command_that_reads_it(name, 
     write(tmp_path / name)
     with pytest.raises(InputError, match=message), open_source(str(tmp_path / name)):
         pass
+    if name != "touch.rec":
+        with pytest.raises(InputError, match=message):
+            Recording(tmp_path / name)
 
 
 def test_lines_with_the_names_of_a_table_are_read_from_stdin_but_a_recording_is_not(tmp_path):

@@ -26,11 +26,11 @@ HEAD_BYTES = 4096
 """Number of bytes at the start of a file from which the kind of the file is recognised."""
 
 RECORDING_START = b'{"isocharge_recording"'
-RECORD_KEYS = (b'"frame_id"', b'"charge_pC"', b'"tare_pC"')
+RECORD_KEYS = (b"frame_id", b"charge_pC", b"tare_pC")  # in JSON, and in the header of a CSV
 MCAP_START = b"\x89MCAP"
 
-PRESS_COLUMNS = {"x_mm", "y_mm", "force_N", "charge_pC.A", "flags"}
-"""Columns that occur only in tables of presses and in records."""
+PRESS_COLUMNS = {"x_mm", "y_mm", "force_N", "flags"}
+"""Columns that occur only in tables of presses."""
 
 Moment = Annotated[float, Meta(ge=-1e11, le=1e11, description="a time before the year 5138, unix seconds")]
 
@@ -81,7 +81,7 @@ def foreign_kind(name: str, head: bytes) -> str:
     first_line = text.partition(b"\n")[0]
     if first_line.startswith(RECORDING_START):
         return f"a recording; play it with: isocharge serve replay {quoted_name}"
-    if first_line.startswith(b"{") and all(key in first_line for key in RECORD_KEYS):
+    if all(key in first_line for key in RECORD_KEYS):
         return (
             "records of `serve stream`; records hold results; record the board with `isocharge serve stream MODEL "
             "--port PORT --record touch.rec` and play it with `isocharge serve replay touch.rec`"

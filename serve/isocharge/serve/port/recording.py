@@ -28,7 +28,7 @@ from isocharge.common.errors import RecordingError, cut, is_printable
 from isocharge.common.files import AtomicWriter, StrPath, as_output_errors, bounded_lines
 from isocharge.common.structs import WrongKey, parse_json
 from isocharge.serve.model.metadata import ModelLabel
-from isocharge.serve.port.file_source import Chunk, Moment
+from isocharge.serve.port.file_source import RECORDING_START, Chunk, Moment, foreign_kind
 
 VERSION = 1
 """Version of the format of the file."""
@@ -189,6 +189,7 @@ class Recording:
             RecordingError: If the file cannot be read, or is not a recording of this version.
         """
         self._path = path = Path(path)
+        first_line = b""
         try:
             if not path.is_file():  # the file is opened twice, but a pipe can be read only once
                 raise RecordingError("there is no regular file of that name")
@@ -196,9 +197,11 @@ class Recording:
                 first_line = file.readline(LONGEST_ENTRY)  # empty if the file is empty
             header = parse_json(first_line.decode("utf-8", "replace"), "first line", RecordingError, _Header)
         except (OSError, ValueError) as error:  # RecordingError is a ValueError
-            raise RecordingError(
-                f"{path}: expected a recording of `serve stream --record` ({cut(str(error))})"
-            ) from error
+            # The kind of a file that holds other data states the command that reads it.
+            is_damaged = first_line.startswith(RECORDING_START)
+            kind = "" if is_damaged else foreign_kind(str(path), first_line)
+            reason = f"got {kind}" if kind else cut(str(error))
+            raise RecordingError(f"{path}: expected a recording of `serve stream --record` ({reason})") from error
         if header.isocharge_recording != VERSION:
             raise RecordingError(
                 f"{path}: recording version {header.isocharge_recording} is not supported (this version reads "
