@@ -319,6 +319,10 @@ def test_hexadecimal_numbers_without_their_prefix_are_not_read_as_decimal_number
     assert feed(*(notation.format(2045 + k % 9, 2054 - k % 7) for k in range(200))) == []
 
 
+def test_damaged_line_that_looks_hexadecimal_does_not_prevent_the_recognition():
+    assert len(feed("07FD,2054", *[f"{2045 + k % 9},2054" for k in range(20)])) == 20
+
+
 @pytest.mark.parametrize("notation", ["{0},5,7", "{1},{2}.5,-{0},{3}", "{4},0,{0}.5", "{2},{3},{4}", "50{1},5,7"])
 def test_column_that_counts_or_has_few_values_is_a_column(notation):
     lines = [notation.format(k, k % 4, -k % 3, 5 * k % 7, k // 5) for k in range(12)]

@@ -319,8 +319,11 @@ class TextParser(DelimitedParser):
         possible_names = (self._columns, *names_in_headers)
         new_names = next((names for names in possible_names if len(names) == unnamed_count), ())
         layout = Layout(frame_lines, new_names, self._meanings)
-        has_wrong_column_count = self._columns and "" in layout.names
-        if has_wrong_column_count or _has_hexadecimal_digits(layout, lines) or _has_channel_number(layout, lines):
+        if self._columns and "" in layout.names:  # the device file names another number of columns
+            return None
+        # In a cycle of several lines, all values have names, which digits and numbers of channels have not.
+        has_one_line = len(layout.patterns) == 1
+        if has_one_line and (_has_hexadecimal_digits(layout, lines) or _has_channel_number(layout, lines)):
             return None
         return layout
 
@@ -397,15 +400,17 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
 def _has_hexadecimal_digits(layout: Layout, lines: Sequence[Line]) -> bool:
     """Return whether the numbers are hexadecimal without the prefix 0x, because other lines have digits such as 07FD.
 
+    At least every tenth line must have such digits, because a single damaged line may have them, too.
+
     Args:
-        layout: Layout of a frame.
+        layout: Layout of a frame of one line.
         lines: The lines since the beginning.
     """
     other_texts = [line.text for line in lines if not layout.patterns[0].fullmatch(line.text)]
     shape, *other_shapes = [
         re.sub(r"\b[0-9][0-9A-Fa-f]*\b", "0", text) for text in (layout.lines[0].text, *other_texts)
     ]
-    return len(layout.patterns) == 1 and shape in other_shapes
+    return 10 * other_shapes.count(shape) >= len(lines)
 
 
 def _has_channel_number(layout: Layout, lines: Sequence[Line]) -> bool:
@@ -426,11 +431,9 @@ def _has_channel_number(layout: Layout, lines: Sequence[Line]) -> bool:
     A frame counter without a name also fulfils these conditions in its first eight lines.
 
     Args:
-        layout: Layout of a frame with its names.
+        layout: Layout of a frame of one line, with its names.
         lines: The lines since the beginning.
     """
-    if len(layout.patterns) > 1:  # a frame consists of several lines, whose values all have names
-        return False
     (pattern,) = layout.patterns
     values_of_lines = [line_values(pattern, line.text) for line in lines[-MAX_CYCLE_LINES:]]
     columns = np.array([values for values in values_of_lines if values]).T  # shape (n_column, n_line)
