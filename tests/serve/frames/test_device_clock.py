@@ -17,10 +17,10 @@ def chunk_at(monotonic_s, wall_s=None):
     return Chunk(b"x", START_S + (monotonic_s if wall_s is None else wall_s), round(monotonic_s * 1e9))
 
 
-def read(clock, chunk, t_us):
+def read(clock, chunk, t_us, modulus=MODULUS):
     """Return frames with the clock values of a device, after the clock has stamped them."""
     frames = [Frame(None, device_us, ()) for device_us in t_us]
-    clock.stamp(chunk, frames, MODULUS)
+    clock.stamp(chunk, frames, modulus)
     return frames
 
 
@@ -89,6 +89,14 @@ def test_late_reading_does_not_change_the_number_of_wraps():
     assert [time.device_us for time in times] == t_us
     assert min(time.dt_s for time in times) == 0.0
     assert not any(time.is_clock_reset for time in times)
+
+
+def test_clock_of_16_bits_in_us_may_wrap_at_each_reading():
+    """The clock wraps after 65.536 ms. The readings have intervals of 50 ms."""
+    clock = DeviceClock()
+    for t_us in range(0, 1_000_000, 50_000):
+        (time,) = read(clock, chunk_at(1e-6 * t_us), [t_us % 2**16], 2**16)
+        assert time.device_us == t_us
 
 
 def test_times_never_decrease():

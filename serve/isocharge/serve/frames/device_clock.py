@@ -165,7 +165,8 @@ class DeviceClock:
         The clock may be lower than at the previous reading for three reasons, which the difference distinguishes:
 
         - At most `MAX_DELAY_s`: the reading arrived late, for example because another datagram has overtaken it.
-        - At least half of the range of the clock: the clock has wrapped to 0.
+        - At least half of the range of the clock: the clock has wrapped to 0. If the range is so small that a late
+          reading could not be distinguished from a wrap, any lower clock has wrapped.
         - Any other difference: the device has restarted.
 
         Args:
@@ -176,9 +177,10 @@ class DeviceClock:
         """
         step_us = 0  # time since the previous reading, which is negative if the clock is lower without a wrap
         if self._has_fit:
-            # The modulo gives the step that is nearest to 0. If the clock has wrapped, this is a step forwards.
-            half_range_us = modulus // 2
-            step_us = (t_us - self._device_us + half_range_us) % modulus - half_range_us
+            # The modulo gives the step that is nearest to 0. If the clock has wrapped, this is a step forwards. A small
+            # range, such as 65.536 ms, leaves no room for a step back.
+            largest_step_back_us = modulus // 2 if modulus > MAX_DELAY_s * 1e6 else 0
+            step_us = (t_us - self._device_us + largest_step_back_us) % modulus - largest_step_back_us
         frame.is_clock_reset = step_us < -MAX_DELAY_s * 1e6
         is_before_zero = self._device_us + step_us < 0  # before the device was started, which is not possible
         if not self._has_fit or frame.is_clock_reset or is_before_zero:
