@@ -163,6 +163,7 @@ CHANNELS = {
     "A0,A1,A2": "123",
     "bat_V,A,B,C": "234",  # the unit of a channel that is no electrode does not matter
     "C,B,A,t_mV": "321",
+    "temp_C,A,B,C": "234",  # the name of a channel may be exactly that of its electrode
 }
 """Numbers of the channels of the electrodes A, B and C, by the names of the channels in a header."""
 

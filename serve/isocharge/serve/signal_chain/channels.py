@@ -165,11 +165,14 @@ class Channels:
         """Return, for each electrode, the indices of the names that belong to it.
 
         A name belongs to an electrode if the name of the electrode is among its words, as in `A_pC`, or is the part in
-        which the names differ, as in `chA` and `chB`. Capital and small letters are not distinguished.
+        which the names differ, as in `chA` and `chB`. Capital and small letters are not distinguished. If each
+        electrode has a name that is exactly its own, only these names count, so that `temp_C` is no name of C.
 
         Args:
             names: Names of channels, or words of a line of text.
         """
+        if set(names).issuperset(self._electrodes):
+            return [[names.index(electrode)] for electrode in self._electrodes]
         folded_names = [name.casefold() for name in names]
         distinctive_parts = _distinctive_parts(folded_names)
         words_of_names = [{*_words_of(name), part} for name, part in zip(folded_names, distinctive_parts, strict=True)]
