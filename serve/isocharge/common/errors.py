@@ -213,6 +213,10 @@ class TareError(IsochargeError, RuntimeError):
     """The film was touched while its tare was measured."""
 
 
+class PluginError(IsochargeError, RuntimeError):
+    """An output or a source, such as that of another package, cannot be used, or has failed."""
+
+
 class MissingExtra(IsochargeError, ImportError):
     """A part of isocharge needs packages that are not installed.
 
@@ -221,12 +225,13 @@ class MissingExtra(IsochargeError, ImportError):
 
 
 @contextmanager
-def error_prefix(where: str, error_class: type[IsochargeError]) -> Iterator[None]:
-    """Add a text in front of the message of each error that the `with` block raises.
+def error_context(error_class: type[IsochargeError], before: str = "", after: str = "") -> Iterator[None]:
+    """Add a text before or after the message of each error that the `with` block raises.
 
     Args:
-        where: Text that is added, for example the name of a file and a colon.
         error_class: Class of the errors whose messages are changed. All other exceptions are not changed.
+        before: Text before the message, for example the name of a file and a colon.
+        after: Text after the message, for example a semicolon and what the user can do.
 
     Raises:
         error_class: If the block raises an error of this class. The new error has the longer message.
@@ -234,24 +239,30 @@ def error_prefix(where: str, error_class: type[IsochargeError]) -> Iterator[None
     try:
         yield
     except error_class as error:
-        raise error_class(f"{where}{error}") from error
+        raise error_class(f"{before}{error}{after}") from error
 
 
 @contextmanager
-def error_advice(advice: str, error_class: type[IsochargeError]) -> Iterator[None]:
-    """Append advice to the message of each error that the `with` block raises.
+def plugin_errors(target: str, plugin: str) -> Iterator[None]:
+    """Convert the errors of an output or of a source to errors that name its target and its entry point.
 
     Args:
-        advice: What the user can do, which follows the message and a semicolon.
-        error_class: Class of the errors whose messages are changed. All other exceptions are not changed.
+        target: What the user has given, such as the URL of a port.
+        plugin: Kind, module and attribute of the entry point, such as "output my_package:SQLITE".
 
     Raises:
-        error_class: If the block raises an error of this class. The new error has the longer message.
+        PluginError: If the block raises an exception or ends the program. Errors of isocharge and a broken pipe, which
+            ends a stream, are not changed.
     """
     try:
         yield
-    except error_class as error:
-        raise error_class(f"{error}; {advice}") from error
+    except (IsochargeError, BrokenPipeError):
+        raise
+    except (Exception, SystemExit) as error:
+        raise PluginError(
+            f"{target}: the {plugin} failed ({type(error).__name__}: {error}); correct or uninstall its package, or do "
+            "without it"
+        ) from error
 
 
 @contextmanager

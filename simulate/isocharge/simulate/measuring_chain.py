@@ -27,7 +27,7 @@ import scipy  # loads each of its subpackages on first use
 from msgspec import Meta, defstruct, structs
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import InputError, error_prefix
+from isocharge.common.errors import InputError, error_context
 from isocharge.common.files import StrPath
 from isocharge.common.structs import Finite, NotNegative, Positive, Settings, read_toml
 from isocharge.simulate.noise import NOISE_LEVELS, NoiseModel
@@ -410,7 +410,7 @@ def load_amplifier(level: StrPath) -> Amplifier:
     white = changes.pop("white_pC", similar_amplifier.noise.white)
     gain = changes.pop("proportional", similar_amplifier.noise.gain)
     noise = NoiseModel(Path(level).stem, white, gain)
-    with error_prefix(f"{level}: ", InputError):
+    with error_context(InputError, f"{level}: "):
         return replace(similar_amplifier, noise=noise, **changes)
 
 

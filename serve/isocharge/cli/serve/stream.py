@@ -41,7 +41,7 @@ from isocharge.cli.shared.terminal import (
     until_stopped,
     write_stdout,
 )
-from isocharge.common.errors import InputError, NoFramesError, error_advice, is_printable, shown
+from isocharge.common.errors import InputError, NoFramesError, error_context, is_printable, shown
 from isocharge.common.files import check_new_output
 from isocharge.serve import (
     PredictionRecord,
@@ -280,7 +280,7 @@ def stream_command(
             writers.insert(0, _require_time)  # is called first, and refuses the file at its first record without a time
         say(f"{predictor.metadata.label} on {port}: taring, leave the film alone")
         try:
-            with error_advice(no_frames_hint(port, device), NoFramesError):
+            with error_context(NoFramesError, after=f"; {no_frames_hint(port, device)}"):
                 write_records(islice(records, count), writers)
         finally:
             if not is_repeatable:

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Meta, Struct, structs, to_builtins
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import ModelError, error_advice, is_printable, shown
+from isocharge.common.errors import ModelError, error_context, is_printable, shown
 from isocharge.common.structs import Finite, NotNegative, Positive, Settings, Text, WrongKey, convert, parse_json
 
 FORMAT_VERSION = 1
@@ -232,7 +232,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         """
         place = f"{where}: metadata"
         names = [name for name in cls.__struct_fields__ if name in props]
-        with error_advice("export the model again", ModelError):
+        with error_context(ModelError, after="; export the model again"):
             values = {name: parse_json(props[name], f"{place}: {name}", ModelError, object) for name in names}
 
         version = values.get("format_version", FORMAT_VERSION)
@@ -241,5 +241,5 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
                 f"{place} format {shown(version)} is not supported (this version reads {FORMAT_VERSION}); export it "
                 "again or upgrade isocharge"
             )
-        with error_advice("export the model again", ModelError):
+        with error_context(ModelError, after="; export the model again"):
             return convert(values, cls, place, ModelError)

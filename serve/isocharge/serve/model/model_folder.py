@@ -29,7 +29,7 @@ import onnxruntime as ort
 from numpy.typing import ArrayLike
 
 from isocharge.common.defaults import MAX_BATCH
-from isocharge.common.errors import ModelError, error_prefix, shown
+from isocharge.common.errors import ModelError, error_context, shown
 from isocharge.common.files import StrPath, check_new_output, new_folder, read_needed, sha256_of, write_whole
 from isocharge.serve.model.contact import as_charges
 from isocharge.serve.model.metadata import LABEL, NAME, VERSION, ModelMetadata
@@ -273,7 +273,7 @@ def check_golden(model: Model) -> None:
     """
     where = str(model.folder / "model.onnx")
     golden = model.golden
-    with error_prefix(f"{where}: ", ModelError):
+    with error_context(ModelError, f"{where}: "):
         outputs = run(model.session, golden.charge_pC)
     for name, rows in outputs.items():
         expected = np.array(golden.outputs[name])

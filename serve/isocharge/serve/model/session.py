@@ -27,7 +27,7 @@ import onnxruntime as ort
 from msgspec import Meta, Struct, json
 
 from isocharge.common.arrays import Singles
-from isocharge.common.errors import ModelError, cut, error_advice
+from isocharge.common.errors import ModelError, cut, error_context
 from isocharge.common.files import sha256_of
 from isocharge.common.structs import Finite, NotNegative, Text, read_json
 from isocharge.serve.model.contact import CORRELATION_COLUMNS, STD_COLUMNS
@@ -327,7 +327,7 @@ def read_golden(path: Path) -> Golden:
     Raises:
         ModelError: If the file is missing or damaged.
     """
-    with error_advice("the file is damaged or missing: copy or export the model again", ModelError):
+    with error_context(ModelError, after="; the file is damaged or missing: copy or export the model again"):
         golden = read_json(path, "golden vectors", ModelError, Golden)
         try:
             _check_sizes(golden)

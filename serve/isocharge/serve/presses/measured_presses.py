@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Integers
-from isocharge.common.errors import PressError, cut, error_prefix, shown
+from isocharge.common.errors import PressError, cut, error_context, shown
 from isocharge.common.files import as_output_errors, write_whole
 from isocharge.serve.presses.number_columns import CHARGE_RULE, ColumnRule, NumberColumns
 from isocharge.serve.presses.table_file import MAX_COLUMNS, CsvTable, csv_text, open_table
@@ -233,7 +233,7 @@ def read_presses(
     expected_header = f"a header with {', '.join(CONTACT)} and {expected_electrodes} (charges in pC)"
     with open_table(path, (*(electrodes or ()), *PRESS_RULES), PressError, expected_header) as table:
         electrode_names = _electrode_columns(table) if electrodes is None else tuple(electrodes)
-        with error_prefix(f"{path}: ", PressError):
+        with error_context(PressError, f"{path}: "):
             _check_electrodes(electrode_names)
         columns = _read_rows(table, dict.fromkeys(electrode_names, CHARGE_RULE), PRESS_RULES)
 
@@ -242,7 +242,7 @@ def read_presses(
     values = {name: columns.values.get(name, unknown_values) for name in (*electrode_names, *PRESS_RULES)}
     for name, std in default_stds.items():
         values[name] = np.where(np.isnan(values[name]), std, values[name])
-    with error_prefix(f"{path}, ", PressError):
+    with error_context(PressError, f"{path}, "):
         return MeasuredPresses(
             contact=np.column_stack([values[name] for name in CONTACT]),
             charge_pC=np.column_stack([values[name] for name in electrode_names]),
@@ -297,7 +297,7 @@ def read_press_list(path: Path) -> Array:
     """
     with open_table(path, CONTACT, PressError, f"a header with {', '.join(CONTACT)}") as table:
         columns = _read_rows(table, {name: PRESS_RULES[name] for name in CONTACT}, {})
-    with error_prefix(f"{path}, ", PressError):
+    with error_context(PressError, f"{path}, "):
         _refuse_half_positions(columns)
     return np.column_stack([columns.values[name] for name in CONTACT])
 

@@ -26,7 +26,7 @@ import numpy as np
 from msgspec import Struct
 
 from isocharge.common.arrays import Array, Booleans, npz_arrays
-from isocharge.common.errors import DatasetError, SensorError, cut, error_prefix, shown
+from isocharge.common.errors import DatasetError, SensorError, cut, error_context, shown
 from isocharge.common.files import StrPath, new_folder, read_needed, sha256_of, write_whole
 from isocharge.common.structs import MAX_JSON_BYTES, Positive, Text, convert, parse_json
 from isocharge.simulate.sensor.footprint import with_rotation
@@ -352,7 +352,7 @@ def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
             f"{folder} is not a dataset: it has no manifest.json; make one with 'isocharge simulate sweep'"
         )
     data = read_needed(path, DatasetError, "make the dataset again", MAX_JSON_BYTES)
-    with error_prefix(f"{path}: not a manifest of a dataset: ", DatasetError):
+    with error_context(DatasetError, f"{path}: not a manifest of a dataset: "):
         manifest = parse_json(data, "", DatasetError, dict[str, Any])  # the messages begin with the prefix above
         if "format_version" not in manifest:
             raise DatasetError("key 'format_version' is missing")

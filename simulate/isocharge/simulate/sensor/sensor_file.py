@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from msgspec import Meta, field
 
-from isocharge.common.errors import SensorError, error_prefix
+from isocharge.common.errors import SensorError, error_context
 from isocharge.common.files import StrPath, new_file
 from isocharge.common.structs import (
     Finite,
@@ -206,7 +206,7 @@ def sensor_from_dict(table: Mapping[str, Any], where: str = "sensor") -> Sensor:
     """
     file = convert(table, SensorTable, where, SensorError)
     calibration = file.calibration
-    with error_prefix(f"{where}: ", SensorError):
+    with error_context(SensorError, f"{where}: "):
         return Sensor(
             name=file.name,
             film=_film(file.film),

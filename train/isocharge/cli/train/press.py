@@ -27,7 +27,7 @@ from isocharge.cli.shared.port_hints import no_frames_hint
 from isocharge.cli.shared.terminal import say
 from isocharge.cli.train.press_dialogue import Dialogue, PressEvents
 from isocharge.common.defaults import DEFAULT_FORCE_RANGE, DEFAULT_RADIUS, DEFAULT_STRESS_LIMIT
-from isocharge.common.errors import NoFramesError, OutputError, PressError, error_advice, error_prefix
+from isocharge.common.errors import NoFramesError, OutputError, PressError, error_context
 from isocharge.common.files import as_output_errors, check_new_output
 from isocharge.serve import ReadingStream, load_device, open_source
 from isocharge.serve.live.steady_press import PressWatch
@@ -110,7 +110,7 @@ def press_command(
             problem, save=partial(_save, output), presses=presses, until=until, executor=executor, **stds
         )
         for number, contact in enumerate([] if contacts is None else contacts, 1):
-            with error_prefix(f"{press_list}, press {number}: ", PressError):
+            with error_context(PressError, f"{press_list}, press {number}: "):
                 session.check(contact)
 
         # Record the presses.
@@ -124,9 +124,8 @@ def press_command(
         )
         try:
             with (
-                error_advice(
-                    no_frames_hint(port, device), NoFramesError
-                ),  # first, because it changes the errors of the next two
+                # First, because it changes the errors of the next two.
+                error_context(NoFramesError, after=f"; {no_frames_hint(port, device)}"),
                 # A machine goes on while the port is lost, so its session must end.
                 open_source(port, baud=baud, reconnect=contacts is None, request=board.request) as source,
                 closing(PressEvents(source, stream, PressWatch(problem.electrodes), keyboard)) as events,

@@ -30,7 +30,7 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace as replace_setting
 
 from isocharge.common.arrays import Array
-from isocharge.common.errors import ModelError, PressError, cut, error_advice
+from isocharge.common.errors import ModelError, PressError, cut, error_context
 from isocharge.common.files import StrPath, write_whole
 from isocharge.common.structs import Text, plain_values, read_json
 from isocharge.serve.model.charge_file import FILE as CHARGES
@@ -124,8 +124,8 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
         PressError: If the file does not fit the format, belongs to another sensor, probe or working area, or contains
             numbers that no calibration can have written.
     """
-    advice = "if another version of isocharge wrote this calibration, calibrate again with its presses"
-    with error_advice(advice, PressError):
+    advice = "; if another version of isocharge wrote this calibration, calibrate again with its presses"
+    with error_context(PressError, after=advice):
         content = read_json(path, "the calibration.json of `train calibrate`", PressError, _CalibrationFile)
     _check_same_problem(path, content, problem)
 
