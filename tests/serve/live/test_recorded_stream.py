@@ -52,10 +52,10 @@ def with_requests(chunks, requests):
 
 def record_presses(path, film, predictor):
     """Record the stream of `chunks_of_presses`, and yield its records as JSON. A new tare is requested at chunk 30."""
-    with Recorder(path, predictor.metadata.label, DEVICE) as recorder:
-        live = RecordedStream(TouchStream(predictor, device_from_table(DEVICE, "test")), recorder)
-        for record in live.follow(with_requests(chunks_of_presses(film), {30: live.request_tare})):
-            yield record.to_json()
+    live = RecordedStream(TouchStream(predictor, device_from_table(DEVICE, "test")))
+    live.request_recording(Recorder(path, predictor.metadata.label, DEVICE))
+    for record in live.follow(with_requests(chunks_of_presses(film), {30: live.request_tare})):
+        yield record.to_json()
 
 
 def replayed_lines(path, predictor):

@@ -22,7 +22,7 @@ def recorded(tmp_path):
         for number, chunk in enumerate(CHUNKS):
             if number == 2:
                 recorder.event(tare=True)
-            records = [f'{{"timestamp": 1.0, "latency_us": {10.0 * record}}}' for record in range(number)]
+            records = [f'{{"timestamp": 1.0, "latency_us": {1e15 * record}}}' for record in range(number)]
             recorder.chunk(chunk, records)
     return path
 

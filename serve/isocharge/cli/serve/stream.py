@@ -3,7 +3,7 @@
 import signal
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing, nullcontext
+from contextlib import closing
 from dataclasses import asdict
 from functools import partial
 from itertools import islice
@@ -241,8 +241,9 @@ def stream_command(
     if follow:
         board = switched_on(board, "follow")
     touch = TouchStream(predictor, board, frame_id=name)
-    recorder = Recorder(record, predictor.metadata.label, board.table, name) if record else None
-    stream = RecordedStream(touch, recorder)
+    new_recorder = partial(Recorder, device=board.table, name=name)
+    recorder = new_recorder(record, predictor.metadata.label) if record else None
+    stream = RecordedStream(touch)
     has_expired = Event()
 
     # Write the records of the port to all outputs, until the stream ends or is stopped.
@@ -264,15 +265,14 @@ def stream_command(
         on_signal(signal.SIGHUP, unless_hung_up(partial(stream.request_model, load_latest))),
         open_source(port, baud=baud, reconnect=True, request=board.request, wait=wait) as source,
         command_outputs(output, touch, is_live=source.is_live) as open_outputs,
-        recorder or nullcontext(),
-        closing(stream.follow(source)) as records,  # closed before the recorder
+        closing(stream.follow(source)) as records,
     ):
         outputs = open_outputs
+        stream.request_recording(recorder)
         writers: list[Callable[[PredictionRecord], object]] = [outputs.write]
         if page is not None:
             # The page must not begin a recording if the command itself records the stream.
-            new_recorder = None if recorder else partial(Recorder, device=board.table, name=name)
-            writers.append(PageFeed(page, touch, stream, new_recorder).write)
+            writers.append(PageFeed(page, touch, stream, None if recorder else new_recorder).write)
         # The sum of currents, the corrections and tracking need the time between frames.
         needs_time = board.has_currents or not {LeakRule, HumRule, ThermalRule, TrackRule}.isdisjoint(board.rules)
         is_repeatable = isinstance(source, FileSource) and source.is_on_disk
@@ -334,7 +334,7 @@ def replay_command(
 
     # The function `play` yields the records. If the model was changed during the recording, `play` changes the model,
     # too, unless the user has chosen one model for the whole recording.
-    touch = TouchStream(predictor, board, frame_id=recording.name or None)
+    touch = TouchStream(predictor, board, frame_id=recording.name)
     load = None if model else lambda label: Predictor(find_labelled_model(label, models))
     play = partial(replay, recording, touch, real_time=real_time, load=load)
 

@@ -88,25 +88,22 @@ def virtual_command(
         if not isinstance(footprint, Circle):
             raise InputError(f"--film: expected a --probe like circle:1.0, whose radius is drawn, too, got {probe!r}")
         played_sensor, footprint = virtual_film(played_sensor, footprint, film)
-    min_force, _ = DEFAULT_PLAYED_FORCE_RANGE
-    map_radius = radius
-    map_force_max = force_max
     if scripted_presses is not None:  # the map must contain all presses of the script
         x_mm, y_mm, force_N = scripted_presses.contact.T
         distance_mm = np.hypot(x_mm, y_mm)
-        map_radius = float(np.fmax.reduce(ROUNDING_MARGIN * distance_mm, initial=radius))  # ignores NaN between presses
-        map_force_max = float(np.max(ROUNDING_MARGIN * force_N, initial=force_max))
+        radius = float(np.fmax.reduce(ROUNDING_MARGIN * distance_mm, initial=radius))  # ignores NaN between presses
+        force_max = float(np.max(ROUNDING_MARGIN * force_N, initial=force_max))
     with shown_progress(), solving_executor(played_sensor.film) as executor:
         forward_map = ForwardMap.build(
             played_sensor,
             footprint,
-            radius=map_radius,
-            force_range=(min_force, map_force_max),
+            radius=radius,
+            force_range=(DEFAULT_PLAYED_FORCE_RANGE[0], force_max),
             executor=executor,
         )
     player = VirtualSensor(
         film_charges(forward_map),
-        scripted_presses or random_script(forward_map, rate, map_force_max, rest),
+        scripted_presses or random_script(forward_map, rate, force_max, rest),
         noise=measure_function(amplifier, len(forward_map.electrodes), rate),
         encode=encode_frame if frames == "binary" else partial(encode_text, notation=frames),
         faults=settings.faults,

@@ -38,22 +38,13 @@ class RecordedStream:
         recorder: Recorder that writes the present recording, or None if nothing is recorded.
     """
 
-    def __init__(self, stream: TouchStream, recorder: Recorder | None = None) -> None:
-        """Store the stream and the recorder of the first recording.
-
-        Args:
-            stream: Stream that computes records from chunks.
-            recorder: Recorder that the caller has opened, and closes after `follow` has ended. None if nothing is
-                recorded at first.
-        """
+    def __init__(self, stream: TouchStream) -> None:
+        """Store the stream, which computes records from chunks. Nothing is recorded at first."""
         self._stream = stream
-        self.recorder = recorder
-        self._opened_recorder = ExitStack()  # closes the present recorder if it was opened on request
-        # The latest chunk and its records, if they have not been recorded yet
-        self._unrecorded: tuple[Chunk, list[PredictionRecord]] | None = None
+        self.recorder: Recorder | None = None
+        self._opened_recorder = ExitStack()  # closes the present recorder
         self._requests: deque[Callable[[], None]] = deque()
         self._preamble = b""  # chunks up to the one with the first frame, which show the layout of the frames
-        self._is_recording_new = False  # whether the present recording was requested and has no chunk yet
         self._loader = ThreadPoolExecutor(1, "model")  # loads one model at a time
 
     def request_tare(self) -> None:
@@ -77,7 +68,7 @@ class RecordedStream:
         """
         if recorder is not None:
             recorder.open()
-        self._requests.append(partial(self._begin_recording, recorder))
+        self._requests.append(partial(self._use_recorder, recorder))
 
     def request_marker(self, marker: Marker) -> None:
         """Request to write a marker to the recording. Without a recording, the marker is ignored."""
@@ -98,9 +89,8 @@ class RecordedStream:
     def follow(self, chunks: Iterable[Chunk]) -> Generator[PredictionRecord]:
         """Process and record the chunks, and yield their prediction records.
 
-        Requests are executed before each chunk. A chunk is recorded after its last record has been yielded. The caller
-        must close the generator before the recorder, so that the present chunk is recorded even if the program is
-        interrupted.
+        Requests are executed before each chunk. A chunk is recorded before its records are computed, and each record
+        before it is yielded. When the caller closes the generator, the recording ends, too.
 
         The bytes up to the first frame (`_preamble`) are stored, because they show the layout of the frames. A
         recording that was requested during the stream begins with them.
@@ -116,73 +106,54 @@ class RecordedStream:
         """
         try:
             for chunk in chunks:
+                previous_recorder = self.recorder
                 while self._requests:
                     execute_request = self._requests.popleft()
                     execute_request()
-                if self._is_recording_new:
-                    chunk = self._record_preamble(chunk)
+                recorder = self.recorder
+                if recorder is not None and recorder is not previous_recorder:
+                    chunk = self._begin_again(recorder, chunk)
                 if self._stream.parser.counts.frames == 0:
                     self._preamble += chunk.data
 
-                # If the caller closes the generator at a `yield`, the chunk must be recorded with the records that were
-                # yielded until then. Chunk and records are therefore stored for `_record_chunk`.
-                records: list[PredictionRecord] = []
-                self._unrecorded = (chunk, records)
+                if recorder is not None:
+                    recorder.event(chunk=chunk)
                 for record in self._stream.feed(chunk):
-                    records.append(record)
+                    if recorder is not None:
+                        recorder.write(record.to_json())
                     yield record
-                self._record_chunk()
             self._stream.finish()
         finally:
-            self._record_chunk()  # if an interruption has prevented it
-            self._end_recording()
+            self._use_recorder(None)
 
-    def _record_chunk(self) -> None:
-        """Write the latest chunk and its records to the recording, unless a call has done this before."""
-        if self.recorder is not None and self._unrecorded is not None:
-            chunk, records = self._unrecorded
-            self.recorder.chunk(chunk, [record.to_json() for record in records])
-        self._unrecorded = None  # also without a recorder, because the next recording must not contain the chunk
-
-    def _begin_recording(self, recorder: Recorder | None) -> None:
-        """End the present recording and, unless `recorder` is None, begin another recording with an open recorder.
-
-        When a new recording begins, the stream is restarted. The records of the new recording therefore depend only on
-        the bytes in this recording.
-        """
-        self._end_recording()
-        if recorder is None:
-            return
+    def _use_recorder(self, recorder: Recorder | None) -> None:
+        """End the present recording, close its recorder, and record with another one, unless `recorder` is None."""
+        self._opened_recorder.close()
         self.recorder = recorder
-        self._opened_recorder.push(recorder)
-        self._stream.restart()
-        self._is_recording_new = True
+        if recorder is not None:
+            self._opened_recorder.push(recorder)
 
-    def _record_preamble(self, chunk: Chunk) -> Chunk:
-        """Process the first bytes of the stream again, and write them as the first chunk of the new recording.
+    def _begin_again(self, recorder: Recorder, chunk: Chunk) -> Chunk:
+        """Restart the stream, and process the first bytes of the stream again, for a new recording.
 
-        The restarted stream and a replay then know the layout of the frames. The chunk is written without records.
+        The records of the new recording then depend only on the bytes in this recording. Its first chunk contains the
+        first bytes, from which a replay learns the layout of the frames. This chunk is written without records.
 
         Args:
+            recorder: Recorder of the new recording.
             chunk: The next chunk of the stream.
 
         Returns:
             The next chunk. Frames that have arrived between the first bytes and this chunk are missing in the
             recording. The chunk therefore states an outage, so that the tare and the clock begin again.
         """
-        self._is_recording_new = False
-        if not self._preamble:
+        if not self._preamble:  # no bytes have been processed yet
             return chunk
+        self._stream.restart()
         preamble = chunk._replace(data=self._preamble, outage_s=0.0)
         deque(self._stream.feed(preamble), maxlen=0)  # processes the chunk, and discards the records
-        if self.recorder is not None:  # the recording may have been ended before this chunk
-            self.recorder.chunk(preamble, [])
+        recorder.event(chunk=preamble)
         return chunk._replace(outage_s=max(chunk.outage_s, 1e-6))  # any outage above 0 has the same effect
-
-    def _end_recording(self) -> None:
-        """End the present recording, and close its recorder unless the caller has opened the recorder."""
-        self.recorder = None
-        self._opened_recorder.close()
 
     def _record_event(self, **event: bool | str | Marker) -> None:
         """Write an event to the recording, if there is a recording; see `Recorder.event`."""

@@ -28,7 +28,7 @@ from isocharge.common.errors import RecordingError, cut, is_printable
 from isocharge.common.files import AtomicWriter, StrPath, as_output_errors, bounded_lines
 from isocharge.common.structs import WrongKey, parse_json
 from isocharge.serve.model.metadata import ModelLabel
-from isocharge.serve.port.file_source import RECORDING_START, Chunk, Moment, foreign_kind
+from isocharge.serve.port.file_source import Chunk, Moment, foreign_kind
 
 VERSION = 1
 """Version of the format of the file."""
@@ -39,7 +39,7 @@ KIND = "isocharge_recording"
 LONGEST_ENTRY = 1 << 20
 """Length of the longest line, characters. A chunk of 64 KiB in base64 has a tenth of this length."""
 
-Latency = Annotated[float, Meta(ge=-1e12, le=1e12, description="a latency of some days at most, us")]
+Latency = Annotated[float, Meta(ge=-2e16, le=2e16, description="a difference of two monotonic clocks, us")]
 
 log = logging.getLogger(__name__)
 
@@ -82,13 +82,8 @@ class Recorder:
         """
         self.path = Path(path)
         self.failed = False
-        header: dict[str, Any] = {KIND: VERSION, "model": model, "device": dict(device)}
-        if name:
-            header["name"] = name
-        self._first_line = json.dumps(header)
+        self._first_line = json.dumps({KIND: VERSION, "model": model, "device": dict(device), "name": name or ""})
         parse_json(self._first_line, "recording", RecordingError, _Header)  # checks the line as a reader does
-        self._latest_chunk: Chunk | None = None  # chunk of the latest call of `chunk`
-        self._latest_start = 0  # size of the file before the latest chunk was written, bytes
 
     def open(self) -> None:
         """Create the file, and write its first line.
@@ -99,7 +94,7 @@ class Recorder:
         """
         with as_output_errors(self.path):
             self._file = AtomicWriter(self.path)
-        self._write(self._first_line)
+        self.write(self._first_line)
 
     def __enter__(self) -> Self:
         """Create the file, and return the recorder; see `open`."""
@@ -113,25 +108,20 @@ class Recorder:
     def chunk(self, chunk: Chunk, records: list[str]) -> None:
         """Write a chunk and the records that were computed from it.
 
-        If Ctrl-C interrupts a call, the caller passes the same chunk again. If the interrupted call has already written
-        the chunk, the file has grown, and the second call writes nothing.
-
         Args:
             chunk: The chunk.
-            records: Records of the frames in the chunk, each as a line of JSON.
+            records: Records of the frames in the chunk, each as a line of JSON. Further records of the chunk may follow
+                with `write`.
         """
-        if chunk is self._latest_chunk and self._file.tell() > self._latest_start:
-            return
-        self._latest_start = self._file.tell()
-        self._latest_chunk = chunk
-        chunk_line = encode({"chunk": chunk}).decode()
-        self._write("\n".join([chunk_line, *records]))
+        self.event(chunk=chunk)
+        for record in records:
+            self.write(record)
 
-    def event(self, **event: bool | str | Marker) -> None:
-        """Write an event: `tare=True` for a request for a new tare, `use=label` for a new model, or `marker=marker`."""
-        self._write(encode(event).decode())
+    def event(self, **event: bool | str | Marker | Chunk) -> None:
+        """Write an event: `chunk=chunk`, `marker=marker`, `tare=True` for a new tare, `use=label` for a new model."""
+        self.write(encode(event).decode())
 
-    def _write(self, lines: str) -> None:
+    def write(self, lines: str) -> None:
         """Append complete lines to the file.
 
         If an interrupted call has left an incomplete line, the new lines are written over it. If the disk is full, an
@@ -197,10 +187,7 @@ class Recording:
                 first_line = file.readline(LONGEST_ENTRY)  # empty if the file is empty
             header = parse_json(first_line.decode("utf-8", "replace"), "first line", RecordingError, _Header)
         except (OSError, ValueError) as error:  # RecordingError is a ValueError
-            # The kind of a file that holds other data states the command that reads it.
-            is_damaged = first_line.startswith(RECORDING_START)
-            kind = "" if is_damaged else foreign_kind(str(path), first_line)
-            reason = f"got {kind}" if kind else cut(str(error))
+            reason = foreign_kind(str(path), first_line) or cut(str(error))
             raise RecordingError(f"{path}: expected a recording of `serve stream --record` ({reason})") from error
         if header.isocharge_recording != VERSION:
             raise RecordingError(
