@@ -247,11 +247,11 @@ def _temporary_path(path: Path) -> Path:
 
 
 @contextmanager
-def as_output_errors(path: Path) -> Iterator[None]:
+def as_output_errors(path: StrPath) -> Iterator[None]:
     """If the `with` block raises an OSError, raise an OutputError instead.
 
     Args:
-        path: Path of the output, for the error message.
+        path: Path or target of the output, for the error message.
 
     Raises:
         OutputError: If the block raises an OSError that is neither an error of isocharge nor a broken pipe.

@@ -2,6 +2,7 @@
 
 import csv
 import re
+import sys
 from contextlib import nullcontext
 from itertools import repeat
 from pathlib import Path
@@ -10,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from boards import interrupt
-from isocharge.common.errors import InputError, OutputError, OutputExists
+from isocharge.common.errors import InputError, OutputError, OutputExists, PluginError
 from isocharge.serve.outputs.output import OutputContext, OutputKind
 from isocharge.serve.outputs.targets import Outputs, output_kind
 
@@ -136,8 +137,8 @@ def test_added_output_that_cannot_be_closed_spoils_no_other_output(record, tmp_p
     path = tmp_path / "touch.jsonl"
     outputs = Outputs([str(path), "mine"], context(is_live=is_live)).__enter__()
     outputs.write(record())
-    message = "mine: the output failed (RuntimeError: not open)"
-    with nullcontext() if is_live else pytest.raises(OutputError, match=re.escape(message)):
+    message = "mine: the output mine:KIND failed (RuntimeError: not open)"
+    with nullcontext() if is_live else pytest.raises(PluginError, match=re.escape(message)):
         outputs.__exit__(None, None, None)
     assert (message in caplog.text) == is_live
     assert path.read_text("utf-8") == record().to_json() + "\n"
@@ -174,7 +175,15 @@ def test_output_that_fails_does_not_end_the_live_stream(record, caplog):
             outputs.write(record(seq=number))
     assert len(printed) == 100
     assert outputs.not_written == {"broken": None}
-    assert (
-        "broken: stopped (broken: the output failed (RuntimeError: not open)); the records after that are missing"
-        in caplog.text
-    )
+    assert "stopped (broken: the output mine:KIND failed (RuntimeError: not open); correct or uninsta" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "load", [raise_error, sys.exit, object, lambda: OutputKind("added", bool, lambda *_: added(sys.exit))]
+)
+def test_added_output_that_fails_is_an_error_with_its_entry_point(record, monkeypatch, load):
+    find = lambda group: [SimpleNamespace(value="mine:KIND", load=load)]  # noqa: ARG005, E731
+    monkeypatch.setattr("isocharge.serve.outputs.targets.entry_points", find)
+    message = r"a\.x: the output mine:KIND failed \(.+\); correct or uninstall its package"
+    with pytest.raises(PluginError, match=message), Outputs(["a.x"], context()) as outputs:
+        outputs.write(record())

@@ -75,12 +75,14 @@ class OutputKind(NamedTuple):
             this is impossible.
         is_standard_output: Whether the output writes to standard output. Only one output of a command may write to
             standard output. The stream ends when standard output is closed.
+        plugin: Name of the output in messages. It is set when the entry point of another package is loaded.
     """
 
     form: str
     accepts: Callable[[str], bool]
     open: Callable[[str, OutputContext], Output]
     is_standard_output: bool = False
+    plugin: str = "output of isocharge"
 
 
 T = TypeVar("T")

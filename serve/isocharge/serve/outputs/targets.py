@@ -1,14 +1,14 @@
 """Available kinds of outputs, and the class that writes records to all outputs of a command."""
 
 import logging
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Self
 
-from isocharge.common.errors import InputError, shown
-from isocharge.common.files import output_error
+from isocharge.common.errors import InputError, plugin_errors, shown
+from isocharge.common.files import as_output_errors
 from isocharge.serve.outputs.output import (
     CSV_FILE,
     JSON_FILE,
@@ -74,6 +74,7 @@ def output_kind(target: str) -> OutputKind:
 
     Raises:
         InputError: If no kind accepts the target.
+        PluginError: If an entry point cannot be imported, or does not refer to an `OutputKind`.
     """
     for kind in OUTPUT_KINDS:
         if kind.accepts(target):
@@ -82,10 +83,12 @@ def output_kind(target: str) -> OutputKind:
     # No built-in kind accepts the target. Try the kinds of other packages, and collect their forms for the message.
     forms = [target_forms()]
     for entry_point in entry_points(group=ENTRY_POINTS):
-        added_kind: OutputKind = entry_point.load()
-        if added_kind.accepts(target):
-            return added_kind
-        forms.append(added_kind.form)
+        plugin = f"output {entry_point.value}"
+        with plugin_errors(target, plugin):
+            added_kind: OutputKind = entry_point.load()
+            if added_kind.accepts(target):
+                return added_kind._replace(plugin=plugin)
+            forms.append(str(added_kind.form))
     raise InputError(f"output {shown(target)}: expected one of the forms {', '.join(forms)}")
 
 
@@ -122,6 +125,12 @@ class Outputs:
         self._is_discarded = False
         self.not_written: dict[str, int | None] = {}
 
+    @contextmanager
+    def _named_errors(self, target: str) -> Iterator[None]:
+        """Convert the errors of an output to errors that state their cause, the target, and what the user can do."""
+        with plugin_errors(target, self._kinds[target].plugin), as_output_errors(target):
+            yield
+
     def __enter__(self) -> Self:
         """Open the outputs.
 
@@ -131,14 +140,16 @@ class Outputs:
         """
         for target, kind in self._kinds.items():
             try:
-                output = kind.open(target, self._context)
-            except BaseException as error:
+                with self._named_errors(target):
+                    output = kind.open(target, self._context)
+                    write = self._named_errors(target)(output.write)  # converts the errors of each call
+            except BaseException:
                 self._is_discarded = True
                 self._stack.close()
-                raise output_error(error, target)  # noqa: B904  # the cause is set
+                raise
             # A live stream must not wait for a slow consumer, so its records are written by another thread.
-            queue = WriterQueue(output.write) if self._context.is_live else None
-            self._writers[target] = output.write if queue is None else queue.put
+            queue = WriterQueue(write) if self._context.is_live else None
+            self._writers[target] = write if queue is None else queue.put
             self._stack.callback(self._close_or_discard, target, output, queue)
         return self
 
@@ -180,11 +191,10 @@ class Outputs:
         Raises:
             Exception: The error, with its cause and the target.
         """
-        complete_error = output_error(error, target)
         if not self._context.is_live or self._kinds[target].is_standard_output:
-            raise complete_error
+            raise error
         if self._writers.pop(target, None) is not None:  # this is the first error, after which there is no writer
-            log.error("%s: stopped (%s); the records after that are missing", target, complete_error)
+            log.error("%s: stopped (%s); the records after that are missing", target, error)
         self.not_written[target] = None  # the number is unknown
 
     def close(self) -> None:
@@ -212,36 +222,29 @@ class Outputs:
         """
         try:
             if queue is not None:
-                self._close_queue(target, queue)
+                queue.close()  # writes the waiting records
+                if queue.error is not None:
+                    self._handle_error(target, queue.error)
+                if queue.lost > 0:
+                    self.not_written.setdefault(target, queue.lost)  # keeps None, which `_handle_error` has set
                 if queue.is_stuck:  # the thread is still in `write` of the output, which therefore cannot be closed
                     return
             has_failed = target not in self._writers  # `_handle_error` removes the writer of an output that fails
-            if self._is_discarded or has_failed:
-                self._discard(output)
-            else:
-                output.close()
+            with self._named_errors(target):
+                if self._is_discarded or has_failed:
+                    self._discard(output)
+                else:
+                    output.close()
         except KeyboardInterrupt:  # the output may be incomplete; a replay then removes the file
             self.not_written[target] = None
             raise
         except Exception as error:
             if self._is_discarded:
-                log.error("%s", output_error(error, target))
+                log.error("%s", error)
             else:
                 self._handle_error(target, error)
         if self._is_discarded:
             self.not_written[target] = None  # the number of missing records is unknown
-
-    def _close_queue(self, target: str, queue: WriterQueue[PredictionRecord]) -> None:
-        """Write the waiting records of an output, and handle the error of its thread and the records that were lost.
-
-        Raises:
-            Exception: The error of standard output.
-        """
-        queue.close()
-        if queue.error is not None:
-            self._handle_error(target, queue.error)
-        if queue.lost > 0:
-            self.not_written.setdefault(target, queue.lost)  # keeps None, which `_handle_error` has set
 
     def _discard(self, output: Output) -> None:
         """Discard an output or, if it has no method `discard`, close it. Remove a file without records."""

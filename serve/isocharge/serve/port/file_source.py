@@ -39,14 +39,14 @@ class Chunk(NamedTuple):
     """Bytes that arrived together, with the time of arrival.
 
     Attributes:
-        data: The bytes, at least one byte.
+        data: The bytes, at least one byte, and at most as many as fit into a line of a recording.
         timestamp: Host time of arrival, unix seconds.
         clock_ns: Value of `time.perf_counter_ns` at arrival, from which latencies and the times between chunks are
             computed.
         outage_s: Length of the outage that ended with these bytes, s; 0 if there was no outage.
     """
 
-    data: bytes
+    data: Annotated[bytes, Meta(max_length=700_000)]
     timestamp: Moment
     clock_ns: Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
     outage_s: Annotated[float, Meta(ge=0.0)] = 0.0
@@ -63,12 +63,16 @@ def check_bytes(name: str, head: bytes) -> None:
         InputError: If the file is of another kind. The message states the kind, and how to use such a file.
     """
     kind = foreign_kind(name, head)
+    if head.startswith(RECORDING_START):
+        kind = f"got a recording; play it with: isocharge serve replay {shlex.quote(name)}"
     if kind:
-        raise InputError(f"{name}: expected a port, or a file of bytes from a board, got {kind}")
+        raise InputError(f"{name}: expected a port, or a file of bytes from a board, {kind}")
 
 
 def foreign_kind(name: str, head: bytes) -> str:
-    """Return the kind of a file that does not come from a board, with advice; empty if it may come from a board.
+    """Return the kind of a file that is no recording and does not come from a board, with advice; empty for others.
+
+    The text continues a sentence that states what was expected, as in "got an MCAP file; ...".
 
     Lines of text with the column names of a table of presses are only accepted from the standard input.
 
@@ -77,25 +81,22 @@ def foreign_kind(name: str, head: bytes) -> str:
         head: First bytes of the file. They are compared with the beginnings of known kinds of files.
     """
     quoted_name = shlex.quote(name)  # for the commands in the advice
-    text = head.removeprefix(codecs.BOM_UTF8).lstrip()
-    first_line = text.partition(b"\n")[0]
-    if first_line.startswith(RECORDING_START):
-        return f"a recording; play it with: isocharge serve replay {quoted_name}"
+    first_line = head.removeprefix(codecs.BOM_UTF8).lstrip().partition(b"\n")[0]
     if all(key in first_line for key in RECORD_KEYS):
         return (
-            "records of `serve stream`; records hold results; record the board with `isocharge serve stream MODEL "
+            "got records of `serve stream`; records hold results; record the board with `isocharge serve stream MODEL "
             "--port PORT --record touch.rec` and play it with `isocharge serve replay touch.rec`"
         )
     if head.startswith(MCAP_START):
         return (
-            "an MCAP file; MCAP files hold results, and isocharge only writes them; play the recording that was made "
-            "beside it with `isocharge serve replay touch.rec`"
+            "got an MCAP file; MCAP files hold results, and isocharge only writes them; play the recording that was "
+            "made beside it with `isocharge serve replay touch.rec`"
         )
     columns = {column.strip(' "') for column in re.split("[,;|\t]", first_line.decode("utf-8", "replace").strip())}
     if not columns.isdisjoint(PRESS_COLUMNS) and name != STDIN:
         return (
-            f"a table of presses; compute its contacts with: isocharge serve predict MODEL {quoted_name}; if a board "
-            f"has sent these lines, use: isocharge serve stream MODEL --port - < {quoted_name}"
+            f"got a table of presses; compute its contacts with: isocharge serve predict MODEL {quoted_name}; if a "
+            f"board has sent these lines, use: isocharge serve stream MODEL --port - < {quoted_name}"
         )
     return ""
 

@@ -25,11 +25,14 @@ import os
 import sys
 import time
 from collections.abc import Iterator
-from importlib.metadata import entry_points
+from functools import partial
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-from isocharge.common.errors import InputError, PortError, PortLost
+from msgspec import convert
+
+from isocharge.common.errors import InputError, PortError, PortLost, plugin_errors
 from isocharge.serve.port.file_source import STDIN, Chunk, FileSource, open_file
 from isocharge.serve.port.serial_line import (
     MAX_READ_BYTES,
@@ -280,6 +283,42 @@ class Source(Protocol):
         """Yield chunks as they arrive, until the source ends."""
 
 
+class AddedSource(contextlib.ExitStack):
+    """Source of another package, whose errors name the entry point of the package.
+
+    Each chunk is checked, so that a recording never contains a chunk that a replay would refuse.
+
+    Attributes:
+        is_live: Whether bytes are lost if they are not read in time.
+    """
+
+    def __init__(self, entry_point: EntryPoint, url: str) -> None:
+        """Open the source, which is closed when the context is left.
+
+        Args:
+            entry_point: Entry point that refers to a function, which returns the source for a URL.
+            url: The URL.
+
+        Raises:
+            PluginError: If the package cannot be imported, or returns no source.
+        """
+        super().__init__()
+        self._named_errors = partial(plugin_errors, url, f"source {entry_point.value}")
+        with self._named_errors():
+            self._source = self.enter_context(entry_point.load()(url))
+            self.is_live = self._source.is_live
+
+    def __iter__(self) -> Iterator[Chunk]:
+        """Yield the chunks of the source.
+
+        Raises:
+            PluginError: If the source fails, or yields something other than a chunk.
+        """
+        with self._named_errors():
+            for chunk in self._source:
+                yield convert(tuple(chunk), Chunk, builtin_types=[bytes])  # a text is no bytes
+
+
 def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> contextlib.AbstractContextManager[Source]:
     """Return a context manager that opens a port, a file or the standard input as a source of chunks.
 
@@ -302,8 +341,7 @@ def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> context
     if not is_path:
         # If another package has added a source for the scheme, the first such source is used.
         for entry_point in entry_points(group=ENTRY_POINTS, name=scheme):
-            added_source: contextlib.AbstractContextManager[Source] = entry_point.load()(url)
-            return added_source
+            return AddedSource(entry_point, url)
 
     # Wait until the path exists, because the type of a missing path (a file or a port) is unknown.
     path = Path(url)
