@@ -45,6 +45,8 @@ def test_live_page_with_allow_host_shows_a_press_and_carries_out_requests(board,
     client.ask("record", on=False)
     client.ask("record", on=True)  # within the same second
     follow(client, lambda _, state: str(state.get("recording", "")).endswith(".rec"))
+    # A second browser cannot end the recording of the first by beginning one.
+    assert client.send("POST", "/request", {"do": "record", "on": True})[0] == 400
     client.ask("marker", text="here")
     follow(client, lambda _, state: state.get("markers"))
     client.ask("record", on=False)

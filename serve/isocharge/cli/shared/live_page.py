@@ -186,6 +186,7 @@ class PageFeed:
         self._touch = touch
         self._stream = stream
         self._new_recorder = new_recorder
+        self._is_recording = False  # whether the page has begun a recording
         self._last_state_s = 0.0
         self._latest_record: PredictionRecord | None = None
         if stream is not None:
@@ -220,7 +221,7 @@ class PageFeed:
         """Carry out a request of the page to write a marker, to begin or end a recording, or to measure a new tare.
 
         Raises:
-            InputError: If the page requests a recording while the stream is recorded.
+            InputError: If the page requests a recording while the stream is recorded, also for another browser.
             OutputError: If the file of the recording cannot be created.
         """
         from isocharge.serve.viewer.live_page import Marker, Tare
@@ -231,13 +232,15 @@ class PageFeed:
             self._page.add_marker(marker)
         elif isinstance(action, Tare):
             stream.request_tare()
-        elif self._new_recorder is None:
-            raise InputError("the command that runs the stream records it already (--record)")
+        elif self._new_recorder is None or (action.on and self._is_recording):
+            raise InputError("the command that runs the stream (--record), or another browser, records it already")
         elif action.on:
             model_label = self._touch.predictor.metadata.label
             path = Path(f"{model_label.replace('/', '-')}-{datetime.now():%Y%m%d-%H%M%S-%f}.rec")
             stream.request_recording(self._new_recorder(path, model_label))
+            self._is_recording = True
             self._page.update(recording=f"{path.name}, which waits for data")
         else:
             stream.request_recording(None)
+            self._is_recording = False
             self._page.update(recording=None)
