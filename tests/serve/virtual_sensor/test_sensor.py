@@ -63,11 +63,6 @@ def test_forward_map_with_wrong_charges_is_refused(charges):
         VirtualSensor(lambda *_: charges, steady())
 
 
-def test_another_number_of_offsets_than_electrodes_is_refused(film):
-    with pytest.raises(ValueError, match="size 1 into shape"):
-        VirtualSensor(film.charges, steady(), offset_pC=[1.0])
-
-
 def read(url, count):
     """Return the next frames from a port, and the counters of the parser."""
     parser = BinaryParser()
@@ -141,14 +136,6 @@ def test_frames_are_withheld_without_a_reader(film):
         assert first_counts == (0, 0)
         frames, _ = read(sensor.url, 3)
         assert frames[0].seq < sensor.sent + sensor.withheld  # the frame numbers begin at 0 again
-
-
-def test_number_of_sent_frames_is_not_negative_if_the_first_frame_is_lost(film):
-    with VirtualSensor(film.charges, steady(), faults=Faults(lose_share=1.0 - 1e-9)) as sensor:
-        for _ in range(100):
-            assert 0 <= sensor.sent <= 1  # the sensor may be counting a frame at present
-            time.sleep(0.001)
-        assert sensor.lost > 0
 
 
 def test_bytes_that_a_sensor_ignores_do_not_block_their_sender(film):
