@@ -179,7 +179,7 @@ def test_output_that_fails_does_not_end_the_live_stream(record, caplog):
 
 
 @pytest.mark.parametrize(
-    "load", [raise_error, sys.exit, object, lambda: OutputKind("added", bool, lambda *_: added(sys.exit))]
+    "load", [raise_error, sys.exit, object, lambda: OutputKind("added", bool, lambda *_: added(raise_error))]
 )
 def test_added_output_that_fails_is_an_error_with_its_entry_point(record, monkeypatch, load):
     find = lambda group: [SimpleNamespace(value="mine:KIND", load=load)]  # noqa: ARG005, E731

@@ -142,7 +142,7 @@ class Outputs:
             try:
                 with self._named_errors(target):
                     output = kind.open(target, self._context)
-                    write = self._named_errors(target)(output.write)  # converts the errors of each call
+                    write = output.write
             except BaseException:
                 self._is_discarded = True
                 self._stack.close()
@@ -191,10 +191,14 @@ class Outputs:
         Raises:
             Exception: The error, with its cause and the target.
         """
-        if not self._context.is_live or self._kinds[target].is_standard_output:
-            raise error
-        if self._writers.pop(target, None) is not None:  # this is the first error, after which there is no writer
-            log.error("%s: stopped (%s); the records after that are missing", target, error)
+        try:
+            with self._named_errors(target):  # not around each call of an output, which would take longer
+                raise error
+        except Exception as named_error:
+            if not self._context.is_live or self._kinds[target].is_standard_output:
+                raise
+            if self._writers.pop(target, None) is not None:  # this is the first error, after which there is no writer
+                log.error("%s: stopped (%s); the records after that are missing", target, named_error)
         self.not_written[target] = None  # the number is unknown
 
     def close(self) -> None:
@@ -229,9 +233,9 @@ class Outputs:
                     self.not_written.setdefault(target, queue.lost)  # keeps None, which `_handle_error` has set
                 if queue.is_stuck:  # the thread is still in `write` of the output, which therefore cannot be closed
                     return
-            has_failed = target not in self._writers  # `_handle_error` removes the writer of an output that fails
             with self._named_errors(target):
-                if self._is_discarded or has_failed:
+                # `_handle_error` removes the writer of an output that fails.
+                if self._is_discarded or target not in self._writers:
                     self._discard(output)
                 else:
                     output.close()
