@@ -40,8 +40,9 @@ with tempfile.TemporaryDirectory() as folder:
     with Recorder(path, "three-25um-biaxial/1", {}) as recorder:
         for number, data in enumerate(islice(board.frames(), FRAMES)):
             chunk = Chunk(data, number / RATE_HZ, 0)
-            lines = [record.to_json() for record in touch.feed(chunk)]
-            recorder.chunk(chunk, lines)
+            recorder.event(chunk=chunk)
+            for record in touch.feed(chunk):
+                recorder.write(record.to_json())
     records = list(Recording(path).records(Touch))
 
 touches = [record for record in records if record.contact]

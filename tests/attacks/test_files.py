@@ -80,7 +80,8 @@ def files(tmp_path):
     (folder / "charges.csv").write_text("A,B,C\n800.5,700.25,900\n1,2,3\n")
     with Recorder(folder / "touch.rec", "linear/1", {"tare": {"frames": 10}}) as recorder:
         for k in range(3):
-            recorder.chunk(Chunk(bytes(9), 1e9 + k, k, 0.0), ['{"timestamp": 1.0, "latency_us": 9.0}'])
+            recorder.event(chunk=Chunk(bytes(9), 1e9 + k, k, 0.0))
+            recorder.write('{"timestamp": 1.0, "latency_us": 9.0}')
             recorder.event(tare=True)
     return folder
 

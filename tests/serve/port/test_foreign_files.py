@@ -12,7 +12,7 @@ from isocharge.serve.record.formats import csv_header
 
 def recording(path):
     with Recorder(path, "linear/1", {}) as recorder:
-        recorder.chunk(Chunk(b"A:1,B:2,C:3\n", 1.7e9, 0), [])
+        recorder.event(chunk=Chunk(b"A:1,B:2,C:3\n", 1.7e9, 0))
 
 
 def table(text):

@@ -22,8 +22,9 @@ def recorded(tmp_path):
         for number, chunk in enumerate(CHUNKS):
             if number == 2:
                 recorder.event(tare=True)
-            records = [f'{{"timestamp": 1.0, "latency_us": {1e15 * record}}}' for record in range(number)]
-            recorder.chunk(chunk, records)
+            recorder.event(chunk=chunk)
+            for _ in range(number):
+                recorder.write('{"timestamp": 1.0, "latency_us": -1e15}')  # from a clock that begins in 1970
     return path
 
 

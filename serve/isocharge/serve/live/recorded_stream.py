@@ -149,10 +149,13 @@ class RecordedStream:
         """
         if not self._preamble:  # no bytes have been processed yet
             return chunk
+        counts = self._stream.parser.counts
         self._stream.restart()
         preamble = chunk._replace(data=self._preamble, outage_s=0.0)
         deque(self._stream.feed(preamble), maxlen=0)  # processes the chunk, and discards the records
         recorder.event(chunk=preamble)
+        self._stream.parser.counts = counts  # continue to count, also the losses before the recording
+        counts.reconnects -= 1  # the outage that the next chunk states is none of the port
         return chunk._replace(outage_s=max(chunk.outage_s, 1e-6))  # any outage above 0 has the same effect
 
     def _record_event(self, **event: bool | str | Marker) -> None:

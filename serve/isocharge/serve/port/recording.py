@@ -105,20 +105,11 @@ class Recorder:
         """Close the file."""
         self._file.close()
 
-    def chunk(self, chunk: Chunk, records: list[str]) -> None:
-        """Write a chunk and the records that were computed from it.
-
-        Args:
-            chunk: The chunk.
-            records: Records of the frames in the chunk, each as a line of JSON. Further records of the chunk may follow
-                with `write`.
-        """
-        self.event(chunk=chunk)
-        for record in records:
-            self.write(record)
-
     def event(self, **event: bool | str | Marker | Chunk) -> None:
-        """Write an event: `chunk=chunk`, `marker=marker`, `tare=True` for a new tare, `use=label` for a new model."""
+        """Write an event: `chunk=chunk`, `marker=marker`, `tare=True` for a new tare, `use=label` for a new model.
+
+        The records of a chunk are written after it, with `write`.
+        """
         self.write(encode(event).decode())
 
     def write(self, lines: str) -> None:
@@ -128,7 +119,7 @@ class Recorder:
         error is logged, and all later calls write nothing.
 
         Args:
-            lines: One or more lines, without the line feed after the last line.
+            lines: One or more lines, such as a record in JSON, without the line feed after the last line.
         """
         if self.failed:
             return
