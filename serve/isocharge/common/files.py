@@ -259,24 +259,10 @@ def as_output_errors(path: StrPath) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise output_error(error, path)  # noqa: B904  # the cause is set
-
-
-def output_error(error: BaseException, target: StrPath) -> BaseException:
-    """Return an error of an output as an error that states its cause and the target.
-
-    Args:
-        error: The error. An `IsochargeError` states its cause already. A broken pipe and Ctrl-C are no errors of the
-            output, and are returned unchanged.
-        target: Target of the output.
-    """
-    if isinstance(error, IsochargeError | BrokenPipeError) or not isinstance(error, Exception):
-        return error
-    output_failure = OutputError(f"{target}: the output failed ({type(error).__name__}: {error})")
-    if isinstance(error, OSError):
-        output_failure = OutputError(f"{target} cannot be written: {error.strerror or error}; choose another output")
-    output_failure.__cause__ = error
-    return output_failure
+        # An error of isocharge already has a message for the user. A broken pipe is not an error of this output.
+        if isinstance(error, IsochargeError | BrokenPipeError):
+            raise
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}; choose another output") from error
 
 
 def flush_to_disk(path: Path) -> None:
