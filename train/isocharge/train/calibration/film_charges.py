@@ -109,9 +109,7 @@ class FilmCharges:
         Returns:
             Charges, shape (n, n_electrode), pC.
         """
-        sensor = self._sensor_with_readout(values)
-        solved_charge, contact_slopes = _read(self.film, sensor).linearised(contact)
-        derivatives = self._stress_derivatives(sensor, contact, solved_charge, contact_slopes[:, :, 2])
+        solved_charge, _, derivatives = self._solved_charges(self._sensor_with_readout(values), contact)
         charge, _ = _add_stress_changes(solved_charge, self._property_changes(values), derivatives)
         return charge
 
@@ -127,14 +125,12 @@ class FilmCharges:
             take the place of the state. The derivatives with respect to the contact are those of the solved film.
         """
         sensor = self._sensor_with_readout(values)
-        solved_charge, contact_slopes = _read(self.film, sensor).linearised(contact)
-        stress_derivatives = self._stress_derivatives(sensor, contact, solved_charge, contact_slopes[:, :, 2])
-        charge, factor = _add_stress_changes(solved_charge, self._property_changes(values), stress_derivatives)
+        solved_charge, contact_slopes, derivatives = self._solved_charges(sensor, contact)
+        charge, factor = _add_stress_changes(solved_charge, self._property_changes(values), derivatives)
 
         # The derivatives are those of the charges with respect to the uneven parts of the pretension in MPa, but the
         # values contain them as shares s of the pretension T. Each part is s T. By the chain rule, the derivative with
         # respect to s is T times that with respect to the part, and s times the latter is added to that for T.
-        derivatives = dict(stress_derivatives)
         for name in UNEVEN_TENSIONS:
             share = values[self.prior.index(name)]
             derivatives[PRETENSION.name] = derivatives[PRETENSION.name] + share * derivatives[name]
@@ -179,10 +175,8 @@ class FilmCharges:
         solved, changed = self._mechanics(self.values), self._mechanics(values)
         return {name: changed[name] - solved[name] for name in changed}
 
-    def _stress_derivatives(
-        self, sensor: Sensor, contact: Array, solved_charge: Array, force_slope: Array
-    ) -> dict[str, Array]:
-        """Compute the derivatives of charges with respect to the properties that change the stress.
+    def _solved_charges(self, sensor: Sensor, contact: Array) -> tuple[Array, Array, dict[str, Array]]:
+        """Compute charges of the solved film, and their derivatives with respect to properties that change the stress.
 
         The values of the properties "young" and "thickness" are the logarithms of Young's modulus E and of the
         thickness h. Their derivatives follow from the other derivatives, because the stress divided by E only depends
@@ -192,13 +186,15 @@ class FilmCharges:
         Args:
             sensor: Sensor with the electrodes and the coefficients.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
-            solved_charge: Their charges on the solved film, shape (n, n_electrode), pC.
-            force_slope: Derivatives of these charges with respect to ln F, of the same shape, pC.
 
         Returns:
-            Derivatives by the name of the property, each of shape (n, n_electrode), pC per unit. The unit of the uneven
-            parts of the pretension is MPa.
+            Charges, shape (n, n_electrode), pC; their derivatives with respect to the contact (x, y, ln F), shape (n,
+            n_electrode, 3); and their derivatives by the name of the property, each of shape (n, n_electrode), pC per
+            unit. The unit of the uneven parts of the pretension is MPa.
         """
+        solved_charge, contact_slopes = _read(self.film, sensor).linearised(contact)
+        force_slope = contact_slopes[:, :, 2]
+
         # Use the solved stresses with the electrodes and the coefficients of the given sensor.
         slopes_of_sensor = replace(
             self.slopes, film=_read(self.slopes.film, sensor), fields=_read(self.slopes.fields, sensor)
@@ -215,7 +211,7 @@ class FilmCharges:
         mechanics = self._mechanics(self.values)
         tension_terms = (mechanics[name] * derivatives[name] for name in (PRETENSION.name, *UNEVEN_TENSIONS))
         derivatives["young"] = solved_charge - force_slope - sum(tension_terms)
-        return derivatives
+        return solved_charge, contact_slopes, derivatives
 
     def _readout_derivative(self, sensor: Sensor, film_property: FilmProperty, contact: Array) -> Array:
         """Compute the derivatives of charges with respect to a property that does not change the stress.
