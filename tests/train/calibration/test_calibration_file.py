@@ -60,9 +60,9 @@ FAULTS = {
         r"unknowns\.pretension\.value: expected 0 to",
     ),
     "negative": ("unknowns.young", {"value": 0.0, "std": -0.1}, r"unknowns\.young\.std: expected a number from 0"),
-    "rows": ("correlations", [[], [0.1, 0.2]], "correlations: expected 148 rows of 0 to 147 numbers"),
-    "large": ("correlations", [[1.0 - 2.0 * (i == 2)] * i for i in range(148)], "positive semidefinite"),
-    "beyond": ("correlations", [[1.5] * i for i in range(148)], r"correlations\[1\]\[0\]: expected"),
+    "rows": ("correlations", [[], [0.1, 0.2]], "correlations: expected 151 rows of 0 to 150 numbers"),
+    "large": ("correlations", [[1.0 - 2.0 * (i == 2)] * i for i in range(151)], "positive semidefinite"),
+    "beyond": ("correlations", [[1.5] * i for i in range(151)], r"correlations\[1\]\[0\]: expected"),
 }
 """Key of an entry, joined by dots, its changed value, and the message that names the fault."""
 

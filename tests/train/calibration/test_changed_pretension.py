@@ -66,17 +66,20 @@ def test_no_node_makes_a_film_slack_in_one_direction(problem, pretension_MPa):
     assert interpolation_weights(node_MPa, np.array([0.2]))[0].max() < 50.0
 
 
-def test_errors_of_the_offset_and_of_d31_partly_cancel_in_the_directions(problem, synthetic, monkeypatch):
+def test_errors_of_an_offset_and_of_d31_partly_cancel_in_the_directions(problem, synthetic, monkeypatch):
     """The presses of the calibration determine their sum better than each of them."""
     monkeypatch.setattr(compact_map, "_nodes", lambda _: np.zeros(1))
     film = uneven_film(problem)
-    unknowns = [film.layout.index(name) for name in ("d31", "offset")]
+    unknowns = [film.layout.index(name) for name in ("d31", "offset B")]
     covariance = np.array([[0.002, -0.4], [-0.4, 100.0]])
     film.covariance[np.ix_(unknowns, unknowns)] = covariance
+    film.values[unknowns[1]] = 7.0
     series = compact_map.compact_charges(problem.domain, synthetic, film, None)
     *_, (changes,) = series.in_state(CONTACT[:1], np.zeros(1 + series.direction_count))
     *_, (by_property,) = synthetic.linearised(film.film_values, CONTACT[:1])
-    slopes = np.column_stack([by_property[:, unknowns[0]], np.ones(4)])
+    only_b = np.array([0.0, 1.0, 0.0, 0.0])
+    np.testing.assert_array_equal(series.offset_pC, 7.0 * only_b)
+    slopes = np.column_stack([by_property[:, unknowns[0]], only_b])
     np.testing.assert_allclose(changes @ changes.T, slopes @ covariance @ slopes.T, rtol=0.02)
 
 

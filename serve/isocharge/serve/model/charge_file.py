@@ -13,7 +13,8 @@ The file is in the same folder as `model.onnx`. It contains these arrays, with t
     force_N          smallest and largest force of the domain, N
     is_folded        1 if the map has a fold, otherwise 0
     charge_std       see `ChargeSeries`
-    offset_pC        charge that is added to Q of each electrode, pC, for example because of a wrong tare
+    offset_pC        charges that are added to Q, shape (n_electrode,) or one for all, pC, for example because of a
+                     wrong tare
     pretension_MPa   see `ChargeSeries`
     tension_std_MPa  see `ChargeSeries`
 """
@@ -40,7 +41,7 @@ ADVICE = "copy the model's folder again, or calibrate or train again"
 """What the user can do about a damaged file, for error messages."""
 
 NUMBERS = ("charge_std", "offset_pC", "pretension_MPa", "tension_std_MPa")
-"""Arrays that contain a single number, which are attributes of `ChargeSeries` of the same names."""
+"""Arrays that contain a single number or, for `offset_pC`, one for each electrode: attributes of `ChargeSeries`."""
 
 
 def charge_map_bytes(series: ChargeSeries) -> bytes:
@@ -80,7 +81,7 @@ def read_charge_map(version_folder: Path, electrodes: tuple[str, ...]) -> Charge
         return None
     data = read_needed(path, ModelError, ADVICE)
     try:
-        arrays = npz_arrays(data)
+        arrays: dict[str, Any] = npz_arrays(data)
         file_format = arrays.get("format", 1)
         if file_format != FORMAT:
             raise ValueError(f"format {file_format} is not supported (this version reads {FORMAT})")
@@ -95,7 +96,7 @@ def read_charge_map(version_folder: Path, electrodes: tuple[str, ...]) -> Charge
             directions=arrays.get("directions", NO_DIRECTIONS).astype(float),
             log_size=arrays.get("log_size"),
             is_folded=bool(arrays["is_folded"]),
-            **{name: float(arrays[name]) for name in NUMBERS},
+            **{name: arrays[name][()] for name in NUMBERS},  # a number instead of an array of shape ()
         )
     except (ValueError, KeyError) as error:
         raise ModelError(f"{path}: {cut(str(error))}; {ADVICE}") from error

@@ -186,7 +186,8 @@ class ChargeSeries:
             `ContactMixture`.
         charge_std: Standard deviation of the part of the charges that the map does not describe, relative to the
             charges.
-        offset_pC: Charge that is added to the charge of each electrode, pC. A calibration found it in all presses.
+        offset_pC: Charges that are added to those of the electrodes, shape (n_electrode,) or one for all, pC. A
+            calibration found them in all presses.
         pretension_MPa: Mean pretension of the film as it was calibrated, MPa.
         tension_std_MPa: Standard deviation of t when a stream begins, MPa.
     """
@@ -199,7 +200,7 @@ class ChargeSeries:
     log_size: Array | None = None
     is_folded: bool = False
     charge_std: float = 0.0
-    offset_pC: float = 0.0
+    offset_pC: Array | float = 0.0
     pretension_MPa: float = 0.0
     tension_std_MPa: float = 0.0
 

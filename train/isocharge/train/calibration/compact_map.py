@@ -111,7 +111,7 @@ def compact_charges(
         directions=_directions(series, film, calibrated, remaining_films, few_contacts, few_charges, executor),
         # A film is at most as well described as its charges can be measured.
         charge_std=max(series.charge_std, film.noise.gain),
-        offset_pC=film.value("offset"),
+        offset_pC=film.values[film.layout.offset],
         pretension_MPa=film.value(PRETENSION.name),
         tension_std_MPa=PRETENSION.drift,
     )
@@ -178,7 +178,8 @@ class _ChangedFilm:
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Compute the charges of this film, and their derivatives with respect to the unknowns of the calibrated film.
 
-        The unknowns are the properties of the film, the offset of the charges and the coefficients of the discrepancy.
+        The unknowns are the properties of the film, the offsets of the electrodes and the coefficients of the
+        discrepancy.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -188,7 +189,7 @@ class _ChangedFilm:
         """
         charge, _, by_changed_property = self.charges.linearised(self.values, contact)
         by_property = by_changed_property @ self.value_jacobian  # chain rule
-        by_offset = np.ones((*charge.shape, 1))
+        by_offset = np.tile(np.eye(charge.shape[1]), (len(charge), 1, 1))
         by_coefficient = discrepancy_jacobian(charge, contact, self.charges.domain)
         return charge, np.concatenate([by_property, by_offset, by_coefficient], axis=2)
 
@@ -372,18 +373,12 @@ def _value_changes(
     """
     # The columns of the root contain the changes of the unknowns by one standard deviation of each combination. The
     # unknowns are those of `_ChangedFilm.linearised`.
-    unknowns = np.r_[film.layout.film, film.layout.index("offset"), film.layout.coefficients]
+    unknowns = np.r_[film.layout.film, film.layout.offset, film.layout.coefficients]
     eigenvalues, vectors = np.linalg.eigh(film.covariance[np.ix_(unknowns, unknowns)])
     covariance_root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
 
-    halves = np.array_split(contact, 2)  # two workers share each film
-    jobs = [partial(one.linearised, half) for one in films for half in halves]
-    results = in_order(executor, call, jobs)  # an iterator over pairs (charges, derivatives)
     changes = []
-    # The results of the two halves of a film follow one another, and each step takes both from the same iterator.
-    for (first_charge, first_jacobian), (second_charge, second_jacobian) in zip(results, results, strict=True):
-        film_charge = np.concatenate([first_charge, second_charge])
-        jacobian = np.concatenate([first_jacobian, second_jacobian])
+    for film_charge, jacobian in in_order(executor, call, [partial(one.linearised, contact) for one in films]):
         charge_per_value = np.maximum(film_charge, LOWEST_CHARGE) if size is None else size  # dQ / dv
         changes.append((jacobian / charge_per_value[:, :, None]) @ covariance_root)
     return changes

@@ -16,7 +16,7 @@ Pukelsheim 1993).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -249,18 +249,15 @@ def _linearise_at(
         contact: Contacts (x, y, F) of the presses, shape (n, 3), mm and N.
         contact_std: Standard deviations of x and y, mm, and of ln F. By default, the contacts are not measured.
     """
-    # The charges of the film depend only on the contacts and the times of the presses, so the charges and their
-    # standard deviations can be zero until they have been computed.
     log_contact = with_log_force(contact)
-    no_charge = np.zeros((len(contact), len(charges.prior.sensor.electrodes)))
-    without_charges = PressData(
-        charge=no_charge,
-        charge_std=no_charge,
+    time = np.linspace(-0.5, 0.5, len(contact))
+    model = model_values(charges, film.layout, time, film.values, log_contact)
+    data = PressData(
+        charge=model.charge_pC,
+        charge_std=film.noise.sigma(model.charge_pC),
         noise=film.noise,
         contact=log_contact,
         contact_std=np.broadcast_to(contact_std, contact.shape),
-        time=np.linspace(-0.5, 0.5, len(contact)),
+        time=time,
     )
-    model = model_values(charges, film.layout, without_charges, film.values, log_contact)
-    data = replace(without_charges, charge=model.charge_pC, charge_std=film.noise.sigma(model.charge_pC))
     return Linearised.of(model, data, log_contact)

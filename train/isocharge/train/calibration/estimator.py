@@ -6,7 +6,7 @@ projection, Golub and Pereyra 1973). During the search, presses that do not agre
 according to Student's t distribution (Lange and others, 1989). The final estimate is computed without them.
 
 Some facts are not known beforehand: how uneven a film is, how large its discrepancy and the errors of the presses are,
-and whether the session has an offset of the charges or of the forces, or a drift. Each combination of these cases is a
+and whether the session has offsets of the charges or of the forces, or a drift. Each combination of these cases is a
 hypothesis. The evidence of a hypothesis follows from the linearised problem (MacKay 1992), and the estimate is the mean
 over the hypotheses, weighted by their evidence.
 """
@@ -234,7 +234,7 @@ def _estimate_with_errors(
     # Compute the residuals of all presses, also of the bad ones, whose contacts remain those that were found.
     log_contact = found.contacts.copy()
     log_contact[is_used] = average.log_contact
-    model = model_values(charges, prior.layout, data, average.unknowns, log_contact)
+    model = model_values(charges, prior.layout, data.time, average.unknowns, log_contact)
     residual, _ = Linearised.of(model, data, log_contact).eliminated()
     press_chi2 = (residual**2).sum(axis=1)
     # Divide by the number of redundant measurements. A press without redundant measurements has no residual.
@@ -280,7 +280,7 @@ def _probable_point(charges: FilmCharges, data: PressData, prior: Prior, previou
     charge_variance = np.nan_to_num(data.charge_std**2)  # shape (n, n_electrode)
     charge_covariance = charge_variance[:, None] * np.eye(charge_variance.shape[1])
     problem = RobustProblem(  # its state is the vector of the unknowns
-        lambda contacts, state: model_values(charges, prior.layout, data, state, contacts),
+        lambda contacts, state: model_values(charges, prior.layout, data.time, state, contacts),
         data.charge,
         charge_covariance,
         prior.mean,
@@ -345,7 +345,7 @@ def _average_estimates(
         log_contact: Contacts (x, y, ln F) at which the charges are linearised, shape (n, 3).
     """
     # Compare the hypotheses. Neighbours in the list with the same errors of the presses share one linearised problem.
-    model = model_values(charges, prior.layout, data, unknowns, log_contact)
+    model = model_values(charges, prior.layout, data.time, unknowns, log_contact)
     groups = [
         _HypothesisGroup.of(model, stated.with_errors(errors), log_contact, unknowns, prior, list(group))
         for errors, group in groupby(all_hypotheses, lambda one: one.errors)

@@ -12,7 +12,7 @@ of the discrepancy. One part is the same for all electrodes, because all charges
 than its properties imply.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
@@ -100,15 +100,15 @@ COEFFICIENT_DRIFT = 0.002
 
 @dataclass(frozen=True)
 class SessionProperty:
-    """Declaration of one unknown of a session of presses, whose effect on the charges is proportional to its value.
+    """Declaration of unknowns of a session of presses, whose effects on the charges are proportional to their values.
 
     Attributes:
-        name: Name of the unknown.
+        name: Name of the unknown, to which the name of the electrode is added for `offset`.
         stds: Standard deviations of the prior distribution that are considered, with their probabilities.
-        effect: Function that computes the derivatives of the charges, shape (n, n_electrode). Its arguments are the
-            times of the presses, shape (n,), the charges of the film, and their derivatives with respect to the force,
-            both of shape (n, n_electrode).
-        caution: Words about a value that is certainly not zero, with the fields `value` and `std`.
+        effect: Function that computes the derivatives of the charges, shape (n, n_electrode, n_value). Its arguments
+            are the times of the presses, shape (n,), the charges of the film, and their derivatives with respect to the
+            force, both of shape (n, n_electrode).
+        caution: Words about values that are certainly not zero, with the field `values`.
     """
 
     name: str
@@ -120,24 +120,24 @@ class SessionProperty:
 SESSION = (
     SessionProperty(
         "offset",
-        ((1e-6, 0.9), (30.0, 0.1)),
-        lambda _time, charge, _slope: np.ones_like(charge),
-        "all charges of all presses contain an offset of {value:.3g} +- {std:.2g} pC: is the tare right? The model "
-        "expects the same offset in later contacts; after a new tare, calibrate again",
+        ((1e-6, 0.75), (10.0, 0.25)),
+        lambda _time, charge, _slope: np.tile(np.eye(charge.shape[1]), (len(charge), 1, 1)),
+        "the charges of all presses contain an offset of {values} pC: is the tare right? The model expects the same "
+        "offset in later contacts; after a new tare, calibrate again",
     ),
     SessionProperty(
         "drift",
         ((1e-6, 0.95), (0.15, 0.05)),
-        lambda time, charge, _slope: time[:, None] * charge,
-        "the charges change by a share of {value:.2g} +- {std:.2g} from the first press to the last: does an amplifier "
-        "drift? The standard deviations of the model contain this change",
+        lambda time, charge, _slope: time[:, None, None] * charge[:, :, None],
+        "the charges change by a share of {values} from the first press to the last: does an amplifier drift? The "
+        "standard deviations of the model contain this change",
     ),
     SessionProperty(
         "force_offset",
         ((1e-6, 0.98), (0.03, 0.02)),
-        lambda _time, _charge, slope: -slope,  # the true force is the stated force minus the offset
-        "all known forces contain an offset of {value:.2g} +- {std:.2g} N: is the load cell zero without a load? The "
-        "forces of the model are without this offset",
+        lambda _time, _charge, slope: -slope[:, :, None],  # the true force is the stated force minus the offset
+        "all known forces contain an offset of {values} N: is the load cell zero without a load? The forces of the "
+        "model are without this offset",
     ),
 )
 """All unknowns of a session, in the order of the vector.
@@ -162,7 +162,8 @@ class Layout:
         electrodes = self.prior.sensor.electrode_names
         degrees_of_terms = ["".join(map(str, degrees)) for degrees in _degrees().tolist()]  # of x, y and ln F
         coefficients = [f"discrepancy {term} {name}" for term in degrees_of_terms for name in electrodes]
-        return (*self.prior.names, *(one.name for one in SESSION), *coefficients)
+        offsets = [f"offset {name}" for name in electrodes]
+        return (*self.prior.names, *offsets, *(one.name for one in SESSION[1:]), *coefficients)
 
     @property
     def film(self) -> slice:
@@ -170,14 +171,14 @@ class Layout:
         return slice(0, len(self.prior.names))
 
     @property
-    def session(self) -> slice:
-        """Unknowns of the session."""
-        return slice(self.film.stop, self.film.stop + len(SESSION))
+    def offset(self) -> slice:
+        """Offsets of the electrodes, which are the first unknowns of the session."""
+        return slice(self.film.stop, self.film.stop + len(self.prior.sensor.electrodes))
 
     @property
     def coefficients(self) -> slice:
         """Coefficients of the discrepancy."""
-        return slice(self.session.stop, len(self.names))
+        return slice(self.offset.stop + len(SESSION) - 1, len(self.names))
 
     def index(self, name: str) -> int:
         """Return the index of an unknown."""
@@ -236,20 +237,25 @@ class FilmEstimate:
         covariance = self.covariance + drift_effects @ drift_effects.T
 
         # Remove the unknowns of this session: their values, and their rows and columns of the covariance.
-        session = layout.session
+        session = slice(layout.film.stop, layout.coefficients.start)
         values = self.values.copy()
         values[session] = 0.0
         covariance[session] = 0.0
         covariance[:, session] = 0.0
         return replace(self, values=values, covariance=covariance)
 
-    def session_cautions(self) -> Sequence[str]:
+    def session_cautions(self) -> list[str]:
         """Return sentences about unknowns of the session that differ from zero by three standard deviations."""
-        return [
-            one.caution.format(value=self.value(one.name), std=self.std(one.name))
-            for one in SESSION
-            if abs(self.value(one.name)) > 3.0 * self.std(one.name)
-        ]
+        cautions = []
+        for one in SESSION:
+            certain_values = [
+                f"{self.value(name):.3g} +- {self.std(name):.2g} ({name})"
+                for name in self.layout.names
+                if name.startswith(one.name) and abs(self.value(name)) > 3.0 * self.std(name)
+            ]
+            if certain_values:
+                cautions.append(one.caution.format(values=", ".join(certain_values)))
+        return cautions
 
 
 REMAINING_DISCREPANCY = 0.3
@@ -293,8 +299,8 @@ class Prior:
         """Terms whose sum is the covariance of the unknowns, shape (4 + n_session, n_unknown, n_unknown).
 
         The first part is the covariance that is the same under all hypotheses. The other parts are the covariances of
-        the uneven tension, of the other imperfections, of the discrepancy, and of each unknown of the session, all of
-        the size 1. A hypothesis multiplies each of them by the square of its size; see `Hypothesis.sizes`.
+        the uneven tension, of the other imperfections, of the discrepancy, and of each entry of `SESSION`, all of the
+        size 1. A hypothesis multiplies each of them by the square of its size; see `Hypothesis.sizes`.
 
         After an earlier calibration, the first part is the covariance that it has found, which contains the
         imperfections. Their own parts are then zero, and the part of the discrepancy describes only what the earlier
@@ -304,10 +310,13 @@ class Prior:
         n_unknown = layout.coefficients.stop
         parts = np.zeros((4 + len(SESSION), n_unknown, n_unknown))
         # These matrices are views of `parts`. They are filled below, one after the other.
-        fixed, uneven_tension, other_imperfections, discrepancy, *session = parts
+        fixed, uneven_tension, other_imperfections, discrepancy, offset, *others = parts
         n_electrode = len(layout.prior.sensor.electrode_names)
-        discrepancy[layout.coefficients, layout.coefficients] = unit_covariance(n_electrode)
-        for index, part in enumerate(session, layout.session.start):  # index of an unknown of the session, and its part
+        coefficient_covariance = unit_covariance(n_electrode)
+        discrepancy[layout.coefficients, layout.coefficients] = coefficient_covariance
+        # An offset, like a coefficient, is the sum of a part of its own and a part that is the same for all electrodes.
+        offset[layout.offset, layout.offset] = coefficient_covariance[:n_electrode, :n_electrode]
+        for index, part in enumerate(others, layout.offset.stop):  # index of an unknown of the session, and its part
             part[index, index] = 1.0
         if self.earlier is not None:
             fixed += self.earlier.covariance

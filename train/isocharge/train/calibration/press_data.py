@@ -77,15 +77,13 @@ class PressData:
         same_place_count = (distance_mm <= PLACE_STEP_mm).sum(axis=1)  # of each press, with the press itself
         position_std = presses.position_std_mm * np.sqrt(same_place_count)
         measured_std = np.column_stack([position_std, position_std, presses.force_std])
-        number = np.arange(len(presses))
-        last_number = max(len(presses) - 1, 1)  # at least 1, to avoid a division by 0
         return cls(
             charge=charge,
             charge_std=np.where(is_charge_known, noise.sigma(charge), UNKNOWN_STD),
             noise=noise,
             contact=np.where(is_contact_known, log_contact, domain.centre),
             contact_std=np.where(is_contact_known, measured_std, UNKNOWN_STD),
-            time=number / last_number - 0.5,  # from -0.5 to 0.5, as if the presses were evenly spaced in time
+            time=np.linspace(-0.5, 0.5, len(presses)),  # as if the presses were evenly spaced in time
         )
 
     def __len__(self) -> int:
@@ -196,16 +194,16 @@ class Linearised:
         return -solution[:, :, 0]
 
 
-def model_values(charges: FilmCharges, layout: Layout, data: PressData, unknowns: Array, contact: Array) -> ModelValues:
+def model_values(charges: FilmCharges, layout: Layout, time: Array, unknowns: Array, contact: Array) -> ModelValues:
     """Compute the charges of presses for given unknowns, and their derivatives.
 
-    The unknowns are properties of the film, unknowns of the session of presses such as an offset of all charges, and
-    coefficients of the discrepancy between the real film and its description.
+    The unknowns are properties of the film, unknowns of the session of presses such as the offsets of the electrodes,
+    and coefficients of the discrepancy between the real film and its description.
 
     Args:
         charges: Charges of a solved film, from which those of films with slightly other properties follow.
         layout: Order of the unknowns.
-        data: The presses, of which only the times are used.
+        time: Time of each press in the session, from -0.5 to 0.5, shape (n,).
         unknowns: Values of the unknowns, shape (n_unknown,).
         contact: Contacts (x, y, ln F), shape (n, 3). Contacts outside the domain are moved to its nearest contact.
 
@@ -215,10 +213,9 @@ def model_values(charges: FilmCharges, layout: Layout, data: PressData, unknowns
     metric_contact = in_domain(contact, charges.domain)  # (x, y, F), mm and N
     film_charge, contact_slopes, film_jacobian = charges.linearised(unknowns[layout.film], metric_contact)
     force_slope = contact_slopes[:, :, 2] / metric_contact[:, 2:]  # with respect to F instead of ln F, pC/N
-    session_effects = [session_unknown.effect(data.time, film_charge, force_slope) for session_unknown in SESSION]
-    session_jacobian = np.stack(session_effects, axis=2)
+    session_effects = [session_unknown.effect(time, film_charge, force_slope) for session_unknown in SESSION]
     coefficient_jacobian = discrepancy_jacobian(film_charge, metric_contact, charges.domain)
-    jacobian = np.concatenate([film_jacobian, session_jacobian, coefficient_jacobian], axis=2)
+    jacobian = np.concatenate([film_jacobian, *session_effects, coefficient_jacobian], axis=2)
 
     # The charges are linear in the unknowns of the session and in the coefficients of the discrepancy.
     beyond_film = slice(layout.film.stop, None)
