@@ -149,6 +149,11 @@ def _fit_film(
 ) -> Estimation:
     """Estimate a film from presses, of which most are in the solved domain.
 
+    Axisymmetric films are solved and the properties are estimated in turn, until the estimate hardly changes. The
+    estimated film is then solved with its imperfections and its real probe, and the properties are estimated again,
+    which is repeated once if the estimate changes the film much. A nearly even film under an axisymmetric probe does
+    not need this.
+
     Args:
         problem: The calibration problem.
         presses: The presses, with the electrodes in the order of the sensor.
@@ -164,7 +169,13 @@ def _fit_film(
         raise unexplained_error(presses, charges, "their charges are very different from those of its films")
 
     data = PressData.of(presses, problem.noise, problem.solved_domain)
-    estimation = _fit_even_film(problem, data, charges, executor)
+    estimation = estimate(charges, data, problem.prior)
+    for _ in range(MAX_SOLVED_FILMS - 1):
+        if _largest_deviation(estimation) < SAME_FILM_STD:
+            break
+        charges = solve_even(problem, executor, estimation.film.film_values)
+        estimation = estimate(charges, data, problem.prior, estimation)
+
     is_at_bound = np.equal(estimation.film.film_values, problem.prior.layout.prior.bounds)
     is_doubtful = estimation.hypothesis.errors.position_ratio > 1.0 or is_at_bound.any()
     if is_doubtful and find_mistakes(presses, charges):
@@ -172,59 +183,21 @@ def _fit_film(
             presses, charges, "only larger errors of the positions or an improbable film would explain them"
         )
 
-    if accurate:
-        estimation = _fit_uneven_film(problem, data, estimation, executor)
+    # The axisymmetric film contains the unevenness as a first-order change, which is enough to refuse presses that no
+    # film explains, before the long solution of the uneven film. The effect of another probe is unknown here.
+    is_final = not accurate or (estimation.is_unexplained and problem.probe.is_axisymmetric)
+    for _ in range(2):
+        values = estimation.film.film_values
+        if is_final or _is_exact(estimation.charges, values, estimation.contact):
+            break
+        estimation = estimate(estimation.charges.solved(values, executor), data, problem.prior, estimation)
     if estimation.is_unexplained:
-        residual = np.sqrt(estimation.chi2 / estimation.redundancy)
         raise unexplained_error(
             presses,
             estimation.charges,
             f"{estimation.is_bad.sum()} of them do not agree with the others, and the charges of the best film differ "
-            f"from those of the others by {residual:.2g} times the noise",
+            f"from those of the others by {estimation.residual:.2g} times the noise",
         )
-    return estimation
-
-
-def _fit_even_film(
-    problem: CalibrationProblem, data: PressData, charges: FilmCharges, executor: Executor | None
-) -> Estimation:
-    """Solve axisymmetric films and estimate the properties in turn, until the estimate hardly changes.
-
-    Args:
-        problem: The calibration problem.
-        data: The presses.
-        charges: Charges of the first solved film.
-        executor: Executor that runs the solves; None for this process.
-    """
-    estimation = estimate(charges, data, problem.prior)
-    for _ in range(MAX_SOLVED_FILMS - 1):
-        if _largest_deviation(estimation) < SAME_FILM_STD:
-            break
-        charges = solve_even(problem, executor, estimation.film.film_values)
-        estimation = estimate(charges, data, problem.prior, estimation)
-    return estimation
-
-
-def _fit_uneven_film(
-    problem: CalibrationProblem, data: PressData, estimation: Estimation, executor: Executor | None
-) -> Estimation:
-    """Solve the estimated film with its imperfections and its real probe, and estimate the properties again.
-
-    This step is repeated once if the estimate changes the film much. A nearly even film under an axisymmetric probe
-    needs no step.
-
-    Args:
-        problem: The calibration problem.
-        data: The presses.
-        estimation: The estimate with an axisymmetric film, with which the first step begins.
-        executor: Executor that runs the solves; None for this process.
-    """
-    for _ in range(2):
-        charges = estimation.charges
-        values = estimation.film.film_values
-        if _is_exact(charges, values, estimation.contact):
-            break
-        estimation = estimate(charges.solved(values, executor), data, problem.prior, estimation)
     return estimation
 
 
@@ -293,9 +266,8 @@ def _check_placement(film: FilmEstimate) -> None:
             that neither the estimate nor its standard deviation is right.
     """
     for film_property in film.layout.prior.properties:
-        lowest, highest = film_property.limits
         value = film.value(film_property.name)
-        if film_property.name in PLACEMENT_PROPERTIES and not lowest < value < highest:
+        if film_property.name in PLACEMENT_PROPERTIES and value in film_property.limits:
             raise PressError(
                 f"{film_property.meaning}: the presses agree best with {value:.3g} {film_property.unit}, which is an "
                 "end of the range that is searched: is the origin of the stage the centre of the film, are its axes "
@@ -309,6 +281,12 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
     film = estimation.film
     if estimation.is_bad.any():
         cautions.append(f"{presses[estimation.is_bad].line_words}: does not agree with the other presses; left out")
+    if estimation.is_improbable:
+        cautions.append(
+            f"the presses differ from the best film by {estimation.residual:.2g} times their errors, so the model may "
+            "err by as many times more than it states: make the presses again, or state larger errors (--charge-std, "
+            "--position-std, --force-std)"
+        )
     errors = estimation.hypothesis.errors
     if errors.noise.gain > MAX_USUAL_NOISE:
         cautions.append(

@@ -362,18 +362,16 @@ def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: st
         charges: Charges of a film and of similar films.
         reason: Reason why the presses are refused, as a part of a sentence.
     """
-    sensor_name = charges.prior.sensor.name
-    statement = f"no film of {sensor_name!r} explains these {len(presses)} presses: {reason}"
+    prior = charges.prior
+    statement = f"no film of {prior.sensor.name!r} explains these {len(presses)} presses: {reason}"
     alternatives = "; or ".join(find_mistakes(presses, charges)[:3])
-    if alternatives:
-        return PressError(
-            f"{statement}. A film would explain them if {alternatives}. Nothing was changed: correct the file or the "
-            "options"
-        )
-    return PressError(
-        f"{statement}; is it this layout and this probe ({charges.prior.probe.notation}), do the places and forces "
-        "belong to these rows, and are the charges touch charges (reading under load minus reading without load)?"
+    advice = (
+        f"; is it this layout and this probe ({prior.probe.notation}), do the places and forces belong to these rows, "
+        "and are the charges touch charges (reading under load minus reading without load)?"
     )
+    if alternatives:
+        advice = f". A film would explain them if {alternatives}. Nothing was changed: correct the file or the options"
+    return PressError(statement + advice)
 
 
 def is_one_place(presses: MeasuredPresses) -> bool:

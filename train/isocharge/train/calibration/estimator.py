@@ -32,8 +32,8 @@ from isocharge.train.calibration.press_data import Linearised, PressData, PressE
 BAD_PROBABILITY = 1e-5
 """Probability of residuals as large as those of a press, below which the press is left out."""
 
-UNEXPLAINED_CHI2 = 9.0
-"""Mean squared residual above which no film explains the presses, in units of the noise variance."""
+MAX_RESIDUAL = 3.0
+"""Root mean square residual above which no film explains the presses, in standard deviations of the noise."""
 
 MAX_BAD_SHARE = 0.3
 """Share of presses that do not agree with the others, above which no film explains the presses."""
@@ -146,7 +146,7 @@ class Estimation:
         press_chi2: Squared residuals of each press per redundant measurement, shape (n,); NaN without redundancy.
         chi2: Sum of the squared residuals of all presses that were not left out, and of the prior, under the most
             probable hypothesis.
-        redundancy: Number of redundant measurements of these presses.
+        redundancy: Number of redundant measurements of these presses, but at least 1.
         hypothesis: The most probable hypothesis.
     """
 
@@ -160,13 +160,19 @@ class Estimation:
     hypothesis: Hypothesis
 
     @property
+    def residual(self) -> float:
+        """Root mean square residual, in standard deviations of the most probable hypothesis, dimensionless."""
+        return float(np.sqrt(self.chi2 / self.redundancy))
+
+    @property
+    def is_improbable(self) -> bool:
+        """Whether the residuals are larger than random errors of the most probable hypothesis cause."""
+        return bool(self.chi2 > chdtri(self.redundancy, BAD_PROBABILITY))
+
+    @property
     def is_unexplained(self) -> bool:
         """Whether the residuals are too large for any film, or too many presses do not agree with the others."""
-        if self.redundancy == 0.0:
-            return False
-        improbable_chi2 = float(chdtri(self.redundancy, BAD_PROBABILITY))
-        has_large_residuals = self.chi2 > max(UNEXPLAINED_CHI2 * self.redundancy, improbable_chi2)
-        return has_large_residuals or self.is_bad.mean() > MAX_BAD_SHARE
+        return (self.is_improbable and self.residual > MAX_RESIDUAL) or self.is_bad.mean() > MAX_BAD_SHARE
 
 
 def estimate(charges: FilmCharges, data: PressData, prior: Prior, previous: Estimation | None = None) -> Estimation:
@@ -247,7 +253,7 @@ def _estimate_with_errors(
         is_bad=is_bad,
         press_chi2=np.where(data.redundancy > 0, chi2_per_measurement, np.nan),
         chi2=float(average.chi2[best]),
-        redundancy=float(data.redundancy[is_used].sum()),
+        redundancy=float(max(data.redundancy[is_used].sum(), 1)),
         hypothesis=average.hypotheses[best],
     )
 

@@ -13,9 +13,9 @@ A further calibration in the same folder becomes its next version. A server load
 models. Programs only read the version folders, and the copies above the version folders are for people.
 
 The file `calibration.json` contains the value and the standard deviation of each unknown, in the unit of the property
-of the same name. The unit of `offset` is pC, that of `force_offset` is N, and coefficients have no unit. `correlations`
-is the lower triangle of the correlation matrix of all unknowns, in this order: one row for each unknown, without the
-diagonal, rounded to six digits. The correlations of an unknown whose standard deviation is zero are zero.
+of the same name. The unit of an `offset` is pC, that of `force_offset` is N, and coefficients have no unit.
+`correlations` is the lower triangle of the correlation matrix of all unknowns, in this order: one row for each unknown,
+without the diagonal, rounded to six digits. The correlations of an unknown whose standard deviation is zero are zero.
 """
 
 import json
@@ -396,7 +396,7 @@ def result_table(result: CalibrationResult) -> dict[str, Any]:
     return {
         "presses": len(result.presses),
         "left_out_lines": result.bad_lines,
-        "reduced_chi2": estimation.chi2 / max(estimation.redundancy, 1.0),
+        "reduced_chi2": estimation.residual**2,
         "press_chi2": estimation.press_chi2.round(3),
         "error_left": result.film_error,
         "error_left_before": result.film_error_before,
