@@ -20,7 +20,7 @@ scaled strain E'. The scaled strain is of order one for every force.
 The stress follows from Saint-Venant-Kirchhoff elasticity in plane stress as S = E_young A^2 (C : E' + tau I). Here, C
 is the elasticity matrix divided by Young's modulus, tau is the scaled pretension, and I is the unit tensor. Energies
 are in units of E_young h a^2 A^4, where h is the thickness of the film. For an uneven pretension, a deviator is added
-to tau I (`theory.DimensionlessGroups`). The bending stiffness is always computed for an isotropic film.
+to tau I (`theory.DimensionlessGroups`). The bending stiffness of an orthotropic film is averaged over all directions.
 """
 
 from functools import cached_property

@@ -25,6 +25,7 @@ Saint-Venant-Kirchhoff elasticity (`load_case.check_press`).
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -322,13 +323,17 @@ def side_force_unit(film: Film, squared_amplitude: Array | float) -> Any:
     return film.young * film.thickness * film.radius * squared_amplitude
 
 
+@lru_cache(maxsize=256)
 def bending_stiffness(film: Film) -> float:
-    """Compute the bending stiffness of a film in units of E h a^2.
+    """Compute the bending stiffness of a film in units of E h a^2, as a mean over all directions.
 
-    Here, E is Young's modulus, h is the thickness and a is the radius of the film. The bending stiffness of a plate is
-    E h^3 / (12 (1 - poisson^2)).
+    Here, E is Young's modulus, h is the thickness and a is the radius of the film. The bending stiffness of an
+    isotropic plate is E h^3 / (12 (1 - poisson^2)). Under a uniform pressure, an orthotropic plate bends like an
+    isotropic plate with the mean stiffness (Timoshenko and Woinowsky-Krieger 1959, art. 86).
     """
-    return (film.thickness / film.radius) ** 2 / (12.0 * (1.0 - film.poisson**2))
+    moduli = elasticity(film, 0.0)
+    mean_modulus = (3.0 * np.trace(moduli) + 2.0 * moduli[0, 1] + moduli[2, 2]) / 8.0
+    return float(mean_modulus * (film.thickness / film.radius) ** 2 / 12.0)
 
 
 def amplitude_squared(film: Film, force: Array | float) -> Any:

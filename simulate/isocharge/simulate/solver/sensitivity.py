@@ -44,7 +44,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.common.errors import SceneError
-from isocharge.simulate.mechanics.theory import elasticity, side_force_unit
+from isocharge.simulate.mechanics.theory import bending_stiffness, elasticity, side_force_unit
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.mesh.placement import Placement
 from isocharge.simulate.sensor.film import Surface, add_axial
@@ -111,7 +111,11 @@ def _add_stiffness(solved: Equilibrium, log_ratio: float, angle: float) -> Equil
     addition = cmath.rect(log_ratio, 2.0 * (solved.direction + angle))
     new_log_ratio, axis = add_axial(math.log(film.young_ratio), film.axis, addition)
     changed_film = replace(film, young_ratio=math.exp(new_log_ratio), axis=axis)
-    groups = replace(solved.groups, elasticity=elasticity(changed_film, solved.direction))
+    groups = replace(
+        solved.groups,
+        elasticity=elasticity(changed_film, solved.direction),
+        bending=solved.groups.bending * bending_stiffness(changed_film) / bending_stiffness(film),
+    )
     return replace(solved, groups=groups)
 
 
