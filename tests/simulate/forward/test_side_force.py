@@ -85,5 +85,5 @@ def test_invalid_side_forces_raise_scene_errors(film, side_force):
 
 
 def test_invalid_coefficient_of_friction_raises_a_scene_error(film):
-    with pytest.raises(SceneError, match=r"coefficient from 0 to 1, got 1\.5"):
+    with pytest.raises(SceneError, match=r"coefficient of friction: expected 0 to 1, got 1\.5"):
         friction_force(press(film, PROBE, (3.0, 0.0), 0.01), 1.5)

@@ -68,13 +68,6 @@ def test_accuracy_without_a_mesh_raises_scene_error(film, accuracy):
             r"press at \(44, 0\) mm comes within 0\.0001 mm of the rim, too near for a",
         ),
         ({}, PROBE, (0.0, 0.0), 0.0, "force: expected at least 1e-12 N .* got 0 N"),
-        (
-            {"radius": 4500.0},
-            Circle(0.03),
-            (0.0, 0.0),
-            1.0,
-            r"expected a reach of at least 1e-05 of the film's radius \(4500 mm\), got 0\.03",
-        ),
         ({}, Ellipse(16.0, 15.984), (36.85, 0.0), 1e-3, r"within 0\.1\d* mm of the rim: expected at least 1\.6 mm"),
         ({"oval": 0.02}, PROBE, (0.0, 43.5), 0.1, r"off the film: .* 44\.5 mm from .*, the rim 44\.1 mm"),
     ],

@@ -199,7 +199,7 @@ def test_no_drawn_contact_is_nearer_than_the_one_that_the_search_finds(split, fa
     rng = np.random.default_rng(1)
     charge = FAULTS[fault](split.test.charge[:12], rng)
     sigma = REFERENCE.sigma(charge)
-    contact, residual = search(field, charge, sigma, starts=4)
+    contact, residual = search(field, charge, sigma)
     assert np.allclose(residual, (charge - field.charges(contact)) / sigma, atol=1e-8)
     assert DOMAIN.contains(contact).all()
     drawn_charge = field.charges(draw_contacts(rng, DOMAIN, 20_000))

@@ -109,13 +109,12 @@ class Sweep:
             SceneError: If a value is not allowed.
         """
         check_domain(Domain(self.radius, self.force_range))
-        if not 1 <= self.samples <= MAX_SAMPLES:
-            bound = "at least 1" if self.samples < 1 else f"at most {MAX_SAMPLES}"
-            raise SceneError(f"samples: expected {bound}, got {self.samples}")
+        for name, smallest in (("samples", 1), ("outside", 0)):
+            count = getattr(self, name)
+            if not smallest <= count <= MAX_SAMPLES:
+                raise SceneError(f"{name}: expected {smallest} to {MAX_SAMPLES} presses, got {count}")
         if self.seed < 0:
             raise SceneError(f"seed: expected 0 or more, got {self.seed}")
-        if not 0 <= self.outside <= MAX_SAMPLES:
-            raise SceneError(f"outside: expected 0 to {MAX_SAMPLES} presses outside the radius, got {self.outside}")
         if self.orientation not in get_args(Orientation):
             raise SceneError(f"orientation: expected 'fixed' or 'random', got {self.orientation!r}")
 

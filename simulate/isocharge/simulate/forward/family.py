@@ -408,7 +408,7 @@ def family_mesh(film: Film, probe: Probe, domain: Domain, settings: SolveSetting
     """
     min_force, max_force = domain.force_range
     middle_force = math.sqrt(min_force * max_force)
-    ring_width = layer_for(film, middle_force) if settings.layer == "auto" else settings.layer
+    ring_width = layer_for(film, middle_force, settings)
 
     # The press that is nearest to the clamp needs the finest mesh. If the pretension is uneven, or if the footprint
     # grows with the force, the smallest force needs the finest mesh.

@@ -226,25 +226,23 @@ def search(
     charge: Array,
     sigma: Array,
     *,
-    starts: int = 2,
     candidates: int = CANDIDATES,
 ) -> tuple[Array, Array]:
     """Find the contacts whose charges are nearest to given charges, without given starting points.
 
-    For each row of charges, several least-squares descents start at different contacts. The result is the best of them.
+    For each row of charges, two least-squares descents start at different contacts. The result is the better of them.
 
     Args:
         charge_map: Map that computes the charges of contacts.
         charge: Given charges, shape (n, n_electrode), pC.
         sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
-        starts: Number of descents for each row of charges.
         candidates: Number of candidates for the starting points.
 
     Returns:
         Contacts (x, y, F), shape (n, 3), mm and N. Residuals, which are the given charges minus the charges of the
         contacts, divided by `sigma`, shape (n, n_electrode), dimensionless.
     """
-    contact, residual = local_minima(charge_map, charge, sigma, starts=starts, candidates=candidates)
+    contact, residual = local_minima(charge_map, charge, sigma, starts=2, candidates=candidates)
     best_start = (residual**2).sum(axis=2).argmin(axis=1)  # shape (n,)
     row = np.arange(len(charge))
     return contact[row, best_start], residual[row, best_start]

@@ -37,7 +37,7 @@ class FilmNumber(NamedTuple):
 
 
 FILM_NUMBERS = {
-    "radius": FilmNumber("radius_mm", "mm", 1.0, 1.0, 1e4),
+    "radius": FilmNumber("radius_mm", "mm", 1.0, 1.0, 1e3),  # the mesh then resolves the smallest probe
     "thickness": FilmNumber("thickness_um", "um", 1e3, 0.1, math.inf),
     "young": FilmNumber("young_GPa", "GPa", 1e-3, 1e-3, 1e3),  # from a soft rubber to nearly diamond
     "young_ratio": FilmNumber("young_GPa, E1 / E2", "", 1.0, 0.1, 10.0),  # the solver has been tested in this range

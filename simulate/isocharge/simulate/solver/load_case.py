@@ -42,12 +42,6 @@ LAYER_WIDTH = 6.0
 MAX_SIDE_SHARE = 1.0
 """Largest ratio of the side force to the force of the press. It corresponds to a coefficient of friction of one."""
 
-MIN_PROBE_REACH = 1e-5
-"""Smallest reach of a probe, in film radii.
-
-For smaller probes, the ratio of the largest to the smallest element of the mesh would exceed the resolution of float64.
-"""
-
 REFINEMENTS = ((0, 1), (1, 1), (0, 2), (2, 1), (1, 2), (0, 3), (2, 2), (1, 3), (2, 3), (3, 3))
 """Refinements of the mesh that are tried one after the other.
 
@@ -113,17 +107,11 @@ def check_press(film: Film, probe: Probe, at: tuple[float, float], force: float)
         force: Force, N.
 
     Raises:
-        SceneError: If the force is smaller than `MIN_FORCE_N` or not finite, if the footprint is too small, too close
-            to the rim or not completely on the film, or if the strains are not small.
+        SceneError: If the force is smaller than `MIN_FORCE_N` or not finite, if the footprint is too close to the rim
+            or not completely on the film, or if the strains are not small.
     """
     if not MIN_FORCE_N <= force < np.inf:
         raise SceneError(f"force: expected at least {MIN_FORCE_N:g} N (F > 0 pushes), got {force:.4g} N")
-    if probe.reach < MIN_PROBE_REACH * film.radius:
-        raise SceneError(
-            f"probe: expected a reach of at least {MIN_PROBE_REACH:g} of the film's radius ({film.radius:.4g} mm), got "
-            f"{probe.reach:.4g} mm"
-        )
-
     _check_position(film, probe, at)
 
     # The squared amplitude is of the order of the strains.
@@ -196,17 +184,18 @@ def farthest_distance(film: Film, probe: Probe, at: tuple[float, float]) -> floa
     return rotated_probe.farthest_distance((film.radius * float(distance_on_circular_film), 0.0))
 
 
-def layer_for(film: Film, force: float) -> float:
-    """Compute the total width of the thin rings of elements at the rim of the film.
+def layer_for(film: Film, force: float, settings: SolveSettings) -> float:
+    """Return the total width of the thin rings of elements at the rim of the film.
 
     Args:
         film: The film.
         force: Force of the press, N.
+        settings: Settings with the width, or with the value "auto" for a width that is chosen here.
 
     Returns:
         Width, in film radii.
     """
-    return LAYER_WIDTH * bending_length(film, force)
+    return LAYER_WIDTH * bending_length(film, force) if settings.layer == "auto" else settings.layer
 
 
 @dataclass(frozen=True)
@@ -250,8 +239,7 @@ class LoadCase:
     @property
     def layer(self) -> float:
         """Total width of the thin rings at the rim, in film radii."""
-        layer = self.settings.layer
-        return layer_for(self.film, self.force) if layer == "auto" else layer
+        return layer_for(self.film, self.force, self.settings)
 
     def place(self, resolution: Resolution) -> PlacedMesh:
         """Create the mesh under this press with a given resolution. With a side force, the whole film is meshed."""

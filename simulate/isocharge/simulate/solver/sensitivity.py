@@ -47,11 +47,12 @@ from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.theory import bending_stiffness, elasticity, side_force_unit
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.sensor.film import Surface, add_axial
+from isocharge.simulate.sensor.film import Surface, add_axial, check_range
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.probe import RoundProbe
 from isocharge.simulate.solver.assembly import SolveTangent, factor_tangent, single_threaded_blas
 from isocharge.simulate.solver.equilibrium import Equilibrium, nodal_stress
+from isocharge.simulate.solver.load_case import MAX_SIDE_SHARE
 
 STEP = 1e-3
 """Step of the central differences, in units of the changed property."""
@@ -285,10 +286,6 @@ def change_by_node_shift(mesh: PlacedMesh, stress: Array, node_shift: Complexes)
     return x_contribution + y_contribution
 
 
-MAX_FRICTION = 1.0
-"""Largest allowed coefficient of friction, dimensionless. The coefficient of steel on PVDF is about 0.2."""
-
-
 def holding_force(solved: Equilibrium) -> tuple[float, float]:
     """Compute, to first order, the side force that cancels the mean in-plane displacement of the footprint.
 
@@ -338,16 +335,15 @@ def friction_force(solved: Equilibrium, coefficient: float) -> tuple[float, floa
 
     Args:
         solved: Press without a side force.
-        coefficient: Coefficient of friction, dimensionless.
+        coefficient: Coefficient of friction, dimensionless. The coefficient of steel on PVDF is about 0.2.
 
     Returns:
         Force (Fx, Fy) of the probe on the film, N, for the argument `side_force` of `press`.
 
     Raises:
-        SceneError: If the coefficient is not between 0 and `MAX_FRICTION`.
+        SceneError: If the coefficient is not between 0 and `MAX_SIDE_SHARE`.
     """
-    if not 0.0 <= coefficient <= MAX_FRICTION:
-        raise SceneError(f"friction: expected a coefficient from 0 to {MAX_FRICTION:g}, got {coefficient}")
+    check_range("coefficient of friction", coefficient, (0.0, MAX_SIDE_SHARE), "", SceneError)
     holding_x, holding_y = holding_force(solved)
     magnitude = max(math.hypot(holding_x, holding_y), 1e-300)  # the limit avoids a division by zero
     reduction = min(1.0, coefficient * solved.force / magnitude)
