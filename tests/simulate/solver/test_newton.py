@@ -7,6 +7,7 @@ import pytest
 
 from isocharge.common.errors import SolveError
 from isocharge.simulate import Circle, Polygon, Resolution, SolveSettings, Theory, deflection, press
+from isocharge.simulate.solver.newton import NewtonResult
 
 FORCES = (1e-5, 10.0)
 MEMBRANE = Theory(bending=False)
@@ -74,14 +75,31 @@ def test_start_with_nan_fails(film):
     np.testing.assert_allclose(solved.field, good.field, atol=1e-6)
 
 
+def test_load_steps_end_when_the_full_force_is_out_of_reach(film, monkeypatch):
+    """Every second solve fails. If all twelve forces were tried, a film that wrinkles would take a minute."""
+    field = press(film, CIRCLE, (0.0, 0.0), 1.0).field
+    statuses = []
+
+    def every_second_solve(*_):
+        statuses.append("converged" if len(statuses) % 2 else "failed")
+        return NewtonResult(field=field, status=statuses[-1], message="", iterations=1, residual=1.0)
+
+    monkeypatch.setattr("isocharge.simulate.solver.press.solve_newton", every_second_solve)
+    with pytest.raises(SolveError):
+        press(film, CIRCLE, (0.0, 0.0), 1.0)
+    assert len(statuses) == 5
+
+
 WRINKLES = r"no equilibrium at .* N, position \(.*\) mm: .* it wrinkles, which has many solutions; press farther"
 
 
 def test_wrinkling_film_raises_solve_error(film, monkeypatch):
-    """The message mentions the compression near the rim, and does not mention it at the centre."""
+    """The message mentions the compression near the rim and of a slack film, but not at the centre of a flat film."""
     monkeypatch.setattr("isocharge.simulate.solver.newton.MAX_ITERATIONS", 2)
     mesh = SolveSettings(theory=FULL, resolution=Resolution(5, 8, 6, 1))
     with pytest.raises(SolveError, match=WRINKLES):
         press(film, CIRCLE, (0.0, 42.0), 5.0, mesh)
+    with pytest.raises(SolveError, match=r"it wrinkles, .* with more force, or give the film a pretension"):
+        press(replace(film, pretension=-2.0), CIRCLE, (10.0, 0.0), 0.05, mesh)
     with pytest.raises(SolveError, match=r"after 4 steps$"):
         press(film, CIRCLE, (0.0, 0.0), 5.0, mesh)

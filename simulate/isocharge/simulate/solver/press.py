@@ -263,8 +263,9 @@ def _solve_by_load_steps(case: LoadCase, failed: NewtonResult, full_load: Elasti
 
     Each solve starts from the field under the largest force for which an equilibrium was found. After each successful
     solve, the force is multiplied by a factor, which is two at the beginning. After each failed solve, the factor is
-    replaced by its square root, and the smaller force is tried. If the solve with the first force fails, no further
-    force is tried.
+    replaced by its square root, and the smaller force is tried. No further force is tried if the remaining solves would
+    not reach the full force even if all of them succeeded. This is the case if the solve with the first force fails.
+    Each failed solve of a film that wrinkles takes seconds.
 
     Args:
         case: The press.
@@ -280,7 +281,7 @@ def _solve_by_load_steps(case: LoadCase, failed: NewtonResult, full_load: Elasti
     iterations = failed.iterations  # of all solves
     field = first_iterate(full_load)
     force = case.force / 16.0
-    for _ in range(12):
+    for tries_left in reversed(range(12)):
         # The field under a smaller force is close to the solution, so full Newton steps are allowed from the start.
         full_steps_below = np.inf if solved_force > 0.0 else UNSTABILISED_BELOW
         elastic = _elastic_film(case, full_load.mesh, force)
@@ -294,10 +295,10 @@ def _solve_by_load_steps(case: LoadCase, failed: NewtonResult, full_load: Elasti
         if result.status == "converged":
             solved_force = force
             field = result.field
-        elif solved_force == 0.0:  # even the first force has no equilibrium
-            break
         else:
             force_factor = np.sqrt(force_factor)
+        if solved_force * force_factor**tries_left < case.force:
+            break
         force = min(case.force, solved_force * force_factor)
     return replace(failed, iterations=iterations)
 
