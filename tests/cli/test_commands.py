@@ -207,7 +207,7 @@ BAD = [
     ),
     ("simulate point SENSOR --at 3", "InputError: --at: expected two numbers in mm"),
     ("simulate point SENSOR --probe cube:1", "SceneError: probe 'cube:1'"),
-    ("simulate point SENSOR --temperature nan", "InputError: --temperature: expected a finite number"),
+    ("simulate point SENSOR --temperature 1000", "sensor file holds): expected -150 to 150 K, got 1000 K"),
     ("simulate point SENSOR --force 1e308", "beyond small strains"),
     ("simulate sweep SENSOR --radius 44.5 -o OUT", "leave the film of radius 45 mm; state a smaller radius"),
     (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from isocharge.simulate import load_sensor
-from isocharge.simulate.mechanics.warming import tension_change, warmed
+from isocharge.simulate.mechanics.warming import tension_change, warmed, warming_limits
 from solved_charges import with_film
 
 SENSOR = load_sensor("four-25um-biaxial")
@@ -30,8 +30,11 @@ def test_tension_turns_with_the_axis_of_an_orthotropic_film():
     np.testing.assert_allclose(change, [expected[0, 0], expected[1, 1], expected[0, 1]], rtol=1e-9)
 
 
-def test_warmed_sensor_of_a_biaxial_film_stays_axisymmetric():
-    warm = warmed(with_film(SENSOR, pretension=0.8, expansion=(1e-4, 1e-4)), 0.5)
+def test_warmed_sensor_of_a_biaxial_film_stays_axisymmetric_and_may_slacken_to_10_MPa_of_compression():
+    expanding = with_film(SENSOR, pretension=0.8, expansion=(1e-4, 1e-4))
+    slackening_per_K = 1e-4 * YOUNG / (1.0 - POISSON)
+    warm = warmed(expanding, 0.5)
     assert warm.film.is_axisymmetric
-    assert warm.film.pretension == pytest.approx(0.8 - 0.5e-4 * YOUNG / (1.0 - POISSON))
+    assert warm.film.pretension == pytest.approx(0.8 - 0.5 * slackening_per_K)
+    assert warming_limits(expanding.film) == pytest.approx((-150.0, 10.8 / slackening_per_K))
     assert warmed(SENSOR, 5.0) == SENSOR

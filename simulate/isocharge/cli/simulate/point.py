@@ -1,6 +1,5 @@
 """Command `isocharge simulate point`, which computes the charges and the deflection of one press."""
 
-import math
 from typing import Annotated
 
 import typer
@@ -23,7 +22,8 @@ from isocharge.simulate import (
 )
 from isocharge.simulate.forward.readout import thermal_charge
 from isocharge.simulate.mechanics.theory import theory_by_name
-from isocharge.simulate.mechanics.warming import warmed
+from isocharge.simulate.mechanics.warming import warmed, warming_limits
+from isocharge.simulate.sensor.film import check_range
 from isocharge.simulate.solver.error_estimate import summary
 from isocharge.simulate.solver.sensitivity import friction_force
 
@@ -67,10 +67,10 @@ def point_command(
     Example: isocharge simulate point three-25um-biaxial --probe triangle:4.0@30 --at 3,-2 --force 1.0
     """
     # Check and read the options.
-    if not math.isfinite(temperature):
-        raise InputError(f"--temperature: expected a finite number of kelvin, got {temperature}")
-
-    film_sensor = warmed(load_sensor(sensor), temperature)
+    unwarmed_sensor = load_sensor(sensor)
+    temperature_meaning = "--temperature (give the change from the temperature at which the sensor file holds)"
+    check_range(temperature_meaning, temperature, warming_limits(unwarmed_sensor.film), "K", InputError)
+    film_sensor = warmed(unwarmed_sensor, temperature)
     footprint = parse_probe(probe)
 
     applied_side_force = parse_pair(side_force, "--side-force: expected two numbers in N like '0.1,0'")

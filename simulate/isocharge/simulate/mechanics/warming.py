@@ -17,7 +17,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.simulate.mechanics.theory import elasticity, rotate_stress
-from isocharge.simulate.sensor.film import Film
+from isocharge.simulate.sensor.film import FILM_NUMBERS, Film
 from isocharge.simulate.sensor.sensor import Sensor
 
 
@@ -44,6 +44,24 @@ def tension_change(film: Film, film_warming_K: float, ring_warming_K: float) -> 
     # products rounds them equally.
     change_in_film_axes = film.young * (elastic_strain * elasticity(film, film.axis)).sum(axis=1)
     return rotate_stress(change_in_film_axes, film.axis)
+
+
+MAX_WARMING_K = 150.0
+"""Largest change of the temperature that is accepted, K. PVDF is used from about -40 to 110 degrees Celsius."""
+
+
+def warming_limits(film: Film) -> tuple[float, float]:
+    """Return the smallest and the largest change of the temperature of a film that the simulator accepts, K.
+
+    If the film has expansion coefficients, its mean pretension must remain in the accepted range.
+    """
+    change_per_K = tension_change(film, 1.0, 0.0)[:2].mean()  # of the mean pretension, MPa/K
+    if change_per_K == 0.0:
+        return -MAX_WARMING_K, MAX_WARMING_K
+    accepted = FILM_NUMBERS["pretension"]
+    changes = np.array([accepted.smallest, accepted.largest]) - film.pretension
+    low, high = np.clip(np.sort(changes / change_per_K), -MAX_WARMING_K, MAX_WARMING_K).tolist()
+    return low, high
 
 
 def warmed(sensor: Sensor, film_warming_K: float, ring_warming_K: float = 0.0) -> Sensor:
