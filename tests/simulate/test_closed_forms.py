@@ -187,13 +187,10 @@ def test_axisymmetric_membrane(share, force, poisson, tension):
 
 def test_centre_of_an_orthotropic_plate_under_a_uniform_pressure():
     """The plate bends like an isotropic plate with a mean stiffness (Timoshenko and Woinowsky-Krieger 1959)."""
-    film = replace(THICK, young_ratio=5.0, shear=600.0, axis=0.4, static_pressure=1e-9)
+    film = replace(THICK, young_ratio=4.0, shear=600.0, axis=0.4, static_pressure=1e-9)
     rest = press(film, Circle(5.0), (0.0, 0.0), TINY).rest
-    plane_modulus = film.young / (1.0 - film.poisson**2)
-    modulus_1 = plane_modulus * film.young_ratio**0.5
-    modulus_2 = plane_modulus / film.young_ratio**0.5
-    mixed_modulus = film.poisson * plane_modulus + 2.0 * film.shear
-    mean_stiffness = (3.0 * modulus_1 + 2.0 * mixed_modulus + 3.0 * modulus_2) / 8.0 * film.thickness**3 / 12.0
+    mixed_modulus = film.poisson + 2.0 * film.shear * (1.0 - film.poisson**2) / film.young
+    mean_stiffness = plate_stiffness(film) * (3.0 * 2.0 + 2.0 * mixed_modulus + 3.0 / 2.0) / 8.0
     expected = film.static_pressure * film.radius**4 / (64.0 * mean_stiffness)
     np.testing.assert_allclose(deflection(rest, np.zeros((1, 2))), expected, rtol=1e-4)
 

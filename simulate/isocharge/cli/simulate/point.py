@@ -1,5 +1,6 @@
 """Command `isocharge simulate point`, which computes the charges and the deflection of one press."""
 
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -20,7 +21,7 @@ from isocharge.simulate import (
     press,
     touch_charge,
 )
-from isocharge.simulate.forward.readout import thermal_charge
+from isocharge.simulate.forward.readout import stress_charge, thermal_charge
 from isocharge.simulate.mechanics.theory import theory_by_name
 from isocharge.simulate.mechanics.warming import warmed, warming_limits
 from isocharge.simulate.sensor.film import check_range
@@ -91,7 +92,7 @@ def point_command(
     warming_charge = thermal_charge(film_sensor, temperature)
     charge = touch_charge(film_sensor, equilibrium) + warming_charge
     charge_pC = dict(zip(film_sensor.electrode_names, charge.tolist(), strict=True))
-    results = {"charge_pC": charge_pC, **summary(equilibrium)}
+    results = {"charge_pC": charge_pC, **summary(equilibrium, partial(stress_charge, film_sensor))}
     if any(applied_side_force):
         results["side_force_N"] = list(applied_side_force)
 

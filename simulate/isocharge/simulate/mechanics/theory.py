@@ -18,9 +18,8 @@ stress at the surfaces of the film. The effect of bending reaches as far as the 
 the bending stiffness and N is the tension force per length. If the pretension and the induced tension are small, the
 bending stiffness carries the load.
 
-The scales of a press also show where a theory is valid. The bending length determines the error of a theory without
-bending (`error_estimate.modelling_error`), and the amplitude determines whether the strains are small enough for
-Saint-Venant-Kirchhoff elasticity (`load_case.check_press`).
+The amplitude of a press also shows whether the strains are small enough for Saint-Venant-Kirchhoff elasticity
+(`load_case.check_press`).
 """
 
 import math
@@ -323,17 +322,26 @@ def side_force_unit(film: Film, squared_amplitude: Array | float) -> Any:
     return film.young * film.thickness * film.radius * squared_amplitude
 
 
+def directional_stiffness(film: Film) -> Array:
+    """Compute the bending stiffness of a film in units of E h a^2 for bending in several directions, shape (5,).
+
+    Here, E is Young's modulus, h is the thickness and a is the radius of the film. The directions are evenly spaced
+    over half a turn. Five directions determine the mean and the standard deviation over all directions exactly. The
+    bending stiffness of an isotropic plate is E h^3 / (12 (1 - poisson^2)).
+    """
+    directions = np.pi / 5.0 * np.arange(5)
+    moduli = np.array([elasticity(film, angle)[0, 0] for angle in directions])
+    return moduli * (film.thickness / film.radius) ** 2 / 12.0
+
+
 @lru_cache(maxsize=256)
 def bending_stiffness(film: Film) -> float:
     """Compute the bending stiffness of a film in units of E h a^2, as a mean over all directions.
 
-    Here, E is Young's modulus, h is the thickness and a is the radius of the film. The bending stiffness of an
-    isotropic plate is E h^3 / (12 (1 - poisson^2)). Under a uniform pressure, an orthotropic plate bends like an
-    isotropic plate with the mean stiffness (Timoshenko and Woinowsky-Krieger 1959, art. 86).
+    Under a uniform pressure, an orthotropic plate bends like an isotropic plate with the mean stiffness (Timoshenko and
+    Woinowsky-Krieger 1959, art. 86).
     """
-    moduli = elasticity(film, 0.0)
-    mean_modulus = (3.0 * np.trace(moduli) + 2.0 * moduli[0, 1] + moduli[2, 2]) / 8.0
-    return float(mean_modulus * (film.thickness / film.radius) ** 2 / 12.0)
+    return float(directional_stiffness(film).mean())
 
 
 def amplitude_squared(film: Film, force: Array | float) -> Any:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from isocharge.common.arrays import Array, Booleans, Integers
+from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.common.defaults import DEFAULT_STRESS_LIMIT
 from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.energy import ElasticFilm
@@ -25,8 +25,8 @@ from isocharge.simulate.mechanics.theory import (
 )
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.mesh.template import locate_points
-from isocharge.simulate.numerics.interpolation import tensor_values
-from isocharge.simulate.numerics.polygon import to_complex
+from isocharge.simulate.numerics.interpolation import gauss_reference_square, tensor_values
+from isocharge.simulate.numerics.polygon import to_complex, to_corners
 from isocharge.simulate.sensor.film import Film, Surface
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.solver.newton import NewtonResult
@@ -212,32 +212,16 @@ def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
     # of the pretension, because this part changes the directions of the principal stresses.
     uneven_tension = equilibrium.groups.uneven_tension
     without_rest = replace(equilibrium, rest=None)  # so that the stress before the contact is not subtracted
-    smallest, largest = principal_stresses(nodal_stress(without_rest) + uneven_tension)
-    if equilibrium.theory.bending:
-        outer_surfaces: tuple[Surface, ...] = ("top", "bottom")
-        for surface in outer_surfaces:
-            _, largest_at_surface = principal_stresses(nodal_stress(without_rest, surface) + uneven_tension)
-            largest = max(largest, largest_at_surface)
+    surfaces: list[Surface] = ["middle", "top", "bottom"] if equilibrium.theory.bending else ["middle"]
+    stresses = [principal_stresses(nodal_stress(without_rest, surface) + uneven_tension) for surface in surfaces]
+    smallest, _ = stresses[0]  # on the mid-surface
+    largest = max(largest_at_surface for _, largest_at_surface in stresses)
 
     # Convert the stresses to MPa, and add the mean pretension, which is the same in all directions.
     stress_unit = equilibrium.film.young * equilibrium.groups.squared_amplitude
     smallest_MPa = stress_unit * smallest + equilibrium.film.pretension
     largest_MPa = stress_unit * largest + equilibrium.film.pretension
     return smallest_MPa, largest_MPa
-
-
-def node_slopes(equilibrium: Equilibrium) -> Array:
-    """Compute the derivatives of (U1, U2, W) with respect to (X1, X2) at the nodes of every element.
-
-    Args:
-        equilibrium: The solved press.
-
-    Returns:
-        Derivatives, shape (n_element, n_local, 2, 3). The last two axes are the coordinate and the displacement
-        component.
-    """
-    mesh = equilibrium.mesh
-    return mesh.node_derivatives(equilibrium.field[mesh.template.nodes])
 
 
 def _continuous_slope(equilibrium: Equilibrium) -> Array:
@@ -255,8 +239,10 @@ def _continuous_slope(equilibrium: Equilibrium) -> Array:
         Derivatives of the deflection W with respect to (X1, X2) at the nodes of each element, shape (n_element,
         n_local, 2).
     """
-    template = equilibrium.mesh.template
-    element_slope = node_slopes(equilibrium)[..., 2]  # of W, shape (n_element, n_local, 2)
+    mesh = equilibrium.mesh
+    template = mesh.template
+    nodal_displacement = equilibrium.field[template.nodes]  # (U1, U2, W)
+    element_slope = mesh.node_derivatives(nodal_displacement)[..., 2]  # of W, shape (n_element, n_local, 2)
     slope_sum = np.zeros((template.n_node, 2))
     np.add.at(slope_sum, template.nodes, element_slope)
     element_count = np.bincount(template.nodes.ravel())  # number of elements that share each node
@@ -320,3 +306,74 @@ def _locate(equilibrium: Equilibrium, points: Array) -> tuple[Integers, Array, A
     mesh = equilibrium.mesh
     element, xi, eta, is_reflected = locate_points(mesh.placement[None], mesh.template, rotated_points[None])
     return element[0], xi[0], eta[0], is_reflected[0]
+
+
+PATCH_RING_RADII = (0.0, 0.1, 0.22, 0.4, 0.6, 0.8)
+"""Radii of the rings on which square patches are placed to compare the charges of two meshes, in film radii."""
+
+
+def relative_difference(solved: Equilibrium, reference: Equilibrium) -> float:
+    """Compute the largest relative difference of an equilibrium from another equilibrium of the same press.
+
+    The function compares the charges that square patches of the film would collect. The charges are compared for a
+    biaxial film and for a uniaxial film. The patches lie on rings around the centre of the film, and on a ring around
+    the footprint. The difference between the two charges of a patch is divided by the largest charge of all patches on
+    the same ring.
+
+    Args:
+        solved: The equilibrium.
+        reference: The other equilibrium. The differences are relative to its charges.
+
+    Returns:
+        Relative difference, dimensionless.
+    """
+    # Centres x + iy of the patches, shape (n_ring, patches_per_ring), mm
+    patches_per_ring = 12
+    film_radius = solved.film.radius
+    unit_circle = np.exp(2j * np.pi * np.arange(patches_per_ring) / patches_per_ring)
+    rings_around_centre = film_radius * np.array(PATCH_RING_RADII)[:, None] * unit_circle
+    ring_around_footprint = complex(*solved.at) + solved.probe.reach * unit_circle
+    patch_centres = np.concatenate([rings_around_centre, ring_around_footprint[None]])
+
+    # Largest difference of the charges, relative to the largest charge on the same ring
+    charges = _patch_charges(solved, patch_centres)
+    reference_charges = _patch_charges(reference, patch_centres)
+    largest_on_ring = np.abs(reference_charges).max(axis=1, keepdims=True)
+    return float((np.abs(charges - reference_charges) / largest_on_ring).max())
+
+
+def _patch_charges(equilibrium: Equilibrium, centres: Complexes) -> Array:
+    """Compute the charge per area of each square patch, for a biaxial film and for a uniaxial film.
+
+    The side of a patch is a fifteenth of the film radius.
+
+    Args:
+        equilibrium: The solved press.
+        centres: Centres x + iy of the patches, shape (n_ring, n_patch), mm.
+
+    Returns:
+        Charges per area in arbitrary units, shape (n_ring, n_patch, 2). The last axis contains the charge of the
+        biaxial film and the charge of the uniaxial film. The part of a patch outside the film does not contribute.
+    """
+    # Integration points of all patches, six along each side. The coordinates xi and eta range from -1 to 1.
+    film_radius = equilibrium.film.radius
+    xi, eta, weights = gauss_reference_square(6)
+    half_side = film_radius / 30.0
+    complex_points = (centres[:, :, None] + half_side * (xi + 1j * eta)).ravel()
+    points = to_corners(complex_points)
+
+    # Stress at the integration points. The stress is set to zero outside the film.
+    is_on_film = equilibrium.film.relative_distance(complex_points) < 1.0
+    stress = np.zeros((len(points), 3))
+    stress[is_on_film] = touch_stress(equilibrium, points[is_on_film])
+
+    # Compute the mean stress of each patch. The sum of the weights of the integration points is 4.
+    patch_stress = stress.reshape(*centres.shape, -1, 3)  # shape (n_ring, n_patch, n_point, 3)
+    mean_stress = 0.25 * (weights @ patch_stress)
+
+    # The charge per area is d31 s11 + d32 s22. The coefficients d31 and d32 of a biaxial film are equal. On a uniaxial
+    # film, d31 is about ten times d32.
+    biaxial_coefficients = [1.0, 1.0]
+    uniaxial_coefficients = [10.0, 1.0]
+    coefficients = np.column_stack([biaxial_coefficients, uniaxial_coefficients])
+    return np.asarray(mean_stress[..., :2] @ coefficients)

@@ -19,8 +19,7 @@ from isocharge.simulate.numerics.interpolation import tensor_values
 from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.solver.assembly import single_threaded_blas
-from isocharge.simulate.solver.equilibrium import Equilibrium, principal_stress
-from isocharge.simulate.solver.error_estimate import relative_difference
+from isocharge.simulate.solver.equilibrium import Equilibrium, principal_stress, relative_difference
 from isocharge.simulate.solver.load_case import (
     LoadCase,
     SolveSettings,
