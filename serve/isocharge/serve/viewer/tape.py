@@ -63,7 +63,7 @@ def sample_values(record: PredictionRecord, electrodes: tuple[str, ...]) -> tupl
     record_count = 1  # `coalesce` adds the counts of the samples that it replaces by a single sample
     charge_pC = record.charge_pC or {}
     charges = [charge_pC.get(electrode) for electrode in electrodes]
-    return *values, *other_position, flags, record.contact, record_count, *charges
+    return *values, *other_position, flags, float(record.contact), record_count, *charges
 
 
 def coalesce(samples: Samples, max_samples: int) -> Samples:
