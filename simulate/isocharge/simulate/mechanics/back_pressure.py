@@ -1,4 +1,4 @@
-"""Energy of a static pressure on the film and of the air that is trapped behind it, and its derivatives."""
+"""Energy of a static pressure on the film and of trapped air behind the film, and the derivatives of this energy."""
 
 from dataclasses import replace
 from functools import cached_property
@@ -33,7 +33,7 @@ class BackPressure:
 
     @cached_property
     def weights(self) -> Array:
-        """Weights with which nodal deflections are integrated over the meshed part of the film, shape (n_node,)."""
+        """Weights that integrate nodal deflections over the meshed part of the film, shape (n_node,)."""
         return self.mesh.gather(self.mesh.node_weights)
 
     def energy(self, deflection: Array) -> float:
@@ -50,7 +50,7 @@ class BackPressure:
             deflection: Scaled deflection W at the nodes, shape (n_node,).
 
         Returns:
-            Energy, dimensionless. It is infinite if the film displaces the whole volume of the air.
+            Energy, dimensionless. The energy is infinite if the film displaces the whole volume of the air.
         """
         volume = self._volume(deflection)
         energy = -self.groups.static_pressure * volume
@@ -70,7 +70,8 @@ class BackPressure:
             deflection: Scaled deflection W at the nodes, shape (n_node,).
 
         Returns:
-            Derivatives, shape (n_node,). They are infinite if the film displaces the whole volume of the air.
+            Derivatives, shape (n_node,). The derivatives are infinite if the film displaces the whole volume of the
+            air.
         """
         displaced_share = self._displaced_share(deflection)
         if displaced_share >= 1.0:
@@ -78,7 +79,7 @@ class BackPressure:
         return -self.at_constant_pressure(deflection).static_pressure * self.weights
 
     def at_constant_pressure(self, deflection: Array) -> DimensionlessGroups:
-        """Return the groups of a film without trapped air, on which the same pressure acts as on this film.
+        """Return dimensionless groups in which an equal static pressure replaces the pressure of the trapped air.
 
         Args:
             deflection: Scaled deflection W at the nodes, shape (n_node,).
@@ -90,7 +91,9 @@ class BackPressure:
         return replace(self.groups, static_pressure=static_pressure, compression=0.0)
 
     def stiffness(self, deflection: Array) -> float:
-        """Compute the factor c in the second derivatives c * weights[i] * weights[j] of the energy.
+        """Compute the factor c of the second derivatives of the energy with respect to the nodal deflections.
+
+        The second derivative with respect to the deflections of the nodes i and j is c * weights[i] * weights[j].
 
         Args:
             deflection: Scaled deflection W at the nodes, shape (n_node,).
@@ -112,7 +115,7 @@ class BackPressure:
         return self._copies * float(self.weights @ deflection)
 
     def _displaced_share(self, deflection: Array) -> float:
-        """Compute the share V / V0 of the volume of the air that the film displaces, dimensionless.
+        """Compute the ratio of the displaced volume V to the volume V0 of the air behind the film, dimensionless.
 
         Args:
             deflection: Scaled deflection W at the nodes, shape (n_node,).

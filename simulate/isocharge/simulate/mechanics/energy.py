@@ -4,10 +4,10 @@ The potential energy of the film is
 
     Pi = stretching energy + bending energy + pressure energy - load * mean(W) - dot(side load, mean(U1, U2)).
 
-Here, W is the deflection, and U1 and U2 are the displacements in the plane. The means are taken over the footprint of
-the probe and weighted with the pressure of the probe. The class `ElasticFilm` computes the potential energy. This class
-adds the energies that the classes `Membrane`, `Bending` and `BackPressure` compute. The pressure energy is the energy
-of a static pressure and of trapped air.
+Here, W is the deflection, and U1 and U2 are the displacements in the plane. The function mean(...) averages over the
+footprint of the probe, with the pressure of the probe as the weight. The class `ElasticFilm` computes the potential
+energy from the energies that the classes `Membrane`, `Bending` and `BackPressure` compute. The pressure energy has two
+parts: the energy of a static pressure and the energy of trapped air.
 
 The energy is a function of the scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3). Lengths are in units
 of the film radius a. The displacements w and u, and the Green-Lagrange strain E, are
@@ -19,8 +19,9 @@ scaled strain E'. The scaled strain is of order one for every force.
 
 The stress follows from Saint-Venant-Kirchhoff elasticity in plane stress as S = E_young A^2 (C : E' + tau I). Here, C
 is the elasticity matrix divided by Young's modulus, tau is the scaled pretension, and I is the unit tensor. Energies
-are in units of E_young h a^2 A^4, where h is the thickness of the film. For an uneven pretension, a deviator is added
-to tau I (`theory.DimensionlessGroups`). The bending stiffness of an orthotropic film is averaged over all directions.
+are in units of E_young h a^2 A^4, where h is the thickness of the film. If the pretension is uneven, the difference
+between the pretension and its mean is added to tau I (see `theory.DimensionlessGroups`). The bending stiffness of an
+orthotropic film is averaged over all directions.
 """
 
 from functools import cached_property
@@ -47,7 +48,7 @@ class ElasticFilm:
     """
 
     def __init__(self, mesh: PlacedMesh, groups: DimensionlessGroups) -> None:
-        """Create the parts of the potential energy that the film has: stretching, bending and the back pressure.
+        """Create one object for each part of the potential energy: stretching, bending and back pressure.
 
         Args:
             mesh: Mesh of the press.
@@ -65,7 +66,7 @@ class ElasticFilm:
 
     @property
     def unknowns_per_node(self) -> int:
-        """Number of unknowns per node in the linear solves. Bending has an auxiliary unknown."""
+        """Number of unknowns per node in the linear solves: 3, or 4 if bending adds an auxiliary unknown."""
         return 3 if self.bending is None else 4
 
     def energy(self, field: Array) -> float:
@@ -105,7 +106,7 @@ class ElasticFilm:
         return element_forces
 
     def out_of_balance(self, field: Array, element_forces: Array) -> Array:
-        """Compute the internal force minus the external force at each node, from the internal forces of the elements.
+        """Sum the internal forces of the elements at each node, and subtract the external force.
 
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
@@ -117,7 +118,7 @@ class ElasticFilm:
         residual = np.stack([self.mesh.gather(element_forces[..., i]) for i in range(3)], axis=1)
         residual -= self.probe_force
 
-        # These forces are derivatives of the energy, like the internal forces. Therefore they are added.
+        # The forces of the back pressure are derivatives of the energy like the internal forces, so they are added.
         if self.back_pressure is not None:
             residual[:, 2] += self.back_pressure.forces(field[:, 2])
         return residual
@@ -126,7 +127,7 @@ class ElasticFilm:
     def load(self) -> Array:
         """Magnitude of the load at each node, shape (n_node,).
 
-        The load is the force of the probe, or the static pressure if there is no probe.
+        The load is the force of the probe. Without a probe, the load is the force of the static pressure.
         """
         if self.back_pressure is None or self.groups.load != 0.0:
             return self.probe_force[:, 2]
@@ -135,8 +136,8 @@ class ElasticFilm:
     def tangent(self, field: Array, added_tension: float = 0.0) -> Array:
         """Compute the tangent matrix of each element, without the stiffness of trapped air.
 
-        The stiffness of trapped air couples all nodes of the mesh. Therefore `solver.assembly` adds this stiffness
-        separately.
+        The stiffness of trapped air couples all nodes of the mesh. Therefore `solver.assembly` adds the stiffness of
+        trapped air separately.
 
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
@@ -153,7 +154,7 @@ class ElasticFilm:
 
 
 EQUAL_TENSION = np.array([1.0, 1.0, 0.0])
-"""Stress (T11, T22, T12) of a tension of one in all directions."""
+"""Stress (T11, T22, T12) that corresponds to a tension of one in every direction."""
 
 
 class Membrane:
@@ -161,8 +162,8 @@ class Membrane:
 
     The energy is integral( E' : C : E' / 2 + tau (tr E' - div U) ), where E' is the scaled strain, C is the elasticity
     matrix, tau is the scaled pretension and U is the in-plane displacement. The integral of div U over a clamped film
-    is zero. The term div U is nevertheless subtracted from tr E', because its rounding errors would otherwise exceed
-    all other terms if the pretension is large.
+    is zero. However, the rounding errors of div U would exceed all other terms if the pretension is large. The formula
+    therefore subtracts div U from tr E'.
 
     The scaled deformation gradient F has the components F_ia = d_ia + A^2 U_i,a for i = 1, 2, and F_3a = W,a. The
     symbol d_ia is the Kronecker delta, and an index after a comma denotes a derivative. If v is a test displacement
@@ -218,11 +219,11 @@ class Membrane:
         return deformation
 
     def energy(self, field: Array) -> float:
-        """Compute the stretching energy of a field: the integral of the energy densities of elasticity and pretension.
+        """Compute the stretching energy of a field as the integral of two energy densities.
 
         The elastic energy density is E' : C : E' / 2, where E' is the scaled strain and C is the elasticity matrix. The
-        energy density of the pretension T is T : (E' - sym grad U), where U is the in-plane displacement. The colon is
-        the sum of the products of corresponding components.
+        energy density of the pretension T is T : (E' - sym grad U), where U is the in-plane displacement. The colon
+        denotes the sum of the products of corresponding components.
 
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
@@ -272,9 +273,10 @@ class Membrane:
         """Compute the second derivatives of the stretching energy of each element.
 
         The energy depends on the unknowns only through the slopes, which are the derivatives of the displacements with
-        respect to the coordinates X1 and X2. The slopes are linear functions of the unknowns. With the matrix G of
-        these functions, the second derivatives with respect to the unknowns are therefore the sum of G' S G over the
-        quadrature points, where S contains the second derivatives of the energy with respect to the slopes.
+        respect to the coordinates X1 and X2. The slopes are linear functions of the unknowns. Let the matrix G contain
+        the factors of these linear functions, and let the matrix S contain the second derivatives of the energy with
+        respect to the slopes. The second derivatives with respect to the unknowns are then the sum of G' S G over the
+        quadrature points.
 
         Args:
             field: Scaled displacements (U1, U2, W) at the nodes, shape (n_node, 3).
@@ -323,8 +325,8 @@ class Membrane:
         """Compute the second derivatives of the elastic energy density with respect to all slopes.
 
         The result is the product B C B', where C is the elasticity matrix. The matrix B contains the derivatives of the
-        strain (E11, E22, 2 E12) with respect to the slopes. The part of the second derivatives that is caused by the
-        stress is not included.
+        strain (E11, E22, 2 E12) with respect to the slopes. The result does not include the second derivatives that the
+        stress causes.
 
         Args:
             deformation: Scaled deformation gradient F, shape (n_element, n_point, 2, 3). The last two axes are the
@@ -332,7 +334,8 @@ class Membrane:
 
         Returns:
             Second derivatives, shape (n_element, n_point, 2, 3, 2, 3). The last four axes are the coordinate and the
-            displacement component of the first slope, and those of the second slope.
+            displacement component of the first slope, followed by the coordinate and the displacement component of the
+            second slope.
         """
         strain_derivative = np.zeros((*deformation.shape, 3))
         strain_derivative[..., 0, :, 0] = deformation[..., 0, :]  # d E11 / d U_i,1
@@ -347,7 +350,7 @@ class Membrane:
 
 
 BENDING_SHIFT = 5.0
-"""Shift s of the linear solves with bending; see `Bending`.
+"""Shift s in the linear equations of a film that resists bending; see the class `Bending`.
 
 The shift must lie between 0 and 11.56, which is twice the lowest eigenvalue of the film.
 """
@@ -362,10 +365,10 @@ class Bending:
 
         integral( m phi ) = -integral( dot(grad W, grad phi) )   for every basis function phi.
 
-    This definition also clamps the slope at the rim, because it includes the basis functions on the rim (Ciarlet and
-    Raviart 1974). The integral of m phi is computed with the Gauss-Lobatto rule of the nodes. With the Gauss-Lobatto
-    rule, the matrix M of the integral is diagonal. The Laplacian is therefore m = -M^-1 L W, where L is the matrix of
-    the integral of dot(grad W, grad phi). The bending energy is beta / 2 * W L^T M^-1 L W.
+    The weak definition also clamps the slope at the rim, because the functions phi include the basis functions on the
+    rim (Ciarlet and Raviart 1974). The integral of m phi is computed with the Gauss-Lobatto rule, whose points are the
+    nodes. This rule makes the matrix M of the integral diagonal. The Laplacian is therefore m = -M^-1 L W, where L is
+    the matrix of the integral of dot(grad W, grad phi). The bending energy is beta / 2 * W L^T M^-1 L W.
 
     The matrix L^T M^-1 L couples elements that do not touch each other. In order to keep the matrix sparse, the linear
     solves have an additional unknown mu = sqrt(beta) M^-1 (L - s M) W at each node. The linear system for a right-hand
@@ -385,10 +388,10 @@ class Bending:
     """
 
     def __init__(self, mesh: PlacedMesh, stiffness: float) -> None:
-        """Take the matrices L and M of a mesh, from which the bending energy is computed.
+        """Store the matrices L and M of a mesh, which determine the bending energy.
 
         The matrix L contains the integrals of dot(grad p, grad q) for all pairs of basis functions p and q. The mass
-        matrix M contains the integrals of p q. With the quadrature rule of the nodes, M is diagonal.
+        matrix M contains the integrals of p q. The quadrature points are the nodes, so M is diagonal.
 
         Args:
             mesh: Mesh of the press.
@@ -403,8 +406,8 @@ class Bending:
     def _system_blocks(self) -> tuple[Array, Array, Array]:
         """Blocks (W, W), (W, mu) and (mu, mu) of the linear system, each of shape (n_element, n_local, n_local).
 
-        The class describes the linear system. The unknowns mu of interior nodes are eliminated: the Schur complement of
-        their equations is added to the block (W, W), and their coupling becomes zero.
+        The docstring of the class describes the linear system. The unknowns mu of interior nodes are eliminated. The
+        Schur complement of their equations is added to the block (W, W), and the coupling of these unknowns is zero.
         """
         mesh = self.mesh
         mass = np.eye(mesh.template.xi.size) * mesh.node_weights[:, None]  # M
@@ -425,7 +428,7 @@ class Bending:
         """Compute the Laplacian m = -M^-1 L W of the deflection W.
 
         The matrix L contains the integrals of dot(grad p, grad q) for all pairs of basis functions p and q. The mass
-        matrix M contains the integrals of p q. With the quadrature rule of the nodes, M is diagonal.
+        matrix M contains the integrals of p q. The quadrature points are the nodes, so M is diagonal.
 
         Args:
             deflection: Scaled deflection W at the nodes, shape (n_node,).
@@ -452,8 +455,9 @@ class Bending:
     def forces(self, deflection: Array) -> Array:
         """Compute the internal forces of the elements, which are the gradient of the bending energy.
 
-        The gradient of the energy beta / 2 * W L^T M^-1 L W is -beta L m, where m = -M^-1 L W is the Laplacian of the
-        deflection W, L and M are matrices of the mesh, and beta is the bending stiffness.
+        The bending energy is beta / 2 * W L^T M^-1 L W, where W is the deflection, L and M are matrices of the mesh,
+        and beta is the bending stiffness. The gradient of the energy is -beta L m, where m = -M^-1 L W is the Laplacian
+        of W.
 
         Args:
             deflection: Scaled deflection W at the nodes, shape (n_node,).
@@ -473,13 +477,14 @@ class Bending:
             [ sqrt(beta) (L - s M)        -M                     ] [mu] = [0],
 
         where r is the right-hand side for W, beta is the bending stiffness, L is the matrix of the weak Laplacian, and
-        M is the diagonal mass matrix. If mu is eliminated, K + beta L^T M^-1 L remains for W. The solution W therefore
-        does not depend on s, which is `BENDING_SHIFT`. With this s, the matrix can be factorised without pivoting. The
-        unknowns mu of the interior nodes have already been eliminated from the blocks that this method adds.
+        M is the diagonal mass matrix. If mu is eliminated, the matrix K + beta L^T M^-1 L remains for W. The solution W
+        therefore does not depend on the shift s. With the shift `BENDING_SHIFT`, the complete matrix can be factorised
+        without pivoting. The unknowns mu of the interior nodes have already been eliminated from the blocks that this
+        method adds.
 
         Args:
-            tangent: Matrices for (U1, U2, W, mu), shape (n_element, 4, n_local, 4, n_local). The entries of mu are
-                zero.
+            tangent: Matrices for (U1, U2, W, mu), shape (n_element, 4, n_local, 4, n_local). The entries that belong to
+                mu are zero before the call.
         """
         # The indices of the unknowns of a node are 0 for U1, 1 for U2, 2 for W and 3 for mu.
         deflection_block, coupling, auxiliary_block = self._system_blocks

@@ -10,10 +10,10 @@ amplitude. With Young's modulus E and the thickness h of the film, the dimension
 (Schwerin 1929; Timoshenko and Woinowsky-Krieger 1959, art. 19). The amplitude A is the solution of a cubic equation, in
 which the sum of the three terms equals F / (E h a). Between the three limiting cases, the cubic equation is a good
 approximation. The in-plane displacement is proportional to A^2. If the deflection is divided by a A, the scaled
-deflection is of order one. In the scaled equations, the only parameters of a press are the ratios of the three terms.
+deflection is of order one. The scaled equations depend on the press only through the ratios of the three terms.
 
 Stretching is always geometrically nonlinear and includes the pretension. *Bending* is the resistance of the film to a
-change of its curvature, and a theory may omit it. Bending is important near the rim and near the probe, and for the
+change of its curvature. A theory may omit bending. Bending is important near the rim and near the probe, and for the
 stress at the surfaces of the film. The effect of bending reaches as far as the bending length sqrt(D / N), where D is
 the bending stiffness and N is the tension force per length. If the pretension and the induced tension are small, the
 bending stiffness carries the load.
@@ -102,18 +102,18 @@ def elasticity(film: Film, angle: float) -> Array:
 
     The product of a strain (E11, E22, 2 E12) and the matrix is the stress (S11, S22, S12) in units of E, without the
     pretension. The moduli along the two axes of the film are E1 = E r and E2 = E / r, where r is the square root of
-    E1 / E2. Poisson's ratio nu is the geometric mean of the ratios along both axes. In the axes of the film, divided by
-    E, the matrix is
+    E1 / E2. Poisson's ratio nu is the geometric mean of the ratios along both axes. In the axes of the film, the matrix
+    is
 
         [ r    nu     0                     ]
         [ nu   1 / r  0                     ] / (1 - nu^2),
         [ 0    0      (1 - nu^2) shear / E  ]
 
-    where the shear modulus is E / (2 + 2 nu) unless the film has another shear modulus.
+    where `shear` is the shear modulus of the film. If the film specifies no shear modulus, the value is E / (2 + 2 nu).
 
     Args:
         film: The film.
-        angle: Angle of axis 1 of the strain and of the stress from the x axis, anticlockwise, rad.
+        angle: Angle from the x axis to axis 1 of the strain and the stress, anticlockwise, rad.
 
     Returns:
         Symmetric matrix, shape (3, 3), dimensionless.
@@ -140,7 +140,7 @@ def elasticity(film: Film, angle: float) -> Array:
 
 
 MEMBRANE_STIFFNESS = 1.6
-"""Ratio of force to deflection of a membrane with a large pretension, in units of pretension times thickness.
+"""Ratio of the force to the deflection for a membrane with a large pretension, in units of pretension times thickness.
 
 The value is 2 pi / ln(a / R) for a probe radius R = 0.02 a, where a is the radius of the film.
 """
@@ -149,13 +149,13 @@ AMBIENT_PRESSURE = 0.101325
 """Pressure of the atmosphere, MPa."""
 
 AIR_SHAPE = 0.6
-"""Square of the ratio of the displaced volume to the deflection of the centre, in units of a^4.
+"""Squared ratio of the displaced volume to the deflection of the centre, in units of a^4.
 
-The value is used in the first iterate of Newton's method. The radius of the film is a.
+Here, a is the radius of the film. The value is used to compute the first iterate of Newton's method.
 """
 
 PLATE_STIFFNESS = 16.0 * np.pi
-"""Ratio of force to deflection of a clamped plate under a central point load.
+"""Ratio of the force to the deflection for a clamped plate under a point load at its centre.
 
 The unit is the bending stiffness of the plate divided by a^2, where a is the radius of the plate.
 """
@@ -188,7 +188,8 @@ class DimensionlessGroups:
     In the descriptions of the attributes, E is Young's modulus, h is the thickness, and a is the radius of the film.
 
     Attributes:
-        squared_amplitude: Square A^2 of the amplitude A, by which the deflection in film radii is scaled.
+        squared_amplitude: Square A^2 of the amplitude A. The scaled deflection is the deflection in film radii divided
+            by A.
         load: Force divided by E h a A^3.
         tension: Mean pretension divided by E A^2.
         bending: Bending stiffness divided by E h a^2 A^2. Zero if the theory omits bending.
@@ -200,8 +201,8 @@ class DimensionlessGroups:
         side_load: Side force (Fx, Fy) divided by E h a A^2, in the axes of the press.
         static_pressure: Static pressure divided by E h A^3 / a, positive in the direction of the push.
         ambient_pressure: Pressure of the atmosphere divided by E h A^3 / a.
-        compression: Displaced share of the volume of the air behind the film, divided by the integral of the scaled
-            deflection W over the film. Zero if the back is vented.
+        compression: Factor that converts the integral of the scaled deflection W over the film into the displaced share
+            of the air volume behind the film. Zero if the back is vented.
     """
 
     squared_amplitude: float
@@ -294,8 +295,8 @@ class DimensionlessGroups:
     def static_height(self) -> float:
         """Approximate scaled deflection of the centre of the film under the static pressure, dimensionless.
 
-        The unit is that of `height`. The deflection H solves a cubic equation that is correct in three limits. For a
-        scaled pressure p, the limits are H^3 = 0.662^3 p for a membrane without pretension (Hencky 1915),
+        The value has the same unit as `height`. The deflection H solves a cubic equation that is correct in three
+        limits. For a scaled pressure p, the limits are H^3 = 0.662^3 p for a membrane without pretension (Hencky 1915),
         H = p / (4 tension) for a membrane with a large pretension, and H = p / (64 bending) for a plate.
         """
         # The cubic equation is cubic_factor H^3 + linear_factor H = p. The trapped air also resists the deflection. The
@@ -323,7 +324,7 @@ def side_force_unit(film: Film, squared_amplitude: Array | float) -> Any:
 
 
 def directional_stiffness(film: Film) -> Array:
-    """Compute the bending stiffness of a film in units of E h a^2 for bending in several directions, shape (5,).
+    """Compute the bending stiffness of a film in each of five directions, in units of E h a^2, shape (5,).
 
     Here, E is Young's modulus, h is the thickness and a is the radius of the film. The directions are evenly spaced
     over half a turn. Five directions determine the mean and the standard deviation over all directions exactly. The
@@ -336,10 +337,11 @@ def directional_stiffness(film: Film) -> Array:
 
 @lru_cache(maxsize=256)
 def bending_stiffness(film: Film) -> float:
-    """Compute the bending stiffness of a film in units of E h a^2, as a mean over all directions.
+    """Compute the mean bending stiffness of a film over all directions, in units of E h a^2.
 
-    Under a uniform pressure, an orthotropic plate bends like an isotropic plate with the mean stiffness (Timoshenko and
-    Woinowsky-Krieger 1959, art. 86).
+    Here, E is Young's modulus, h is the thickness and a is the radius of the film. Under a uniform pressure, an
+    orthotropic plate bends like an isotropic plate with the mean stiffness (Timoshenko and Woinowsky-Krieger 1959,
+    art. 86).
     """
     return float(directional_stiffness(film).mean())
 
@@ -347,10 +349,10 @@ def bending_stiffness(film: Film) -> float:
 def amplitude_squared(film: Film, force: Array | float) -> Any:
     """Compute the square A^2 of the amplitude of a press.
 
-    The amplitude A is the approximate deflection of the centre under a force at the centre, in film radii. It solves
-    the equation A^3 + linear_factor A = F / (E h a), where F is the force, E is Young's modulus, h is the thickness and
-    a is the radius of the film. The cubic term is the resistance of a membrane without pretension. The linear term is
-    the resistance of the pretension and of bending.
+    The amplitude A is the approximate deflection of the centre under a force at the centre, in film radii. The
+    amplitude A solves the equation A^3 + linear_factor A = F / (E h a), where F is the force, E is Young's modulus, h
+    is the thickness and a is the radius of the film. The cubic term is the resistance of a membrane without pretension.
+    The linear term is the resistance of the pretension and of bending.
 
     Args:
         film: The film.
@@ -384,16 +386,16 @@ def _cubic_root(linear_factor: float, right_side: Array | float) -> Any:
 
 
 ACCURACY = 1e-3
-"""Default target of the relative error of a charge, dimensionless."""
+"""Default target for the relative error of a charge, dimensionless."""
 
 INDUCED_STRAIN = 0.44
 """Radial strain at the rim of a membrane without pretension, in units of the squared amplitude A^2."""
 
 
 def bending_length(film: Film, force: float) -> float:
-    """Compute the distance from the clamped edge over which the film is bent, in film radii.
+    """Compute the width of the zone along the clamped edge in which the film is bent, in film radii.
 
-    The distance is sqrt(D / N), where D is the bending stiffness and N is the tension force per length at the edge.
+    The width is sqrt(D / N), where D is the bending stiffness and N is the tension force per length at the edge.
 
     Args:
         film: The film.

@@ -1,14 +1,14 @@
-"""Change of the pretension by the temperatures of a film and of its ring.
+"""Change of the pretension that the temperatures of a film and its ring cause.
 
 A film that is clamped in a ring cannot expand freely. If the film becomes warmer by dT and the ring by dR, the elastic
 strain along axis i of the film changes by
 
     strain_i = ring_expansion * dR - expansion_i * dT.
 
-The pretension changes by the stress that this change of the strain causes. The stress follows from the plane-stress
-stiffness of the film. A drawn film expands more across the drawn direction than along the drawn direction. The tension
-of a drawn film therefore becomes uneven. The temperature of a thin film follows the temperature of the air within
-seconds. The ring needs many minutes to reach the temperature of the air.
+The change of the pretension is the stress that the change of the strain causes. The stress follows from the
+plane-stress stiffness of the film. A drawn film expands more across the drawn direction than along the drawn direction.
+The tension of a drawn film therefore becomes uneven. The temperature of a thin film follows the temperature of the air
+within seconds. The ring needs many minutes to reach the temperature of the air.
 """
 
 from dataclasses import replace
@@ -47,11 +47,11 @@ def tension_change(film: Film, film_warming_K: float, ring_warming_K: float) -> 
 
 
 MAX_WARMING_K = 150.0
-"""Largest change of the temperature that is accepted, K. PVDF is used from about -40 to 110 degrees Celsius."""
+"""Largest accepted change of the temperature, K. PVDF is used from about -40 to 110 degrees Celsius."""
 
 
 def warming_limits(film: Film) -> tuple[float, float]:
-    """Return the smallest and the largest change of the temperature of a film that the simulator accepts, K.
+    """Return the smallest and the largest accepted change of the temperature of a film, K.
 
     If the film has expansion coefficients, its mean pretension must remain in the accepted range.
     """
@@ -65,7 +65,7 @@ def warming_limits(film: Film) -> tuple[float, float]:
 
 
 def warmed(sensor: Sensor, film_warming_K: float, ring_warming_K: float = 0.0) -> Sensor:
-    """Return a copy of a sensor, with its pretension at other temperatures of the film and its ring.
+    """Return a copy of a sensor with the pretension that results from other temperatures of the film and the ring.
 
     Args:
         sensor: The sensor at the temperatures for which it is described.
@@ -76,7 +76,7 @@ def warmed(sensor: Sensor, film_warming_K: float, ring_warming_K: float = 0.0) -
         The copy, which equals the sensor if the film has no expansion coefficients.
 
     Raises:
-        SensorError: If the film becomes so slack that it is outside the range of the simulator.
+        SensorError: If the film becomes too slack for the simulator.
     """
     film = sensor.film
     change_11, change_22, change_12 = tension_change(film, film_warming_K, ring_warming_K).tolist()
