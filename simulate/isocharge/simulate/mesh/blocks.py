@@ -35,10 +35,10 @@ class Resolution:
 
     Attributes:
         order: Polynomial order of the elements.
-        around: Number of elements around the innermost circle. It is rounded to the nearest multiple of 2 n, where n is
-            the number of corners of the core polygon.
-        rings: Number of rings between the innermost circle and the rim without the thin rings. The logarithm of the
-            radius increases by the same step in each ring.
+        around: Number of elements around the innermost circle. The number is rounded to the nearest multiple of 2 n,
+            where n is the number of corners of the core polygon.
+        rings: Number of rings between the innermost circle and the rim, not counting the thin rings. The logarithm of
+            the radius increases by the same step in each ring.
         rim: Number of thin rings at the rim, which resolve the boundary layer of bending.
     """
 
@@ -95,7 +95,7 @@ class Blocks:
         Args:
             resolution: Fineness of the mesh.
             topology: Number and kind of the blocks in and around the footprint.
-            whole: Whether to mesh the whole film although the footprint is symmetric.
+            whole: Whether to mesh the whole film even if the footprint is symmetric.
         """
         self.resolution = resolution
         self.topology = topology
@@ -154,9 +154,9 @@ class Blocks:
         of the edge before the first corner, the first corner, the middle of the next edge, and so on. The last end is
         the middle of the edge after the last corner of the meshed part.
 
-        The positions of the corners are not known here. Each end is therefore described by weights, with which it is a
-        sum of the corners and of the centroid. There is one row for each end. Its columns are the weights of the
-        corners, followed by the weight of the centroid.
+        The positions of the corners are not known here. Each end is therefore expressed as a weighted sum of the
+        corners and the centroid. Each row of the array contains the weights for one end: first the weights of the
+        corners, and then the weight of the centroid.
         """
         # The weights of a corner are 1 for the corner itself, and 0 for all other corners and for the centroid.
         corners = np.eye(self.n_corner, self.n_corner + 1)
@@ -169,8 +169,8 @@ class Blocks:
     def core_outline(self) -> Array:
         """Points at equal distances along each half edge of the core polygon, shape (n_sector + 1, n_corner + 1).
 
-        The points are the inner ends of the sides between the sectors. They are described by weights, as in
-        `half_edge_ends`.
+        The points are the inner ends of the lines that separate the sectors. Each point is expressed by the weights of
+        the corners and the centroid, as in `half_edge_ends`.
         """
         return divide_intervals(self.half_edge_ends.T, self.n_half_edge).T
 
@@ -183,8 +183,8 @@ class Blocks:
         and the centroid of the core polygon. The weights of a corner on a curved side are zero, because
         `Placement.sides` computes the curved sides.
 
-        The elements of the core polygon come first. One or two layers of `n_sector` elements each follow, which
-        surround the core polygon up to the innermost circle.
+        The elements of the core polygon come first. The elements of one or two layers around the core polygon follow,
+        with `n_sector` elements in each layer.
         """
         weights = np.zeros((self.n_inner, 4, self.n_corner + 1))
         weights[: self.n_quad] = self._core_element_corners()
@@ -202,12 +202,14 @@ class Blocks:
         The core polygon is divided into one quadrilateral for each of its corners. The inner side of a quadrilateral
         extends from the centroid of the core polygon to the middle of the edge after the corner. The outer side extends
         from the middle of the edge before the corner to the corner. A quadrilateral is divided into a square grid of
-        n_half_edge * n_half_edge elements. All points are described by weights, as in `half_edge_ends`.
+        n_half_edge * n_half_edge elements. All points are expressed by the weights of the corners and the centroid, as
+        in `half_edge_ends`.
 
         Returns:
             First and last corner of the inner side, and first and last corner of the outer side of each element, shape
-            (n_quad, 4, n_corner + 1). The last axis contains the weights of the corners and of the centroid of the core
-            polygon, whose weighted sum is the corner. The elements are ordered quadrilateral by quadrilateral.
+            (n_quad, 4, n_corner + 1). Each corner of an element is a weighted sum of the corners and the centroid of
+            the core polygon. The last axis contains the weights of this sum. The elements are ordered quadrilateral by
+            quadrilateral.
         """
         centroid = np.eye(self.n_corner + 1)[-1]  # has the weight 1 for itself
         middles = self.half_edge_ends[::2]
@@ -234,18 +236,19 @@ class Blocks:
         return by_quadrilateral.reshape(self.n_quad, 4, self.n_corner + 1)
 
     def rotated_elements(self, steps: int, steps_per_turn: int) -> Integers:
-        """Return how the elements are renumbered by a rotation of the probe that maps the mesh onto itself.
+        """Return the new numbers of the elements after a rotation of the probe, which must map the mesh onto itself.
 
         The mesh consists of the core polygon under the probe, and of layers and rings around it, which are divided into
-        sectors. In the core polygon, all elements at one corner are numbered before those at the next corner. The
-        sectors are numbered layer by layer and ring by ring, and anticlockwise within each layer or ring.
+        sectors. In the core polygon, all elements at one corner are numbered before the elements at the next corner.
+        The sectors are numbered layer by layer and ring by ring, and anticlockwise within each layer or ring.
 
         Args:
             steps: Number of steps by which the probe is rotated anticlockwise.
             steps_per_turn: Number of steps in a full turn.
 
         Returns:
-            For each element, the index of the element whose place it takes, shape (n_element,).
+            For each element, the index of the element that was at its new place before the rotation, shape
+            (n_element,).
         """
         # The rotation maps corners onto corners, so it is a rotation by a whole number of corners. At each corner, two
         # half edges meet, and each element along them begins a sector.

@@ -5,13 +5,11 @@ All lengths are in film radii, and all angles are in radians. The conformal map 
     Z = (z + c) / (1 + c z),   0 <= c < 1.
 
 The map converts points z of the template plane into film points Z in film radii. The probe lies on the positive x axis
-of the film. The map converts circles into circles. With the parameters
+of the film. The map converts circles into circles. The innermost circle of the mesh has the radius R and the centre p
+on the x axis. The map converts the circle |z| = r0 into the innermost circle if
 
     c  = tanh( (atanh(p + R) + atanh(p - R)) / 2 ),
-    r0 = tanh( (atanh(p + R) - atanh(p - R)) / 2 ),
-
-the map converts the circle |z| = r0 into the circle with the radius R and the centre p, which is the innermost circle
-of the mesh.
+    r0 = tanh( (atanh(p + R) - atanh(p - R)) / 2 ).
 """
 
 import math
@@ -64,7 +62,7 @@ def distance_coordinate(distance: Array | float) -> Any:
 
     If a press is near the clamp, the fields change strongly within the short distance between the press and the clamp.
     The coordinate stretches this short distance. Polynomials in the coordinate therefore interpolate the fields
-    accurately. The conformal map of the mesh is a translation along this coordinate.
+    accurately. In this coordinate, the conformal map of the mesh is a translation.
 
     Args:
         distance: Distances of presses from the centre of the film, in film radii.
@@ -76,7 +74,7 @@ def distance_coordinate(distance: Array | float) -> Any:
 
 
 def enclosing_circle(outline: Complexes, centroid: Array) -> tuple[Array, Array]:
-    """Compute for each footprint a circle on the film that encloses the footprint with a gap.
+    """Compute a circle on the film around each footprint, with a gap between the footprint and the circle.
 
     The centre of the circle is the centroid of the footprint if the circle keeps a minimum distance from the rim. If
     the circle would be too close to the rim, its centre is shifted towards the centre of the film. The smallest
@@ -110,7 +108,7 @@ def enclosing_circle(outline: Complexes, centroid: Array) -> tuple[Array, Array]
 
 
 def _enclosing_radius(outline: Complexes, centre: Array, rim_gap: Array) -> Array:
-    """Compute the radius of a circle that encloses a footprint with a gap. The centre of the circle is given.
+    """Compute the radius at which a circle around a given centre encloses a footprint with a gap.
 
     Args:
         outline: Points x + iy along the boundary of each footprint, shape (..., n), in film radii.
@@ -135,24 +133,24 @@ def sector_angles(
 ) -> Array:
     """Compute the angles at which the sides of the sectors meet the innermost circle of the mesh.
 
-    The innermost circle encloses the footprint of the probe. Its centre lies on the line from the centre of the film to
-    the centroid of the footprint, but not always at the centroid. The sectors divide the rings between this circle and
-    the rim of the film. The sides of the sectors begin where rays from the centroid meet the circle.
+    The innermost circle encloses the footprint of the probe. The centre of this circle lies on the line from the centre
+    of the film to the centroid of the footprint, but not always at the centroid. The sectors divide the rings between
+    this circle and the rim of the film. The sides of the sectors begin where rays from the centroid meet the circle.
 
     Args:
         blocks: The elements.
         inner_points: Points x + iy on the inner boundary of the last layer inside the circle, shape
-            (..., 2 * n_meshed_corner + 1), in film radii. They belong to the middles of the edges and to the corners of
-            the core polygon, which alternate.
+            (..., 2 * n_meshed_corner + 1), in film radii. The points belong alternately to the middle of an edge and to
+            a corner of the core polygon.
         centroid: Position of the centroid of the footprint on the x axis, shape (...), in film radii.
         centre: Position of the centre of the circle on the x axis, shape (...), in film radii.
         radius: Radius of the circle, shape (...), in film radii.
-        stretch: Factor with which `stretch_angles` converts angles on the circle into angles in the template plane,
+        stretch: Factor that `stretch_angles` uses to convert angles on the circle into angles in the template plane,
             shape (...).
 
     Returns:
-        Angles in the template plane, which the conformal map converts into the film. They increase, and have the shape
-        (..., n_sector + 1), rad.
+        Angles in the template plane in increasing order, shape (..., n_sector + 1), rad. The conformal map converts the
+        template plane into the film.
     """
     # Add an axis for the points or the rays.
     ray_origin = centroid[..., None]
@@ -174,7 +172,7 @@ def sector_angles(
 
 
 def _intersections_with_circle(origin: Array, ray: Complexes, radius: Array) -> Complexes:
-    """Compute the points at which rays from the inside of a circle meet the circle. The centre of the circle is 0.
+    """Compute the points at which rays that start inside a circle around the origin meet this circle.
 
     Args:
         origin: Positions of the origins of the rays on the x axis.
@@ -182,7 +180,7 @@ def _intersections_with_circle(origin: Array, ray: Complexes, radius: Array) -> 
         radius: Radii of the circles.
 
     Returns:
-        Points x + iy, in the common shape to which the shapes of all arguments are broadcast.
+        Points x + iy. Their shape results from broadcasting the arguments with each other.
     """
     # The length t of a ray is the positive solution of |origin + t ray|^2 = radius^2.
     projection = origin * ray.real
@@ -193,16 +191,16 @@ def _intersections_with_circle(origin: Array, ray: Complexes, radius: Array) -> 
 def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) -> Array:
     """Compute the directions of rays that extend from the centroid of the footprint to the innermost circle.
 
-    Outside the circle, each ray continues as the side of a sector. One ray belongs to each of the given points on an
-    inner boundary. This ray has the direction of the point, and is then rotated a little so that the rays become more
-    evenly spaced. All other rays divide the angle between two rays of points into equal parts.
+    Outside the circle, each ray continues as the side of a sector. One ray is assigned to each given point on an inner
+    boundary. This ray has the direction of the point, and is then rotated a little so that the rays become more evenly
+    spaced. Between the rays of two neighbouring points, further rays divide the angle into equal parts.
 
     Args:
         blocks: The elements.
         inner_points: Points x + iy on the inner boundary, relative to the centroid, shape (..., n_point). Middles of
             edges and corners of the inner boundary alternate.
-        radius_ratio: Radius of the innermost circle divided by the largest distance of these points from its centre,
-            shape (..., 1).
+        radius_ratio: Ratio of the radius of the innermost circle to the largest distance of the inner points from the
+            centre of the circle, shape (..., 1).
 
     Returns:
         Angles, shape (..., n_sector + 1), rad.
@@ -232,15 +230,15 @@ def _max_ray_rotation(inner_points: Complexes) -> Array:
 
     An element folds if a ray meets an edge of the boundary at a small angle and is then rotated too far. The largest
     rotation is therefore 0.2 (1 - |cos(t)|) rad, where t is the smallest angle between an edge and the ray to the
-    middle of this edge. The result is 0.2 rad if all these rays are perpendicular to their edges, as in a square. It is
-    zero if one of the rays is parallel to its edge.
+    middle of this edge. The result is 0.2 rad if all these rays are perpendicular to their edges, as in a square. The
+    result is zero if one of the rays is parallel to its edge.
 
     Args:
         inner_points: Points x + iy on the inner boundary, relative to the origin of the rays, shape (..., n_point).
             Middles of edges and corners of the boundary alternate, beginning and ending with a middle.
 
     Returns:
-        Angle, shape (..., 1), rad.
+        Largest rotation, shape (..., 1), rad.
     """
     middle = inner_points[..., :-1:2]  # without the last middle, which no corner follows
     corner_after_middle = inner_points[..., 1::2]
@@ -275,12 +273,12 @@ def rim_angles(angle: Array, map_parameter: Array, template_radius: Array) -> Ar
 
 
 def map_stretch(map_parameter: Array, radius: Array | float) -> Array:
-    """Compute the factor by which the inverse conformal map multiplies the tangents of half of the angles on a circle.
+    """Compute the factor by which the inverse conformal map multiplies tan(angle / 2) for the angles on a circle.
 
     The conformal map converts a circle around the origin of the template plane into a circle on the film. The angles on
-    the film are measured around the centre of this circle. The factor converts them into angles in the template plane
-    (`stretch_angles`). On the rim, the factor is also the ratio of lengths in the template plane to lengths on the
-    film, at the point of the rim that is next to the press.
+    the film are measured around the centre of this circle. The function `stretch_angles` uses the factor to convert
+    angles on the film into angles in the template plane. At the point of the rim that is next to the press, the factor
+    for the rim is also the ratio of lengths in the template plane to lengths on the film.
 
     Args:
         map_parameter: Parameter c of the conformal map, shape (...).
@@ -294,14 +292,14 @@ def map_stretch(map_parameter: Array, radius: Array | float) -> Array:
 
 
 def stretch_angles(angle: Array, factor: Array) -> Array:
-    """Change each angle such that the tangent of half of the angle is multiplied by a factor.
+    """Change each angle such that tan(angle / 2) is multiplied by a factor.
 
     The conformal map with the parameter c also changes angles in this way. For points at the distance r from the
-    origin, the map multiplies the tangent of half of the angle by (1 - c r) / (1 + c r). On the rim, r is 1.
+    origin, the map multiplies tan(angle / 2) by (1 - c r) / (1 + c r). On the rim, r is 1.
 
     Args:
         angle: Angles, shape (..., n), rad.
-        factor: Factor of the tangents, shape (...).
+        factor: Factor of tan(angle / 2), shape (...).
 
     Returns:
         Changed angles, shape (..., n), rad. Each angle remains in the same full turn.
@@ -312,7 +310,7 @@ def stretch_angles(angle: Array, factor: Array) -> Array:
 
 
 def ring_edges(resolution: Resolution, template_radius: Array, thin_ring_width: Array) -> Array:
-    """Compute the depths of the edges of the rings of a mesh, from 0 on the innermost circle to 1 on the rim.
+    """Compute the depths at which the rings of a mesh begin and end, from 0 on the innermost circle to 1 on the rim.
 
     The mesh is created in a unit disk, the template plane. The depth of a point is ln(r / r0) / ln(1 / r0), where r is
     the distance of the point from the origin, and r0 is the radius of the innermost circle. All rings except the thin

@@ -1,7 +1,8 @@
 """Deformation of the mesh of a circular film into the mesh of an oval film.
 
-The shape of an oval clamp is the complex number e exp(2 i alpha). In the direction `angle`, the rim of the film lies at
-the distance 1 + e cos(2 (angle - alpha)) from the centre, in film radii. The shape of a circular clamp is 0.
+The shape of an oval clamp is described by the complex number e exp(2 i alpha). In the direction `angle`, the rim of the
+film lies at the distance 1 + e cos(2 (angle - alpha)) from the centre, in film radii. For a circular clamp, the complex
+number is 0.
 
 The class `placement.Placement` displaces the footprint without a deformation, and deforms only the rings of the mesh.
 """
@@ -13,7 +14,9 @@ from isocharge.simulate.sensor.film import Film
 
 
 def film_oval(film: Film, direction: float | Array) -> Complexes:
-    """Return the shape e exp(2 i alpha) of the clamp of a film, with alpha measured from the direction of a press.
+    """Return the complex number e exp(2 i alpha) that describes the shape of the clamp of a film.
+
+    The angle alpha is measured from the direction of a press.
 
     Args:
         film: The film.
@@ -23,15 +26,17 @@ def film_oval(film: Film, direction: float | Array) -> Complexes:
 
 
 def oval_displacement(points: Complexes, oval: Complexes) -> Complexes:
-    """Return the displacement of points that deforms a circular film into an oval film.
+    """Return the displacements of points by which a circular film is deformed into an oval film.
 
     Each point is displaced in the radial direction. The displacement increases with the fifth power of the distance
     from the centre. The point of the rim in the direction `angle` is displaced by e cos(2 (angle - alpha)) film radii.
-    A point beyond the rim, which a search for electrode positions may examine, has the displacement of the rim.
+    A search for electrode positions may examine points beyond the rim. A point beyond the rim is displaced like the
+    point of the rim in the same direction.
 
     Args:
         points: Points x + iy of the circular film, any shape, in film radii.
-        oval: Shape of the clamp in the frame of the press, which broadcasts with the points.
+        oval: Complex number that describes the clamp in the frame of the press, of a shape that broadcasts with the
+            points.
 
     Returns:
         Displacements x + iy, same shape, in film radii.
@@ -43,15 +48,15 @@ def oval_displacement(points: Complexes, oval: Complexes) -> Complexes:
 
 
 def circular_distance(distance: Array, oval: Complexes, reach: float) -> Array:
-    """Convert the distance of a press from the centre of an oval film into its distance on the circular film.
+    """Convert the distance of a press from the centre of an oval film into the distance on the circular film.
 
-    The circular film is deformed into the oval film, which displaces the press in the radial direction. The
-    displacement increases with the fifth power of the distance. A footprint that touches the rim is displaced like the
-    rim, so it touches the rim of both films.
+    The deformation of the circular film into the oval film displaces the press in the radial direction. The
+    displacement increases with the fifth power of the distance. A footprint that touches the rim of the circular film
+    is displaced like the rim, so it also touches the rim of the oval film.
 
     Args:
         distance: Distance of the press from the centre of the oval film, any shape, in film radii.
-        oval: Shape of the clamp in the frame of the press, of the shape of `distance`.
+        oval: Complex number that describes the clamp in the frame of the press, of the shape of `distance`.
         reach: Distance from the centroid of the footprint to its farthest point, in film radii.
 
     Returns:

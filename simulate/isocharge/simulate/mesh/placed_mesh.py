@@ -1,7 +1,7 @@
 """Mesh of a press.
 
 The mesh consists of a template and the position of the template on the film. The integration rules for the elements are
-computed when they are needed first.
+computed only when they are first needed.
 """
 
 import math
@@ -28,7 +28,7 @@ from isocharge.simulate.sensor.film import Film
 from isocharge.simulate.sensor.footprint import Probe
 
 PRESSURE_POINTS = 32
-"""Number of integration points in each direction of an element for a pressure that is not uniform."""
+"""Number of integration points in each direction of an element if the pressure of the probe is not uniform."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class PlacedMesh:
 
     @property
     def stacked_gradient(self) -> Array:
-        """The array `gauss_gradient`, in which one axis contains all points and both derivatives at each point.
+        """Array `gauss_gradient` with the axes of the points and of the two coordinates joined into one axis.
 
         The shape is (n_element, n_point * 2, n_local).
         """
@@ -100,7 +100,7 @@ class PlacedMesh:
     def load(self) -> Array:
         """Share of the force of the probe that acts on each node, shape (n_node,).
 
-        The sum of all shares is one over the number of copies of the mesh that cover the film.
+        The shares add up to one divided by the number of copies of the mesh that cover the film.
         """
         template = self.template
         placement = self.placement
@@ -141,13 +141,13 @@ class PlacedMesh:
 
     @property
     def _element_rule(self) -> "_ElementRule":
-        """Integration rule on the reference element, whose points are the quadrature points."""
+        """Integration rule on the reference element, which defines the quadrature points."""
         order = self.resolution.order
         return _gauss_rule(order, order + 1)
 
     @property
     def shape_error(self) -> float:
-        """Prediction of the relative error of a charge from the shapes of the elements; infinite if one is folded.
+        """Relative error of a charge, predicted from the shapes of the elements; infinite if an element is folded.
 
         The elements approximate the conformal map by polynomials, so the area of the mesh differs slightly from the
         area of the film. The predicted error is the square root of the relative difference between both areas. In tests
@@ -217,11 +217,11 @@ def place(
         at: Centroid (x, y) of the footprint, mm.
         resolution: Fineness of the mesh.
         layer: Total width of the thin rings at the rim, in film radii.
-        whole: Whether to mesh the whole film although film and footprint are symmetric. A load that is not symmetric
-            requires such a mesh.
+        whole: Whether to mesh the whole film even if the film and the footprint are symmetric. A load that is not
+            symmetric requires a mesh of the whole film.
 
     Returns:
-        The mesh. It is rotated such that the press lies on the positive x axis.
+        The mesh, rotated such that the press lies on the positive x axis.
     """
     needs_whole_mesh = whole or not film.is_axisymmetric
     template = template_for(resolution, probe.topology, needs_whole_mesh)
@@ -241,7 +241,8 @@ class _ElementRule(NamedTuple):
     Attributes:
         values: Basis functions at the points, shape (n_point, n_local).
         derivatives: Derivatives of the basis functions with respect to (xi, eta) at the points, shape
-            (2, 1, n_point, n_local). The second axis is for the elements, for which the derivatives are the same.
+            (2, 1, n_point, n_local). The second axis has the length 1, because the derivatives are the same for all
+            elements.
         weights: Weights of the points, shape (n_point,).
     """
 
@@ -251,7 +252,7 @@ class _ElementRule(NamedTuple):
 
     @classmethod
     def of(cls, order: int, xi: Array, eta: Array, weights: Array) -> "_ElementRule":
-        """Evaluate the basis functions of elements of the given order at the points of a quadrature rule.
+        """Create the rule for elements of the given order from the points and weights of a quadrature rule.
 
         The coordinates xi and eta and the weights of the points each have the shape (n_point,).
         """
@@ -259,7 +260,7 @@ class _ElementRule(NamedTuple):
         return cls(values, derivatives[:, None], weights)  # one axis is added for the elements
 
     def film_weights(self, points: Complexes) -> Array:
-        """Compute the weights with which the rule integrates over the elements on the film.
+        """Compute the integration weights of the rule for the elements on the film.
 
         Args:
             points: Film points x + iy of the nodes of every element, shape (n_element, n_local), in film radii.
@@ -280,7 +281,7 @@ def _gauss_rule(order: int, points_per_side: int) -> _ElementRule:
 
 @lru_cache(maxsize=16)
 def _lobatto_rule(order: int) -> _ElementRule:
-    """Return the Gauss-Lobatto rule for elements of a given order, whose points are the nodes."""
+    """Return the Gauss-Lobatto rule, whose points are the nodes, for elements of a given order."""
     return _ElementRule.of(order, *tensor_rule(lobatto_nodes(order), lobatto_quadrature(order)))
 
 

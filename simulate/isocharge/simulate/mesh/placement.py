@@ -8,10 +8,11 @@ the element. The sides of the elements lie on the core polygon, on the boundary 
 circle. The edges of a polygonal footprint remain straight, so the load is integrated exactly over the footprint. The
 values of fields at the nodes are smooth functions of the position of the probe.
 
-The class `Placement` combines these steps for one or several presses on a circular film. If the clamp is oval, it then
-displaces the points. All points inside the innermost circle have the same displacement, so the footprint keeps its
-shape. In the rings, the displacement changes gradually into that of the rim (`oval.oval_displacement`). The function
-`template.locate_points` finds the element that contains a film point.
+The class `Placement` combines these steps for one or several presses on a circular film. If the clamp is oval, the
+class then displaces the points. All points inside the innermost circle have the same displacement, so the footprint
+keeps its shape. In the rings, the displacement changes gradually from the displacement of the footprint to the
+displacement of the rim (`oval.oval_displacement`). The function `template.locate_points` finds the element that
+contains a film point.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -35,24 +36,25 @@ from isocharge.simulate.sensor.footprint import CurvedProbe, Probe
 
 @dataclass(frozen=True)
 class Placement:
-    """Position of a template on the film. An object can contain several placements in the leading axes of its arrays.
+    """Position of a mesh template on the film, or several positions along the leading axes of the arrays.
 
     Attributes:
         map_parameter: Parameter c of the conformal map, shape (...).
         template_radius: Radius of the innermost circle in the template plane, shape (...).
         corners: Corners of the core polygon, followed by its centroid, as points x + iy of the circular film, in film
             radii, shape (..., n_corner + 1).
-        circle_angles: Angles of the sides of the sectors on the innermost circle in the template plane, shape
+        circle_angles: Angles at which the sides of the sectors meet the innermost circle in the template plane, shape
             (..., n_sector + 1), rad.
-        rim_angles: Angles of the sides of the sectors on the rim in the template plane, shape (..., n_sector + 1), rad.
+        rim_angles: Angles at which the sides of the sectors meet the rim in the template plane, shape
+            (..., n_sector + 1), rad.
         ring_depths: Depths of the edges of the rings, from 0 on the innermost circle to 1 on the rim, shape
             (..., n_ring + 1).
         rotation_and_scale: Complex factor for points of the footprint relative to its centroid, shape (...). The factor
             rotates the points by the additional rotation of the footprint, and converts them from mm to film radii.
         probe: The probe.
-        oval: Shape of the clamp in the frame of the press, shape (...); see the module `oval`.
+        oval: Complex number that describes the clamp in the frame of the press, shape (...); see the module `oval`.
         footprint_displacement: Displacement of the footprint from the circular film to the real film along the x axis,
-            shape (...), in film radii. It is zero if the clamp is circular.
+            shape (...), in film radii. The displacement is zero if the clamp is circular.
     """
 
     map_parameter: Array
@@ -85,13 +87,14 @@ class Placement:
         its points are displaced later.
 
         Args:
-            blocks: The elements. Their topology must be the topology of the probe.
+            blocks: The elements, which must have the topology of the probe.
             probe: The probe in the frame in which the press lies on the positive x axis.
             distance: Distance of the centroid of the footprint from the centre of the real film, any shape, mm.
             film_radius: Radius of the film, mm.
             thin_ring_width: Total width of the thin rings at the rim, in film radii.
             rotation: Additional rotation of the footprint, a number or of the shape of `distance`, rad.
-            oval: Shape of the clamp in the frame of the press, a number or of the shape of `distance`.
+            oval: Complex number that describes the clamp in the frame of the press, a number or of the shape of
+                `distance`.
         """
         # Compute the position of the centroid on the real film and on the circular film. Both are coordinates on the x
         # axis, because the press lies on this axis.
@@ -185,14 +188,14 @@ class Placement:
             template_points: Points x + iy of the template plane, shape (..., n).
 
         Returns:
-            Depths, shape (..., n). They are zero inside the innermost circle.
+            Depths, shape (..., n). The depth is zero inside the innermost circle.
         """
         with np.errstate(divide="ignore"):  # at the origin, the logarithm is infinite, and the depth is clipped to 0
             log_ratio = np.log(np.abs(template_points)) / np.log(self.template_radius)[..., None]
         return np.clip(1.0 - log_ratio, 0.0, 1.0)
 
     def displacement(self, points: Complexes, depth: Array) -> Complexes:
-        """Compute the displacements of points from a circular film to the real film, whose clamp may be oval.
+        """Compute the displacements that move points from a circular film to the real film, whose clamp may be oval.
 
         Args:
             points: Points x + iy of the circular film, shape (..., n), in film radii.
@@ -209,7 +212,7 @@ class Placement:
     def to_circular_film(self, points: Complexes) -> Complexes:
         """Convert points of the real film, whose clamp may be oval, into points of a circular film.
 
-        The displacement depends on the point of the circular film, so the point is found by a fixed-point iteration.
+        The displacement depends on the unknown point of the circular film, so a fixed-point iteration finds the point.
 
         Args:
             points: Points x + iy of the real film, shape (..., n), in film radii.
@@ -276,7 +279,7 @@ class Placement:
         return points
 
     def sides(self, blocks: Blocks, element: Integers, angular: Array) -> tuple[Complexes, Complexes]:
-        """Compute points of the inner and the outer side of elements inside the innermost circle.
+        """Compute points on the inner and outer sides of elements that lie inside the innermost circle.
 
         The object contains n placements, one for each element.
 
@@ -333,7 +336,7 @@ class Placement:
         return self.to_film(self.template_radius[:, None] * np.exp(1j * angle))
 
     def _ring_element_points(self, blocks: Blocks) -> Complexes:
-        """Compute the film points of the nodes of the elements between the innermost circle of the mesh and the rim.
+        """Compute the film points of the nodes in the rings, which lie between the innermost circle and the rim.
 
         Args:
             blocks: The elements.

@@ -1,4 +1,4 @@
-"""Mesh templates, which contain the elements of a mesh and the numbers of the nodes, and the search for points in them.
+"""Mesh templates with numbered nodes, and the search for the elements that contain given points.
 
 A template is the same for all positions of a probe. `locate_points` finds the elements that contain given film points.
 For points outside the innermost circle, the elements are computed by closed formulas. For points inside the innermost
@@ -22,9 +22,9 @@ from isocharge.simulate.sensor.footprint import FootprintTopology
 from isocharge.simulate.sensor.probe import RoundProbe
 
 SAMPLE_REACH = 0.1
-"""Reach of the footprint of the sample press, in film radii.
+"""Radius of the circular footprint of the sample press, in film radii.
 
-Nodes of different elements that coincide under the sample press are the same node.
+If nodes of different elements coincide under the sample press, they are the same node.
 """
 
 SAMPLE_DISTANCE = 0.1
@@ -36,7 +36,7 @@ SAMPLE_LAYER = 0.05
 
 @dataclass(frozen=True)
 class SampleProbe(RoundProbe):
-    """Probe of the sample press, whose circular footprint replaces another footprint with the same topology.
+    """Probe of the sample press, with a circular footprint that has the topology of another footprint.
 
     Attributes:
         radius: Radius of the circle, mm.
@@ -58,7 +58,7 @@ class Template(Blocks):
         nodes: Number of each node of each element, shape (n_element, (order + 1)^2).
         n_node: Number of nodes.
         first_occurrence: Index of the first occurrence of each node among the nodes of all elements, shape (n_node,).
-        is_interior: Whether each node of an element lies in its interior, shape ((order + 1)^2,).
+        is_interior: Whether each node of an element lies in the interior of the element, shape ((order + 1)^2,).
         on_rim: Whether each node lies on the rim, shape (n_node,).
         on_axis: Whether each node lies on the line of symmetry of a half mesh, shape (n_node,).
     """
@@ -71,7 +71,7 @@ class Template(Blocks):
         Args:
             resolution: Fineness of the mesh.
             topology: Number and kind of the blocks in and around the footprint.
-            whole: Whether to mesh the whole film although the footprint is symmetric.
+            whole: Whether to mesh the whole film even if the footprint is symmetric.
         """
         super().__init__(resolution, topology, whole)
         # No element is folded under the sample press. Therefore two nodes have the same position only if they are the
@@ -133,9 +133,9 @@ def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tu
 def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Complexes) -> tuple[Integers, Array]:
     """Find the elements that contain points between the innermost circle of the mesh and the rim of the film.
 
-    There, the mesh consists of rings, which are divided into sectors. The depth of a point determines its ring, and the
-    angle of the point determines its sector. The depth increases from 0 on the innermost circle to 1 on the rim, in
-    proportion to the logarithm of the distance from the origin of the template plane.
+    Between the circle and the rim, the mesh consists of rings, which are divided into sectors. The depth of a point
+    determines its ring, and the angle of the point determines its sector. The depth increases from 0 on the innermost
+    circle to 1 on the rim, in proportion to the logarithm of the distance from the origin of the template plane.
 
     Args:
         placement: Positions of the mesh under k presses, one for each row of points.
@@ -171,15 +171,14 @@ def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Comp
 
 
 def _locate_in_intervals(edges: Array, values: Array) -> tuple[Integers, Array]:
-    """Find the intervals that contain values. Values outside all intervals belong to the first or the last interval.
+    """Find the interval that contains each value. A value outside all intervals is assigned to the nearest interval.
 
     Args:
         edges: Edges of adjacent intervals in increasing order, shape (n_interval + 1, k, n) or (n_interval + 1, k, 1).
         values: The values, shape (k, n).
 
     Returns:
-        Index of the interval, and coordinate in the interval, which is 0 at its start and 1 at its end, each of shape
-        (k, n).
+        Index of the interval, and coordinate from 0 at the start to 1 at the end of the interval, each of shape (k, n).
     """
     # The index of the interval is the number of inner edges that do not exceed the value.
     index = np.sum(edges[1:-1] <= values, axis=0)
@@ -194,9 +193,9 @@ def _locate_inside(
 
     A straight line is drawn through each side of an element. The signed distance of a point from the line is positive
     if the point and the element lie on the same side of the line. For points inside an element with straight sides, the
-    smallest of the four distances is therefore positive. For each point, the elements are tried in the order of their
-    smallest distances, beginning with the largest. Most points lie in the first element that is tried. Near curved
-    sides, a further element may be needed.
+    smallest of the four distances is therefore positive. For each point, the elements are sorted by the smallest of
+    their four distances. The element with the largest value is tried first. Most points lie in the first element that
+    is tried. Near curved sides, further elements may have to be tried.
 
     Args:
         placement: n placements, one for each point.
@@ -239,8 +238,8 @@ def _inner_corners(placement: Placement, blocks: Blocks) -> Complexes:
         blocks: The elements.
 
     Returns:
-        Corners x + iy, shape (n, n_inner, 4), in film radii. They are the first and the last corner of the inner side,
-        and the first and the last corner of the outer side of each element.
+        Corners x + iy, shape (n, n_inner, 4), in film radii. The four corners of an element are the first and the last
+        corner of the inner side, and the first and the last corner of the outer side.
     """
     # The corners are the ends of the inner and the outer side, at the angular coordinates 0 and 1. The sides of all
     # elements are computed for each placement.
@@ -264,7 +263,8 @@ def _local_coordinates(placement: Placement, blocks: Blocks, points: Complexes, 
         element: Index of the element that contains each point, shape (n,).
 
     Returns:
-        Radial coordinate and angular coordinate, shape (2, n). They are between 0 and 1 for points inside the element.
+        Radial coordinate and angular coordinate, shape (2, n). Both coordinates are between 0 and 1 for points inside
+        the element.
     """
     step_size = 1e-5  # of the angular coordinate, for the derivative of the sides by central differences
     coordinates = np.full((2, points.size), 0.5)
@@ -299,7 +299,7 @@ def _overshoot(coordinates: Array) -> Array:
         coordinates: Radial and angular coordinates, shape (2, n).
 
     Returns:
-        Larger excess of the two coordinates, shape (n,). It is negative if both coordinates lie within the range.
+        Larger of the two excesses, shape (n,). The excess is negative if both coordinates lie within the range.
     """
     return np.asarray(np.abs(coordinates - 0.5).max(axis=0) - 0.5)
 
