@@ -32,7 +32,7 @@ class Rings:
 
     @classmethod
     def spread(cls, radius: float, rings: int = 100, angles: int = 180) -> "Rings":
-        """Create rings with equal distances between them. The outermost ring has the given radius.
+        """Create evenly spaced rings, the outermost of which has the given radius.
 
         The positions do not include the centre of the rings.
 
@@ -63,7 +63,7 @@ class Rings:
 
     @classmethod
     def _at(cls, distance: Array, direction: Complexes) -> "Rings":
-        """Return the positions at given distances, shape (n_ring,), and unit vectors x + iy, shape (n_angle,)."""
+        """Create rings from radii, shape (n_ring,), and from directions as unit vectors x + iy, shape (n_angle,)."""
         return cls(distance, to_corners(np.outer(distance, direction)))
 
     def contacts(self, force: float) -> Array:
@@ -97,14 +97,14 @@ def onto_disk(position: Array, radius: float) -> Array:
         radius: Radius of the disk, whose centre is the origin.
 
     Returns:
-        Positions within the disk or on its edge, same shape. Positions that were inside are unchanged.
+        Positions within the disk or on its edge, same shape. Positions inside the disk are unchanged.
     """
     relative_distance = np.linalg.norm(position, axis=-1, keepdims=True) / radius
     return np.asarray(position / np.maximum(1.0, relative_distance))
 
 
 def contacts_at(position: Array, force: float) -> Array:
-    """Return contacts (x, y, F), shape (n, 3), at positions (x, y), shape (n, 2), which all have the same force F."""
+    """Return contacts (x, y, F), shape (n, 3), with the same force F at all positions (x, y), shape (n, 2)."""
     return np.column_stack([position, np.full(len(position), force)])
 
 

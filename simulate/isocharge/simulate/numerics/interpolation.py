@@ -34,13 +34,13 @@ def lobatto_nodes(order: int) -> Array:
 def lobatto_quadrature(order: int) -> Array:
     """Return the quadrature weights of the Gauss-Lobatto-Legendre nodes on the interval [-1, 1].
 
-    The rule integrates every polynomial of degree 2 * order - 1 or less exactly.
+    The rule is exact for every polynomial up to the degree 2 * order - 1.
 
     Args:
         order: Order of the nodes that `lobatto_nodes` returns.
 
     Returns:
-        Weights, shape (order + 1,). They add up to 2, the length of the interval.
+        Weights, shape (order + 1,). The weights add up to 2, the length of the interval.
     """
     return _read_only(2.0 / (order * (order + 1) * eval_legendre(order, lobatto_nodes(order)) ** 2))
 
@@ -94,8 +94,8 @@ def divide_intervals(ends: Array, count: int) -> Array:
 def lagrange_values(nodes: Array, points: Array) -> Array:
     """Evaluate the Lagrange polynomials of given nodes.
 
-    The polynomial of a node is 1 at this node and 0 at all other nodes. The polynomial is the product of (x - y) /
-    (node - y) over all other nodes y.
+    The polynomial of a node is 1 at this node and 0 at all other nodes. At a point x, the polynomial is the product of
+    (x - y) / (node - y) over all other nodes y.
 
     Args:
         nodes: Interpolation nodes, shape (n,).
@@ -208,11 +208,11 @@ def gauss_reference_square(count: int) -> tuple[Array, Array, Array]:
 
 
 def tensor_rule(points: Array, weights: Array) -> tuple[Array, Array, Array]:
-    """Return the rule for the square [-1, 1]^2 that is the product of two equal rules for the interval [-1, 1].
+    """Return the quadrature rule for the square [-1, 1]^2 that combines two equal rules for the interval [-1, 1].
 
     Args:
         points: Points of the rule for the interval, shape (n,).
-        weights: Weights of these points, shape (n,).
+        weights: Weights of the points, shape (n,).
 
     Returns:
         Coordinates xi and eta of the points, and the weights of the points, each of shape (n^2,). The coordinate xi
@@ -224,19 +224,19 @@ def tensor_rule(points: Array, weights: Array) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True)
 class Turns:
-    """Directions of presses and rotations of a probe at which presses are solved.
+    """Pairs of a press direction and a probe rotation for which presses are solved.
 
     On a film that is not axisymmetric, the stress depends on the direction from the centre of the film to the press.
     Under a probe that is not axisymmetric, the stress also depends on the rotation of the probe relative to this
-    direction. A turn is a pair of these two angles. In a frame that rotates with the probe, the stress at a node of the
-    mesh is the Fourier series
+    direction. A turn consists of a direction and a rotation. In a frame that rotates with the probe, the stress at a
+    node of the mesh is the Fourier series
 
         sum c_mk exp(i (2 m d + k r)),
 
     where r is the rotation, and d is the direction plus the rotation. The film is the same after half a turn about its
     centre, so only the even harmonics of d occur. The coefficients decrease like u^|m| p^|k|, where u is the unevenness
     of the film, and p is the size of the probe divided by its distance from the rim. Both numbers are less than 1.
-    Therefore the series is cut off at a smaller |k| if |m| is larger.
+    Therefore the largest |k| in the series decreases if |m| increases.
 
     The presses are solved at the points of a lattice of rank one: the rotations r are evenly spaced over a full turn,
     and d increases by the same step from each rotation to the next. The step is chosen such that no two terms of the
@@ -244,14 +244,14 @@ class Turns:
 
     Attributes:
         direction: Directions from the centre of the film to the presses, plus the rotation of a probe that is not
-            axisymmetric, shape (n_turn,), rad. They are zero if the film is axisymmetric, or if the probe keeps its
-            orientation on the film.
+            axisymmetric, shape (n_turn,), rad. The directions are zero if the film is axisymmetric, or if the probe
+            keeps its orientation on the film.
         rotation: Rotations of the probe relative to the direction of the press, evenly spaced over a full turn, shape
-            (n_turn,), rad. They are zero if the probe is axisymmetric.
+            (n_turn,), rad. The rotations are zero if the probe is axisymmetric.
         harmonics: Pairs (2 m, k) of the terms of the Fourier series, shape (n_term, 2).
         symmetry_order: Order of the rotational symmetry of the probe: the number of rotations within a full turn that
-            map the probe onto itself. Only the first n_turn / symmetry_order turns are solved. The other turns
-            describe the same presses, with the probe rotated by some of its periods.
+            map the probe onto itself. Only the first n_turn / symmetry_order turns are solved. The other turns describe
+            the same presses, with the probe rotated by one or more periods of its symmetry.
     """
 
     direction: Array
@@ -267,11 +267,11 @@ class Turns:
         of this direction and the rotation. The term (m, k) of the series is proportional to exp(i (2 m d + k r)).
 
         Args:
-            largest_harmonics: Largest |k| of the terms of the series for |m| = 0, 1, 2, and so on. Without directions,
-                only m = 0 is used. For an axisymmetric probe, only k = 0 is used.
+            largest_harmonics: Largest |k| of the terms of the series for |m| = 0, 1, 2, and so on. If the direction
+                does not vary, only m = 0 is used. For an axisymmetric probe, only k = 0 is used.
             period: Smallest rotation that maps the probe onto itself, rad; 0 if the probe is axisymmetric.
-            has_directions: Whether the angle d varies. It does not vary if the film is axisymmetric, so that d has no
-                effect, or if the probe keeps its orientation on the film, so that d is zero.
+            has_directions: Whether the angle d varies. On an axisymmetric film, d has no effect and does not vary. If
+                the probe keeps its orientation on the film, d is always zero.
         """
         # Choose the terms (m, k) of the series. A real function needs the term (-m, -k) for each term (m, k).
         has_rotations = period > 0.0
@@ -301,16 +301,16 @@ class Turns:
         return list(zip(self.direction[:n_solved].tolist(), self.rotation[:n_solved].tolist(), strict=True))
 
     def weights(self, direction: Array, rotation: Array) -> Array:
-        """Compute the weights with which the values at all turns are interpolated at other presses.
+        """Compute the weights that interpolate a value from all turns to the angles of given presses.
 
         A turn is a pair of angles, a direction and a rotation, at which presses are solved. Let a be the angles of a
         press, and b_j the angles of the turn j. A value v depends on the angles like the Fourier series
 
             v(a) = sum over h of c_h exp(i h.a),
 
-        where h is a pair of integers in `harmonics`. The turns are the points of a lattice on which the terms are
-        orthogonal, so that c_h is the mean of v(b_j) exp(-i h.b_j) over all turns. The value at the press is therefore
-        the sum of w_j v(b_j) with the weights
+        where h is a pair of integers in `harmonics`. The turns are the points of a lattice on which the terms of the
+        series are orthogonal. The coefficient c_h is therefore the mean of v(b_j) exp(-i h.b_j) over all turns. The
+        value at the press follows as the sum of w_j v(b_j) with the weights
 
             w_j = (sum over h of exp(i h.a) exp(-i h.b_j)) / n_turn.
 
@@ -335,7 +335,7 @@ class Turns:
 
 
 def _smallest_lattice(term_orders: Integers, symmetry_order: int) -> tuple[int, int]:
-    """Find the fewest turns at which no two terms of a Fourier series have the same values.
+    """Find the smallest number of turns at which no two terms of a Fourier series have the same values.
 
     A turn is a pair of two angles: the rotation r of the probe relative to the direction of the press, and the sum d of
     this direction and the rotation. The n turns form a lattice with the step s. The turn j has the angles
@@ -346,14 +346,14 @@ def _smallest_lattice(term_orders: Integers, symmetry_order: int) -> tuple[int, 
 
         exp(i (2 m d + k r)) = exp(2 pi i (m s + k) j / n)
 
-    at the turn j. The value does not change if n is added to m s + k. Two terms with the same remainder of m s + k
-    after the division by n therefore have the same values at all turns, so that their coefficients cannot be
+    at the turn j. The value does not change if n is added to m s + k. If the division of m s + k by n leaves the same
+    remainder for two terms, the terms have the same values at all turns. Their coefficients can then not be
     distinguished. The remainders of all terms must be different.
 
-    Only the turns of one period of the probe are solved, which is 2 pi / q for a probe with the symmetry order q. In
-    each further period, the directions d - r must be the same except for half turns, which do not change the film.
-    During one period, d - r increases by pi s / q - 2 pi / q = pi (s - 2) / q. The difference s - 2 must therefore be a
-    multiple of q.
+    Presses are solved only at the turns within one period of the probe. The period of a probe with the symmetry order q
+    is 2 pi / q. In each further period, the directions d - r must be the same, or differ by half turns, which do not
+    change the film. During one period, d - r increases by pi s / q - 2 pi / q = pi (s - 2) / q. The difference s - 2
+    must therefore be a multiple of q.
 
     Args:
         term_orders: Pairs (m, k) of the terms, shape (n_term, 2).

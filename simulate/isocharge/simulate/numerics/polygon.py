@@ -29,7 +29,7 @@ The length of a mitre is proportional to 1 / (1 + cos(angle)). The largest allow
 
 
 def area_of(corners: Array) -> float:
-    """Compute the signed area of a polygon by the shoelace formula. It is positive if the corners are anticlockwise.
+    """Compute the signed area of a polygon by the shoelace formula; positive if the corners are anticlockwise.
 
     Args:
         corners: Corners (x, y), shape (n, 2).
@@ -73,7 +73,7 @@ def to_corners(z: Complexes) -> Array:
 
 
 def cross_product(first: Complexes, second: Complexes) -> Array:
-    """Compute the cross products of plane vectors x + iy. They are positive if `second` is anticlockwise of `first`."""
+    """Compute the cross products of plane vectors x + iy; positive if `second` is anticlockwise of `first`."""
     return (np.conj(first) * second).imag
 
 
@@ -81,12 +81,12 @@ def area_in_disk(corners: Complexes, centre: complex, radius: Array | float) -> 
     """Compute the area that a polygon has in common with each of several concentric disks.
 
     Each edge of the polygon forms a triangle with the centre of the disk. The area of a triangle counts as positive if
-    its edge runs anticlockwise around the centre, and as negative otherwise. The sum of these areas is the area of the
-    polygon. In the same way, the sum of the areas that the triangles and the disk have in common is the common area of
-    the polygon and the disk.
+    its edge runs anticlockwise around the centre, and as negative otherwise. The sum of the signed areas of all
+    triangles is the area of the polygon. In the same way, the signed areas that the triangles share with the disk add
+    up to the area that the polygon shares with the disk.
 
     The part of an edge inside the circle is a chord. Between the centre and the chord, the common area is a triangle.
-    Between the centre and a part of an edge outside the circle, before or after the chord, it is a circular sector.
+    Before and after the chord, the edge lies outside the circle, and the common area is a circular sector.
 
     Args:
         corners: Corners x + iy, anticlockwise, shape (n,).
@@ -127,12 +127,12 @@ def gauss_quadrilaterals(corners: Complexes, line_area: Array, count: int) -> tu
     """Compute the points and weights of a Gauss rule for each of several quadrilaterals, triangles and lines.
 
     A bilinear function maps the points of the rule for the unit square into each quadrilateral. The weights are
-    multiplied by the determinant of the Jacobian of this function. For a line, the determinant is zero, and the weights
-    are multiplied by the area that the line represents instead.
+    multiplied by the determinant of the Jacobian of the bilinear function. For a line, the determinant is zero. The
+    weights of a line are therefore multiplied by the area that the line represents.
 
     Args:
-        corners: Corners x + iy, anticlockwise, shape (n, 4). The last two corners of a triangle are equal. A line is a
-            quadrilateral whose first and last corners are equal, and whose second and third corners are equal.
+        corners: Corners x + iy, anticlockwise, shape (n, 4). The last two corners of a triangle are equal. In a line,
+            the first corner equals the last corner, and the second corner equals the third corner.
         line_area: Area that a line represents, shape (n,); zero for a quadrilateral or a triangle.
         count: Number of points along a side.
 
@@ -159,13 +159,14 @@ def gauss_quadrilaterals(corners: Complexes, line_area: Array, count: int) -> tu
 
 
 def halve_quadrilaterals(corners: Complexes) -> Complexes:
-    """Divide each quadrilateral into two, by a line between the middles of its longest side and of the opposite side.
+    """Divide each quadrilateral by a line from the middle of its longest side to the middle of the opposite side.
 
     Args:
         corners: Corners x + iy, anticlockwise, shape (n, 4).
 
     Returns:
-        Corners x + iy, shape (2 n, 4): first one half of all quadrilaterals, and then the other half.
+        Corners x + iy of the halves, shape (2 n, 4). The first n rows contain one half of each quadrilateral, and the
+        last n rows contain the other half.
     """
     # Renumber the corners such that the longest side is the first side, between the first and the second corner, or the
     # third side, between the third and the fourth corner.
@@ -185,7 +186,7 @@ def halve_quadrilaterals(corners: Complexes) -> Complexes:
 
 
 def is_simple(corners: Array) -> bool:
-    """Return whether the corners of a polygon are in anticlockwise order and the polygon does not cross itself.
+    """Return whether a polygon does not cross itself and has its corners in anticlockwise order.
 
     The function compares the signed area of the polygon with the area that the polygon covers. The two areas differ if
     the polygon covers a region twice or encloses a region clockwise. A polygon that touches itself at a point or along
@@ -207,10 +208,10 @@ def union_triangles(
 
     Args:
         front: Simple polygons, each of shape (n, 2), mm.
-        back: Further simple polygons, each of shape (n, 2), mm. If there are any, the function divides the intersection
-            of the union of `front` and the union of `back`.
+        back: Further simple polygons, each of shape (n, 2), mm. If `back` is not empty, the function divides only the
+            region that `front` and `back` have in common.
         max_side: Largest length of the sides that lie on the outline of the divided region, mm. Longer sides of the
-            outline are divided first.
+            outline are divided before the triangles are formed.
 
     Returns:
         Triangles with anticlockwise corners, each of shape (3, 2), mm.
