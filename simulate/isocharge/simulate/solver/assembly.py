@@ -13,14 +13,15 @@ template, U2 is zero if the field is even, and all unknowns except U2 are zero i
 
 The trapped air behind the film resists deflections that compress the air. The stiffness matrix of the air is c v v',
 where c is a number. The vector v contains the weights with which the deflections of the nodes contribute to the
-displaced volume. The matrix c v v' couples all nodes, but has only rank one. Therefore the system (K + c v v') x = b
-can be solved with the factorisation of the sparse matrix K (Sherman and Morrison 1950). The solution is
+displaced volume. The matrix c v v' couples all nodes, but has only rank one. Let K be the sparse matrix of the film
+without the air. The system (K + c v v') x = b can be solved with the factorisation of K alone (Sherman and Morrison
+1950). The solution is
 
     x = K^-1 b - y c (v' K^-1 b) / (1 + c v' y),   y = K^-1 v.
 
 Fields that are odd about the line of symmetry do not change the volume of the air. For these fields, the matrix is K.
 
-The dense matrices are small. `single_threaded_blas` limits the threads of all computations with such matrices.
+The dense matrices are small. The function `single_threaded_blas` limits computations with small matrices to one thread.
 """
 
 from collections.abc import Callable
@@ -39,8 +40,8 @@ from isocharge.simulate.mesh.template import Template
 SolveTangent = Callable[[Array], Array]
 """Function that solves a linear system with a factorised tangent for the displacements at the nodes.
 
-The argument is the right-hand side for (U1, U2, W) at the nodes, and the result is the solution, both of the shape
-(n_node, 3). Fixed unknowns are zero.
+The argument is the right-hand side for (U1, U2, W) at the nodes, and the result is the solution. Both have the shape
+(n_node, 3). In the solution, fixed unknowns are zero.
 """
 
 
@@ -99,9 +100,9 @@ class Assembly:
     def _elimination_order(self) -> Integers:
         """Return an order of the skeleton unknowns in which the factors of their matrix have few nonzero entries.
 
-        The order is computed by the minimum-degree method. SuperLU returns it only after a factorisation. Therefore a
-        matrix is factorised that has the pattern of the skeleton matrix and a dominant diagonal, because such a matrix
-        needs no pivoting.
+        The order is computed by the minimum-degree method. SuperLU returns the order only after a factorisation.
+        Therefore an auxiliary matrix is factorised, which has the pattern of the skeleton matrix. The auxiliary matrix
+        needs no pivoting, because its diagonal is dominant.
 
         Returns:
             Indices into `skeleton` in the order of elimination, shape (n_skeleton,).
@@ -115,11 +116,12 @@ class Assembly:
         """Determine which entries of the skeleton matrix may be nonzero, and where the element matrices are added.
 
         The skeleton matrix is the matrix of the unknowns in `skeleton`, and is the sum of the matrices of all elements.
-        Only the entries that may be nonzero are stored, in an array that is ordered column by column, and within a
+        Only the entries that may be nonzero are stored. They form an array that is sorted by columns, and within each
         column by rows (compressed sparse column format). The method sets three attributes:
 
         - `_entry_positions`: Position in this array to which each entry of each element matrix is added. Entries of
-          fixed unknowns do not belong to the skeleton matrix. Their position is behind the last nonzero entry.
+          fixed unknowns do not belong to the skeleton matrix. Such entries have the position after the last nonzero
+          entry.
         - `_indices`: Row of each nonzero entry.
         - `_indptr`: Position at which each column begins, followed by the number of nonzero entries.
         """
@@ -136,10 +138,9 @@ class Assembly:
         column = np.broadcast_to(side_numbers[:, None, :], shape)
         is_free = (row >= 0) & (column >= 0)
 
-        # Compute the index that each entry would have if all entries of the skeleton matrix, with the zeros, were
-        # stored column by column. The sorted different indices belong to the nonzero entries, in the order in which
-        # these are stored. Several entries of element matrices may belong to the same nonzero entry, to which they are
-        # added.
+        # Compute the index that each entry would have if all entries of the skeleton matrix, including zeros, were
+        # stored column by column. The distinct indices in ascending order belong to the nonzero entries in their stored
+        # order. Several entries of element matrices may be added to the same nonzero entry.
         dense_index = column[is_free] * n_skeleton + row[is_free]
         nonzero_index, stored_position = np.unique(dense_index, return_inverse=True)
         positions = np.full(shape, nonzero_index.size, dtype=np.intp)  # the position of the entries of fixed unknowns
@@ -156,7 +157,7 @@ class Assembly:
         """Factorise the matrix of the mesh, which is the sum of the matrices of its elements.
 
         The unknowns in the interior of an element belong to this element only. Interior unknowns are eliminated element
-        by element, so that a sparse matrix of the other unknowns remains, the skeleton matrix.
+        by element. The sparse matrix of the remaining unknowns is the skeleton matrix.
 
         Args:
             matrix: Symmetric element matrices, shape (n_element, unknowns_per_node, n_local, unknowns_per_node,
@@ -179,8 +180,8 @@ class Assembly:
         side_block = element_matrix[:, sides[:, None], sides]  # C
         schur_complement = side_block - coupling.transpose(0, 2, 1) @ reduced_coupling
 
-        # Add the Schur complements of all elements. All entries of fixed unknowns are added to a further number behind
-        # the nonzero entries, which is not used.
+        # Add the Schur complements of all elements. All entries of fixed unknowns are added to an unused number after
+        # the nonzero entries.
         entry_count = self._indices.size + 1
         skeleton_entries = np.bincount(self._entry_positions, schur_complement.ravel(), entry_count)[:-1]
         skeleton_factor = factorise(self._skeleton_matrix(skeleton_entries), "NATURAL")

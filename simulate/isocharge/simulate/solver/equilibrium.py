@@ -32,7 +32,7 @@ from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.solver.newton import NewtonResult
 
 SURFACE_HEIGHT = {"middle": 0.0, "top": 1.0, "bottom": -1.0}
-"""Height of each surface above the mid-surface in half thicknesses, positive towards the probe."""
+"""Height of each surface above the mid-surface in units of half the film thickness, positive towards the probe."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class Equilibrium(NewtonResult):
         groups: Dimensionless groups of the press.
         seconds: CPU time of the process for meshing and solving, s.
         proven_error: Relative difference of the charges between this mesh and a mesh whose order is lower by one; None
-            if only one mesh was solved.
+            if the press was solved on one mesh only.
         rest: Equilibrium on the same mesh before the contact, under the static pressure alone; None if there is no
             static pressure. The touch stress does not include the stress of this equilibrium.
     """
@@ -113,7 +113,8 @@ def deflection(equilibrium: Equilibrium, points: Array) -> Array:
         SceneError: If a point lies outside the film.
     """
     mesh = equilibrium.mesh
-    # The last value states which points are reflected to the meshed part. A reflection does not change the deflection.
+    # The last value, which is not needed, states which points were reflected into the meshed part. A reflection does
+    # not change the deflection.
     element, xi, eta, _ = _locate(equilibrium, points)
     basis_values = tensor_values(mesh.resolution.order, xi, eta)  # shape (n, n_local)
     nodal_field = equilibrium.field[mesh.template.nodes[element]]  # (U1, U2, W), shape (n, n_local, 3)
@@ -128,8 +129,8 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
     Args:
         equilibrium: The solved press.
         points: Points (x, y) on the film, shape (n, 2), mm.
-        surface: Surface of the film at which the stress is computed. The probe touches the surface "top". The bending
-            stress is included even if the theory neglects the resistance of the film to bending.
+        surface: Surface of the film at which the stress is computed. The probe touches the surface "top". At an outer
+            surface, the bending stress is included even if the theory neglects the bending stiffness of the film.
 
     Returns:
         Stress (s11, s22, s12) in the axes of the film, shape (n, 3), MPa, tension positive.
@@ -177,13 +178,14 @@ def _induced_stress(equilibrium: Equilibrium, surface: Surface, derivatives_of: 
     """Compute the scaled induced stress at some points of the elements.
 
     The induced stress is the stress that the probe and the static pressure add to the pretension. At an outer surface,
-    it includes the bending stress.
+    the induced stress includes the bending stress.
 
     Args:
         equilibrium: The solved press.
         surface: Surface of the film at which the stress is computed. The probe touches the surface "top".
-        derivatives_of: Function that computes the derivatives of fields with respect to (X1, X2) at the points, shape
-            (..., 2, k), from the values of the fields at the nodes of every element, shape (n_element, n_local, k).
+        derivatives_of: Function that computes the derivatives of fields at the points. Its argument contains the values
+            of the fields at the nodes of every element, shape (n_element, n_local, k). It returns the derivatives with
+            respect to (X1, X2), shape (..., 2, k).
 
     Returns:
         Stress (S11, S22, S12) in units of E_young A^2, shape (..., 3).
@@ -228,9 +230,9 @@ def _continuous_slope(equilibrium: Equilibrium) -> Array:
     """Compute a slope of the deflection that is continuous from element to element.
 
     The slope that follows from the solved deflection has small jumps between the elements. The derivatives of the slope
-    within the elements do not contain these jumps. The mean bending stress of an electrode would therefore be wrong
-    near the edge of the footprint. Therefore, the slope at a node is the mean of the slopes of all elements that share
-    the node. The slope is zero at the clamped rim.
+    within the elements do not contain these jumps. If these derivatives were used, the mean bending stress of an
+    electrode would be wrong near the edge of the footprint. Therefore, the slope at a node is set to the mean of the
+    slopes in all elements that share the node. The slope is zero at the clamped rim.
 
     Args:
         equilibrium: The solved press.
@@ -313,7 +315,7 @@ PATCH_RING_RADII = (0.0, 0.1, 0.22, 0.4, 0.6, 0.8)
 
 
 def relative_difference(solved: Equilibrium, reference: Equilibrium) -> float:
-    """Compute the largest relative difference of an equilibrium from another equilibrium of the same press.
+    """Compute the largest relative difference between the charges of two equilibria of the same press.
 
     The function compares the charges that square patches of the film would collect. The charges are compared for a
     biaxial film and for a uniaxial film. The patches lie on rings around the centre of the film, and on a ring around
@@ -321,8 +323,8 @@ def relative_difference(solved: Equilibrium, reference: Equilibrium) -> float:
     the same ring.
 
     Args:
-        solved: The equilibrium.
-        reference: The other equilibrium. The differences are relative to its charges.
+        solved: The first equilibrium.
+        reference: The second equilibrium. The differences are relative to the charges of this equilibrium.
 
     Returns:
         Relative difference, dimensionless.

@@ -1,13 +1,14 @@
 """Estimates of the errors of a solved press, warnings, and a summary of its results.
 
-In the inner part of the film, the shapes of the elements determine whether a mesh is fine enough. The shapes are not
-sufficient for presses near the rim or for large footprints that are not circular. Under such presses, elements that are
-too coarse may lie far from the elements with the largest stress. The shapes are not sufficient for a pressure on the
-whole film, either, because the pressure also bends the large elements far from the probe. The module `press` therefore
-solves these presses on meshes of increasing polynomial order, until two successive meshes result in nearly the same
-charges. The module also does so if the required accuracy is better than the default accuracy. If the polynomial order
-of the elements increases by one, the error decreases by a factor of three to ten. The difference between the charges of
-two successive meshes is therefore an upper bound of the error on the finer mesh.
+In the inner part of the film, the shapes of the elements show whether a mesh is fine enough. The shapes are not a
+sufficient criterion for presses near the rim, or for large footprints that are not circular. Under such presses,
+elements that are too coarse may lie far from the elements with the largest stress. The shapes are also insufficient for
+a pressure on the whole film, because this pressure also bends the large elements far from the probe. The module `press`
+therefore solves these presses on meshes of increasing polynomial order, until two successive meshes result in nearly
+the same charges. The module solves all other presses in the same way if the required accuracy is better than the
+default accuracy. If the polynomial order of the elements increases by one, the error decreases by a factor of three to
+ten. The difference between the charges of two successive meshes is therefore an upper bound of the error on the finer
+mesh.
 """
 
 from collections.abc import Callable
@@ -26,7 +27,11 @@ from isocharge.simulate.solver.load_case import SolveSettings
 from isocharge.simulate.solver.press import press
 
 MESH_ERROR_SAFETY = 2.0
-"""Ratio of the estimated error of a mesh to the change of the charges if the order of the mesh increases by one."""
+"""Safety factor in the estimated error of a mesh, dimensionless.
+
+The estimated error is this factor times the change of the charges that results if the order of the mesh increases by
+one.
+"""
 
 MIN_MESH_ERROR = 5e-5
 """Smallest relative error of a charge that is reported.
@@ -91,14 +96,15 @@ def mesh_error(equilibrium: Equilibrium, read_charges: ReadCharges) -> float:
 def modelling_error(equilibrium: Equilibrium, read_charges: ReadCharges) -> float:
     """Estimate the error that the theory of the film causes in a charge, relative to the largest charge.
 
-    Bending changes the stress near the clamp and near the edge of the footprint, by an amount that depends on the
-    positions and the shapes of the footprint and of the electrodes. Therefore the press is solved again: with bending
-    if the given solution omits bending, and without bending otherwise. The effect of bending is the difference between
-    the charges of both solutions.
+    Bending changes the stress near the clamp and near the edge of the footprint. The effect on the charges depends on
+    the positions and the shapes of the footprint and of the electrodes. Therefore the press is solved a second time.
+    The second solution includes bending if the given solution omits bending, and omits bending otherwise. The effect of
+    bending is the difference between the charges of both solutions.
 
-    Without bending, the error is the effect of bending. A theory with bending averages the bending stiffness of an
-    orthotropic film over all directions. The error of this mean is the effect of bending, which is at most 1,
-    multiplied by the relative standard deviation of the bending stiffness over the directions.
+    If the given solution omits bending, its error is the effect of bending. The theory with bending averages the
+    bending stiffness of an orthotropic film over all directions. The error of this average is the effect of bending
+    times the relative standard deviation of the bending stiffness over the directions. In this product, the effect of
+    bending is limited to 1.
 
     Args:
         equilibrium: The solved press.

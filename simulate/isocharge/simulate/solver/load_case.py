@@ -19,13 +19,13 @@ from isocharge.simulate.sensor.film import Film, check_range
 from isocharge.simulate.sensor.footprint import Probe
 
 TOLERANCE = 1e-7
-"""Ratio of the out-of-balance force to the load at which a solve has converged, dimensionless.
+"""Largest ratio of the out-of-balance force to the load that a converged solve may have, dimensionless.
 
 The ratio is far below the error of the mesh, and well above rounding errors.
 """
 
 Auto = Literal["auto"]
-"""Value of a setting if the program chooses the setting for a press, or for all presses of a forward map."""
+"""Value of a setting that the program chooses itself, either for one press or for all presses of a forward map."""
 
 MAX_AMPLITUDE2 = 0.1
 """Largest squared amplitude A^2 for which Saint-Venant-Kirchhoff elasticity is valid, dimensionless.
@@ -40,25 +40,25 @@ LAYER_WIDTH = 6.0
 """Total width of the thin rings at the rim, in bending lengths. Widths from 4 to 14 change a charge by at most 1e-4."""
 
 MAX_SIDE_SHARE = 1.0
-"""Largest ratio of the side force to the force of the press. It corresponds to a coefficient of friction of one."""
+"""Largest ratio of the side force to the force of the press. A coefficient of friction of one results in this ratio."""
 
 REFINEMENTS = ((0, 1), (1, 1), (0, 2), (2, 1), (1, 2), (0, 3), (2, 2), (1, 3), (2, 3), (3, 3))
 """Refinements of the mesh that are tried one after the other.
 
-Each pair consists of the increase of the order, and of the factor by which the number of elements around the innermost
-circle is multiplied.
+The first number of a pair is added to the polynomial order of the elements. The second number multiplies the number of
+elements around the innermost circle.
 """
 
 MAX_UNEVENNESS = 0.3
-"""Largest ratio of the uneven part of the pretension to the stress of the load for eight elements around the probe.
+"""Eight elements around the probe suffice up to this ratio of the uneven pretension to the stress of the load.
 
 With eight elements, the error of a charge is 1e-4 at a ratio of 0.24, 8e-4 at 0.45, and 4e-3 at 3.5.
 """
 
 MAX_SHAPE_ERROR = 0.05
-"""Largest allowed relative error of a charge that is predicted for the finest mesh.
+"""Largest relative error of a charge that may be predicted for the finest mesh.
 
-A press with a larger error is rejected, because it is too close to the rim.
+A press with a larger predicted error is too close to the rim, and is rejected.
 """
 
 RELIABLE_RADIUS = 0.6
@@ -87,7 +87,7 @@ class SolveSettings:
         theory: Terms of the film theory.
         resolution: Fineness of the mesh; "auto" for the coarsest mesh that reaches the accuracy.
         layer: Total width of the thin rings at the rim, in film radii; "auto" for six bending lengths.
-        tolerance: Ratio of the out-of-balance force to the load at which a solve has converged.
+        tolerance: Largest ratio of the out-of-balance force to the load that a converged solve may have.
     """
 
     accuracy: float = ACCURACY
@@ -163,9 +163,10 @@ def _check_position(film: Film, probe: Probe, at: tuple[float, float]) -> None:
 def farthest_distance(film: Film, probe: Probe, at: tuple[float, float]) -> float:
     """Compute the distance from the centre of the film to the farthest point of the footprint, mm.
 
-    The mesh of an oval film is the deformed mesh of a circular film. On an oval film, the press is therefore moved to
-    the place on the circular film from which the deformation displaces it to its actual place, and the distance is
-    measured there. On every film, the footprint lies on the film if the distance is less than the radius of the film.
+    The mesh of an oval film is the deformed mesh of a circular film. For a press on an oval film, the function
+    therefore first computes the place of the press on the circular film before the deformation. The distance is
+    measured from this place. On both kinds of film, the footprint lies on the film if the returned distance is less
+    than the radius of the film.
 
     Args:
         film: The film.
@@ -190,7 +191,7 @@ def layer_for(film: Film, force: float, settings: SolveSettings) -> float:
     Args:
         film: The film.
         force: Force of the press, N.
-        settings: Settings with the width, or with the value "auto" for a width that is chosen here.
+        settings: Settings of the solve. If their width of the thin rings is "auto", the function chooses the width.
 
     Returns:
         Width, in film radii.
@@ -209,7 +210,7 @@ class LoadCase:
         force: Force, N.
         settings: Settings of the solve.
         side_force: Force (Fx, Fy) of the probe on the film in the plane of the film, N.
-        began: Reading of the CPU clock of the process at the beginning of the work on the press, s.
+        began: CPU time of the process when the work on the press began, s.
     """
 
     film: Film
@@ -249,8 +250,8 @@ class LoadCase:
 def choose_mesh(case: LoadCase) -> PlacedMesh:
     """Return the coarsest mesh whose predicted error is at most half of the required accuracy.
 
-    The error is predicted from the shapes of the elements. If no mesh is sufficient, the finest mesh is returned, as
-    long as its error is moderate.
+    The error is predicted from the shapes of the elements. If no mesh is sufficient, the finest mesh is returned,
+    unless its predicted error exceeds `MAX_SHAPE_ERROR`.
 
     Args:
         case: The press and the required accuracy.
@@ -324,8 +325,8 @@ def _first_resolution(case: LoadCase) -> Resolution:
     The mesh is created in a unit disk, which a conformal map maps onto the film. A circle in the disk encloses the
     footprint, and rings of elements lie between this circle and the rim. A small probe needs more rings. A press close
     to the rim needs more rings and more elements around the circle, because the conformal map stretches the mesh.
-    Trapped air or a static pressure also bends the film between the probe and the rim, in narrow strips that need more
-    rings.
+    Trapped air or a static pressure also bends the film in narrow strips between the probe and the rim. The narrow
+    strips need more rings.
 
     Args:
         case: The press and the required accuracy.
@@ -360,8 +361,8 @@ def _needs_more_sectors(case: LoadCase) -> bool:
     The innermost circle encloses the footprint of the probe, and the rings of the mesh lie around it. Eight elements
     are too few in two cases:
 
-    - The footprint is not circular, and the innermost circle with the normal gap around the footprint does not fit on
-      the film.
+    - The footprint is not circular, and the film has no room for the normal gap between the footprint and the innermost
+      circle.
     - The uneven part of the pretension is not small compared with the stress that the force causes. The deflection
       around the probe then depends strongly on the direction.
 
@@ -386,9 +387,9 @@ def _thin_ring_count(placement: Placement, total_width: float) -> int:
     At the clamped rim, the film bends within a narrow strip, which the thin rings resolve. The mesh is created in a
     unit disk, the template plane, and a conformal map maps the disk onto the film. In the template plane, the strip is
     therefore widest next to the probe, and narrowest on the opposite side of the film. All thin rings together are as
-    wide as the widest strip. Each ring is a third as wide as the previous ring, up to the rim. The number of rings is
-    chosen such that the last rings are thin enough for the narrowest strip: it increases by `THIN_RINGS_PER_FACTOR`
-    for each factor of three between both widths of the strip.
+    wide as the strip at its widest point. Towards the rim, each ring is a third as wide as the previous ring. The
+    number of rings is chosen such that the last rings are thin enough for the strip at its narrowest point. One ring is
+    added for each factor of three between the largest and the smallest width of the strip.
 
     Args:
         placement: Placement of the mesh under the press.
@@ -402,7 +403,8 @@ def _thin_ring_count(placement: Placement, total_width: float) -> int:
     opposite_width = min(total_width, 0.2) / stretch
 
     # Divide the widths by the range of ln(r) that all rings cover, where r is the distance from the origin. At the rim,
-    # r is 1, and a small width is also a difference of ln(r). The upper limit keeps the thin rings near the rim.
+    # r is 1, so a small width is equal to the difference of ln(r) across it. The upper limit keeps the thin rings near
+    # the rim.
     log_range = -math.log(placement.template_radius)
     max_share = 1.0 / 8.0
     largest_share = min(width_next_to_probe / log_range, max_share)

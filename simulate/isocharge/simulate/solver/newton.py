@@ -33,7 +33,7 @@ MAX_ITERATIONS = 60
 """Largest number of Newton steps. Typical presses need five to ten steps."""
 
 ROUND_OFF = 1e-9
-"""Size below which a Newton step is caused by rounding errors only.
+"""Largest size of a Newton step that is treated as an effect of rounding errors.
 
 The size of a step is its energy norm relative to the work of the load.
 """
@@ -50,8 +50,8 @@ class NewtonResult:
             "failed".
         message: Description of the outcome in one sentence.
         iterations: Number of Newton steps with a new tangent.
-        residual: Larger of two ratios, namely of the transverse residual to the load, and of the in-plane residual to
-            the in-plane forces.
+        residual: Larger of two ratios: the transverse residual divided by the load, and the in-plane residual divided
+            by the in-plane forces.
     """
 
     field: Array
@@ -66,8 +66,8 @@ def first_iterate(elastic: ElasticFilm) -> Array:
 
     The deflection under the probe is proportional to 1 - r^(2/3), where r is the distance from the origin of the
     template plane. This is the shape of a membrane without pretension under a point load if Poisson's ratio is 1/3
-    (Schwerin 1929). The deflection under the static pressure is a paraboloid, which is added. The in-plane
-    displacements are zero.
+    (Schwerin 1929). A paraboloid is added for the deflection under the static pressure. The in-plane displacements are
+    zero.
 
     Args:
         elastic: Discrete model of the film.
@@ -101,9 +101,9 @@ def solve_newton(
     Args:
         elastic: Discrete model of the film.
         first_field: First iterate, shape (n_node, 3), which is zero where the film is fixed.
-        tolerance: Relative residual at which the solve has converged.
-        full_steps_below: Relative residual below which a full Newton step that halves the residual is accepted even if
-            the step increases the energy.
+        tolerance: Largest relative residual that a converged solve may have.
+        full_steps_below: Relative residual below which a full Newton step may increase the energy. Such a step is
+            accepted if it halves the residual.
 
     Returns:
         The result, which may not have converged.
@@ -217,7 +217,7 @@ def _stabilising_tension(elastic: ElasticFilm, relative_residual: float) -> floa
 
 
 def _take_step(iterate: _Iterate, step: Array, full_steps_below: float) -> _Iterate | None:
-    """Take a full Newton step, or a shorter or modified step that lowers the energy.
+    """Take a full Newton step if it is acceptable, and otherwise a shorter or modified step that lowers the energy.
 
     Close to the equilibrium, the full step is taken if it halves the residual, even if it increases the energy. The
     reason is that the flat equilibrium of a compressed film can have a slightly higher energy than the wrinkled
@@ -251,7 +251,7 @@ def _chord_steps(iterate: _Iterate, solve: SolveTangent, previous_residual: floa
         iterate: Iterate after the Newton step.
         solve: Function that solves linear systems with the tangent of the last Newton step.
         previous_residual: Relative residual before the Newton step.
-        tolerance: Relative residual at which the solve has converged.
+        tolerance: Largest relative residual that a converged solve may have.
 
     Returns:
         The last iterate whose step reduced the residual sufficiently.

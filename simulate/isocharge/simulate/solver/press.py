@@ -35,7 +35,7 @@ from isocharge.simulate.solver.newton import (
 )
 
 MAX_EXTRA_ORDERS = 3
-"""Largest number of times that the order of the elements is increased after the first mesh."""
+"""Largest number of meshes that are tried after the first mesh. Each has the next higher order of the elements."""
 
 DIFFERENT_EQUILIBRIUM = 0.1
 """Relative difference of the charges above which the solutions on two meshes are treated as different equilibria.
@@ -59,12 +59,12 @@ def press(
     Args:
         film: The clamped film.
         probe: The probe. The direction of its pressure does not change while the film deflects. The attribute `probe`
-            of the result has the footprint under this force.
+            of the result is the probe with its footprint under the given force.
         at: Centroid (x, y) of the footprint, mm.
         force: Force, N, positive in the direction of the push.
         settings: Accuracy, theory and mesh.
-        side_force: Force (Fx, Fy) of the probe on the film in the plane of the film, N. It is distributed over the
-            footprint like the pressure, and its direction does not change. `solver.sensitivity.friction_force`
+        side_force: Force (Fx, Fy) of the probe on the film in the plane of the film, N. The side force is distributed
+            over the footprint like the pressure, and its direction does not change. `solver.sensitivity.friction_force`
             computes the side force of a probe with friction.
         start: Equilibrium of a similar press on the same mesh, whose field is the first iterate; None if there is no
             such equilibrium.
@@ -130,7 +130,8 @@ def _solve_until_meshes_agree(case: LoadCase, start: Equilibrium | None) -> Equi
         start: Equilibrium of a similar press from which the first solve starts; None if there is no such equilibrium.
 
     Returns:
-        Equilibrium on the finest mesh. Its `proven_error` is the difference from the previous mesh.
+        Equilibrium on the finest mesh. Its `proven_error` is the relative difference between the charges on this mesh
+        and on the previous mesh.
     """
     solved = _solve(case, choose_mesh(case), start)
     if solved.status != "converged":
@@ -206,22 +207,22 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
 def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
     """Solve the film before the contact, and add the solution to an equilibrium as the attribute `rest`.
 
-    Before the contact, only the static pressure acts on the film. The touch stress is the difference of the stresses of
-    both equilibria.
+    Before the contact, only the static pressure acts on the film. The touch stress is the stress under the press minus
+    the stress before the contact.
 
     Args:
         equilibrium: Equilibrium of the press.
-        tolerance: Relative residual at which the solve has converged.
+        tolerance: Largest relative residual that a converged solve may have.
 
     Returns:
-        Equilibrium of the press with the attribute `rest`. Its status is "failed" if the solve before the contact
-        fails.
+        Equilibrium of the press with the attribute `rest`. Its status is "failed" if no equilibrium before the contact
+        is found.
     """
     groups = replace(equilibrium.groups, load=0.0, side_load=(0.0, 0.0))  # the units remain those of the press
     elastic = ElasticFilm(equilibrium.mesh, groups)
     result = solve_newton(elastic, first_iterate(elastic), tolerance)
 
-    # The number of iterations is the sum of both solves.
+    # The number of iterations includes those of both solves.
     rest = replace(equilibrium, groups=groups, field=result.field, force=0.0, side_force=(0.0, 0.0))
     iterations = equilibrium.iterations + result.iterations
     equilibrium_with_rest = replace(equilibrium, rest=rest, iterations=iterations)
@@ -232,14 +233,14 @@ def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
 
 
 def _elastic_film(case: LoadCase, mesh: PlacedMesh, force: float) -> ElasticFilm:
-    """Create the discrete model of the film for a press whose force is replaced by another force.
+    """Create the discrete model of the film for a given press, but with a different force.
 
     The side force is changed in proportion to the force.
 
     Args:
         case: The press.
         mesh: Mesh of the press.
-        force: The other force, N.
+        force: The different force, N.
     """
     x, y = case.at
     force_factor = force / case.force
@@ -262,9 +263,9 @@ def _solve_by_load_steps(case: LoadCase, failed: NewtonResult, full_load: Elasti
 
     Each solve starts from the field under the largest force for which an equilibrium was found. After each successful
     solve, the force is multiplied by a factor, which is two at the beginning. After each failed solve, the factor is
-    replaced by its square root, and the smaller force is tried. No further force is tried if the remaining solves would
-    not reach the full force even if all of them succeeded. This is the case if the solve with the first force fails.
-    Each failed solve of a film that wrinkles takes seconds.
+    replaced by its square root, and the smaller force is tried. The attempts end as soon as the remaining solves could
+    not reach the full force, even if all of them succeeded. They also end if the solve with the first force fails. The
+    early end saves time, because each failed solve of a film that wrinkles takes seconds.
 
     Args:
         case: The press.
@@ -272,8 +273,8 @@ def _solve_by_load_steps(case: LoadCase, failed: NewtonResult, full_load: Elasti
         full_load: Discrete model of the film under the full force.
 
     Returns:
-        Result of a successful solve with the full force. If there is none, `failed` with the total number of
-        iterations.
+        Result of a successful solve with the full force. If no such solve succeeds, `failed` is returned with the total
+        number of iterations.
     """
     solved_force = 0.0  # largest force with an equilibrium; 0 if there is none
     force_factor = 2.0  # ratio of the next force to `solved_force`
@@ -305,9 +306,9 @@ def _solve_by_load_steps(case: LoadCase, failed: NewtonResult, full_load: Elasti
 def _first_field(start: Equilibrium | None, elastic: ElasticFilm) -> Array:
     """Return the first iterate of Newton's method, shape (n_node, 3).
 
-    If the mesh of the starting equilibrium has the same elements, which may have another polynomial order, the first
-    iterate is interpolated from the field of the starting equilibrium. Without such a mesh, the first iterate is an
-    approximate deflection under the probe and the static pressure.
+    If the mesh of the starting equilibrium has the same elements, its field is interpolated to the nodes of the new
+    mesh. The polynomial orders of the elements may differ. In all other cases, the first iterate is an approximate
+    deflection under the probe and the static pressure.
 
     Args:
         start: Equilibrium of a similar press; None if there is no such equilibrium.
@@ -324,8 +325,8 @@ def _first_field(start: Equilibrium | None, elastic: ElasticFilm) -> Array:
     if start_elements != (template.topology, template.half, template.resolution):
         return first_iterate(elastic)
 
-    # Evaluate the field of each element at the nodes of its new order. A node of several elements is assigned several
-    # times, with equal values, because the field is continuous.
+    # Evaluate the field of each element at the nodes of its new order. A node that several elements share is assigned
+    # several times. The values are equal, because the field is continuous.
     basis_values = tensor_values(start_template.resolution.order, template.xi, template.eta)
     field = np.empty((template.n_node, 3))
     field[template.nodes] = basis_values @ start.field[start_template.nodes]

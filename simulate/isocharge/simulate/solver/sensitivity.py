@@ -1,4 +1,4 @@
-"""Effect of small changes of the film or the probe, and of friction under the probe, on an equilibrium.
+"""Change of an equilibrium due to small changes of the film or the probe, or due to friction under the probe.
 
 The displacements u of an equilibrium satisfy R(u, m) = 0, where R is the residual and m is the value of an
 imperfection, or of another property of the film or the probe. The tangent is K = dR/du. The derivative of the
@@ -9,10 +9,10 @@ displacements with respect to m is
 If the tangent is already factorised, the derivative costs only one back substitution.
 
 An imperfection may have two axes, like an ellipse. Let alpha be the angle between one axis of the imperfection and the
-direction of the press. To first order, the change of the equilibrium is a sum of two fields, which have the factors
-cos(2 alpha) and sin(2 alpha). With respect to a reflection in the line through the centre of the film and the press,
-the first field is even and the second field is odd. Both fields are solved on the meshed half of the film, but
-different displacement components are fixed on the line of symmetry.
+direction of the press. To first order, the equilibrium changes by the sum of two fields. The first field is multiplied
+by cos(2 alpha), and the second field by sin(2 alpha). Under a reflection in the line through the centre of the film and
+the press, the first field is even and the second field is odd. Both fields are solved on the meshed half of the film,
+but different displacement components are fixed on the line of symmetry.
 
 The derivative dR/dm and the change of the stress are computed by central differences.
 
@@ -58,20 +58,20 @@ STEP = 1e-3
 """Step of the central differences, in units of the changed property."""
 
 AddChange = Callable[[Equilibrium, float], Equilibrium]
-"""Function that changes a property of the film or of the probe of an equilibrium by a given value.
+"""Function that changes one property of an equilibrium, namely of its film or its probe, by a given value.
 
-The displacements of the returned equilibrium are unchanged, and are therefore not in equilibrium.
+The displacements remain unchanged, so the returned state is not in equilibrium.
 """
 
 
 @dataclass(frozen=True)
 class StressField:
-    """Field of the stress changes that a change of the film or of the probe causes.
+    """Stress field that describes the effect of a change of one property of the film or of the probe.
 
     Attributes:
         name: Name of the changed property.
         add: Function that adds a value to this property.
-        odd: Whether the field is odd about the direction of the press.
+        odd: Whether the field is odd under a reflection in the line through the centre of the film and the press.
     """
 
     name: str
@@ -87,8 +87,8 @@ def _add_tension(solved: Equilibrium, value: float, direction: tuple[float, floa
 
     Args:
         solved: The press.
-        value: Size of the added tension in this unit.
-        direction: Components (T11, T22, T12) of an added tension of the size 1.
+        value: Size of the added tension, in units of E A^2 plus the mean pretension.
+        direction: Components (T11, T22, T12) of an added tension whose size is 1.
     """
     groups = solved.groups
     tension_unit = 1.0 + groups.tension  # divided by E A^2, like all tensions in `groups`
@@ -99,7 +99,7 @@ def _add_tension(solved: Equilibrium, value: float, direction: tuple[float, floa
 
 
 def _add_stiffness(solved: Equilibrium, log_ratio: float, angle: float) -> Equilibrium:
-    """Add a second anisotropy, which may have other axes, to the moduli of the film.
+    """Add a second anisotropy, whose axes may differ from the axes of the film, to the moduli of the film.
 
     Args:
         solved: The press.
@@ -150,9 +150,10 @@ def _place_mesh_again(solved: Equilibrium, probe: Probe, oval: complex | Complex
 
     Args:
         solved: The press.
-        probe: Probe for which the mesh is placed, of the same topology.
-        oval: Shape of the clamp in the frame of the press, e exp(2 i alpha): the semi-axes are 1 + e and 1 - e film
-            radii, and alpha is the angle from the direction of the press to the longer axis.
+        probe: Probe for which the mesh is placed. It has the same topology as the probe of the press.
+        oval: Shape of the clamp in the frame of the press, as the complex number e exp(2 i alpha). The clamp has the
+            semi-axes 1 + e and 1 - e film radii. The angle alpha leads from the direction of the press to the longer
+            axis.
     """
     mesh = solved.mesh
     distance = np.array(np.hypot(*solved.at))
@@ -173,27 +174,28 @@ FILM_FIELDS = (
 """Stress fields of a changed probe or film: radius of the probe, mean and uneven tension, uneven stiffness, oval clamp.
 
 The radius of the probe and the mean tension have one field each. Each imperfection has an even field and an odd field,
-in this order. They belong to two properties of the film: the size of the imperfection times the cosine and the sine of
-twice the angle from the x axis to its axis 1.
+in this order. Let alpha be the angle from the x axis to axis 1 of the imperfection. The two fields belong to two
+properties of the film: the size of the imperfection times cos(2 alpha), and the size times sin(2 alpha).
 """
 
 SCALAR_FIELDS = 2
-"""Number of fields without a direction, which are the first of `FILM_FIELDS`."""
+"""Number of fields without a direction. They are the first entries of `FILM_FIELDS`."""
 
 TENSION_FIELDS = slice(1, 4)
-"""Stress fields of a changed tension in `FILM_FIELDS`."""
+"""Indices of the entries of `FILM_FIELDS` that describe a change of the tension."""
 
 FILM_IS_ODD = np.array([field.odd for field in FILM_FIELDS])
-"""Whether each of `FILM_FIELDS` is odd about the direction of the press, shape (n_field,)."""
+"""Values of `StressField.odd` for the fields in `FILM_FIELDS`, shape (n_field,)."""
 
 
 def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
     """Compute how the scaled stress at the nodes changes if a property of the film or the radius of the probe changes.
 
-    The properties are those of `FILM_FIELDS`. The film is rotated such that the press lies on the positive x axis. The
-    stress is compared at fixed points of the rotated film. An even change of the film is symmetric about the x axis,
-    and an odd change is antisymmetric. The unit of a change of the tension is E A^2 + T, the order of magnitude of the
-    tension under the press, where E is Young's modulus, A is the amplitude of the press, and T is the mean pretension.
+    `FILM_FIELDS` lists the properties. The film is rotated such that the press lies on the positive x axis. The stress
+    is compared at fixed points of the rotated film. An even change of the film is symmetric about the x axis, and an
+    odd change is antisymmetric. A change of the tension is measured in units of E A^2 + T, where E is Young's modulus,
+    A is the amplitude of the press, and T is the mean pretension. The tension under the press has the same order of
+    magnitude.
 
     Args:
         solved: Press with a circular probe.
@@ -203,7 +205,8 @@ def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
         Change of the stress per unit of each property, shape (n_element, n_local, n_field, 3). The last axis is the
         stress component (S11, S22, S12).
     """
-    # The touch stress is the stress under the press minus the stress before the contact, and so are its changes.
+    # The touch stress is the stress under the press minus the stress before the contact. Its changes are the same
+    # difference of the changes of both stresses.
     if solved.rest is not None:
         before_contact = stress_changes(solved.rest, surface)
         under_press = stress_changes(replace(solved, rest=None), surface)
@@ -270,7 +273,7 @@ def _change_of_stress(solved: Equilibrium, add_change: AddChange, solve: SolveTa
 
 
 def change_by_node_shift(mesh: PlacedMesh, stress: Array, node_shift: Complexes) -> Array:
-    """Compute to first order how the stress at the nodes changes if the nodes move in a constant stress field.
+    """Compute, to first order, how the stress at the nodes changes if the nodes move through an unchanged stress field.
 
     Args:
         mesh: Mesh before the movement.
@@ -329,16 +332,18 @@ def holding_force(solved: Equilibrium) -> tuple[float, float]:
 def friction_force(solved: Equilibrium, coefficient: float) -> tuple[float, float]:
     """Compute the side force that friction exerts on the film under a probe on a stage that moves vertically.
 
-    The holding force is the side force that would keep the film under the probe in place. If it is at most the
-    coefficient of friction times the force of the press, the film sticks to the probe, and the side force is the
-    holding force. Otherwise the film slips, and the side force is reduced to this limit.
+    The holding force is the side force that would keep the film under the probe in place. The largest possible friction
+    is the coefficient of friction times the force of the press. If the holding force does not exceed the largest
+    friction, the film sticks to the probe, and the side force is the holding force. Otherwise the film slips, and the
+    magnitude of the side force is the largest friction.
 
     Args:
         solved: Press without a side force.
         coefficient: Coefficient of friction, dimensionless. The coefficient of steel on PVDF is about 0.2.
 
     Returns:
-        Force (Fx, Fy) of the probe on the film, N, for the argument `side_force` of `press`.
+        Force (Fx, Fy) of the probe on the film, N. The function `press` accepts this force as its argument
+        `side_force`.
 
     Raises:
         SceneError: If the coefficient is not between 0 and `MAX_SIDE_SHARE`.

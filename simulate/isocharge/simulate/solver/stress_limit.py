@@ -43,7 +43,7 @@ def largest_stress(film: Film, probe: Probe, force: float) -> float:
 
 
 def stress_caution(film: Film, probe: Probe, force: float) -> str:
-    """Return a warning if the stress under a press exceeds `DEFAULT_STRESS_LIMIT`; empty otherwise.
+    """Return a warning if the stress under a press exceeds `DEFAULT_STRESS_LIMIT`, and an empty string otherwise.
 
     Args:
         film: The film.
@@ -64,7 +64,7 @@ def stress_caution(film: Film, probe: Probe, force: float) -> str:
 
 
 def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tuple[float, float]) -> float:
-    """Compute the largest force within a range for which the stress in the film does not exceed a limit.
+    """Compute the largest force of a range at which the stress in the film does not exceed a limit.
 
     The equation ln(stress / limit) = 0 is solved for the logarithm of the force by Brent's method, which does not leave
     the range. The relative error of the force is below 0.1 %.
@@ -76,10 +76,10 @@ def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tup
         force_range: Smallest and largest force, N.
 
     Returns:
-        Force, N. If no force of the range exceeds the limit, the largest force of the range is returned.
+        Force, N. If the stress does not exceed the limit at any force of the range, the largest force is returned.
 
     Raises:
-        SceneError: If even the smallest force exceeds the limit, or a press cannot exist.
+        SceneError: If the stress exceeds the limit even at the smallest force, or if a press cannot exist.
         SolveError: If no equilibrium is reached.
     """
     min_force, max_force = force_range
