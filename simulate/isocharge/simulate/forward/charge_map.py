@@ -1,6 +1,7 @@
 """Charge maps, which compute the charges of the electrodes from contacts.
 
-The module also contains functions that check the shapes and values of contacts and charges.
+The module also contains functions that restrict the domain of a charge map, compute derivatives by central differences,
+and check the number of electrodes.
 """
 
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from isocharge.common.errors import SceneError
 STEPS = (0.05, 0.05, 1e-3)
 """Steps of the central differences in x and y (mm) and in ln F (dimensionless), where F is the force.
 
-The steps in x and y are those for a probe with a radius of 1 mm.
+The steps in x and y are suitable for a probe with a radius of 1 mm.
 """
 
 
@@ -85,13 +86,13 @@ def differences(function: Callable[[Array], Array], contact: Array, steps: Array
     """Compute the derivatives of a function of contacts by central differences.
 
     Args:
-        function: Function of contacts (x, y, F), shape (n, 3), mm and N, that returns values, shape (n, k). The
+        function: Function that computes values, shape (n, k), from contacts (x, y, F), shape (n, 3), mm and N. The
             function is called once with all stepped contacts, because one call is faster than six.
         contact: Contacts (x, y, F) at which the derivatives are computed, shape (n, 3), mm and N.
         steps: Steps in x and y, mm, and in ln F.
 
     Returns:
-        Derivatives with respect to (x, y, ln F), shape (n, k, 3), in the unit of the values per mm, per mm and per 1.
+        Derivatives with respect to (x, y, ln F), shape (n, k, 3), in the unit of the values divided by mm, mm and 1.
     """
     # Increase and decrease one variable of each contact at a time.
     centre = with_log_force(contact)

@@ -2,11 +2,11 @@
 
 The splines compute charges and their derivatives about two hundred times faster than the forward map.
 
-Each charge is divided by the squared amplitude of the press, which the module `mechanics.theory` computes from the
-force. The scaled charges depend only weakly on the force. At each of a few forces, a cubic spline in (x, y)
-approximates the scaled charges. The spline is fitted by least squares to presses on a disk around the centre of the
-film. For all other forces, the scaled charges are interpolated by Lagrange polynomials in ln F. A forward map
-interpolates its stress fields between forces in the same way. The interpolation between forces therefore adds no
+A scaled charge is a charge divided by the squared amplitude of the press. The module `mechanics.theory` computes the
+squared amplitude from the force. The scaled charges depend only weakly on the force. At each of a few forces, a cubic
+spline in (x, y) approximates the scaled charges. The spline is fitted by least squares to presses on a disk around the
+centre of the film. For all other forces, the scaled charges are interpolated by Lagrange polynomials in ln F. A forward
+map interpolates its stress fields between forces in the same way. The interpolation between forces therefore adds no
 further error.
 """
 
@@ -34,8 +34,8 @@ RELATIVE_KNOT_SPACING = 0.25
 """Largest distance between the knots in units of the reach of the probe, dimensionless.
 
 The reach is the largest distance of a point of the footprint from its centroid. The charge of an electrode changes
-considerably if the press moves by the reach. With knots at a quarter of the width of a narrow footprint, the spline
-would follow the readout error of the forward map, and its derivatives would be less accurate.
+considerably if the press moves by the reach. If the knot spacing were a quarter of the width of a narrow footprint, the
+spline would follow the readout error of the forward map. The derivatives of the spline would then be less accurate.
 """
 
 MAX_CELLS = 200
@@ -55,7 +55,7 @@ LOG_FORCE_STEP = 1e-4
 SMOOTHING = 5e-3
 """Weight of the third differences of the spline coefficients in the fit, dimensionless.
 
-The third differences determine the coefficients in regions without positions.
+In regions without fitted positions, the third differences determine the coefficients.
 """
 
 
@@ -87,9 +87,9 @@ class ChargeSpline:
         Args:
             forward_map: Forward map to which the splines are fitted. The probe keeps the orientation with which the map
                 was built.
-            spacing: Largest distance between the knots, mm. If None, it is a quarter of the reach of the probe, but at
-                most `MAX_KNOT_SPACING`. The reach is the radius of a circular probe. There are at most `MAX_CELLS`
-                cells between the knots.
+            spacing: Largest distance between the knots, mm. If None, the distance is a quarter of the reach of the
+                probe, but at most `MAX_KNOT_SPACING`. The reach of a circular probe is its radius. There are at most
+                `MAX_CELLS` cells between the knots along each axis.
         """
         spacing = spacing or min(MAX_KNOT_SPACING, RELATIVE_KNOT_SPACING * forward_map.probe.reach)
         force = _force_nodes(forward_map)
@@ -186,11 +186,11 @@ def _force_nodes(forward_map: ForwardMap) -> Array:
 
 
 def _scaled_charges(forward_map: ForwardMap, force: Array, position: Array) -> Array:
-    """Compute the scaled charges that presses at given positions cause, to which splines are fitted.
+    """Compute the scaled charges of presses at given positions. Splines are fitted to these charges.
 
-    A scaled charge is a charge divided by the squared amplitude of the press. The charges consist of the stress
-    charges, which the stress causes by d31, d32 and d12, and the pressure charges, which the contact pressure causes by
-    d33.
+    A scaled charge is a charge divided by the squared amplitude of the press. Each charge is the sum of two parts. The
+    stress causes the first part by the coefficients d31, d32 and d12. The contact pressure causes the second part by
+    the coefficient d33.
 
     Args:
         forward_map: Forward map that computes the charges.
@@ -222,7 +222,8 @@ def _fit_disk(forward_map: ForwardMap, force: Array, spacing: float) -> "scipy.i
     """Fit a cubic spline to the scaled charges of all electrodes over the disk.
 
     The fit is by least squares, with a penalty on the third differences of the coefficients. The spline is defined on
-    the square around the disk. The penalty determines the coefficients in its corners, where there are no positions.
+    the square around the disk. The penalty determines the coefficients in the corners of the square, where there are no
+    positions.
 
     Args:
         forward_map: Forward map that computes the charges.
@@ -278,8 +279,8 @@ def _third_differences(count: int) -> "scipy.sparse.sparray":
 def _fit_positions(cells: int) -> Array:
     """Return the positions at which a spline is fitted, in the unit disk and on its edge.
 
-    There are 1.6 positions for each cell of the spline. On the edge of the disk, there are two further positions for
-    each length of one cell.
+    There are 1.6 positions for each cell of the spline. On the edge of the disk, there are two further positions per
+    side length of a cell.
 
     Args:
         cells: Number of cells of the spline along the diameter of the disk.

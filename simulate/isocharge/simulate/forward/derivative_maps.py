@@ -2,8 +2,8 @@
 
 A change of a property of the film, such as its pretension or an oval clamp, changes the stress. The class `FilmSlopes`
 computes these changes from the factorised tangent of the equilibrium (see `solver.sensitivity`), at a few distances and
-forces. Between the solved presses, the changes are interpolated as in a forward map. They need few solved presses,
-because they are used for small corrections.
+forces. Between the solved presses, the changes are interpolated as in a forward map. A few solved presses suffice,
+because the changes are only used for small corrections.
 
 Each property with two axes, like an ellipse, has two components. Let alpha be the angle from the x axis to axis 1 of
 the property. The components are the size of the property times cos(2 alpha) and sin(2 alpha).
@@ -44,9 +44,9 @@ from isocharge.simulate.solver.sensitivity import (
 def few_nodes(film: Film, domain: Domain) -> NodeCount:
     """Return the numbers of distances and forces that suffice for derivatives and for approximate charges.
 
-    The errors of the charges are below 0.05 % (root mean square), and those of the derivatives are a few thousandths of
-    the largest value. Only for presses near the clamp, where the distance coordinate is large, more distances are
-    needed.
+    The root-mean-square error of the charges is below 0.05 %. The errors of the derivatives are a few thousandths of
+    the largest derivative. More distances are needed only for presses near the clamp, where the distance coordinate is
+    large.
 
     Args:
         film: The film.
@@ -112,14 +112,15 @@ class FilmSlopes:
     def jacobian(self, contact: Array) -> dict[str, Array]:
         """Compute the derivatives of the charges with respect to the properties of the film.
 
-        The names of the properties are those of `sensitivity.FILM_FIELDS`. The unit of a tension is MPa, that of the
-        radius of the probe is mm, and the other properties are dimensionless.
+        `sensitivity.FILM_FIELDS` lists the properties. The unit of a tension is MPa, the unit of the radius of the
+        probe is mm, and the other properties are dimensionless.
 
         Args:
             contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
 
         Returns:
-            Derivatives by the name of the property, each of shape (n, n_electrode), pC per unit of the property.
+            Dictionary from the name of each property to the derivatives of the charges, shape (n, n_electrode), pC per
+            unit of the property.
 
         Raises:
             SceneError: If a press lies outside the domain.
@@ -133,10 +134,11 @@ class FilmSlopes:
         tension_unit = film.young * amplitude_squared(film, contact[:, 2]) + film.pretension
         field_charge[:, TENSION_FIELDS] /= tension_unit[:, None, None]
 
-        # After the fields without a direction, there are pairs of an even and an odd field. The fields of a pair are
-        # the changes by an imperfection with the axis along the press, at the angle t from the x axis, and at 45
-        # degrees from it. An imperfection is the complex number size * exp(2 i axis), because half a turn does not
-        # change it. The factor exp(2 i t) therefore rotates the pair into the axes x and y.
+        # After the fields without a direction, there are pairs of an even and an odd field. The even field is the
+        # change that is caused by an imperfection whose axis points to the press, at the angle t from the x axis. For
+        # the odd field, the axis is rotated by 45 degrees. An imperfection is the complex number size * exp(2 i axis),
+        # because half a turn does not change it. The factor exp(2 i t) therefore rotates the pair into the axes x and
+        # y.
         directed_charge = field_charge[:, SCALAR_FIELDS:]  # a view, so that changes also change `field_charge`
         even = directed_charge[:, ::2]
         odd = directed_charge[:, 1::2]
@@ -148,7 +150,7 @@ class FilmSlopes:
 
 
 def _stress_and_changes(solved: Equilibrium, surface: Surface) -> Array:
-    """Compute the scaled stress under a press and its changes with the properties of the film.
+    """Compute the scaled stress under a press, and its change per unit of each property in `FILM_FIELDS`.
 
     Args:
         solved: Equilibrium of the film under the press.

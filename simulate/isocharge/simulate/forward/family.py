@@ -36,10 +36,11 @@ from isocharge.simulate.solver.load_case import SolveSettings, check_press, laye
 from isocharge.simulate.solver.press import needed_resolution, press
 
 DEFAULT_HARMONICS = (4, 3, 2, 1)
-"""Default of the largest harmonics of a family; see `Turns.spread`.
+"""Default value of the largest harmonics of a family; see `Turns.spread`.
 
-On a film of 45 mm radius, the error of a charge is at most 2e-4 under a rectangle of 4 mm by 2 mm if T1 / T2 is 1.7,
-and 3e-4 under a triangle of 4 mm if T1 / T2 is 3.
+Two examples on a film of 45 mm radius show the resulting error of a charge. Let T1 / T2 be the ratio of the pretensions
+along the two axes. If T1 / T2 is 1.7, the error under a rectangle of 4 mm by 2 mm is at most 2e-4. If T1 / T2 is 3, the
+error under a triangle of 4 mm is at most 3e-4.
 """
 
 
@@ -66,8 +67,8 @@ NODE_COUNTS = (
 )
 """Numbers of nodes that are tried one after the other, until the interpolation is sufficiently accurate.
 
-The last entry is for films with a large pretension. With increasing force, the charges of such a film change from one
-power of the force to another, and pass through zero.
+The last entry is for films with a large pretension. As the force increases, the charges of such a film first follow one
+power of the force and then another, and pass through zero.
 """
 
 ASYMMETRIC_NODE_COUNTS = (
@@ -80,8 +81,8 @@ ASYMMETRIC_NODE_COUNTS = (
 """Numbers of nodes that are tried for a film that is not axisymmetric.
 
 The number of forces is increased first, because a taut film needs many forces. A further force also costs less than a
-further distance, because its solve starts from the equilibrium under the previous force. A film with a pretension
-starts with the second entry.
+further distance, because the solve for a force starts from the equilibrium under the previous force. For a film with a
+pretension, the first entry is omitted.
 """
 
 
@@ -116,8 +117,8 @@ class Family:
     Attributes:
         domain: Presses for which the stress can be interpolated.
         film_radius: Radius of the film, mm.
-        distance: Distances of the solved presses from the centre of the film, shape (n_distance,), mm. Their
-            `distance_coordinate` has Chebyshev nodes.
+        distance: Distances of the solved presses from the centre of the film, shape (n_distance,), mm. The values of
+            `distance_coordinate` for these distances are Chebyshev nodes.
         force: Forces of the solved presses, shape (n_force,), N. Their logarithms are Chebyshev nodes.
         turns: Directions of the presses on the film, and rotations of the probe.
         is_oriented: Whether the probe has the same orientation on the film in all presses. Otherwise, each press may
@@ -135,15 +136,15 @@ class Family:
     def spread(
         cls, domain: Domain, film: Film, probe: Probe, count: NodeCount, orientation: Orientation = "fixed"
     ) -> "Family":
-        """Distribute the solved presses, between which the stress is interpolated, over a domain.
+        """Create a family whose solved presses are distributed over a domain.
 
         Args:
             domain: Presses for which the stress will be interpolated.
             film: Film on which the probe presses.
             probe: Probe that presses the film.
             count: Numbers of distances and of forces, and the largest harmonics of the angles.
-            orientation: Whether the probe keeps its own orientation ("fixed") or may be rotated ("random"). On an
-                axisymmetric film, and under an axisymmetric probe, a rotation needs no further solves.
+            orientation: Whether the probe keeps its own orientation ("fixed") or may be rotated ("random"). If the film
+                or the probe is axisymmetric, a rotation needs no further solves.
 
         Returns:
             The family. It has only one force if the smallest and the largest force of the domain are equal.
@@ -160,7 +161,8 @@ class Family:
         # Find the period, which is the smallest rotation of the probe relative to the press after which the stress
         # repeats. If the orientation of the probe on the film may change, this is the period of the probe. If the probe
         # keeps its orientation on the film, the film rotates together with the probe. Half a turn does not change the
-        # film. It does not change the probe either if the number of its periods in a full turn is even.
+        # film. Half a turn also does not change the probe if a full turn contains an even number of periods of the
+        # probe.
         period = probe.period
         is_oriented = orientation == "fixed" and not film.is_axisymmetric and not probe.is_axisymmetric
         if is_oriented:
@@ -186,8 +188,8 @@ class Family:
                 is axisymmetric.
 
         Returns:
-            Weights, shape (n, n_distance * n_force * n_turn), dimensionless. An interpolated value is the sum over the
-            nodes of the weight of a node times the value at this node.
+            Weights, shape (n, n_distance * n_force * n_turn), dimensionless. An interpolated value is the sum of the
+            values at all nodes, each multiplied by the weight of its node.
         """
         # Compute the interpolation weights along each axis. The direction of a turn includes the rotation of the probe.
         node_coordinates = distance_coordinate(self.distance / self.film_radius)
@@ -243,7 +245,7 @@ class Family:
         read: Reading,
         place: tuple[float, tuple[float, float]],
     ) -> Array:
-        """Solve the presses with all forces of the family at one position and rotation, one after the other.
+        """Solve the presses at one position and rotation for all forces of the family, one after the other.
 
         Args:
             sensor: Sensor with the film, and with the surface at which the stress is read.
@@ -273,8 +275,8 @@ class Family:
         """Copy the stress from the rotations within one period of the probe to all rotations.
 
         A period is the smallest rotation that maps the probe onto itself. A rotation of the probe by one period does
-        not change the press, but rotates the mesh. The stress of each further period is therefore the stress of the
-        solved period, with renumbered elements of the mesh and rotated stress components.
+        not change the press, but rotates the mesh. The stress of each further period is therefore obtained from the
+        stress of the solved period: the elements of the mesh are renumbered, and the stress components are rotated.
 
         Args:
             solved: Scaled stress in a frame that rotates with the probe, as returned by `solve`, shape
@@ -282,8 +284,8 @@ class Family:
             mesh: Template of the mesh of the solves.
 
         Returns:
-            Scaled stress, shape (n_distance * n_force * n_turn, n_element * n_local * 3), dimensionless. The rows have
-            the order of the columns of `weights`.
+            Scaled stress, shape (n_distance * n_force * n_turn, n_element * n_local * 3), dimensionless. The rows are
+            in the same order as the columns of the array that `weights` returns.
         """
         symmetry_order = self.turns.symmetry_order
         n_value = solved.shape[-1]
@@ -384,7 +386,7 @@ def check_family(film: Film, probe: Probe, domain: Domain) -> None:
 
 
 def nearest_to_clamp(film: Film, distance: float) -> tuple[float, float]:
-    """Return the position (x, y), mm, that is nearest to the clamp of all positions at a distance from the centre.
+    """Return the position (x, y), mm, nearest to the clamp among all positions at a given distance from the centre.
 
     Args:
         film: The film.
@@ -395,7 +397,7 @@ def nearest_to_clamp(film: Film, distance: float) -> tuple[float, float]:
 
 
 def family_mesh(film: Film, probe: Probe, domain: Domain, settings: SolveSettings) -> tuple[Resolution, float]:
-    """Choose the mesh that is the same for all presses of a domain.
+    """Choose a common mesh for all presses of a domain.
 
     Args:
         film: Film of the forward map.

@@ -2,12 +2,12 @@
 
 All presses with one probe form a family with two coordinates: the distance from the centre of the film, and the force.
 If the probe is not axisymmetric, its orientation is a further coordinate. If the film is not axisymmetric, the
-direction from the centre is a further coordinate. Otherwise, presses in other directions are obtained by a rotation of
-the film. In a frame that moves with the probe, the stress at the nodes of the mesh is a smooth function of the
+direction from the centre is a further coordinate. On an axisymmetric film, presses in other directions are obtained by
+a rotation. In a frame that moves with the probe, the stress at the nodes of the mesh is a smooth function of the
 coordinates of the family. Presses are solved at Chebyshev nodes in the distance and in the logarithm of the force, and
 at evenly spaced orientations and directions. For every other press, the stress field is interpolated. The charges are
 integrals of the interpolated field over the electrodes. The positions of the electrodes therefore do not affect the
-accuracy of the interpolation. When a map is built, its charges are compared with those of direct solves.
+accuracy of the interpolation. When a map is built, its charges are compared with the charges of direct solves.
 """
 
 from concurrent.futures import Executor
@@ -50,19 +50,19 @@ from isocharge.simulate.solver.assembly import single_threaded_blas
 from isocharge.simulate.solver.load_case import SolveSettings
 
 CHUNK_SIZE = 256
-"""Number of presses that are evaluated at once, multiplied by the number of stress fields.
+"""Largest product of the number of presses and the number of stress fields that are evaluated at once.
 
 The number limits the size of the working arrays to about 100 MB.
 """
 
 INTERPOLATION_ERROR = 5e-4
-"""Largest relative error of a charge, with respect to direct solves, that a forward map may have, dimensionless."""
+"""Largest allowed relative error of a charge of a forward map, compared with direct solves, dimensionless."""
 
 EVEN_FIELD = np.zeros(1, dtype=bool)
 """Value of the argument `is_odd` for a single even field.
 
-The stress under a press on an axisymmetric film is such a field. The argument has no effect for other films, which are
-meshed completely.
+On an axisymmetric film, the stress under a press is a single even field. On other films, the argument has no effect,
+because the whole film is meshed.
 """
 
 SKIP_RATIO = 10.0
@@ -120,12 +120,12 @@ class ForwardMap:
             radius: Largest distance of a press from the centre, mm.
             force_range: Smallest and largest force, N.
             settings: Accuracy, theory and mesh. A setting that is "auto" is chosen once for all presses. The mesh is as
-                fine as the outermost press requires. The width of the thin rings is that of the geometric mean of the
-                smallest and the largest force.
-            orientation: Whether the probe keeps its own orientation ("fixed") or may be rotated ("random"). It only
-                matters if neither the film nor the probe is axisymmetric. A fixed orientation then needs fewer solves:
-                a quarter of them for a rectangle, and two thirds for an equilateral triangle.
-            executor: Executor that runs the solves; None for this process. The result does not depend on it.
+                fine as the outermost press requires. The width of the thin rings is chosen for the geometric mean of
+                the smallest and the largest force.
+            orientation: Whether the probe keeps its own orientation ("fixed") or may be rotated ("random"). The choice
+                only matters if neither the film nor the probe is axisymmetric. A fixed orientation then needs only a
+                quarter of the solves for a rectangle, and two thirds of the solves for an equilateral triangle.
+            executor: Executor that runs the solves; None for this process. The result does not depend on the executor.
 
         Raises:
             SceneError: If some presses of the domain cannot exist.
@@ -136,7 +136,7 @@ class ForwardMap:
         build_map = partial(cls.build_unchecked, sensor, probe, domain, orientation=orientation, executor=executor)
         forward_map = build_map(counts[0], settings)
 
-        # Solve a few check presses directly. The interpolated charges of all maps are compared with their charges, so
+        # Solve a few check presses directly. The interpolated charges of every map are compared with these charges, so
         # all maps have the mesh of the first map.
         contact, rotation = spread_check_presses(domain, CHECK_COUNT)
         if forward_map.family.is_oriented:
@@ -176,7 +176,7 @@ class ForwardMap:
         read: Reading = probe_frame_stress,
         executor: Executor | None = None,
     ) -> "ForwardMap":
-        """Build a forward map from a few solves, and do not compare it with direct solves. Its error is not known.
+        """Build a forward map from a few solves, without a check by direct solves. The error of the map is not known.
 
         Args:
             sensor: Sensor whose charges the map computes.
@@ -238,8 +238,8 @@ class ForwardMap:
             Charges, shape (n, n_electrode), pC.
 
         Raises:
-            SceneError: If a press with a force lies outside the domain, an orientation is not finite, or the map is
-                only valid for the probe's own orientation.
+            SceneError: If a press with a force lies outside the domain, if an orientation is not finite, or if the
+                probe is rotated although the map is only valid without a rotation.
         """
         contact = as_contacts(contact, "forward map")
         orientation = np.broadcast_to(orientation, len(contact))
@@ -252,7 +252,7 @@ class ForwardMap:
                 f"{orientation[orientation != 0.0][0]:.4g} rad; build the map with orientation='random'"
             )
 
-        # A press without a force may lie anywhere. It is replaced by a valid press, whose charges become zero.
+        # A press without a force may lie anywhere. It is replaced by a valid press, whose charges are then set to zero.
         has_force = contact[:, 2:] != 0.0
         valid_contact = (0.0, 0.0, self.domain.force_range[0])
         checked_contact = self.domain.check(np.where(has_force, contact, valid_contact), "forward map")
@@ -261,8 +261,8 @@ class ForwardMap:
     def derivatives(self, contact: Array) -> Array:
         """Compute the derivatives of the charges with respect to x, y and ln F by central differences.
 
-        The probe has the orientation of its description. At the edge of the domain, the central differences also
-        evaluate presses slightly outside the domain.
+        The probe keeps its own orientation. At the edge of the domain, the central differences also evaluate presses
+        slightly outside the domain.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
@@ -271,7 +271,7 @@ class ForwardMap:
             Derivatives, shape (n, n_electrode, 3), pC/mm, pC/mm and pC.
 
         Raises:
-            SceneError: If a press lies outside the domain, or the domain has a single force, so that the derivative
+            SceneError: If a press lies outside the domain, or if the domain has only one force, so that the derivative
                 with respect to the force is unknown.
         """
         contact = self.domain.check(contact, "forward map")
@@ -292,7 +292,7 @@ class ForwardMap:
     def linearised(self, contact: Array) -> tuple[Array, Array]:
         """Compute the charges of presses, and their derivatives with respect to x, y and ln F.
 
-        The methods `charges` and `derivatives` describe the arrays. A `ChargeSpline` computes both much faster.
+        See `charges` and `derivatives` for the shapes of the arrays. A `ChargeSpline` computes both much faster.
         """
         return self.charges(contact), self.derivatives(contact)
 
@@ -300,13 +300,13 @@ class ForwardMap:
         """Compute the charges of each stress field at given positions, for all forces at which presses were solved.
 
         If the footprint of the probe grows with the force, each force has its own mesh. Otherwise, all forces have the
-        same mesh, and the integration points are located only once. The stress fields then have single precision. The
-        result includes neither the crosstalk nor the charges that the contact pressure causes. The probe keeps its own
-        orientation.
+        same mesh, and the integration points are located only once. In this case, the stress fields are converted to
+        single precision. The result includes neither the crosstalk nor the charges that the contact pressure causes.
+        The probe keeps its own orientation.
 
         Args:
             position: Positions (x, y) in the domain, shape (n, 2), mm.
-            is_odd: Whether each field is odd with respect to a reflection in the direction of the press, shape
+            is_odd: Whether each field is odd under a reflection in the line from the centre to the press, shape
                 (n_field,).
 
         Returns:
@@ -319,21 +319,21 @@ class ForwardMap:
         return np.concatenate([self._same_mesh_charges(position, is_odd, force, np.float64) for force in single_forces])
 
     def _same_mesh_charges(self, position: Array, is_odd: Booleans, forces: slice, precision: type) -> Array:
-        """Compute the charges of each stress field for some forces of the family, whose presses have the same mesh.
+        """Compute the charges of each stress field for some forces of the family that share the same mesh.
 
         Args:
             position: Positions (x, y) in the domain, shape (n, 2), mm.
-            is_odd: Whether each field is odd with respect to a reflection in the direction of the press, shape
+            is_odd: Whether each field is odd under a reflection in the line from the centre to the press, shape
                 (n_field,).
-            forces: Which forces of the family are used.
+            forces: Slice that selects the forces from the family.
             precision: Number type to which the stress fields are converted.
 
         Returns:
             Charges, shape (n_selected_force, n, n_electrode, n_field), pC.
         """
         # The integration points depend on the mesh, and not on the force. To locate them only once, treat the fields of
-        # different forces like different fields of one force: create a map with the first selected force, whose fields
-        # at each node are those of all selected forces. Its table has one row for each distance and turn.
+        # different forces like different fields of one force. Create a map that has only the first selected force, but
+        # the fields of all selected forces at each node. The table of this map has one row for each distance and turn.
         family = self.family
         force = family.force[forces]
         n_field = is_odd.size
@@ -349,7 +349,8 @@ class ForwardMap:
         charge = single_force_map.field_charges(contacts_at(position, force[0]), np.tile(is_odd, force.size))
         charge_by_force = charge.reshape(*charge.shape[:2], force.size, n_field)
 
-        # The map multiplies all fields by the squared amplitude of its own force. Replace it by that of each force.
+        # The map multiplies all fields by the squared amplitude of its own force. Replace this factor by the squared
+        # amplitude of each force.
         squared_amplitude = amplitude_squared(self.sensor.film, force)
         charge_by_force *= (squared_amplitude / squared_amplitude[0])[:, None]
         return np.moveaxis(charge_by_force, 2, 0)  # from (n, n_electrode, n_force, n_field)
@@ -357,8 +358,8 @@ class ForwardMap:
     def _unchecked_charges(self, contact: Array, orientation: Array | float = 0.0) -> Array:
         """Compute the charges of presses that lie in the domain or slightly outside the domain.
 
-        The charges that the stress causes and the charges that the contact pressure causes are added. Then the
-        crosstalk is added.
+        The result is the sum of the charges that the stress causes and the charges that the contact pressure causes,
+        with crosstalk.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
@@ -380,9 +381,9 @@ class ForwardMap:
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
-            is_odd: Whether each field is odd with respect to a reflection in the direction of the press, shape
-                (n_field,). A row of the table contains the values of all fields at one node, then those at the next
-                node.
+            is_odd: Whether each field is odd under a reflection in the line from the centre to the press, shape
+                (n_field,). A row of the table contains the values of all fields at one node, then the values at the
+                next node.
             orientation: Rotation of the probe in addition to its own orientation, shape (n,) or a number, rad.
 
         Returns:
@@ -414,7 +415,7 @@ class ForwardMap:
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
-            is_odd: Whether each field is odd with respect to a reflection in the direction of the press, shape
+            is_odd: Whether each field is odd under a reflection in the line from the centre to the press, shape
                 (n_field,).
 
         Returns:
@@ -435,16 +436,16 @@ class ForwardMap:
         """Interpolate the stress fields under several presses, and convert them into charge per area.
 
         If only half of the film is meshed, the charge per area is also computed for the reflection of the mesh. The
-        electrodes are divided into pieces, which may be of different kinds with different weights of the stress.
+        pieces of the electrodes may be of different kinds. Each kind has its own weights of the stress.
 
         Args:
             position: Positions x + iy, shape (n,), mm.
             force: Forces, shape (n,), N.
             orientation: Rotation of the probe in addition to its own orientation, shape (n,), rad.
-            is_odd: Whether each field of the table is odd with respect to a reflection in the direction of the press,
-                shape (n_field,).
-            charge_per_stress: Charge per area and stress (s11, s22, s12) of each kind of piece, shape (n_kind, 3),
-                pC/N.
+            is_odd: Whether each field is odd under a reflection in the line from the centre to the press, shape
+                (n_field,).
+            charge_per_stress: Charge per area and per unit of the stress (s11, s22, s12), for each kind of piece, shape
+                (n_kind, 3), pC/N.
 
         Returns:
             Charge per area at the nodes of the mesh under each press.
@@ -485,7 +486,7 @@ class ForwardMap:
 def _reflection_signs(is_odd: Booleans) -> Array:
     """Return the signs of the stress components at a point of the half mesh and at its reflection.
 
-    At the reflection, s12 of an even field changes its sign, and s11 and s22 of an odd field change theirs.
+    In an even field, s12 changes its sign under the reflection. In an odd field, s11 and s22 change their signs.
 
     Args:
         is_odd: Whether each field is odd with respect to the reflection, shape (n_field,).

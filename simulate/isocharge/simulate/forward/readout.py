@@ -37,10 +37,10 @@ from isocharge.simulate.sensor.sensor import Electrode, Readout, Sensor
 from isocharge.simulate.solver.equilibrium import Equilibrium, touch_stress
 
 DIRECT_COUNTS = (20, 8)
-"""Numbers of Gauss points along a side of a near piece and of a distant piece of an electrode, for single presses."""
+"""Numbers of Gauss points along a side of an electrode piece for single presses: (near piece, distant piece)."""
 
 MAP_COUNTS = (12, 4)
-"""Numbers of Gauss points along a side of a near piece and of a distant piece of an electrode, for many presses.
+"""Numbers of Gauss points along a side of an electrode piece for many presses: (near piece, distant piece).
 
 The relative error of a charge is at most 1e-4.
 """
@@ -52,14 +52,15 @@ NEAR_SIDE = 5.0
 """Longest side of a near piece of an electrode, in units of half the width of the footprint.
 
 Half the width of a circle is its radius. The stress has a peak at the probe and a kink at the edge of the footprint.
-With longer sides, the error of a charge exceeds 1e-4. It is 9e-4 for 8 units, and 1e-3 for 20 units with 20 points.
+With longer sides, the error of a charge exceeds 1e-4. With sides of 8 units, the error is 9e-4. With sides of 20 units
+and 20 points, the error is 1e-3.
 """
 
 NEAR_SURFACE_SIDE = 1.25
 """Longest side of a near piece if the stress is read at an outer surface, in units of half the width of the footprint.
 
-The bending stress changes within a few bending lengths from the edge of the footprint. With 5 units, the error of a
-charge reaches 1.4e-3.
+The bending stress changes within a few bending lengths from the edge of the footprint. With sides of 5 units, the error
+of a charge reaches 1.4e-3.
 """
 
 RIM_SIDE = 8.0
@@ -77,7 +78,7 @@ The edge readout has two kinds of pieces: lines on the left and right edges, and
 
 
 class PieceRule(NamedTuple):
-    """Integration points on pieces of electrodes, for pairs of a press and a piece.
+    """Integration points for pairs of a press and a piece of an electrode.
 
     Attributes:
         press: Index of the press of each pair, shape (n_pair,).
@@ -94,12 +95,12 @@ class PieceRule(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """Quadrilateral that is a part of an electrode, or line of the edge readout.
+    """Piece of an electrode: a quadrilateral for the area readout, or a line along an edge for the edge readout.
 
     Attributes:
         corners: Nominal corners (x, y), anticlockwise, shape (4, 2), mm; see `ElectrodePieces.corners`.
         line_area: Area that a line represents, mm^2. Zero for a quadrilateral.
-        kind: Index of the weights of the piece in the rows of `STRESS_WEIGHTS`.
+        kind: Index of the row of `STRESS_WEIGHTS` that contains the weights of the piece.
     """
 
     corners: Array
@@ -109,15 +110,16 @@ class Piece(NamedTuple):
 
 @dataclass(frozen=True)
 class ElectrodePieces:
-    """Quadrilaterals that together cover the electrodes of a sensor, or the lines of the edge readout.
+    """All pieces of the electrodes of a sensor: quadrilaterals that cover the electrodes, or lines along their edges.
 
     Attributes:
         corners: Corners x + iy of each piece, anticlockwise, shape (n_piece, 4), mm. In a triangle, the last two
             corners are equal. In a line, the first and the last corner are equal, and so are the second and the third.
         line_area: Area that a line represents, shape (n_piece,), mm^2. Zero for a quadrilateral.
         electrode: Index of the electrode to which each piece belongs, shape (n_piece,).
-        kind: Index of the weights of each piece in the rows of `STRESS_WEIGHTS`, shape (n_piece,).
-        surface_film: Film whose stress is read at an outer surface; None if it is read in the middle of the film.
+        kind: Index of the row of `STRESS_WEIGHTS` that contains the weights of each piece, shape (n_piece,).
+        surface_film: Film whose stress is read at an outer surface; None if the stress is read in the middle of the
+            film.
     """
 
     corners: Complexes
@@ -135,7 +137,8 @@ class ElectrodePieces:
         Args:
             electrodes: Electrodes of a layout, at least one.
             readout: "area" for a mean over the area of an electrode, "edge" for a mean over its edges.
-            rotation: Angle by which the electrodes are turned later, rad. It decides which edges are the left ones.
+            rotation: Angle by which the electrodes are turned later, rad. The angle determines which edges count as
+                left edges.
         """
         pieces_of = partial(_edge_lines, rotation=rotation) if readout == "edge" else _area_pieces
         pieces = [(index, piece) for index, electrode in enumerate(electrodes) for piece in pieces_of(electrode)]
@@ -161,12 +164,13 @@ class ElectrodePieces:
     def rules(self, probe: Probe, position: Complexes, counts: tuple[int, int] = MAP_COUNTS) -> Iterator[PieceRule]:
         """Compute the integration points of all pieces of the electrodes under several presses.
 
-        Near a press, the stress changes strongly, so a near piece gets more integration points. A press and a piece are
-        near if the distance of their centres is less than `NEAR_DISTANCE` times the sum of the radii of the circles
-        around the footprint and the piece. A near piece is divided into two halves along its longest side, again and
-        again, until each part is distant or small. A part is small if its sides are at most `NEAR_SIDE` times half of
-        the width of the footprint. If the stress is read at an outer surface, a near part must be smaller. A part
-        beside the rim then also counts as near, and its sides are at most `RIM_SIDE` times its distance from the rim.
+        Near a press, the stress changes strongly, so a near piece gets more integration points. One circle encloses the
+        footprint, and another circle encloses the piece. The piece is near if the distance between the centres of the
+        circles is less than `NEAR_DISTANCE` times the sum of their radii. A near piece is halved repeatedly until each
+        part is distant or small. Each time, the longest side is halved. A part is small if its sides are at most
+        `NEAR_SIDE` times half of the footprint width. If the stress is read at an outer surface, a near part must be
+        smaller. A part beside the rim then also counts as near, and its sides are at most `RIM_SIDE` times its distance
+        from the rim.
 
         Args:
             probe: Probe of the presses.
@@ -174,7 +178,8 @@ class ElectrodePieces:
             counts: Numbers of Gauss points along a side of a near piece and of a distant piece.
 
         Yields:
-            The integration points of some of the pairs of a press and a piece. Together, the rules contain every pair.
+            Rules with the integration points of some pairs of a press and a piece. Together, the rules contain every
+            pair.
         """
         # Four arrays describe the pairs of a press and a piece, or of a press and a part of a piece. The first round
         # has all pairs. Each further round has the parts into which near pieces are divided.
@@ -221,8 +226,8 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
         equilibrium: Equilibrium of the film under the press.
 
     Returns:
-        Charges in the order of `sensor.electrode_names`, shape (n_electrode,), pC. Positive for tension along a
-        direction with a positive coefficient.
+        Charges in the order of `sensor.electrode_names`, shape (n_electrode,), pC. A tension along a direction with a
+        positive coefficient causes a positive charge.
 
     Raises:
         SensorError: If another film was solved, or if the readout is at an outer surface and the theory omits bending.
@@ -304,10 +309,10 @@ def contact_charges(sensor: Sensor, probe: Probe, contact: Array, orientation: A
 
 
 def thermal_charge(sensor: Sensor, step: float) -> Array:
-    """Compute the charge that a uniform change of the temperature of the film causes without a touch.
+    """Compute the charge that a uniform temperature change of the film causes without a touch.
 
-    The charge is the pyroelectric charge of a free film and, if the film has expansion coefficients, the charge of the
-    change of its pretension in a ring of constant temperature.
+    The charge contains the pyroelectric charge of a free film. If the film has expansion coefficients, its pretension
+    changes as well, because the temperature of the ring remains constant. The charge that this change causes is added.
 
     Args:
         sensor: Sensor with the electrodes, the film and its coefficients.
@@ -341,9 +346,10 @@ def _area_pieces(electrode: Electrode) -> Iterator[Piece]:
 def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[Piece]:
     """Yield the lines of the edge readout (Mirbagheri et al., 2007, equation 3).
 
-    The charge is the area of the electrode times d31 mean(s11) + d32 mean(s22). The stress s11 is averaged over the
-    left and right edges of the rotated electrode, and the stress s22 over its lower and upper edges. Each edge is
-    divided into two lines, because a line has a fixed number of integration points, which would be too few for an edge.
+    The charge is the area of the electrode times the sum d31 mean(s11) + d32 mean(s22). The stress s11 is averaged over
+    the left and right edges of the rotated electrode, and the stress s22 over its lower and upper edges. Each edge is
+    divided into two lines, because the fixed number of integration points on a line would be too small for a whole
+    edge.
 
     Args:
         electrode: A square electrode.
@@ -375,9 +381,9 @@ class ChargeDensity:
         template: Template of the meshes.
         placement: Position of the template under each press, after the press has been rotated onto the x axis.
         values: Charge per area that each stress field causes, shape (n_sign, n_kind, n, n_element, n_local, n_field),
-            pC/mm^2. The first axis has one entry for points of the meshed part of the film and, if only half of the
-            film is meshed, a second entry for points that are reflected into it. The second axis is the kind of a
-            piece; see `STRESS_WEIGHTS`.
+            pC/mm^2. The first entry of the first axis is for points of the meshed part of the film. If only half of the
+            film is meshed, a second entry is for points that are reflected into the meshed half. The second axis is the
+            kind of a piece; see `STRESS_WEIGHTS`.
     """
 
     position: Complexes
@@ -388,7 +394,7 @@ class ChargeDensity:
     values: np.ndarray
 
     def integrate(self, pieces: ElectrodePieces) -> Array:
-        """Integrate the charge per area, which is known at the nodes of the mesh, over electrodes.
+        """Integrate the charge per area over electrodes, and return the charges of the electrodes.
 
         Each electrode consists of pieces. The integral over a piece is a sum over integration points. At a point, the
         charge per area is interpolated between the nodes of the element that contains the point. If only half of the
@@ -426,7 +432,7 @@ class ChargeDensity:
             node_weights = rule.area.reshape(-1, 1) * basis_values  # shape (n_pair * n_point, n_local)
 
             # For each pair, sum over its points and over the nodes of their elements, which are combined in one axis.
-            # Then add the charge of the piece to that of its electrode.
+            # Then add the charge of the piece to the charge of its electrode.
             nodal_density = nodal_density.reshape(len(press), -1, n_field)  # shape (n_pair, n_point * n_local, n_field)
             pair_weights = node_weights.reshape(len(press), 1, -1).astype(nodal_density.dtype)
             pair_charge = pair_weights @ nodal_density  # shape (n_pair, 1, n_field)

@@ -36,7 +36,8 @@ The coarse mesh does not resolve a narrower gap.
 COARSE_SMALL_PROBE_GAP = 0.042
 """Smallest gap between a very small probe and the clamp in the coarse map, in film radii, dimensionless.
 
-An element of the coarse mesh would be folded in a narrower gap. The gap decreases by 0.75 of the reach of the probe.
+An element of the coarse mesh would be folded in a narrower gap. For a larger probe, the smallest gap is narrower by
+0.75 times the reach of the probe.
 """
 
 COARSE_DISTANCES = 10
