@@ -22,9 +22,9 @@ class FilmNumber(NamedTuple):
     """Unit and accepted range of a property of a film in a sensor file.
 
     Attributes:
-        key: Key of the section `film`, which contains the unit. Some keys belong to several properties.
+        key: Key in the section `film`. The key contains the unit, and some keys belong to several properties.
         unit: Unit of the value in the file.
-        factor: Value in the file divided by the value of the attribute of `Film`.
+        factor: Factor that converts the value of the attribute of `Film` into the value in the file.
         smallest: Smallest accepted value, in the unit of the file.
         largest: Largest accepted value, in the unit of the file.
     """
@@ -69,8 +69,8 @@ class Film:
         young: Young's modulus, MPa. For an orthotropic film, this is sqrt(E1 E2).
         poisson: Poisson's ratio, from 0 to less than 0.5, dimensionless. For an orthotropic film, this is
             sqrt(nu12 nu21).
-        pretension: Stress of the unloaded film, MPa, tension positive. It is the second Piola-Kirchhoff stress, and the
-            mean of its components T11 and T22.
+        pretension: Stress of the unloaded film, MPa, tension positive. The value is the mean of the components T11 and
+            T22 of the second Piola-Kirchhoff stress.
         deviator: Half difference (T11 - T22) / 2 and shear T12 of a pretension that depends on the direction, MPa.
         young_ratio: Ratio E1 / E2 of Young's moduli of an orthotropic film, dimensionless.
         shear: Shear modulus G12 of an orthotropic film, MPa; None for young / (2 (1 + poisson)).
@@ -79,7 +79,7 @@ class Film:
         oval_axis: Angle of the longer semi-axis of an oval clamp from the x axis, anticlockwise, rad.
         back_volume: Volume of the closed cavity behind the film, mm^3; None if the back is vented.
         static_pressure: Constant pressure on the film, MPa, positive in the direction of the push. With a closed
-            cavity, this is the pressure on the film if it is flat.
+            cavity, this is the pressure on the flat film.
         expansion: Thermal expansion coefficients of the film along its axes 1 and 2, 1/K; None if the temperature does
             not change the pretension.
         ring_expansion: Thermal expansion coefficient of the ring, 1/K.
@@ -121,7 +121,7 @@ class Film:
             points: Points x + iy, any shape, mm.
 
         Returns:
-            Ratios, same shape, dimensionless. They are less than 1 on the film and 1 on the rim.
+            Ratios, same shape, dimensionless. The ratios are less than 1 on the film and 1 on the rim.
         """
         return np.abs(points) / self.rim_distance(np.angle(points))
 
@@ -181,9 +181,10 @@ class Film:
 
 
 PIEZO_LIMITS = (1e-3, 1e5)
-"""Smallest accepted magnitude of d31, d32 or d33 if it is not zero, and largest magnitude, pC/N or pC/(mm^2 K).
+"""Smallest magnitude of a nonzero d31, d32 or d33, and largest magnitude of any coefficient, pC/N or pC/(mm^2 K).
 
-A smaller coefficient was probably given in C/N. The largest magnitude is thirty times that of the strongest crystals.
+A smaller coefficient was probably given in C/N. The largest magnitude is thirty times the coefficient of the strongest
+crystals.
 """
 
 
@@ -203,7 +204,7 @@ class Piezo:
         d33: Charge density per tensile stress through the thickness, pC/N.
         d12: Coefficient of the shear stress s12, pC/N. The charge density is 2 d12 s12. If the piezoelectric axes are
             rotated by an angle, d12 is (d31 - d32) / 2 times the sine of twice this angle.
-        pyro: Charge density per change of the temperature of a film that is free to expand, pC/(mm^2 K).
+        pyro: Charge density per temperature change of a film that is free to expand, pC/(mm^2 K).
     """
 
     d31: float
@@ -237,9 +238,9 @@ class Piezo:
 
 
 OTHER_UNITS = {"mm": ("m", 1e3), "um": ("mm", 1e3), "MPa": ("Pa", 1e-6), "GPa": ("MPa", 1e-3)}
-"""For some units, another unit in which a value is easily given by mistake, and the factor that converts the value.
+"""Map from a unit to another unit that is easily used by mistake, and to the conversion factor.
 
-A value in the other unit is multiplied by the factor.
+A value in the other unit times the factor is the value in the expected unit.
 """
 
 
@@ -251,8 +252,8 @@ def tidy(value: float) -> float:
 def check_range(what: str, value: float, allowed: tuple[float, float], unit: str, error: type[InputError]) -> None:
     """Raise an error if a quantity is infinite or outside its accepted range.
 
-    The value was probably given in another unit (`OTHER_UNITS`) by mistake if it would then be in the range. In this
-    case, the message converts the value.
+    If a conversion from another unit (`OTHER_UNITS`) would bring the value into the range, the value was probably given
+    in the other unit by mistake. The error message then contains the converted value.
 
     Args:
         what: Name of the quantity in the error message.
@@ -280,8 +281,8 @@ def check_range(what: str, value: float, allowed: tuple[float, float], unit: str
 def add_axial(size: float, axis: float, addition: complex) -> tuple[float, float]:
     """Change a property of a film that has a size and an axis, such as the shape of an oval clamp.
 
-    Half a turn maps an axis onto itself. Such properties are therefore added as complex numbers size * exp(2 i axis),
-    which do not change after half a turn.
+    Half a turn maps an axis onto itself. The property is therefore converted into the complex number
+    size * exp(2 i axis), which remains the same if the axis makes half a turn.
 
     Args:
         size: Size of the property.
@@ -291,7 +292,7 @@ def add_axial(size: float, axis: float, addition: complex) -> tuple[float, float
     Returns:
         New size and new axis (rad). If the addition is zero, both are unchanged. Otherwise, the new size is not
         negative, because a negative size is the same as a positive size with a perpendicular axis. If the new size is
-        zero except for rounding errors, it has no axis, and the given axis is returned.
+        zero except for rounding errors, the property has no axis, and the given axis is returned.
     """
     if addition == 0.0:
         return size, axis

@@ -1,14 +1,15 @@
 """Unknown properties of a real film, and their prior distribution.
 
-A sensor file describes a film. The real film differs from the described film: the properties of the film and its
-piezoelectric coefficients are known only to within some percent, the positions of the electrodes to within tenths of a
-millimetre, and the pretension is almost unknown. `FILM_PROPERTIES` declares these properties, each with its name, its
-unit and its prior distribution, and `changed_film` changes a sensor by their values. A calibration estimates the
-properties, and virtual films are drawn from their prior distribution.
+A sensor file describes a film. The real film differs from the described film. The properties of the film and its
+piezoelectric coefficients are known only to within some percent. The positions of the electrodes are known to within
+tenths of a millimetre. The pretension is almost unknown. The table `FILM_PROPERTIES` declares the unknown properties,
+each with its name, its unit and its prior distribution. The function `changed_film` changes a sensor according to given
+values of the properties. A calibration estimates the properties, and virtual films are drawn from their prior
+distribution.
 
 A value of a property is its deviation from the sensor file. The pretension is an exception: its value is the pretension
-itself. A property that depends on the direction has two components, the size of the property times the cosine and the
-sine of twice the angle of its axis.
+itself. A property that depends on the direction has a size and an axis. Its two components are the size times the
+cosine, and the size times the sine, of twice the angle of the axis.
 """
 
 import cmath
@@ -31,10 +32,10 @@ MAX_DEVIATION = 4.0
 """Largest allowed deviation of a property from its mean, in standard deviations."""
 
 MAX_DRAWN_DEVIATION = 2.5
-"""Largest deviation of a drawn property from its mean, in standard deviations."""
+"""Largest deviation of a randomly drawn property from its mean, in standard deviations."""
 
 LARGEST_PRETENSION = 3.0
-"""Largest pretension of a drawn film, MPa. All values from zero to this pretension are equally likely."""
+"""Largest pretension of a randomly drawn film, MPa. All values from zero to this pretension are equally likely."""
 
 MIN_RIM_GAP_MM = 0.5
 """Smallest distance between an electrode and the rim, mm."""
@@ -52,9 +53,9 @@ class FilmProperty:
         meaning: Description of the property, for tables.
         unit: Unit of the value.
         std: Standard deviation of the prior distribution.
-        drift: Standard deviation of the change of the property in the time between two calibrations.
+        drift: Standard deviation of the change of the property between two calibrations.
         mean: Mean of the prior distribution.
-        bounds: Smallest and largest value; None for `MAX_DEVIATION` standard deviations on both sides of the mean.
+        bounds: Smallest and largest value; None for limits at `MAX_DEVIATION` standard deviations from the mean.
         is_imperfection: Whether the property is an imperfection, which a good film does not have.
     """
 
@@ -74,14 +75,14 @@ class FilmProperty:
 
 
 def _imperfection(name: str, meaning: str, unit: str, std: float, largest: float | None = None) -> FilmProperty:
-    """Declare an imperfection of a film, which drifts by a tenth of its standard deviation.
+    """Declare an imperfection of a film. The drift of the imperfection is a tenth of its standard deviation.
 
     Args:
         name: Name of the property.
         meaning: Description of the property, for tables.
         unit: Unit of the value.
         std: Standard deviation of the prior distribution.
-        largest: Largest magnitude of the value; None for `MAX_DEVIATION` standard deviations.
+        largest: Largest magnitude of the value; None for a limit of `MAX_DEVIATION` standard deviations.
     """
     bounds = None if largest is None else (-largest, largest)
     return FilmProperty(name, meaning, unit, std, drift=0.1 * std, bounds=bounds, is_imperfection=True)
@@ -91,15 +92,15 @@ PRETENSION = FilmProperty(
     "pretension",
     "mean pretension",
     "MPa",
-    LARGEST_PRETENSION / math.sqrt(12.0),  # that of the uniform distribution
+    LARGEST_PRETENSION / math.sqrt(12.0),  # standard deviation of the uniform distribution
     drift=0.35,  # creep, and a degree of temperature
     mean=0.5 * LARGEST_PRETENSION,
     bounds=(0.0, 4.0),
 )
-"""The pretension. Its value is the pretension itself."""
+"""Mean pretension. The value of this property is the pretension itself, not a deviation."""
 
 UNEVEN_TENSIONS = ("tension_difference", "tension_shear")
-"""Names of the properties that describe the uneven part of the pretension, as shares of the mean pretension."""
+"""Names of the properties for the uneven part of the pretension, whose values are shares of the mean pretension."""
 
 FILM_PROPERTIES = (
     PRETENSION,
@@ -119,24 +120,27 @@ FILM_PROPERTIES = (
     _imperfection("d12", "d12, by axes that are rotated", "pC/N", 0.3),
     _imperfection("crosstalk", "share of the charge of each other electrode", "1", 0.01),
 )
-"""Properties of every film. In the vector of values, the probe radius and the gains of the electrodes follow."""
+"""Properties of every film.
+
+In a vector of values, the probe radius and the gains of the electrodes come after these properties.
+"""
 
 
 def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> tuple[Sensor, Probe]:
-    """Change properties of a film, of its electrodes, and the radius of a probe.
+    """Change the properties of a film and its electrodes, and the radius of a probe.
 
     Args:
         sensor: Sensor that is changed.
-        probe: Probe that is changed. The radius of a probe that is not circular does not change.
+        probe: Probe that is changed. A probe that is not circular remains unchanged.
         values: Value of each property by its name. The value of the pretension is the new pretension. Any other value
-            is a change: a number that is added, or the logarithm of a factor. Properties without a value remain
-            unchanged.
+            is a change: either a number that is added to the property, or the logarithm of a factor. Properties without
+            a value remain unchanged.
 
     Returns:
         The changed sensor and the changed probe.
 
     Raises:
-        SensorError: If no such sensor can exist, for example because an electrode lies over the rim.
+        SensorError: If the changed sensor cannot exist, for example because an electrode lies over the rim.
     """
     # Use the value 0, which changes nothing, for properties without a value, and keep the pretension if it has no
     # value.
@@ -175,7 +179,7 @@ def _changed_mechanics(film: Film, value_of: Mapping[str, float]) -> Film:
     Args:
         film: Film that is changed.
         value_of: Value of each property by its name. The value of the pretension is the new pretension. Any other value
-            is a change: a number that is added, or the logarithm of a factor.
+            is a change: either a number that is added to the property, or the logarithm of a factor.
     """
     pretension = value_of[PRETENSION.name]
     difference, shear = film.deviator
@@ -202,11 +206,11 @@ def _changed_mechanics(film: Film, value_of: Mapping[str, float]) -> Film:
 
 @dataclass(frozen=True)
 class FilmPrior:
-    """Prior distribution of the properties of a real film, of its electrodes, and of the radius of a circular probe.
+    """Prior distribution of the properties of a real film and its electrodes, and of the radius of a circular probe.
 
     Attributes:
-        sensor: Sensor as described by its file.
-        probe: Described probe.
+        sensor: Sensor as its file describes it.
+        probe: Probe as its notation describes it.
     """
 
     sensor: Sensor
@@ -234,7 +238,7 @@ class FilmPrior:
 
     @cached_property
     def properties(self) -> tuple[FilmProperty, ...]:
-        """Declarations of all unknown properties of a real film, in the order of the vector of their values.
+        """Declarations of all unknown properties, in the order of their values in a vector.
 
         The properties in `FILM_PROPERTIES` come first. The radius of a circular probe and the gains of the electrodes
         follow.
@@ -283,11 +287,11 @@ class FilmPrior:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the properties, in the order of the vector."""
+        """Names of the properties, in the order of their values in a vector."""
         return tuple(film_property.name for film_property in self.properties)
 
     def index(self, name: str) -> int:
-        """Return the index of the property with the given name in the vector."""
+        """Return the index of the property with the given name in a vector of values."""
         return self.names.index(name)
 
     @cached_property
@@ -315,7 +319,7 @@ class FilmPrior:
     def changes_stress(self) -> Booleans:
         """Whether each property changes the stress of the film, shape (n_property,).
 
-        Properties of the electrodes and of the piezoelectric coefficients do not change the stress.
+        Changes of the electrodes and of the piezoelectric coefficients do not change the stress.
         """
         # In each row, one property differs from its mean by one standard deviation. The stress can only change if the
         # film or the probe changes.
@@ -331,8 +335,9 @@ class FilmPrior:
         """Return the values of a film with the same properties, but without imperfections.
 
         The sensor file may describe a film with imperfections. The value of an imperfection is its deviation from the
-        sensor file, so a value of zero leaves the described imperfection unchanged. The returned values are the
-        opposites of the described imperfections, and cancel them. A described shear modulus remains.
+        sensor file, so a value of zero leaves the described imperfection unchanged. The returned value of each
+        imperfection is the described imperfection with the opposite sign, so that both cancel. A shear modulus in the
+        sensor file remains unchanged.
 
         Args:
             values: Values of the properties, shape (n_property,).
@@ -360,13 +365,13 @@ class FilmPrior:
         return np.where(self.is_imperfection, cancelling_values, values)
 
     def film(self, values: Array) -> tuple[Sensor, Probe]:
-        """Return the sensor and the probe with the given values of the properties.
+        """Return the sensor and the probe that have the given values of the properties.
 
         Args:
-            values: Values, shape (n_property,).
+            values: Values of the properties, shape (n_property,).
 
         Raises:
-            SensorError: If no such sensor can exist, for example because an electrode lies over the rim.
+            SensorError: If the sensor cannot exist, for example because an electrode lies over the rim.
         """
         if len(values) != len(self.properties):
             raise SceneError(f"expected {len(self.properties)} values ({', '.join(self.names)}), got {len(values)}")
@@ -383,7 +388,7 @@ class FilmPrior:
             count: Number of films.
 
         Returns:
-            Values, shape (count, n_property).
+            Values of the properties of each film, shape (count, n_property).
         """
         deviation = rng.standard_normal((count, len(self.properties)))
         while (is_far := np.abs(deviation) > MAX_DRAWN_DEVIATION).any():
@@ -404,7 +409,7 @@ def virtual_film(sensor: Sensor, probe: Probe, seed: int) -> tuple[Sensor, Probe
         seed: Seed of the random number generator.
 
     Returns:
-        Sensor with the drawn film, gains and electrode positions. Probe, with the drawn radius if it is circular.
+        Sensor with the drawn film, gains and electrode positions, and probe. A circular probe has the drawn radius.
     """
     prior = FilmPrior(sensor, probe)
     return prior.film(prior.draw(np.random.default_rng(seed), 1)[0])

@@ -3,9 +3,9 @@
 Points of a footprint are complex numbers x + iy in mm, relative to the centroid of the footprint. The position of a
 probe is the centroid of its footprint.
 
-The mesh of a polygonal footprint consists of blocks with straight sides. A probe whose footprint has a smooth boundary
-is a subclass of `CurvedProbe`. Its footprint contains a core polygon. The mesh of the footprint consists of blocks with
-straight sides in the core polygon, and of blocks with one curved side between the core polygon and the boundary.
+The mesh of a polygonal footprint consists of blocks with straight sides. Probes whose footprints have smooth boundaries
+are subclasses of `CurvedProbe`. A footprint with a smooth boundary contains a core polygon. Inside the core polygon,
+the blocks of the mesh have straight sides. Between the core polygon and the boundary, each block has one curved side.
 """
 
 import math
@@ -22,12 +22,13 @@ from isocharge.simulate.numerics.polygon import to_corners
 from isocharge.simulate.sensor.film import check_range
 
 MIN_LENGTH = 0.02
-"""Smallest accepted radius, side, axis or diameter of a footprint, mm. A smaller one was probably given in metres."""
+"""Smallest accepted radius, side, axis or diameter of a footprint, mm. A smaller value was probably in metres."""
 
 CORE_SHARE = 0.45 * math.sqrt(2.0)
-"""Ratio of two distances from the centroid in the same direction, dimensionless.
+"""Size of the core polygon relative to the footprint, dimensionless.
 
-The ratio is the distance of a corner of the core polygon, divided by the distance of the boundary.
+The value is a ratio of two distances from the centroid in the same direction: the distance of a corner of the core
+polygon, divided by the distance of the boundary.
 """
 
 OUTLINE_POINTS = 1024
@@ -35,7 +36,7 @@ OUTLINE_POINTS = 1024
 
 
 def with_rotation(notation: str, angle_deg: float) -> str:
-    """Return the notation of a probe with its rotation, which is omitted if it is zero."""
+    """Return the notation of a probe, followed by its rotation unless the rotation is zero."""
     return f"{notation}@{angle_deg:g}" if angle_deg else notation
 
 
@@ -75,11 +76,11 @@ class Probe(ABC):
     @property
     @abstractmethod
     def notation(self) -> str:
-        """Notation of this probe without its rotation, as `parse_probe` accepts it."""
+        """Notation of this probe for `parse_probe`, without the rotation of the probe."""
 
     @property
     def rotated_notation(self) -> str:
-        """Notation of this probe, with its angle in degrees behind the mark `@` if the probe is rotated."""
+        """Notation of this probe. If the probe is rotated, the notation ends with `@` and the angle in degrees."""
         return with_rotation(self.notation, round(math.degrees(self.angle), 9) % 360.0)
 
     @property
@@ -122,12 +123,12 @@ class Probe(ABC):
     def core(self) -> Complexes:
         """Return the corners x + iy of the core polygon, anticlockwise, shape (topology.n_corner,), mm.
 
-        The corners of the core polygon of a curved footprint are evenly spaced in the boundary parameter. The parameter
-        of the first corner is half of the spacing.
+        For a curved footprint, the corners are evenly spaced in the boundary parameter. The parameter of the first
+        corner is half of the spacing.
         """
 
     def rotated(self, angle: float) -> Self:
-        """Return a copy of the probe that is rotated further about its centroid.
+        """Return a copy of the probe after a further rotation about its centroid.
 
         Args:
             angle: Further rotation, anticlockwise, rad.
@@ -161,7 +162,7 @@ class Probe(ABC):
             points: Points x + iy relative to the centroid, any shape, mm.
 
         Returns:
-            Relative pressure, of the shape of `points`, dimensionless. Its mean over the footprint is 1, and its centre
+            Relative pressure, of the shape of `points`, dimensionless. The mean over the footprint is 1, and the centre
             of pressure is the centroid.
         """
         return np.ones(points.shape)
@@ -210,7 +211,8 @@ class CurvedProbe(Probe):
         The core polygon has the rotational symmetry of the footprint. The layer around a circular footprint reaches up
         to the innermost circle of the mesh.
         """
-        # A circle, and a footprint that only a half turn or a full turn maps onto itself, has a core with four corners.
+        # The core of a circle has four corners. The same holds if only a half turn or a full turn maps the footprint
+        # onto itself.
         n_corner = 4
         if 0.0 < self.period < 0.9 * math.pi:
             n_corner = round(math.tau / self.period)

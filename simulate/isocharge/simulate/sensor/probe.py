@@ -46,7 +46,7 @@ from isocharge.simulate.sensor.footprint import (
 class RoundProbe(CurvedProbe):
     """Base class of probes with a circular footprint.
 
-    A subclass has a `name`. A subclass whose pressure is not uniform also overrides `pressure`.
+    A subclass defines `name`. A subclass with a non-uniform pressure also overrides `pressure`.
 
     Attributes:
         radius: Radius of the footprint, mm.
@@ -68,7 +68,7 @@ class RoundProbe(CurvedProbe):
 
     @property
     def notation(self) -> str:
-        """Notation of this probe, as `parse_probe` accepts it."""
+        """Notation of this probe for `parse_probe`."""
         return f"{self.name}:{tidy(self.radius)}"
 
     @property
@@ -121,7 +121,7 @@ class Finger(RoundProbe):
     has_uniform_pressure = False
 
     def pressure(self, points: Complexes) -> Array:
-        """Return the Hertzian pressure at points, divided by the mean pressure. It is zero outside the footprint.
+        """Return the Hertzian pressure at points, divided by the mean pressure; zero outside the footprint.
 
         Args:
             points: Points x + iy relative to the centre of the footprint, any shape, mm.
@@ -153,10 +153,11 @@ class Finger(RoundProbe):
 
 @dataclass(frozen=True)
 class GrowingFinger(Finger):
-    """Fingertip whose contact area grows with the force, as that of an elastic sphere does.
+    """Fingertip whose contact area grows with the force, like the contact area of an elastic sphere.
 
     Attributes:
-        radius: Radius of the footprint at 1 N, mm. Under the force F, it is multiplied by the cube root of F / (1 N).
+        radius: Radius of the footprint at 1 N, mm. Under the force F, the radius is this value times the cube root of
+            F / (1 N).
     """
 
     name = "growing-finger"
@@ -166,7 +167,7 @@ class GrowingFinger(Finger):
         """Return the fingertip with the radius that it has under a force (N).
 
         Raises:
-            SceneError: If the force is so small that the radius is below `MIN_LENGTH`, or if it is not positive.
+            SceneError: If the force is not positive, or so small that the radius is below `MIN_LENGTH`.
         """
         radius = self.radius * math.cbrt(force)
         if not radius >= MIN_LENGTH:
@@ -182,8 +183,8 @@ class Ellipse(CurvedProbe):
     """Probe with an elliptical footprint and a uniform pressure.
 
     Attributes:
-        width: Length of the axis along x before the rotation, mm.
-        height: Length of the axis along y before the rotation, mm.
+        width: Length of the ellipse axis that lies along x before the rotation, mm.
+        height: Length of the ellipse axis that lies along y before the rotation, mm.
         angle: Rotation about the centre, anticlockwise, rad.
     """
 
@@ -192,7 +193,7 @@ class Ellipse(CurvedProbe):
     angle: float = 0.0
 
     period = math.pi
-    """Smallest rotation that maps the ellipse onto itself, rad. It is half a turn."""
+    """Smallest rotation that maps the ellipse onto itself, which is half a turn, rad."""
 
     def __post_init__(self) -> None:
         check_length("probe width", self.width)
@@ -201,7 +202,7 @@ class Ellipse(CurvedProbe):
 
     @property
     def notation(self) -> str:
-        """Notation of this probe without its rotation, as `parse_probe` accepts it."""
+        """Notation of this probe for `parse_probe`, without the rotation of the probe."""
         return f"ellipse:{tidy(self.width)}x{tidy(self.height)}"
 
     @property
@@ -211,7 +212,7 @@ class Ellipse(CurvedProbe):
 
     @property
     def reach(self) -> float:
-        """Distance from the centre to the farthest point of the ellipse, mm. It is half of the longer axis."""
+        """Distance from the centre to the farthest point of the ellipse, which is half of the longer axis, mm."""
         return 0.5 * max(self.width, self.height)
 
     def boundary(self, parameter: Array) -> Complexes:
@@ -223,7 +224,7 @@ class Ellipse(CurvedProbe):
 MAX_CORNERS = 64
 """Largest number of corners of a polygon.
 
-A polygon with more corners has nearly the charges of a circle, which needs fewer unknowns.
+A polygon with more corners causes nearly the same charges as a circle, which needs fewer unknowns.
 """
 
 
@@ -232,7 +233,7 @@ class Polygon(Probe):
     """Probe with a convex polygonal footprint and a uniform pressure.
 
     Attributes:
-        corners: Corners (x, y) before the rotation, anticlockwise, mm. They are stored relative to the centroid.
+        corners: Corners (x, y) before the rotation, anticlockwise, mm. The stored corners are relative to the centroid.
         angle: Rotation about the centroid, anticlockwise, rad.
         shape: Notation of a rectangle or a triangle without its rotation; empty for another polygon.
     """
@@ -242,10 +243,10 @@ class Polygon(Probe):
     shape: str = ""
 
     def __post_init__(self) -> None:
-        """Check that the corners form a convex polygon, and shift them such that its centroid becomes the origin.
+        """Check that the corners form a convex polygon, and move the centroid of the polygon to the origin.
 
         Raises:
-            SceneError: If the corners do not form such a polygon, or if the polygon is too small.
+            SceneError: If the corners do not form a convex polygon, or if the polygon is too small.
         """
         corners = np.array(self.corners, dtype=float)
         are_points = corners.shape[1:] == (2,) and np.isfinite(corners).all()
@@ -307,7 +308,7 @@ class Polygon(Probe):
 
     @property
     def notation(self) -> str:
-        """Notation of this probe without its rotation, as `parse_probe` accepts it."""
+        """Notation of this probe for `parse_probe`, without the rotation of the probe."""
         corners = ";".join(f"{tidy(x)},{tidy(y)}" for x, y in self.corners)
         return self.shape or f"polygon:{corners}"
 
@@ -364,7 +365,7 @@ PROBE_SHAPES: dict[str, Callable[..., Probe]] = {
     "finger:RADIUS": Finger,
     "growing-finger:RADIUS": GrowingFinger,
 }
-"""Notations of all probe shapes, and the functions that create the probes without a rotation from the numbers (mm).
+"""Notation of each probe shape, and function that creates an unrotated probe from the numbers of the notation (mm).
 
 Each word of capital letters stands for a number, and a polygon may have more corners. The parser, the help text and the
 error messages are derived from this table.
@@ -389,7 +390,7 @@ def parse_probe(text: str) -> Probe:
         text: Notation such as "rectangle:4.0x2.0@30"; see the docstring of the module.
 
     Raises:
-        SceneError: If the text is not the notation of a probe, or no such footprint can exist.
+        SceneError: If the text is not the notation of a probe, or if the footprint cannot exist.
     """
     for notation, create in PROBE_SHAPES.items():
         # Convert the notation into a regular expression. A polygon may have more corners. Each word of capital letters

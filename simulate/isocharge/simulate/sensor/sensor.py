@@ -44,15 +44,16 @@ The number is limited because all pairs of edges are searched for intersections.
 """
 
 MIN_EXTENT = 0.02
-"""Smallest accepted size of an electrode, mm. The size is the larger one of its extents along x and along y.
+"""Smallest accepted size of an electrode, mm. The size is the larger of the extents along x and along y.
 
 A smaller value was probably given in metres.
 """
 
 MAX_PART_SIDE = 3.0
-"""Largest side along the outline of the triangles into which metal that is not convex is divided, mm.
+"""Largest length of a triangle side that lies on the outline of an electrode, mm.
 
-The layout design keeps its distance from the bounding box of each triangle, so the triangles must be small.
+Metal that is not convex is divided into triangles. The layout design keeps new electrodes away from the bounding box of
+each triangle, so the triangles must be small.
 """
 
 MAX_CROSSTALK = 0.2
@@ -67,7 +68,7 @@ RESERVED_NAMES = (
 )
 """Names that an electrode cannot have, because they have another meaning in a file or a frame.
 
-They are keys of the sensor file, columns of tables of presses, and fields of a frame.
+The reserved names are keys of the sensor file, columns in tables of presses, or fields of a frame.
 """
 
 MAX_ELECTRODES = 64
@@ -89,7 +90,7 @@ class Electrode:
         name: Name of the electrode in the sensor file.
         corners: Corners of the pad, which is the first polygon of metal on the front.
         more: Further polygons of metal on the front, such as traces. Overlapping areas count once.
-        back: Polygons of metal on the back. If there are none, the back is completely covered with metal.
+        back: Polygons of metal on the back; empty if the back is completely covered with metal.
     """
 
     name: str
@@ -112,7 +113,7 @@ class Electrode:
             side: Length of the sides, mm.
 
         Returns:
-            The electrode, whose corners start at the lower left corner.
+            The electrode. Its first corner is the lower left corner.
         """
         directions = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
         corners = np.array(centre) + 0.5 * side * directions
@@ -125,12 +126,12 @@ class Electrode:
         polygon of `more`.
 
         Args:
-            path: Points (x, y) that the centre line of the trace connects by straight lines, mm.
+            path: Points (x, y) of the centre line of the trace, mm. Straight lines connect the points.
             width: Width of the trace, mm.
 
         Raises:
-            SensorError: If the path has too few or too many points, repeats a point or turns back, or if the trace
-                crosses itself.
+            SensorError: If the path has too few or too many points, if it repeats a point or turns back, or if the
+                trace crosses itself.
         """
         where = f"trace of electrode {self.name!r}"
         if not 2 <= len(path) <= MAX_CORNERS // 2:
@@ -153,7 +154,7 @@ class Electrode:
 
     @cached_property
     def side(self) -> float | None:
-        """Side of the electrode if it is a square whose sides are parallel to the axes, mm; otherwise None.
+        """Side length of a square electrode with sides parallel to the axes, mm; None for any other electrode.
 
         The corners of the square must begin at the lower left and follow anticlockwise, as `of_square` creates them.
         The square must be the only metal on the front, and the back must be completely covered with metal.
@@ -177,13 +178,13 @@ class Electrode:
 
     @cached_property
     def collecting_polygons(self) -> tuple[Array, ...]:
-        """Polygons that do not overlap and together form the collecting area of the electrode.
+        """Non-overlapping polygons that together form the collecting area of the electrode.
 
         The collecting area consists of one convex polygon or of several triangles. The corners (x, y) of a polygon are
         an array of shape (n, 2), mm.
 
         Raises:
-            SensorError: If a polygon crosses itself, or there are too few or too many corners.
+            SensorError: If a polygon crosses itself, or if the number of corners is too small or too large.
         """
         polygons = (*self.front, *self.back)
         for polygon in polygons:
@@ -215,8 +216,8 @@ class Electrode:
     def metal(self) -> tuple[Array, ...]:
         """Convex parts of all metal on the front, including metal that collects no charge.
 
-        A convex pad without further metal is one part. All other metal is divided into triangles, whose sides along the
-        outline are at most `MAX_PART_SIDE` long. The corners (x, y) of a part are an array of shape (n, 2), mm.
+        A convex pad without further metal is one part. All other metal is divided into triangles. The triangle sides on
+        the outline are at most `MAX_PART_SIDE` long. The corners (x, y) of a part are an array of shape (n, 2), mm.
         """
         if replace(self, back=())._is_convex:
             return (np.array(self.corners),)
@@ -239,12 +240,12 @@ class Calibration:
     """Measured gains and positions of the electrodes of a real film.
 
     Attributes:
-        gain: Ratio of the charge that is read to the charge that is collected, by the name of the electrode. The gain
-            of an electrode that is not contained is 1.
+        gain: Gain of each electrode by its name. The gain is the charge that is read, divided by the charge that is
+            collected. An electrode without an entry has the gain 1.
         shift: Displacement (x, y) of the electrodes from their nominal positions in the layout, mm.
-        rotation: Rotation of the electrodes about the centre of the film, anticlockwise, rad. It is applied before the
-            shift.
-        crosstalk: Fraction of the charge of every other electrode that is added to the charge of an electrode,
+        rotation: Rotation of the electrodes about the centre of the film, anticlockwise, rad. The rotation is applied
+            before the shift.
+        crosstalk: Fraction of the charge of each electrode that is added to the charges of all other electrodes,
             dimensionless.
     """
 
@@ -286,13 +287,13 @@ class Sensor:
 
     Attributes:
         name: Name of the sensor.
-        film: Film, whose stiffness does not include the metal of the electrodes.
+        film: Film. Its stiffness does not include the metal of the electrodes.
         piezo: Piezoelectric coefficients of the film.
         electrodes: Electrodes, in the order of the charges.
         readout: "area" if the stress is averaged over the area of an electrode, "edge" if it is averaged over its
             edges.
         surface: Surface at which the stress is read: "middle", "top" or "bottom" of the film.
-        calibration: Gains and positions of the electrodes that were measured on a real film.
+        calibration: Gains and electrode positions that were measured on a real film.
     """
 
     name: str
@@ -307,7 +308,7 @@ class Sensor:
         """Check the names, the gains and the positions of the electrodes.
 
         Raises:
-            SensorError: If a value is not allowed, or an electrode overlaps another electrode or the rim.
+            SensorError: If a value is not allowed, or if an electrode overlaps another electrode or the rim.
         """
         object.__setattr__(self, "electrodes", _as_tuples(self.electrodes))  # the dataclass is frozen
 
@@ -366,7 +367,9 @@ def electrode_index(sensor: Sensor, name: str) -> int:
 
 
 def outermost_corner(sensor: Sensor, polygons: Sequence[ArrayLike]) -> float:
-    """Return the largest distance of a corner of polygons on the real film from the centre of the film, mm.
+    """Return the distance from the centre of the film to the outermost corner of several polygons, mm.
+
+    The polygons are first moved from their nominal positions to their calibrated positions on the real film.
 
     Args:
         sensor: Sensor with the calibrated positions.
@@ -393,8 +396,8 @@ def _check_name(name: str) -> None:
         name: Name of the electrode.
 
     Raises:
-        SensorError: If the name is empty, too long or reserved, contains a comma or characters that are not printable,
-            or begins or ends with a blank.
+        SensorError: If the name is empty, too long or reserved, if it contains a comma or unprintable characters, or if
+            it begins or ends with a blank.
     """
     has_valid_length = 0 < len(name) <= MAX_NAME_LENGTH
     has_valid_characters = is_printable(name) and "," not in name and name == name.strip()
@@ -411,7 +414,7 @@ def _check_name(name: str) -> None:
 
 @lru_cache(maxsize=64)
 def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
-    """Raise an error if a layout of electrodes is not possible on any film.
+    """Raise an error if a layout of electrodes is invalid for every film.
 
     The result is cached, because many films have the same layout.
 
@@ -419,8 +422,8 @@ def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
         electrodes: Electrodes of the layout.
 
     Raises:
-        SensorError: If a polygon crosses itself, an electrode collects no charge or is too small, or two electrodes
-            overlap.
+        SensorError: If a polygon crosses itself, if an electrode is too small or collects no charge, or if two
+            electrodes overlap.
     """
     for electrode in electrodes:
         name = f"electrode {electrode.name!r}"
@@ -429,8 +432,8 @@ def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
         corners = np.array(electrode.corners)
         check_range(name, float(np.ptp(corners, axis=0).max()), (MIN_EXTENT, np.inf), "mm", SensorError)
     for first, second in combinations(electrodes, 2):
-        # Because of rounding errors, electrodes that only touch share a strip along their outline, whose length is at
-        # most the shorter perimeter.
+        # Because of rounding errors, electrodes that only touch share a narrow strip along their outlines. The strip is
+        # at most as long as the shorter perimeter.
         touching_area = MERGE_DISTANCE * min(first.region.length, second.region.length)
         if shapely.intersection(first.region, second.region).area > touching_area:
             raise SensorError(f"electrodes {first.name!r} and {second.name!r} overlap; move one of them")
@@ -441,7 +444,7 @@ def _check_on_film(electrode: Electrode, film: Film, calibration: Calibration) -
 
     Args:
         electrode: Electrode at its nominal position.
-        film: Film with the distance of its rim.
+        film: Film on which the electrode must lie.
         calibration: Shift and rotation of the electrodes on the film.
 
     Raises:

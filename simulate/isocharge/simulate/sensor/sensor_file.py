@@ -40,7 +40,7 @@ BUILT_IN_FOLDER = Path(__file__).parents[1] / "sensors"
 log = logging.getLogger(__name__)
 
 SIDE = "side_mm"
-"""Key of the section `electrodes` whose value is the side of all square electrodes."""
+"""Key in the section `electrodes` for the side length of all square electrodes."""
 
 Coordinate = Annotated[float, Meta(ge=-MAX_COORDINATE_mm, le=MAX_COORDINATE_mm)]
 Point = Annotated[tuple[Coordinate, Coordinate], Meta(description=f"[x, y] in mm, each at most {MAX_COORDINATE_mm:g}")]
@@ -155,10 +155,10 @@ def built_in_sensors() -> tuple[str, ...]:
 
 
 def load_sensor(sensor: StrPath) -> Sensor:
-    """Read a sensor file, which belongs to the package (built-in sensor) or to the user.
+    """Read the file of a built-in sensor or a sensor file of the user, and return the sensor.
 
-    If a file of the user describes a sensor with only one electrode, or an electrode of several parts that do not
-    touch, a warning is logged.
+    A warning is logged if the file describes only one electrode, or an electrode with parts that do not touch each
+    other.
 
     Args:
         sensor: Name of a built-in sensor such as "three-25um-biaxial", or path of a TOML file.
@@ -167,7 +167,7 @@ def load_sensor(sensor: StrPath) -> Sensor:
         The sensor that the file describes.
 
     Raises:
-        SensorError: If there is no such sensor, or its file is invalid. The message contains the file and the key.
+        SensorError: If the sensor does not exist, or if its file is invalid. The message names the file and the key.
     """
     names = built_in_sensors()
     path = BUILT_IN_FOLDER / f"{sensor}.toml" if str(sensor) in names else Path(sensor)
@@ -259,7 +259,7 @@ def film_to_dict(film: Film) -> dict[str, Any]:
     """Convert a film into the section `film` of a sensor file.
 
     This function is the inverse of `_film`. Young's modulus is a single number if it does not depend on the direction,
-    and a list if it does. The same applies to the pretension. Optional keys with their default value are omitted.
+    and a list if it does. The same applies to the pretension. Optional keys whose values are the defaults are omitted.
 
     Args:
         film: Film to be converted.
@@ -330,8 +330,8 @@ def write_sensor(sensor: Sensor, path: StrPath, comment: Iterable[str] = ()) -> 
 def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
     """Convert the electrodes of a sensor into the section `electrodes` of a sensor file.
 
-    All squares of a file have the same side. A square whose side differs from that of the first square is therefore
-    described as a polygon.
+    In a sensor file, all squares have the same side length. A square that is larger or smaller than the first square is
+    therefore described as a polygon.
 
     Args:
         sensor: Sensor with the electrodes.
@@ -360,7 +360,7 @@ def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
 
 
 def _tidy_all(values: Any) -> Any:
-    """Round a number, or all numbers of nested tuples or lists, which are returned as nested lists."""
+    """Round a number or all numbers in a nested tuple or list, and convert all tuples into lists."""
     if isinstance(values, tuple | list):
         return [_tidy_all(value) for value in values]
     return tidy(values)
@@ -402,10 +402,12 @@ def _film(table: FilmTable) -> Film:
 
 
 def _along_axes(value: float | list[float]) -> list[float]:
-    """Return the components of a property along both axes of the film. They are equal if the file contains one number.
+    """Return the components of a property along both axes of the film.
+
+    Both components are equal if the file contains only one number.
 
     Args:
-        value: Value in the file, which is a number or a list of both components.
+        value: Value in the file: one number, or a list of both components.
     """
     return value if isinstance(value, list) else [value, value]
 
