@@ -28,13 +28,13 @@ DEFAULT_SIDE = 3.0
 """Side of new squares if the sensor has no square electrodes, mm."""
 
 GAP = 0.5
-"""Smallest allowed gap between two electrodes, mm. It is sufficient if the gap along x or along y is large enough."""
+"""Smallest allowed gap between two electrodes, mm. The rule applies to the larger of the gaps along x and along y."""
 
 RIM_DISTANCE = 1.0
 """Smallest allowed distance of an electrode from the rim of the film, mm."""
 
 NAMES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-"""Names of new electrodes. New electrodes get the first of these names that no kept electrode has."""
+"""Names of new electrodes. New electrodes get the first letters that no kept electrode uses."""
 
 SEARCH_PRESSES = 150
 """Number of presses for which the search evaluates random layouts."""
@@ -48,9 +48,9 @@ class Nuisances:
     """Prior standard deviations of parameters that are not known exactly when a press is measured.
 
     Attributes:
-        probe_radius: Standard deviation of the probe radius, mm. It also accounts for the unknown distribution of the
-            contact pressure. A uniform pressure and the pressure under a rigid flat punch have the same effect outside
-            the footprint as two probes whose radii differ by 5 %.
+        probe_radius: Standard deviation of the probe radius, mm. This value also accounts for the unknown distribution
+            of the contact pressure. Outside the footprint, replacing a uniform pressure by the pressure under a rigid
+            flat punch has the same effect as changing the probe radius by 5 %.
         pretension: Standard deviation of the pretension after a calibration, MPa.
         gain: Standard deviation of the relative gain of each electrode, dimensionless.
     """
@@ -65,7 +65,7 @@ class Nuisances:
 
 
 NO_NUISANCES = Nuisances(probe_radius=0.0, pretension=0.0, gain=0.0)
-"""Standard deviations of zero, for a press of which only the position and the force are unknown."""
+"""Standard deviations of zero. Only the position and the force of a press are then unknown."""
 
 
 Goal = Literal["worst", "rms"]
@@ -89,7 +89,7 @@ class DesignCase:
         force: Force of the presses, N.
         noise: Noise of the readings.
         nuisances: Standard deviations of the parameters that are not known exactly.
-        side: Side of the new squares, mm; None for the side of the squares of the sensor.
+        side: Side of the new squares, mm; None for the same side as the existing squares of the sensor.
         seed: Seed of the random layouts from which the search starts.
 
     Raises:
@@ -142,8 +142,8 @@ class DesignCase:
 
         The attribute `keep` contains the names of electrodes of the sensor that keep their positions, and `electrodes`
         is the number of electrodes of the new layout. At least one electrode must be new. The sensor must not be
-        calibrated, because a calibration moves its electrodes. With the readout 'edge', kept squares must have the side
-        of the new squares.
+        calibrated, because a calibration moves its electrodes. With the readout 'edge', all squares must have the same
+        side.
 
         Raises:
             InputError: If a rule is violated.
@@ -199,7 +199,7 @@ class DesignCase:
     def fine_presses(self) -> Array:
         """Positions (x, y) of many presses, shape (n, 2), mm.
 
-        The largest position error mostly occurs in a small region beside an electrode.
+        Many presses are needed, because the largest position error mostly occurs in a small region beside an electrode.
         """
         return self.radius * sunflower(FINE_PRESSES)
 
@@ -213,8 +213,8 @@ class DesignCase:
             positions: Centres (x, y) of the squares, shape (n, 2), mm.
 
         Returns:
-            Smallest margin of each square, which is an actual distance minus a required distance, shape (n,), mm. It is
-            negative if the square violates a rule.
+            Smallest margin of each square, shape (n,), mm. A margin is the actual distance minus the required distance,
+            and is negative if the square violates a rule.
         """
         # The outermost corner of a square determines its distance from the rim of the film.
         half_side = 0.5 * self.square_side
@@ -231,14 +231,14 @@ class DesignCase:
         return np.asarray(np.min(clearances, axis=0))
 
     def pair_clearance(self, positions: Array, others: Array) -> Array:
-        """Compute the margin with which each pair of new squares satisfies the rule for the gap between electrodes.
+        """Compute by how much the gap between each pair of new squares exceeds the smallest allowed gap.
 
         Args:
             positions: Centres (x, y) of the first squares, shape (n, 2), mm.
             others: Centres (x, y) of the second squares, shape (m, 2), mm.
 
         Returns:
-            Actual gap minus required gap for each pair, shape (n, m), mm. It is negative if a pair violates the rule.
+            Actual gap minus required gap for each pair, shape (n, m), mm; negative for a pair that violates the rule.
         """
         # The gap between two squares along an axis is the distance of their centres along this axis, minus one side. It
         # is sufficient if the gap along x or the gap along y is large enough, so the larger distance counts.
@@ -260,7 +260,7 @@ class DesignCase:
         return np.concatenate([self.clearance(positions), pair_clearances])
 
     def position_errors(self, charges: Array, nuisances: Nuisances) -> Array:
-        """Compute the Cramer-Rao limit of the position of each press with uncertain nuisance parameters.
+        """Compute the Cramer-Rao limit of the position error of each press if the nuisance parameters are uncertain.
 
         The parameters of a press are x, y, ln F, the probe radius and the pretension. The uncertainty of the gains is
         added to the noise.

@@ -1,13 +1,14 @@
 """Design of an electrode layout that has small position errors and unambiguous charges.
 
-A layout is described by the coordinates of its new squares. The minimised quantity is a power mean of the position
-errors of many presses: the p-th root of the mean of the p-th powers of the errors. The exponent is 2 for the root mean
-square. For the largest error, a large exponent makes the power mean a smooth approximation of the maximum.
+A layout is described by the coordinates of its new squares. The design minimises a power mean of the position errors of
+many presses. For the exponent p, the power mean of the errors is mean(error^p)^(1/p). If the goal is the root mean
+square, the exponent is 2. If the goal is the largest error, the exponent is large, so that the power mean is a smooth
+approximation of the maximum.
 
 Sequential quadratic programming (SLSQP) minimises the logarithm of the power mean over a few presses, and respects the
-smallest allowed distances. It starts at several random layouts. The largest error mostly occurs near the edge of an
-electrode, between these presses. The best layouts are therefore improved further. Each improvement reduces the errors
-of the worst of many presses, and the worst presses are then selected again.
+smallest allowed distances. The minimisation starts at several random layouts. The largest error mostly occurs near the
+edge of an electrode, between the few presses. The best layouts are therefore improved further. Each improvement reduces
+the largest errors among many presses. The presses with the largest errors are then selected again.
 """
 
 import math
@@ -41,22 +42,22 @@ STARTS = 24
 """Number of random layouts from which the search starts."""
 
 POWER = 12.0
-"""Exponent of the power mean of few presses if the goal is the largest error. It is doubled in each further round."""
+"""Exponent of the power mean if the goal is the largest error. Each further round doubles the exponent."""
 
 EXTENT = 1.0 / 3.0
-"""Distance by which the random squares extend beyond the presses, in film radii, dimensionless.
+"""Largest distance of the random squares from the disk of the presses, in film radii, dimensionless.
 
 The charges of electrodes that are farther out depend little on the position of a press.
 """
 
 ROUNDS = 5
-"""Number of improvements of a layout for the presses with the largest errors."""
+"""Number of rounds in which a layout is improved for the presses with the largest errors."""
 
 MAX_FINALISTS = 3
 """Largest number of layouts that are improved further."""
 
 MIN_DIFFERENCE = 2e-3
-"""Relative difference of the errors above which two layouts are different and not rotations of each other."""
+"""Relative difference of the errors up to which two layouts count as rotations of each other."""
 
 CLEARANCE_TOLERANCE = 1e-3
 """Largest violation of a distance rule that a layout may have, mm."""
@@ -71,7 +72,7 @@ class Layout:
 
     Attributes:
         positions: Centres (x, y), shape (n_new, 2), mm.
-        error: Value of the minimised quantity, mm.
+        error: Position error that the design minimises, mm.
     """
 
     positions: Array
@@ -105,10 +106,10 @@ def random_layouts(case: DesignCase) -> list[Array]:
 
 
 def _layouts_within(radius: float, case: DesignCase) -> list[Array]:
-    """Choose random layouts of new squares, whose centres all lie within a radius.
+    """Choose random layouts of new squares whose centres lie within a radius around the centre of the film.
 
-    Candidates are points that are distributed evenly over the disk. For each layout, they are tried in random order,
-    and added if the squares keep the smallest allowed distances.
+    Candidates are points that are distributed evenly over the disk. For each layout, the candidates are tried in random
+    order. A square is added at a candidate if all squares keep the smallest allowed distances.
 
     Args:
         radius: Largest distance of a centre from the centre of the film, mm.
@@ -135,7 +136,7 @@ def _layouts_within(radius: float, case: DesignCase) -> list[Array]:
 
 @dataclass(frozen=True)
 class Search:
-    """Search for the electrode positions whose errors, summarised by the goal of a design case, are smallest.
+    """Search for the electrode positions that minimise the position errors according to the goal of a design case.
 
     Attributes:
         case: Requirements of the layout.
@@ -154,8 +155,8 @@ class Search:
             sensor: Sensor whose layout is evaluated.
 
         Returns:
-            Position errors that the noise causes alone, and those that the noise and the uncertain nuisance parameters
-            of the design case cause together.
+            Position errors due to the noise alone, and position errors due to the noise and the uncertain nuisance
+            parameters of the design case together.
         """
         presses = self.case.fine_presses
         charges = charges_and_derivatives(self.fields, presses, sensor.electrodes)
@@ -175,7 +176,7 @@ class Search:
         return self.error_map(self.case.layout(positions)).with_nuisances
 
     def optimum(self, start: Array) -> Layout:
-        """Minimise the power mean of the errors of a few presses, from the positions of a layout.
+        """Minimise the power mean of the errors of a few presses, starting from a given layout.
 
         Args:
             start: Centres (x, y) of the new squares, shape (n_new, 2), mm.
@@ -220,7 +221,8 @@ class Search:
             power: Exponent of the power mean.
 
         Returns:
-            Layout with its power mean. If the new positions violate a distance rule, it is the layout of the start.
+            New layout with its power mean. If the new positions violate a distance rule, the starting layout is
+            returned.
         """
         density = charge_density(self.fields, presses)
         kept_charges = electrode_charges(density, self.case.kept_electrodes)
@@ -309,7 +311,7 @@ class ErrorMap:
     with_nuisances: Array
 
     def to_dict(self) -> dict[str, dict[str, Any]]:
-        """Return a dictionary for JSON with the maximum and the rms of the errors without and with nuisances."""
+        """Return a dictionary for JSON with the largest and the rms error, both without and with nuisances."""
         return {
             "noise_alone": self._statistics(self.noise_alone),
             "with_nuisances": self._statistics(self.with_nuisances),
@@ -337,7 +339,7 @@ class Design:
         sensor: Sensor with the new layout.
         summary: Sentence about folds and ambiguous pairs of the new layout over the default range of forces.
         n_rejected: Number of layouts with a smaller error that were rejected because their charges are ambiguous.
-        errors_before: Errors of the initial sensor; None if it has fewer than three electrodes.
+        errors_before: Errors of the initial sensor; None if the sensor has fewer than three electrodes.
         errors_after: Errors of the new layout.
     """
 
@@ -382,7 +384,8 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
             on the executor.
 
     Returns:
-        The layout and its errors, with the errors of the initial sensor if this sensor has at least three electrodes.
+        The new layout and its errors. The errors of the initial sensor are included if the sensor has at least
+        three electrodes.
 
     Raises:
         InputError: If the electrodes do not fit on the film.
@@ -431,7 +434,7 @@ def _solve_forward_map(case: DesignCase, executor: Executor | None) -> ForwardMa
 
     Args:
         case: Requirements of the layout.
-        executor: Executor that runs the solves; None for this process.
+        executor: Executor that runs the solves; None to run the solves in this process.
 
     Raises:
         SceneError: If the film cannot bear a force of the map.
@@ -450,7 +453,7 @@ def describe_ambiguities(case: DesignCase, charges: ChargeMap) -> str:
         charges: Charge map of the layout.
 
     Returns:
-        `UNAMBIGUOUS` if there are no folds and no ambiguous pairs. Otherwise a text with the smallest distance of a
+        `UNAMBIGUOUS` if there are no folds and no ambiguous pairs. Otherwise, a text with the distance of the nearest
         fold from the centre and the number of pairs.
     """
     area = working_area(charges, case.noise, error=np.inf)

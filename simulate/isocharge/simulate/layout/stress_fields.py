@@ -1,4 +1,4 @@
-"""Charges of electrodes at any position on the film, and their derivatives with respect to the parameters of a press.
+"""Charges of electrodes anywhere on the film, and derivatives of the charges with respect to the press parameters.
 
 A forward map interpolates the stress and its derivatives with respect to the position and the force of the press, the
 probe radius and the pretension. All presses have the same probe and the same force. The equilibrium of the film under a
@@ -29,14 +29,14 @@ from isocharge.simulate.solver.press import press
 from isocharge.simulate.solver.sensitivity import change_by_node_shift
 
 COLUMNS = ("charge", "x", "y", "ln force", "probe radius", "pretension")
-"""Results for one press and one electrode, in the order of the last axis of arrays.
+"""Names of the results for one press and one electrode, in the order of the last axis of an array.
 
 The columns are the charge (pC) and its derivatives with respect to x and y (pC/mm), ln F (pC), the probe radius (pC/mm)
 and the pretension (pC/MPa).
 """
 
 COLUMN_IS_ODD = np.array([column == "y" for column in COLUMNS])
-"""Whether a mirror image of the film about the direction of the press inverts each column's sign, shape (6,)."""
+"""Whether each column changes its sign if the film is mirrored about the direction of the press, shape (6,)."""
 
 STEPS = (0.02, 0.02, 0.05, 0.02, 0.1)
 """Steps of the finite differences of the stress, in the order of the derivatives in `COLUMNS`.
@@ -46,7 +46,7 @@ MPa.
 """
 
 NODE_COUNT = NodeCount(distances=8, forces=1)
-"""Numbers of distances and directions of the solved presses."""
+"""Numbers of distances and forces of the solved presses."""
 
 PRESS_CHUNK = 256
 """Number of presses that are evaluated at once, which limits the required memory to about 100 MB."""
@@ -62,10 +62,10 @@ def solve_fields(
         probe: Circular probe that presses the film.
         force: Force of the presses, N.
         radius: Largest distance of a press from the centre, mm.
-        executor: Executor that runs the solves; None for this process.
+        executor: Executor that runs the solves; None to run the solves in this process.
 
     Returns:
-        Forward map whose table contains the scaled stress and its derivatives with single precision.
+        Forward map with a table of the scaled stress and its derivatives in single precision.
 
     Raises:
         SolveError: If a press has no equilibrium.
@@ -99,7 +99,7 @@ def charge_density(fields: ForwardMap, presses: Array) -> ChargeDensity:
     """Interpolate the stress fields at the positions of presses, and convert the stress to charge per area.
 
     Args:
-        fields: Stress fields that `solve_fields` returns, in a domain that contains the presses.
+        fields: Stress fields that `solve_fields` returns. The domain of the fields must contain the presses.
         presses: Positions (x, y) of the presses, shape (n, 2), mm.
 
     Returns:
@@ -140,9 +140,9 @@ def electrode_charges(density: ChargeDensity, electrodes: Sequence[Electrode]) -
 
 
 def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
-    """Compute the stress under a press and its derivatives at the nodes of the mesh, in the frame of the press.
+    """Compute the stress and its derivatives at the mesh nodes for one press, in the frame of the press.
 
-    The derivatives refer to fixed points of the film. They are computed by finite differences between solved presses.
+    The derivatives refer to fixed points of the film, and are computed by finite differences between solved presses.
 
     Args:
         solved: Equilibrium of the film under a press on the positive x axis.
@@ -212,16 +212,17 @@ def _nodes_in_film_axes(solved: Equilibrium) -> Complexes:
 
 
 def _change_at_fixed_points(solved: Equilibrium, first: Equilibrium, second: Equilibrium, surface: Surface) -> Array:
-    """Compute the difference of the stress between two presses at the nodes of a third press.
+    """Compute how much the stress differs between two presses, at the mesh nodes of a third press.
 
     Args:
         solved: Third press, at whose nodes both stresses are read.
-        first: First press, whose stress is subtracted from that of the second press.
+        first: First press, whose stress is subtracted from the stress under the second press.
         second: Second press.
         surface: Surface at which the stress is read.
 
     Returns:
-        Difference of the stress (s11, s22, s12), shape (n_element, n_local, 3), MPa.
+        Stress (s11, s22, s12) under the second press minus stress under the first press, shape (n_element, n_local, 3),
+        MPa.
     """
     points = solved.film.radius * (1.0 - 1e-12) * solved.mesh.points  # on the film despite rounding errors
     corners = to_corners(points.ravel())
