@@ -40,20 +40,20 @@ class CramerRao:
 
 
 def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel, nuisance: Array | None = None) -> CramerRao:
-    """Use charges and their derivatives to compute the Cramer-Rao limits of contacts.
+    """Compute the Cramer-Rao limits of contacts from charges and their derivatives.
 
     Args:
         charge: Charges, shape (n, n_electrode), pC.
         jacobian: Derivatives d(Q)/d(parameters), shape (n, n_electrode, p). The first three parameters are x, y and
             ln F.
         noise: Noise of the readings. The white noise must be positive.
-        nuisance: Change of the charges by one prior standard deviation of each nuisance parameter, such as the radius
-            of the probe or the pretension, shape (n, n_electrode, n_nuisance), pC. The information of the prior
-            distributions of these parameters is added (Van Trees 1968, sec. 2.4.3). None if there are no such
+        nuisance: Change of the charges if a nuisance parameter, such as the probe radius or the pretension, changes by
+            one prior standard deviation, shape (n, n_electrode, n_nuisance), pC. The information of the prior
+            distributions of these parameters is added (Van Trees 1968, sec. 2.4.3). None if there are no nuisance
             parameters.
 
     Returns:
-        The limits. Their covariance is the inverse of the sum of the Fisher information and the prior information.
+        The limits. The covariance is the inverse of the sum of the Fisher information and the prior information.
     """
     prior_information = np.zeros(jacobian.shape[2])
     if nuisance is not None:
@@ -67,7 +67,7 @@ def cramer_rao(charge: Array, jacobian: Array, noise: NoiseModel, nuisance: Arra
 
 
 def limits_at(charge_map: ChargeMap, contact: Array, noise: NoiseModel) -> CramerRao:
-    """Use a charge map to compute the Cramer-Rao limits of contacts.
+    """Compute the Cramer-Rao limits of contacts by means of a charge map.
 
     Args:
         charge_map: Map that computes the charges of contacts.

@@ -80,12 +80,12 @@ class LimitMap:
     def statistics(self) -> dict[str, float]:
         """Return a dictionary for JSON with the median, the root mean square and the maximum of the error limits.
 
-        The weight of a position is the area that it represents. Errors of the force are in percent of the force.
+        Each position is weighted by the area that it represents. Errors of the force are in percent of the force.
         """
         # Each position represents a part of a strip around its ring. All strips are as wide as the distance between the
         # rings, so their areas are proportional to the radii and to the numbers 1, 2, ... of the rings. Half of the
-        # strip of the outermost ring lies outside the disk. In the median, an error is repeated according to its area,
-        # so the areas are integers in an arbitrary unit: twice the number of the ring, and once for the outermost ring.
+        # strip of the outermost ring lies outside the disk. For the median, each error is repeated in proportion to its
+        # area, so the areas must be integers: twice the number of the ring, but once the number for the outermost ring.
         n_ring, n_angle = self.position.shape
         ring_area = np.append(2 * np.arange(1, n_ring), n_ring)
         area = np.repeat(ring_area, n_angle)  # of each position, shape (n_ring * n_angle,)
@@ -116,7 +116,7 @@ class Identification:
             for the largest force.
         inner_maps: Error limits within the working area for the same forces; empty if the working area has the
             radius 0.
-        mirror: Share of the presses outside the working area that have the charges of a press inside the working area.
+        mirror: Share of the presses outside the working area that have the charges of a press inside the working area;
             None if the share was not computed; see `mirror_region`.
     """
 
@@ -222,12 +222,12 @@ def identify(
     Args:
         sensor: Sensor to be analysed.
         probe: Probe that presses the film.
-        noise: Noise of the readings, whose white noise must be positive. If None, the noise level is `reference`.
+        noise: Noise of the readings, with positive white noise. If None, the noise level is `reference`.
         force_range: Smallest and largest force, N.
         radius: Distance from the centre up to which contacts are analysed, mm. If None, the distance is chosen by
             `map_to_search`.
         error: Largest Cramer-Rao position error that is allowed in the working area, mm.
-        executor: Executor that runs the solves; None for this process.
+        executor: Executor that runs the solves; None to run the solves in this process.
 
     Raises:
         SceneError: If there are fewer than three electrodes, if the forces are equal, if there is no white noise, or if
@@ -291,14 +291,14 @@ def map_to_search(
         sensor: Sensor of the forward map.
         probe: Probe that presses the film.
         force_range: Smallest and largest force, N.
-        executor: Executor that runs the solves; None for this process.
+        executor: Executor that runs the solves; None to run the solves in this process.
 
     Returns:
-        The forward map with the largest of these radii at which the map is accurate.
+        The forward map with the largest tried radius at which the charges can be interpolated accurately.
 
     Raises:
         SceneError: If a press in the domain cannot exist.
-        SolveError: If the map with the smallest of these radii cannot be built.
+        SolveError: If even the map with the smallest radius cannot be built.
     """
     _, max_force = force_range
     first_radius = search_radius(sensor, probe.under(max_force))

@@ -2,9 +2,9 @@
 
 A press in the mirror region lies outside the working area and has the same charges as a press inside the working area.
 Therefore no method can conclude from the charges that the press lies outside the working area. If all electrodes lie on
-one circle of radius R, the mirror region covers almost the whole film. An inversion in this circle preserves the ratios
-of the distances to the points of the circle. Point loads at the distances r and R^2 / r from the centre therefore have
-nearly the same influence on the points of the circle.
+one circle of radius R, the mirror region covers almost the whole film. An inversion in this circle moves a point such
+that the ratios between its distances from the points of the circle remain the same. Point loads at the distances r and
+R^2 / r from the centre therefore have nearly the same influence on the points of the circle.
 """
 
 import logging
@@ -28,9 +28,10 @@ from isocharge.simulate.sensor.sensor import Sensor
 _log = logging.getLogger(__name__)
 
 DETECTABLE_SIGMAS = 5.0
-"""Smallest distance from the charges of all presses in the working area at which a press outside can be noticed.
+"""Smallest distance between charges at which a press outside the working area can be noticed.
 
-The distance is in standard deviations of the noise. It equals the smallest limit of the misfit in `isocharge.serve`.
+The distance between the charges of this press and the nearest charges of a press in the working area is in standard
+deviations of the noise. The value equals the smallest limit of the misfit in `isocharge.serve`.
 """
 
 N_FORCES = 5
@@ -55,15 +56,15 @@ charges.
 
 @dataclass(frozen=True)
 class MirrorRegion:
-    """Share of the presses at each position outside the working area that have the charges of a press inside it.
+    """Share of the presses at each position outside the working area that have the charges of a press inside the area.
 
     Attributes:
         inner: Radius of the working area, mm.
         outer: Largest distance of the presses from the centre, mm.
         forces: Forces of the presses at each position, shape (n_force,), N.
-        share: Share of the forces at which a press has the charges of a press in the working area, shape (n_ring,
-            n_sector), dimensionless. The rings between `inner` and `outer` have equal widths. The first sector begins
-            at the x axis, and the others follow anticlockwise.
+        share: Share of the forces at which a press in a sector has the same charges as a press in the working area,
+            shape (n_ring, n_sector), dimensionless. The rings between `inner` and `outer` have equal widths. The first
+            sector begins at the x axis, and the others follow anticlockwise.
     """
 
     inner: float
@@ -77,7 +78,7 @@ class MirrorRegion:
 
         The part of the film outside the working area is divided into rings, and each ring is divided into sectors. In
         the middle of each sector, presses with several forces are tested. The share of a sector is the fraction of its
-        presses whose charges also belong to a press inside the working area, within the noise.
+        presses that have, within the noise, the same charges as a press inside the working area.
 
         Args:
             charges: Accurate charge map of the working area.
@@ -103,7 +104,7 @@ class MirrorRegion:
 
     @property
     def total_share(self) -> float:
-        """Share of the presses outside the working area whose charges agree with those of a press inside it.
+        """Share of the presses outside the working area that have the same charges as a press inside the working area.
 
         The weight of a press is the area of its sector.
         """
@@ -136,15 +137,15 @@ class MirrorRegion:
 
 
 def has_mirror(inside: ChargeMap, charge: Array, noise: NoiseModel) -> Booleans:
-    """Return for each press outside a domain whether a press inside it has the same charges within the noise.
+    """Return for each press outside a domain whether a press inside the domain has the same charges within the noise.
 
     Args:
         inside: Charge map of the domain.
-        charge: Charges of the presses outside without noise, shape (n, n_electrode), pC.
+        charge: Charges of the presses outside the domain, without noise, shape (n, n_electrode), pC.
         noise: Noise of the readings.
 
     Returns:
-        Whether a press inside the domain causes the charges of each row, shape (n,).
+        Whether each row contains the charges of a press inside the domain, shape (n,).
     """
     contact, residual = search(inside, charge, noise.sigma(charge))
     is_same_charge = np.linalg.norm(residual, axis=1) < DETECTABLE_SIGMAS
@@ -166,9 +167,9 @@ def mirror_region(
 ) -> MirrorRegion | None:
     """Compute the mirror region of a sensor by means of a coarse charge map of the whole film.
 
-    The mirror region contains the presses outside the working area that have the same charges as a press inside it. The
-    charge map of the whole film is solved for a round probe. A probe of another shape is replaced by the smallest
-    circle around its centroid that contains the probe.
+    The mirror region contains the presses outside the working area that have the same charges as a press inside the
+    working area. The charge map of the whole film is solved for a round probe. A probe of another shape is replaced by
+    the smallest circle around its centroid that contains the probe.
 
     Args:
         sensor: Sensor with the film and the electrodes.
@@ -176,7 +177,7 @@ def mirror_region(
         charges: Accurate charge map of the working area.
         radius: Radius of the working area, mm.
         noise: Noise of the readings.
-        executor: Executor that runs the solves; None for this process.
+        executor: Executor that runs the solves; None to run the solves in this process.
 
     Returns:
         The mirror region; None if there is no working area, if the working area reaches the clamp, or if the film

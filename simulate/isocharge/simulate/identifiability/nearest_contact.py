@@ -28,14 +28,14 @@ from isocharge.simulate.forward.charge_map import ChargeMap
 from isocharge.simulate.numerics.disk import INNER_RADIUS, ROUNDING
 
 ResidualFunction = Callable[[Integers, Array], tuple[Array, Array]]
-"""Function that evaluates the residuals of some of the problems.
+"""Function that evaluates the residuals of selected least-squares problems.
 
-Its arguments are the indices of the problems, shape (m,), and the points u, shape (m, 3). The function returns the
+The arguments are the indices of the problems, shape (m,), and the points u, shape (m, 3). The function returns the
 residuals r, shape (m, k), and their derivatives dr/du, shape (m, 3, k).
 """
 
 MIN_CHANGE = 1e-7
-"""Default value for the change of |r|^2 below which the iteration ends, relative to 1 + |r|^2."""
+"""Default change of the sum of squared residuals |r|^2 below which an iteration ends, relative to 1 + |r|^2."""
 
 
 def minimise(
@@ -43,7 +43,7 @@ def minimise(
     start: Array,
     min_change: float = MIN_CHANGE,
 ) -> tuple[Array, Array]:
-    """Find a local minimum of each problem by damped Gauss-Newton steps, which begin at a given starting point.
+    """Find a local minimum of each problem by damped Gauss-Newton steps from a given starting point.
 
     Each problem minimises the sum of squares |r(u)|^2 over all points u of the domain D. The domain D is the unit disk
     times the interval [-1, 1]. A step that increases |r|^2 is rejected. The damping decreases after each accepted step
@@ -53,7 +53,7 @@ def minimise(
     Args:
         evaluate: Function that evaluates the residuals r and their derivatives dr/du for some of the problems. Its
             arguments are the indices of the problems, shape (m,), and a point of each problem, shape (m, 3).
-        start: Starting points, shape (n, 3). Points outside D are replaced by the nearest point of D.
+        start: Starting points, shape (n, 3). A point outside D is replaced by the nearest point of D.
         min_change: Change of |r|^2 below which the iteration ends, relative to 1 + |r|^2.
 
     Returns:
@@ -124,8 +124,9 @@ def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -
     inside of D if this decreases f. Otherwise, the edge is active, and the step must not cross it.
 
     Args:
-        normals: Outward normals of both edges of D at each point, shape (n, 2, 3): of the circle that bounds x and y,
-            and of the end of the interval that bounds the force; zeros for an edge on which the point does not lie.
+        normals: Outward normals of two edges of D at each point, shape (n, 2, 3). The first edge is the circle that
+            bounds x and y, and the second edge is the end of the interval that bounds the force. The normal of an edge
+            on which the point does not lie is zero.
         matrix: Damped matrices J'J, shape (n, 3, 3).
         gradient: Gradients J'r, shape (n, 3).
         trace: Traces of the matrices J'J, shape (n, 1, 1).
@@ -183,7 +184,7 @@ def explain(
         charge: Given charges, shape (n, n_electrode), pC.
         sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
         start: Contacts (x, y, F) from which the descents start, shape (n, 3), mm and N.
-        min_change: A descent ends if the squared distance changes by less than `min_change` times 1 + its value.
+        min_change: A descent ends if the squared distance s of the charges changes by less than min_change * (1 + s).
 
     Returns:
         Contacts (x, y, F) within the domain of the map, shape (n, 3), mm and N. Residuals, which are the given charges
@@ -230,7 +231,7 @@ def search(
 ) -> tuple[Array, Array]:
     """Find the contacts whose charges are nearest to given charges, without given starting points.
 
-    For each row of charges, two least-squares descents start at different contacts. The result is the better of them.
+    For each row of charges, two least-squares descents start at different contacts. The better result is returned.
 
     Args:
         charge_map: Map that computes the charges of contacts.
@@ -257,7 +258,7 @@ def local_minima(
     candidates: int = CANDIDATES,
     min_change: float = MIN_CHANGE,
 ) -> tuple[Array, Array]:
-    """Descend from each of the contacts of `starting_contacts`, and return all results.
+    """Descend from every contact that `starting_contacts` finds, and return the results of all descents.
 
     All descents run together, because the charge map is faster for many contacts at once.
 
@@ -267,12 +268,11 @@ def local_minima(
         sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
         starts: Number of descents for each row of charges.
         candidates: Number of candidates for the starting points.
-        min_change: A descent ends if the squared distance of the charges changes by less than `min_change` times 1 +
-            its value.
+        min_change: A descent ends if the squared distance s of the charges changes by less than min_change * (1 + s).
 
     Returns:
-        Contact (x, y, F) that each descent finds, shape (n, starts, 3), mm and N. Residuals, which are given charges
-        minus the charges of the contacts, divided by `sigma`, shape (n, starts, n_electrode), dimensionless.
+        Contact (x, y, F) that each descent finds, shape (n, starts, 3), mm and N. Residuals, which are the given
+        charges minus the charges of the contacts, divided by `sigma`, shape (n, starts, n_electrode), dimensionless.
     """
     start = starting_contacts(charge_map, charge, sigma, starts=starts, candidates=candidates)
     contact, residual = explain(
@@ -306,8 +306,8 @@ def starting_contacts(
         candidates: Number of candidates.
 
     Returns:
-        For each row of charges, the contacts (x, y, F) with the nearest charges, in ascending order of the distance of
-        their charges, shape (n, starts, 3), mm and N. They do not lie close together.
+        Contacts (x, y, F) with the nearest charges for each row, in ascending order of the distance between the
+        charges, shape (n, starts, 3), mm and N. Contacts in a row do not lie close together.
     """
     # Compute the charges of the candidates, and find the pairs of candidates that lie close together.
     unit_candidates, is_neighbour = _unit_candidates(candidates)
@@ -323,7 +323,7 @@ def starting_contacts(
 
 @cache
 def _unit_candidates(count: int) -> tuple[Array, Booleans]:
-    """Return contacts that are evenly distributed over a domain (Sobol sequence), and which pairs are close together.
+    """Return evenly distributed contacts in a domain (Sobol sequence), and whether each pair of them is close together.
 
     A quarter of the contacts lie on the edge of the disk.
 
@@ -350,9 +350,9 @@ def _unit_candidates(count: int) -> tuple[Array, Booleans]:
 def _nearest_rows(
     charge: Array, sigma: Array, candidate_charges: Array, is_neighbour: Booleans, count: int
 ) -> Integers:
-    """For each row of charges, find the candidates whose charges are nearest to this row.
+    """For each row of charges, find the candidates whose charges are nearest to the charges in the row.
 
-    For each row, at most one of two neighbouring candidates is returned. The function searches for the smallest
+    For each row, at most one of any two neighbouring candidates is returned. The function searches for the smallest
     distance several times, because sorting all distances would be slower.
 
     Args:
@@ -363,7 +363,7 @@ def _nearest_rows(
         count: Number of candidates to find for each row of charges.
 
     Returns:
-        Indices of the candidates in ascending order of the distance of their charges, shape (n, count).
+        Indices of the candidates in ascending order of the distance between the charges, shape (n, count).
     """
     # The squared distance of the charges Q_c of a candidate from the given charges Q is
     #   sum((Q - Q_c)^2 / sigma^2) = sum(Q_c^2 / sigma^2 - 2 Q Q_c / sigma^2) + const.

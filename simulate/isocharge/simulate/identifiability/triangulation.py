@@ -1,10 +1,10 @@
-"""Triangulation of presses. The position of a press is the point at which its contours meet (Mirbagheri et al. 2007).
+"""Triangulation: a press is at the point where the contours of its charges meet (Mirbagheri et al. 2007).
 
 The charge of an electrode restricts a press to an isocharge contour (figures 9 and 10 of the paper). The contours of
 three or more electrodes rarely meet exactly in one point. `Triangulation` therefore estimates the contact for which the
 mean square distance of the position from the contours is smallest. To first order, the distance from a contour is the
-difference of the charges divided by the length of the gradient of the charge. The estimate is therefore the nearest
-contact with these lengths as standard deviations of the charges.
+difference of the charges divided by the length of the gradient of the charge. The class therefore searches for the
+contact with the nearest charges, and uses the lengths of the gradients as standard deviations of the charges.
 """
 
 from dataclasses import dataclass
@@ -17,19 +17,22 @@ from isocharge.simulate.forward.charge_map import ChargeMap, check_electrode_cou
 from isocharge.simulate.identifiability.nearest_contact import explain, starting_contacts
 
 ROUNDS = 3
-"""Number of searches, each of which uses the gradients of the charges at the result of the previous search."""
+"""Number of successive searches. Each search uses the charge gradients at the result of the previous search."""
 
 STARTS = 4
 """Number of searches for each press, which start at different contacts."""
 
 TOLERANCE = 1.0
-"""Largest spread at which contours meet, and largest distance between contacts that count as one contact, mm."""
+"""Largest spread of contours that count as meeting, and largest distance of contacts that count as one contact, mm."""
 
 MIN_RELATIVE_SLOPE = 0.02
-"""Lower bound of the gradient of a charge, relative to the largest gradient of the charges of a press."""
+"""Lower bound of the gradient of a charge, relative to the largest charge gradient of the same press."""
 
 AMBIGUOUS_RATIO = 2.0
-"""Ratio of the spreads at a second contact and at the best contact up to which the second is as good as the best."""
+"""Ratio of spreads up to which a second contact is as good as the best contact, dimensionless.
+
+The ratio is the spread at the second contact, divided by the spread at the best contact.
+"""
 
 AMBIGUOUS_SPREAD = 0.01
 """Spread up to which a second contact is always as good as the best contact, mm."""
@@ -42,7 +45,7 @@ class Fix:
     Attributes:
         contact: Contact (x, y, F) of each press, shape (n, 3), mm and N; NaN if the contours do not meet within the
             tolerance, or if they meet at two positions.
-        spread: Root mean square distance of the contours from the position at which it is smallest, shape (n,), mm. If
+        spread: Smallest root mean square distance of a position from the contours of each press, shape (n,), mm. If
             the spread is at most the tolerance, and the contact is NaN, the contours meet at two positions.
     """
 
@@ -57,7 +60,7 @@ class Fix:
 
 @dataclass(frozen=True)
 class Triangulation:
-    """Estimator that determines a contact as the point at which its contours meet.
+    """Estimator that finds the contact at which the contours of the given charges meet.
 
     Attributes:
         charge_map: Map that computes the charges of contacts. A `ChargeSpline` is much faster than a forward map. If
@@ -75,17 +78,17 @@ class Triangulation:
     def locate(self, charge: Array) -> Fix:
         """Estimate the contact (x, y, F) of each press from its charges.
 
-        The contour of an electrode consists of the positions at which a press causes its charge. The estimate is the
-        position that is nearest to the contours of all electrodes.
+        The contour of an electrode consists of the positions at which a press causes the given charge. The estimate is
+        the position that is nearest to the contours of all electrodes.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
 
         Returns:
-            The contacts. A contact is NaN if no position, or more than one, agrees with the charges.
+            The contacts. A contact is NaN if no position or more than one position agrees with the charges.
 
         Raises:
-            ChargeError: If there is not one finite charge for each electrode.
+            ChargeError: If the shape of the charges is wrong, or if a charge is not finite.
         """
         charge = np.asarray(charge, dtype=float)
         names = self.charge_map.electrodes
@@ -115,7 +118,7 @@ class Triangulation:
         return Fix(best_contact, best_spread)
 
     def _descend(self, charge: Array, contact: Array) -> tuple[Array, Array]:
-        """Find the contacts near starting points for which the mean square distance from the contours is smallest.
+        """Find the contacts with the smallest mean square distance from the contours, starting from given contacts.
 
         The contour of an electrode consists of the positions at which a press causes the given charge. To first order,
         the distance from the contour is the difference of the charges divided by the length of the gradient.

@@ -2,15 +2,15 @@
 
 Charges Q determine a contact only where the map from (x, y, ln F) to the charges is one to one. Near a fold, different
 contacts have the same charges. At a fold, the derivative J = d(Q)/d(x, y, ln F) is singular, so that the Cramer-Rao
-limit of the position is infinite, and the map reverses its orientation across the fold. With three electrodes, folds
-are lines at which det J changes its sign. With more electrodes, J is not square and is singular only at isolated points
+limit of the position is infinite. Across a fold, the map reverses its orientation. With three electrodes, folds are
+lines at which det J changes its sign. With more electrodes, J is not square and is singular only at isolated points
 (Whitney 1944).
 
 The search refines the maxima of the position error on a grid. A maximum is a fold if the orientation of the map is
 reversed across it. The orientation is reversed between two contacts a and b if det(J(a)' W J(b)) < 0, where the
-diagonal matrix W contains the inverse variances of the charges. For more than three electrodes, the criterion is
-reliable only for contacts that are close to each other: beside an electrode, the directions of the derivatives change
-by more than a right angle within 0.1 mm without a fold.
+diagonal matrix W contains the inverse variances of the charges. For more than three electrodes, this criterion is
+reliable only for contacts that are close to each other. Beside an electrode, the directions of the derivatives may
+change by more than a right angle within 0.1 mm although there is no fold.
 
 If all electrodes of an isotropic film lie on one circle, a press and its mirror image in this circle cause nearly the
 same charges. The map therefore has a fold near the circle for any number of electrodes.
@@ -38,10 +38,10 @@ from isocharge.simulate.numerics.polygon import to_corners
 from isocharge.simulate.sensor.film import tidy
 
 FOLD_WIDTH = 0.02
-"""Distance between two contacts on both sides of a fold, mm.
+"""Distance between two contacts on opposite sides of a fold, mm.
 
-Beside an electrode, the orientation may be reversed within 0.1 mm without a fold. At a true fold, such as that on a
-circle of four electrodes, the orientation is reversed within about 0.01 mm.
+Beside an electrode, the orientation may be reversed within 0.1 mm although there is no fold. At a true fold, such as
+the fold on a circle through four electrodes, the orientation is reversed within about 0.01 mm.
 """
 
 
@@ -49,7 +49,7 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
     """Find the folds of a charge map for contacts that all have the same force.
 
     At a fold, the map from contacts to charges turns back, so that contacts on both sides of the fold have the same
-    charges. There, the position error of an estimate from noisy charges is infinite (Cramer-Rao limit).
+    charges. At a fold, the position error of an estimate from noisy charges is infinite (Cramer-Rao limit).
 
     Args:
         charge_map: Map that computes the charges of contacts (x, y, F).
@@ -59,8 +59,8 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
 
     Returns:
         Positions (x, y) on folds, ordered by the distance from the centre, shape (n, 2), mm. With three electrodes, the
-        positions lie on fold lines. With more electrodes, they are points. The second array contains the position
-        errors on the rings, shape (n_ring, n_angle), mm.
+        positions lie on fold lines. With more electrodes, folds are single points. The second array contains the
+        position errors on the rings, shape (n_ring, n_angle), mm.
     """
     radius = INNER_RADIUS * charge_map.domain.radius
 
@@ -96,8 +96,9 @@ def _reverses_orientation(charge_map: ChargeMap, pairs: Array, force: float, noi
     """Return whether a charge map reverses its orientation between the two positions of each pair.
 
     Let J1 and J2 be the derivatives of the charges at the two positions, divided by the noise of the charges. The
-    orientation is reversed if det(J1' J2) is negative. With three electrodes, this is the product of both determinants,
-    which have different signs. With more electrodes, J1 and J2 are not square and have no determinants.
+    orientation is reversed if det(J1' J2) is negative. With three electrodes, det(J1' J2) is the product of det(J1) and
+    det(J2), and is negative if they have different signs. With more electrodes, J1 and J2 are not square and have no
+    determinants.
 
     Args:
         charge_map: Map that computes the charges of contacts.
@@ -122,10 +123,11 @@ def _starting_points(rings: Rings, precision: Array) -> tuple[Array, Array]:
 
     Args:
         rings: Positions on concentric rings, whose distances are equal. Each ring is closed.
-        precision: Inverse of the position error at each position, shape (n_ring, n_angle). It is zero at a fold.
+        precision: Inverse of the position error at each position, shape (n_ring, n_angle); zero at a fold.
 
     Returns:
-        Positions (x, y), shape (n, 2), mm, and the distance of each from its farthest neighbour, shape (n,), mm.
+        Positions (x, y), shape (n, 2), mm, and the distance of each position from its farthest neighbour, shape (n,),
+        mm.
     """
     # A position is chosen if none of its eight neighbours has a smaller precision. The neighbours are on the same ring,
     # which is closed ("wrap"), and on the two adjacent rings. The first and the last ring take the place of the
@@ -166,7 +168,10 @@ If the distance is smaller, the two contacts count as a single contact with a la
 """
 
 STARTS = 3
-"""Number of searches for a second contact of each first contact. Mostly, one of them finds the first contact itself."""
+"""Number of searches for a second contact with the charges of a first contact.
+
+Mostly, one of the searches finds the first contact itself.
+"""
 
 
 @dataclass(frozen=True)
@@ -222,7 +227,7 @@ class AmbiguousPairs:
 
 
 NO_PAIRS = AmbiguousPairs(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
-"""Result without any pair."""
+"""Result without ambiguous pairs."""
 
 
 def find_ambiguous_pairs(
@@ -231,7 +236,7 @@ def find_ambiguous_pairs(
     """Find pairs of distant contacts whose charges cannot be distinguished because of the noise.
 
     The first contact of a pair is a press with one of the given forces at one of several positions. For each first
-    contact, a search that starts at distant contacts with similar charges finds other contacts with its charges.
+    contact, several searches start at distant contacts with similar charges, and look for contacts with equal charges.
 
     Args:
         charge_map: Map that computes the charges of contacts.
@@ -270,7 +275,7 @@ def find_ambiguous_pairs(
 
 
 def _is_repeated(position: Array, is_selected: Booleans, tolerance: Array) -> Booleans:
-    """Return whether each of several positions in a row is the same as an earlier selected position of the row.
+    """Return for each position whether it repeats an earlier selected position in the same row.
 
     Args:
         position: Positions (x, y), shape (n_row, n, 2), mm.
@@ -297,13 +302,16 @@ RADIUS_STEP = 0.1
 """The radius of a working area is rounded down to a multiple of this step, mm."""
 
 MAX_RINGS = 200
-"""Largest number of rings on which the position error is evaluated. Larger disks have a multiple of `RADIUS_STEP`."""
+"""Largest number of rings on which the position error is evaluated.
+
+On a large disk, the distance between the rings is a larger multiple of `RADIUS_STEP`.
+"""
 
 Bound = Literal["fold", "twins", "error", "searched"]
 """Reason for the radius of a working area.
 
-"twins" are an ambiguous pair, and "searched" means that only the radius of the search bounds the area. The error grows
-without limit towards a fold. An area that ends just before a fold therefore mostly has the bound "error".
+"twins" stands for an ambiguous pair, and "searched" means that only the radius of the search bounds the area. The error
+grows without limit towards a fold. An area that ends just before a fold therefore mostly has the bound "error".
 """
 
 
@@ -312,11 +320,11 @@ class WorkingArea:
     """Largest disk around the centre of the film within which the charges determine the contact.
 
     Attributes:
-        radius: Radius of the disk, mm, rounded down to 0.1 mm; 0 if there is no such disk.
+        radius: Radius of the disk, rounded down to a multiple of 0.1 mm, mm; 0 if there is no working area.
         bound: Reason for the radius.
         fold_radius: Distance of the nearest fold from the centre, mm; infinite if there are no folds.
         error_radius: Radius within which the position error is at most `error` for every force, mm.
-        error_force: Force at which the position error is largest at the distance where it first exceeds `error`, N.
+        error_force: Force with the largest error at the distance where the position error first exceeds `error`, N.
         error: Largest allowed Cramer-Rao position error (root mean square), mm.
         search_radius: Radius of the disk that was searched for the working area, mm.
         force_range: Smallest and largest force of the contacts, N.
@@ -379,8 +387,8 @@ def working_area(
     distant contacts with the same charges.
 
     The errors, folds and pairs are computed at several forces, each at most 1.7 times the previous one. On a taut film,
-    the charges change their sign with increasing force, and a fold or an ambiguous pair may exist at one of these
-    forces only.
+    the charges change their sign with increasing force, and a fold or an ambiguous pair may exist at only one of the
+    forces.
 
     For forces from 0.05 to 2 N, the charge map is evaluated for about 500,000 contacts, or for about 200,000 contacts
     without the search for ambiguous pairs. Use a `ChargeSpline` instead of a forward map, which would take minutes.
@@ -447,6 +455,6 @@ def working_area(
 
 def _round_down(radius: float, step: float = RADIUS_STEP) -> float:
     """Round a radius down to a multiple of a step, mm."""
-    # The factor compensates the rounding error of the quotient. The function `tidy` removes that of the product.
+    # The factor compensates the rounding error of the quotient. The function `tidy` removes the error of the product.
     n_step = np.floor(radius / step * (1.0 + 1e-9))
     return tidy(n_step * step)
