@@ -7,8 +7,8 @@ are files such as shard-00000.npz. Each shard contains the columns x_mm, y_mm, f
 and charge_pC. The column charge_pC has the shape (n, n_electrode), and all other columns have the shape (n,).
 
 The column outside marks presses between the working area and the clamp. A network must recognise that such a press is
-outside, but need not locate the press. The charges of presses near the clamp are less accurate than those of the other
-presses.
+outside, but need not locate the press. The charges of presses near the clamp are less accurate than the charges of
+other presses.
 
 A dataset is written into a temporary folder, which is renamed when the dataset is complete. A dataset of measured
 presses has the same format, but the manifest has no entries `solver` and `seed`, and no press is marked as outside.
@@ -34,7 +34,7 @@ from isocharge.simulate.sensor.sensor import Sensor
 from isocharge.simulate.sensor.sensor_file import sensor_from_dict, sensor_to_dict
 
 FORMAT_VERSION = 2
-"""Version of the format of datasets, which the manifest contains."""
+"""Version of the dataset format, which the manifest contains."""
 
 COLUMNS = {
     "x_mm": "position of the press along the drawn direction, mm",
@@ -81,7 +81,7 @@ class Samples:
 
     @property
     def probes(self) -> tuple[str, ...]:
-        """Notations of the probes. If a probe has the same rotation in all presses, its notation contains it."""
+        """Notations of the probes. If all presses of a probe have one rotation, the notation contains this rotation."""
         notations = []
         for notation in np.unique(self.probe).tolist():
             rotations_deg = np.unique(self.orientation_deg[self.probe == notation])
@@ -89,14 +89,14 @@ class Samples:
         return tuple(notations)
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return the array of each column, by the name of the column."""
+        """Return a dictionary with the array of each column by its name."""
         columns = {name: getattr(self, name) for name in COLUMNS}
         if self.outside is None:
             columns["outside"] = np.zeros(np.shape(self.x_mm), dtype=bool)
         return columns
 
     def __getitem__(self, rows: Booleans) -> "Samples":
-        """Return some of the samples."""
+        """Return the samples in the selected rows."""
         return Samples(**{name: column[rows] for name, column in self.columns().items()})
 
 
@@ -108,8 +108,8 @@ class Dataset:
         sensor: Sensor to which the charges belong.
         samples: Samples within the working area, in the order of the shards.
         manifest: Content of the manifest.
-        sha256: Checksum of the manifest. It identifies the whole dataset, because the manifest contains the checksums
-            of the shards.
+        sha256: Checksum of the manifest. The checksum identifies the whole dataset, because the manifest contains the
+            checksums of the shards.
         outside: Samples between the working area and the clamp; None if there are none.
     """
 
@@ -124,7 +124,7 @@ def write_dataset(folder: StrPath, sensor: Sensor, shards: Iterable[Samples], ab
     """Write a dataset into a new folder.
 
     Args:
-        folder: Folder that is created. It must not exist yet.
+        folder: Folder that is created. The folder must not exist yet.
         sensor: Sensor to which the charges belong.
         shards: Samples of each shard, which is one file of the dataset. The samples of a shard are requested from the
             iterable only when the shard is written.
@@ -135,7 +135,7 @@ def write_dataset(folder: StrPath, sensor: Sensor, shards: Iterable[Samples], ab
 
     Raises:
         OutputExists: If the folder already exists.
-        DatasetError: If a column of a shard has a wrong shape or type, or contains a number that is not finite.
+        DatasetError: If a column of a shard has a wrong shape or type, or if a number in the column is not finite.
     """
     folder = Path(folder)
     with new_folder(folder) as draft:
@@ -154,7 +154,7 @@ def write_files(folder: Path, name: str, sensor: Sensor, shards: Iterable[Sample
         about: Entries of the manifest about the origin of the samples, such as probes, ranges, seed and solver.
 
     Raises:
-        DatasetError: If a column of a shard has a wrong shape or type or contains a number that is not finite, or if a
+        DatasetError: If a column of a shard has a wrong shape or type, if a number in the column is not finite, or if a
             file is too large.
     """
     entries = [
@@ -188,7 +188,7 @@ def _write_shard(folder: Path, file_name: str, samples: Samples, n_electrode: in
         Entry of the manifest that describes the shard.
 
     Raises:
-        DatasetError: If a column has a wrong shape or type or contains a number that is not finite, or if the file is
+        DatasetError: If a column has a wrong shape or type, if a number in the column is not finite, or if the file is
             too large.
     """
     _check_samples(samples, n_electrode, file_name)
@@ -243,7 +243,7 @@ def data_card(name: str, manifest: dict[str, Any]) -> str:
 
 
 def _check_samples(samples: Samples, n_electrode: int, shard_label: str) -> None:
-    """Raise an error if a shard has no samples, or its columns have wrong shapes, types or values.
+    """Raise an error if a shard has no samples, or if its columns have wrong shapes, types or values.
 
     Args:
         samples: Samples of a shard.
@@ -251,7 +251,7 @@ def _check_samples(samples: Samples, n_electrode: int, shard_label: str) -> None
         shard_label: Name of the shard for error messages.
 
     Raises:
-        DatasetError: If there are no samples, or if a column has a wrong shape or type, or contains a number that is
+        DatasetError: If there are no samples, if a column has a wrong shape or type, or if a number in the column is
             not finite.
     """
     columns = samples.columns()
@@ -344,7 +344,7 @@ def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
         Content of the manifest, and checksum of its file.
 
     Raises:
-        DatasetError: If there is no manifest, or if it is damaged or has another version.
+        DatasetError: If the manifest does not exist, is damaged, or has another version of the format.
     """
     path = folder / "manifest.json"
     if not path.is_file():

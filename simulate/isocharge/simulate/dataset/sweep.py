@@ -1,13 +1,13 @@
-"""Sweeps: the presses of a sweep are sampled, and their charges are computed and written as a dataset.
+"""Sweeps: sampling of many presses, computation of their charges, and creation of a dataset.
 
-The presses are scrambled Sobol points, which cover the domain more evenly than independent random numbers (Owen 1998),
-with a separate sequence for each probe. The positions are uniformly distributed over the disk. The logarithms of the
+The presses are scrambled Sobol points, which cover the domain more evenly than independent random numbers (Owen 1998).
+Each probe has its own Sobol sequence. The positions are uniformly distributed over the disk. The logarithms of the
 forces are uniformly distributed over the range of forces. If a sweep has several probes, successive presses cycle
 through the probes.
 
 A forward map is built for every probe and evaluated for every press. For the presses between the radius of the sweep
 and the clamp, a coarse map of the whole film is built, with a round probe. An error of a few percent is acceptable in
-the coarse map, because a network only learns from these presses which charges belong to no contact in its working area.
+the coarse map, because these presses only teach a network which charges belong to no contact in its working area.
 
 A task of the executor computes the charges of one shard, which is one file of the dataset. The files are therefore the
 same for every executor. The dataset is written completely or not at all.
@@ -56,7 +56,7 @@ SAMPLING = "scrambled Sobol, uniform over the disk, log-uniform in force"
 """Description of the sampling in the manifest of a dataset."""
 
 OUTSIDE_PROBE = -1
-"""Index of the round probe of the presses outside the disk, which is the last of all probes."""
+"""Index of the round probe for the presses outside the disk. This probe is the last of all probes."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ class Sweep:
         force_range: Smallest and largest force, N.
         samples: Number of presses, which are divided equally among the probes.
         seed: Seed of the random numbers.
-        orientation: "fixed" if all presses have the orientation of the given probes, "random" for orientations over a
-            full turn.
+        orientation: "fixed" if the given probes keep their orientations, "random" if the probes are rotated randomly
+            over a full turn.
         outside: Number of additional presses between the disk and the clamp; 0 for none.
     """
 
@@ -137,8 +137,8 @@ class Sweep:
     def presses(self, probes: Sequence[Probe]) -> SweepPresses:
         """Return the presses of a sweep with several probes.
 
-        Successive presses cycle through the probes. The rotations are uniformly distributed over a full turn, or zero
-        if the orientation is "fixed".
+        Successive presses cycle through the probes. If the orientation is "random", the rotations are uniformly
+        distributed over a full turn. Otherwise, all rotations are zero.
 
         Args:
             probes: Probes of the sweep.
@@ -194,7 +194,7 @@ class Sweep:
 _log = logging.getLogger(__name__)
 
 SHARD_SIZE = 16384
-"""Default number of samples in a shard, whose charges are computed in about two seconds."""
+"""Default number of samples in a shard. Computing the charges of one shard takes about two seconds."""
 
 MIN_RING_WIDTH = 0.02
 """Smallest width of the ring between the radius of a sweep and the clamp, in film radii, dimensionless.
@@ -217,21 +217,21 @@ def run_sweep(
     """Compute the charges of the presses of a sweep, and write them as a dataset.
 
     Args:
-        folder: Folder that is created. It must not exist yet.
+        folder: Folder that is created. The folder must not exist yet.
         sensor: Sensor whose charges are computed.
         probes: Probes. Successive presses cycle through them.
         sweep: Definition of the presses.
         settings: Accuracy, theory and mesh of the solver.
         executor: Executor that runs the tasks, such as a process pool or the executor of a Dask cluster; None for this
             process. The files do not depend on the executor.
-        maps: Forward map of each probe; empty if they are to be built.
+        maps: Forward map of each probe; empty if this function must build the maps.
         shard: Number of samples in a shard, which is one file of the dataset.
 
     Returns:
         Path of the folder.
 
     Raises:
-        SceneError: If a press of the sweep cannot exist, or `maps` are not those of the sensor and the probes.
+        SceneError: If a press of the sweep cannot exist, or if `maps` do not belong to the sensor and the probes.
         SolveError: If a press has no equilibrium, or the interpolation error of a forward map is too large.
         OutputExists: If the folder already exists. This error is raised before the computation starts.
         OutputError: If a file cannot be written.
@@ -274,7 +274,7 @@ def solve_maps(
         probes: Probes of the sweep.
         sweep: Definition of the presses.
         settings: Accuracy, theory and mesh of the solver.
-        executor: Executor that runs the solves; None for this process.
+        executor: Executor that runs the solves; None to run the solves in this process.
     """
     return tuple(
         ForwardMap.build(
@@ -295,18 +295,18 @@ def outside_map(
 ) -> ForwardMap | None:
     """Build the coarse map of the whole film for the presses outside the radius of a sweep.
 
-    The probe of the map is a disk whose radius is the largest reach of the probes of the sweep. The reach of a probe is
+    The probe of the map is a disk whose radius is the largest reach of all probes of the sweep. The reach of a probe is
     the distance from the centroid of its footprint to the farthest point of the footprint.
 
     Args:
         sensor: Sensor whose charges are computed.
         probes: Probes of the sweep.
         sweep: Definition of the presses.
-        executor: Executor that runs the solves; None for this process.
+        executor: Executor that runs the solves; None to run the solves in this process.
 
     Returns:
-        The map; None if the sweep has no presses outside, because none are requested, the ring is too narrow, or the
-        film cannot be solved up to the clamp. The last case is logged as a warning.
+        The map; None if no presses outside the radius are requested, if the ring between the radius and the clamp is
+        too narrow, or if the film cannot be solved up to the clamp. The last case is logged as a warning.
     """
     _, max_force = sweep.force_range
     largest_reach = max(probe.under(max_force).reach for probe in probes)
@@ -327,7 +327,7 @@ def write_sweep(folder: Path, maps: Sequence[ForwardMap], sweep: Sweep) -> Path:
     """Compute the charges of a sweep with given forward maps in this process, and write them as a dataset.
 
     Args:
-        folder: Folder that is created. It must not exist yet.
+        folder: Folder that is created. The folder must not exist yet.
         maps: Forward map of each probe.
         sweep: Definition of the presses.
 
@@ -343,7 +343,7 @@ def _manifest_entries(maps: Sequence[ForwardMap], whole_film: ForwardMap | None,
 
     Args:
         maps: Forward map of each probe.
-        whole_film: Map of the presses outside the radius of the sweep; None if there are none.
+        whole_film: Map of the presses outside the radius of the sweep; None if no press is outside.
         sweep: Definition of the presses.
     """
     outside: dict[str, Any] = {"samples": 0}
@@ -388,7 +388,7 @@ def _divide_into_shards(
         sweep: Definition of the presses.
         presses: Presses within the radius of the sweep.
         size: Number of presses in a shard. The last shard may have fewer.
-        whole_film: Map of the presses outside the radius, which get shards of their own; None if there are none.
+        whole_film: Map of the presses outside the radius, which get their own shards; None if no press is outside.
     """
     parts = [presses]
     if whole_film is not None:
@@ -397,10 +397,10 @@ def _divide_into_shards(
 
 
 def _shard_size(probes: Sequence[Probe], largest: int) -> int:
-    """Return the number of samples in a shard, which is smaller than `largest` if the file would become too large.
+    """Return the number of samples in a shard: `largest`, or fewer if the file would become too large.
 
-    A sample contains the notation of its probe, which is long for a polygon with many corners. The notations fill at
-    most half of the largest file.
+    A sample contains the notation of its probe, which is long for a polygon with many corners. The notations may
+    fill at most half of the largest allowed file.
 
     Args:
         probes: Probes of the sweep.
@@ -416,13 +416,13 @@ def _compute_samples(
     shards: Sequence[SweepPresses],
     executor: Executor | None,
 ) -> Iterator[Samples]:
-    """Compute the samples of shards, yield them in the order of the shards, and report the number of finished presses.
+    """Yield the computed samples of each shard in the order of the shards, and report the number of finished presses.
 
     Args:
         maps: Forward map of each probe.
-        whole_film: Map of the presses outside the radius of the sweep; None if there are none.
+        whole_film: Map of the presses outside the radius of the sweep; None if no press is outside.
         shards: Presses of each shard.
-        executor: Executor that computes the charges; None for this process.
+        executor: Executor that computes the charges; None to compute the charges in this process.
     """
     # The index `OUTSIDE_PROBE` selects the last map.
     all_maps = list(maps) if whole_film is None else [*maps, whole_film]
@@ -436,7 +436,7 @@ def _compute_samples(
 
 
 def _samples_of_shard(maps: Sequence[ForwardMap], presses: SweepPresses) -> Samples:
-    """Compute the charges of the presses of a shard, and return the columns of the shard.
+    """Compute the charges of the presses in a shard, and return all columns of the shard.
 
     Args:
         maps: Forward map of each probe, and of the whole film if presses lie outside the radius of the sweep.
