@@ -1,4 +1,4 @@
-"""Pictures that show the lower limit of the position error, or the mirror region of a sensor, over the film."""
+"""Pictures of a film that show the lower limits of the position errors, or the mirror region of a sensor."""
 
 from typing import Any
 
@@ -17,17 +17,17 @@ from isocharge.simulate.plots.film import draw_circle, draw_electrodes, draw_rim
 from isocharge.simulate.sensor.sensor import Sensor
 
 MAX_ERROR_RATIO = 10.0
-"""Ratio of the largest to the smallest error of the colour scale in the maps of a design, dimensionless."""
+"""Ratio of the largest to the smallest error on the colour scale of the error maps of a layout, dimensionless."""
 
 ERROR_LABEL = "lower limit of the position error (rms), mm"
-"""Label of the colour bars and of the axis of the errors."""
+"""Label of the colour bars and of the error axis."""
 
 
 def identification_picture(identification: Identification) -> Figure:
-    """Draw the position errors of an identification.
+    """Draw the lower limits of the position errors that `identify` has computed.
 
-    Two maps show the errors over the film for the smallest and the largest force. Their colours end at the allowed
-    error. A diagram shows the errors as a function of the distance from the centre.
+    Two maps show the errors over the film for the smallest and the largest force. The colour scale of
+    both maps ends at the allowed error. A diagram shows the errors as a function of the distance from the centre.
 
     Args:
         identification: Result of `identify`.
@@ -122,7 +122,7 @@ def error_maps_picture(design: Design) -> Figure:
 
 
 def _draw_errors(axes: Any, sensor: Sensor, positions: Array, errors: Array, norm: LogNorm) -> Any:
-    """Draw position errors as colours, and the electrodes.
+    """Draw a map that shows the position errors as colours and the electrodes as outlines.
 
     Args:
         axes: Axes of matplotlib.
@@ -140,7 +140,7 @@ def _draw_errors(axes: Any, sensor: Sensor, positions: Array, errors: Array, nor
 
 
 def _add_colour_bar(figure: Figure, coloured_area: Any, axes: list[Any]) -> None:
-    """Add a colour bar for position errors beside axes that have the same colour scale."""
+    """Add a colour bar for position errors beside several axes that have the same colour scale."""
     colour_bar = figure.colorbar(coloured_area, ax=axes, label=ERROR_LABEL, shrink=0.85, extend="max")
     _label_errors(colour_bar.ax.yaxis)
 
@@ -153,14 +153,15 @@ def _label_errors(axis: Any) -> None:
 
 
 def mirror_picture(sensor: Sensor, mirror: MirrorRegion) -> Figure:
-    """Draw a map of the presses outside the working area that have the charges of a press inside it.
+    """Draw a map of the presses outside the working area that have the same charges as a press inside the working area.
 
     Args:
         sensor: Sensor whose mirror region is drawn.
         mirror: Mirror region of the sensor.
 
     Returns:
-        Figure with the clamp, the working area, the electrodes, and the share of such presses at each position.
+        Figure with the clamp, the working area and the electrodes. Shades show at each position the share of presses
+        that have the same charges as a press inside the working area.
     """
     figure = new_figure(7.4, 6.4)
     axes = figure.subplots()

@@ -107,7 +107,7 @@ def draw_layout(axes: Any, sensor: Sensor, radius: float, title: str = "", highl
 
 
 def draw_charge_map(axes: Any, charge_map: ChargeMap, electrode: int) -> None:
-    """Draw the charge of one electrode as a function of the position of a press of 1 N.
+    """Draw the charge that a press of 1 N causes on one electrode, as a function of the position of the press.
 
     The charge is shown by shades and by labelled contours.
 
