@@ -1,4 +1,4 @@
-"""Drawing of an electrode layout in DXF and SVG files, and writer of a design as a folder.
+"""Functions that draw an electrode layout as DXF and SVG files, and that write a design into a folder.
 
 The unit of the drawing is the millimetre. There is one layer for each kind of object.
 """
@@ -37,7 +37,7 @@ MARGIN = 5.0
 
 
 def draw_layout(sensor: Sensor) -> Drawing:
-    """Create a drawing of the film, the electrodes, their names, and the metal of the back.
+    """Create a drawing of the film, the electrodes with their names, and the metal on the back of the film.
 
     The electrodes are closed polylines at their nominal positions. The layer `BACK` is empty if the back is completely
     covered with metal.

@@ -3,8 +3,8 @@
 The caller divides the work into jobs, and the results are returned in the order of the jobs. The results therefore do
 not depend on the executor, on the number of workers, or on the order in which the workers finish.
 
-The functions `local_workers` and `dask_workers` provide executors. A worker refuses a job if it has another version of
-the code. In a worker, BLAS uses only one thread.
+The functions `local_workers` and `dask_workers` provide executors. A worker with another version of the code refuses
+all jobs. In a worker, BLAS uses only one thread.
 """
 
 import multiprocessing
@@ -31,7 +31,7 @@ Result = TypeVar("Result")
 MAX_PENDING = 64
 """Largest number of submitted jobs whose results have not been returned yet.
 
-The value suffices for about thirty workers. It limits the memory that finished results occupy.
+The value suffices for about thirty workers, and limits the memory that finished results occupy.
 """
 
 CONNECT_TIMEOUT_s = 10.0
@@ -51,7 +51,7 @@ def in_order(executor: Executor | None, function: Callable[[Job], Result], jobs:
 
     Args:
         executor: Executor that runs the jobs, such as a process pool with any start method, a thread pool, or
-            `Client.get_executor()` of Dask. If it is None, each job runs in this process when its result is requested.
+            `Client.get_executor()` of Dask. If None, each job runs in this process when its result is requested.
         function: Function that is called with each job. Worker processes must be able to import it.
         jobs: Argument of each call.
 
@@ -121,7 +121,7 @@ def run_same_code(versions: str, function: Callable[[Job], Result], job: Job) ->
         Result of the call.
 
     Raises:
-        WorkersLost: If the code of the worker differs, because the results might then differ, too.
+        WorkersLost: If the worker has another version of the code, which might lead to other results.
     """
     if code_versions() != versions:
         raise WorkersLost(
@@ -143,7 +143,7 @@ def local_workers(count: int) -> Iterator[Executor | None]:
     The workers end when the `with` block ends, and also if this process is killed.
 
     Args:
-        count: Number of worker processes. For 1, no process is started, and None is provided in place of the executor.
+        count: Number of worker processes. If it is 1, no process is started, and None takes the place of the executor.
     """
     if count == 1:
         yield None
@@ -223,7 +223,7 @@ def _initialise_worker() -> None:
 
 
 def _end_with_parent() -> None:
-    """Wait until the parent process ends, also if it is killed, and end this process."""
+    """Wait until the parent process ends or is killed, and then end this process."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -6,9 +6,8 @@ amplifier decays by a factor of e within the time tau. The output v of the ampli
     v[n] = a v[n-1] + (g (q[n] - q[n-1]) + b dt) (1 + a) / 2,        a = exp(-dt / tau),
 
 where q is the charge of the film, g is the gain, b is the bias current, and dt is the time between two readings. The
-charge of the film is the sum of the touch charge and the pyroelectric charge. To the output of the amplifier, the
-simulation adds an offset, hum and white noise. The output is finally clipped, and rounded to the codes of the
-converter.
+charge of the film is the sum of the touch charge and the pyroelectric charge. The simulation adds an offset, hum and
+white noise to the output of the amplifier. Finally, the output is clipped and rounded to the codes of the converter.
 
 The noise levels `bench` and `surgery` contain plausible values of the hum, the offset, the bias current and the
 mismatch for environments with weak or strong electrical interference. The values of `bench` and `surgery` were not
@@ -33,10 +32,10 @@ from isocharge.common.structs import Finite, NotNegative, Positive, Settings, re
 from isocharge.simulate.noise import NOISE_LEVELS, NoiseModel
 
 PVDF_PYRO = -30.0 * 9.0
-"""Pyroelectric charge of a PVDF electrode of 9 mm^2 per temperature change, pC/K, for -30 uC/(m^2 K).
+"""Pyroelectric charge per temperature change of a PVDF electrode of 9 mm^2, pC/K.
 
-The sign is negative if a press results in positive charges (d31 > 0), because a warmer film is thicker, and a pressed
-film is thinner.
+The pyroelectric coefficient is -30 uC/(m^2 K). The sign is negative if a press results in positive charges (d31 > 0),
+because a warmer film is thicker, and a pressed film is thinner.
 """
 
 FILM_TIME = 1.78e-3 * 1.2 * 0.025 / (2.0 * 1e-5)
@@ -50,7 +49,7 @@ PositiveOrInfinite = Annotated[float, Meta(gt=0.0, description="a positive numbe
 """Type of a positive parameter that may be infinite."""
 
 Mismatch = Annotated[float, Meta(ge=0.0, le=0.2, description="a number from 0 to 0.2")]
-"""Type of a relative standard deviation that is so small that no drawn factor is negative."""
+"""Type of a small relative standard deviation, with which no randomly drawn factor is negative."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +113,7 @@ class Amplifier:
         Args:
             electrodes: Number of electrodes, each of which has one channel.
             rate: Readings per second, Hz.
-            rng: Generator of the properties of the channels and of the noise of all readings.
+            rng: Random number generator for the channel properties and the noise of all readings.
 
         Returns:
             The measurement, with the drawn properties of each channel.
@@ -128,7 +127,7 @@ class Measurement:
     Attributes:
         amplifier: Parameters of the measuring chain.
         rate: Readings per second, Hz.
-        rng: Generator of the noise.
+        rng: Random number generator for the noise.
         leak_time: Time constant of the leak of each channel, shape (electrodes,), s.
         gain: Gain of each channel, shape (electrodes,), dimensionless.
         bias: Bias current of each channel, shape (electrodes,), pC/s.
@@ -144,7 +143,7 @@ class Measurement:
             amplifier: Parameters of the measuring chain.
             electrodes: Number of electrodes, each of which has one channel.
             rate: Readings per second, Hz.
-            rng: Generator of the properties and of the noise.
+            rng: Random number generator for the properties and the noise.
         """
         self.amplifier = amplifier
         self.rate = rate
@@ -326,7 +325,7 @@ BENCH_AMPLIFIER = Amplifier(
     limit=1500.0,
     bits=16,
 )
-"""Amplifier of the level `bench`, which is plausible for an electric environment with little interference."""
+"""Amplifier of the level `bench`, which is plausible for an environment with weak electrical interference."""
 
 AMPLIFIER_LEVELS = {
     **{level: Amplifier(noise=NOISE_LEVELS[level]) for level in ("clean", "reference", "measured")},
@@ -351,9 +350,9 @@ AMPLIFIER_FILE_KEYS = {
     "film_time": "film_time_s",
     "limit": "limit_pC",
 }
-"""Keys of the TOML file that differ from the names of the attributes of `Amplifier`, because the keys contain the unit.
+"""Keys of the TOML file that contain a unit and therefore differ from the attribute names of `Amplifier`.
 
-The dictionary maps the name of each attribute to the key.
+The dictionary maps the name of each of these attributes to its key.
 """
 
 AmplifierFile = defstruct(
@@ -374,8 +373,8 @@ AmplifierFile = defstruct(
 )
 """Content of the TOML file, which consists of the parameters of the noise and the attributes of `Amplifier`.
 
-The values must be within the bounds of the types of the attributes. If a key is absent, the value of the level `like`
-is used.
+Each value must be within the bounds that the type of its attribute states. If a key is absent, the value of the level
+`like` is used.
 """
 
 

@@ -19,7 +19,7 @@ from isocharge.common.errors import InputError, SceneError
 class GaussianNoise:
     """Base class of Gaussian noise that is independent for each reading.
 
-    The attributes are numbers, or arrays that are broadcast with the charges.
+    Each attribute is either a number or an array. Arrays are broadcast with the charges.
 
     Attributes:
         white: Standard deviation of the part of the noise that does not depend on the charge, pC.
@@ -46,7 +46,7 @@ class GaussianNoise:
 
         Args:
             charge: Charges without noise, any shape, pC.
-            rng: Generator of the noise.
+            rng: Random number generator for the noise.
 
         Returns:
             Charges with noise, same shape, pC.
@@ -131,7 +131,7 @@ NOISE_LEVELS = {
 """Noise model of each noise level.
 
 The level `reference` is an assumption. The proportional noise of the level `measured` comes from the data set
-Tactile_Heatmaps of the University of Genoa: a PVDF channel repeats to at most 2 % at equal force in 1,171 recordings.
-For the levels `bench` and `surgery`, the noise model is the part of the disturbances that does not depend on earlier
-readings.
+Tactile_Heatmaps of the University of Genoa: in 1,171 recordings, the charge of a PVDF channel varies by at most 2 % at
+equal force. For the levels `bench` and `surgery`, the noise model is the part of the disturbances that does not depend
+on earlier readings.
 """
