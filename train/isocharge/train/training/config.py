@@ -20,7 +20,7 @@ Count = Annotated[int, Meta(ge=1, le=10_000_000)]
 
 
 class Sizes(NamedTuple):
-    """Sizes of the networks and of their training, of which the defaults depend on the number of electrodes.
+    """Sizes of the networks and of their training. The default sizes depend on the number of electrodes.
 
     Attributes:
         hidden: Widths of the hidden layers of the contact network.
@@ -28,8 +28,8 @@ class Sizes(NamedTuple):
         steps: Number of optimiser steps of the contact network.
         misfit_steps: Number of optimiser steps of the misfit network.
         misfit_charges: Number of sets of charges from which the misfit network learns.
-        rate_factor: Factor by which the learning rate of the contact network is multiplied. It is less than 1 for many
-            electrodes, because the loss sometimes increases with the full learning rate.
+        rate_factor: Factor by which the learning rate of the contact network is multiplied. The factor is less than 1
+            for many electrodes, because the loss sometimes increases with the full learning rate.
     """
 
     hidden: Widths
@@ -112,7 +112,7 @@ class TrainingConfig(Settings, frozen=True):
         noise: Noise that is drawn again in every step, as a `NoiseModel` or as a name that `noise_model` accepts.
         seed: Seed of the initial weights, the batches and the noise.
         threads: Number of CPU threads. For networks of these sizes, one thread is nearly as fast as two threads, and
-            programs on the second core do not delay it.
+            programs on the second core do not delay the training.
     """
 
     steps: Count | None = None
@@ -139,8 +139,8 @@ class TrainingConfig(Settings, frozen=True):
         """Noise model that the setting `noise` contains or names.
 
         Raises:
-            InputError: If the name is unknown, or the noise is only proportional to the charge. Misfits are measured in
-                standard deviations of the noise, which must not be zero for a charge of zero.
+            InputError: If the name is unknown, or if the noise has no part that is independent of the charge. Misfits
+                are measured in standard deviations of the noise, so the noise of a zero charge must not be zero.
         """
         noise = noise_model(self.noise) if isinstance(self.noise, str) else self.noise
         if noise.gain > 0.0:

@@ -19,7 +19,8 @@ TAIL_FACTOR = 3.71
 """Factor of the logarithm in the loss of the covariance, for the degrees of freedom nu above, dimensionless.
 
 With the factor 1 / (2 - 2 sqrt(pi nu / 2) erfcx(sqrt(nu / 2))), the loss of normally distributed errors is smallest at
-their standard deviation, because the mean of z times the derivative of the loss is 1 for a standard normal z.
+their standard deviation. The reason is that, for a standard normal z, the mean of z times the derivative of the loss is
+then 1.
 """
 
 MIN_SINE = 0.003
@@ -27,12 +28,12 @@ MIN_SINE = 0.003
 
 
 def mean_loss(posterior: Posterior, target: Tensor) -> Tensor:
-    """Compute half of the weighted squared errors of the mean of each press, shape (n,).
+    """Compute for each press half of the weighted sum of the squared errors of the mean, shape (n,).
 
     The gradient of a Gaussian likelihood with respect to the mean is divided by the variance. Therefore, a network
-    learns the mean slowly where it overestimates the standard deviation (Seitzer et al., 2022, arXiv 2203.09168). In
-    this loss, the squared errors of a Gaussian likelihood are multiplied by the estimated standard deviation. The
-    factors are scaled so that their mean over the presses is 1.
+    learns the mean slowly for presses whose standard deviation it overestimates (Seitzer et al., 2022, arXiv
+    2203.09168). In this loss, the squared errors of a Gaussian likelihood are multiplied by the estimated standard
+    deviation. The factors are scaled so that their mean over the presses is 1.
 
     Args:
         posterior: Estimated unit coordinates with their standard deviations.
@@ -47,10 +48,10 @@ def mean_loss(posterior: Posterior, target: Tensor) -> Tensor:
 def covariance_loss(posterior: Posterior, error: Tensor) -> Tensor:
     """Compute the negative log-likelihood of the errors of each press without its constant terms, shape (n,).
 
-    The errors are divided by the standard deviations, and their correlations are removed. The three results are
-    independent. The assumed distribution of each result has longer tails than a normal distribution: where the map from
-    contacts to charges nearly folds, a few errors are large. Because of these few errors, a Gaussian likelihood would
-    enlarge the intervals of all contacts.
+    The errors are divided by the standard deviations, and their correlations are removed. The three resulting values
+    are independent. The assumed distribution of each of the three values has longer tails than a normal distribution:
+    where the map from contacts to charges nearly folds, a few errors are large. Because of these few errors, a Gaussian
+    likelihood would enlarge the intervals of all contacts.
 
     Args:
         posterior: Standard deviations and angles of the correlations (`isocharge.train.training.folded_network`).
@@ -126,21 +127,21 @@ Without this value, the weights of units that are nearly linear functions of oth
 """
 
 LOSS_TOLERANCE = 1e-5
-"""Relative decrease of the loss in one iteration below which `refit_covariance` ends, dimensionless."""
+"""`refit_covariance` ends if the loss decreases by less than this fraction in one iteration, dimensionless."""
 
 
 def refit_covariance(network: InverseNetwork, train: LabelledPresses, noise: Noise) -> None:
     """Fit the last layer for the standard deviations and the correlations to the errors of the trained mean.
 
-    During the training, the errors of the mean decrease until the last step. The covariance is therefore partly that of
-    the larger errors of earlier steps. This function minimises the loss of the covariance on a large sample of presses
-    by the method L-BFGS. The loss does not change the mean.
+    During the training, the errors of the mean decrease until the last step. The learned covariance therefore still
+    reflects, in part, the larger errors of earlier steps. This function minimises the loss of the covariance on a large
+    sample of presses by the method L-BFGS. The loss does not change the mean.
 
     The hidden units are correlated, and a fit of their weights would take hundreds of iterations. Instead, the function
     fits the weights of combinations of the hidden units that are nearly orthonormal over the presses. Let H be the
     matrix of the hidden units of all presses, and L the Cholesky factor of their Gram matrix H' H. The combinations are
-    the columns of H L'^-1. If M contains the changes of their weights, the weights of the hidden units change by
-    M L^-1. The matrix M is fitted.
+    the columns of H L'^-1. The function fits a matrix M, which contains the changes of the weights of the combinations.
+    The weights of the hidden units then change by M L^-1.
 
     Args:
         network: Network that learns the force, with a trained contact perceptron.

@@ -64,18 +64,18 @@ DEFAULT_STEPS = 1_200
 
 TRAINING_NOISE_FACTOR = 0.5
 """Noise that is added in every step, relative to the noise of the presses. With a larger factor, the network cannot
-resolve the map from charges to contacts. With a smaller factor, it overfits the presses."""
+resolve the map from charges to contacts. With a smaller factor, the network overfits the presses."""
 
 DISTILLATION_NOISE_FACTORS = (0.0, 0.5, 0.5, 1.0, 1.0, 2.0)
-"""Noise that is added to each copy of the presses from which the last network learns, relative to the noise of the
-presses."""
+"""Noise that is added to each copy of the presses, relative to the noise of the presses. The last network learns from
+these copies."""
 
 PRESSES_FILE = "presses.csv"
 """Name of the file in the version folder with the presses on which the model was trained."""
 
 UNKNOWN_FORCE_N = 1.0
-"""Force that a model states if it was trained on presses without forces, N. Its standard deviation has the same
-size."""
+"""Force that a model states if it was trained on presses without forces, N. The standard deviation of this force has
+the same size."""
 
 
 def fit_presses(
@@ -92,8 +92,8 @@ def fit_presses(
     all presses have nearly the same force, or if no press has a known force. The network then only learns x and y.
 
     Args:
-        presses: At least 500 presses at 50 places. Presses with an unknown place or charge are left out, and presses
-            with an unknown force, unless all forces are unknown.
+        presses: At least 500 presses at 50 places. Presses with an unknown place or charge are left out. Presses with
+            an unknown force are also left out, unless all forces are unknown.
         name: Name of the sensor.
         config: Settings. The settings `noise` and `hold_out` are not used.
         probes: Notations of the probes.
@@ -107,7 +107,8 @@ def fit_presses(
         ConfigError: If a setting is out of its range.
         TrainingError: If the loss is not finite.
     """
-    # Measured presses are few and noisy. Therefore, the misfit network is trained like that of many electrodes.
+    # Measured presses are few and noisy. Therefore, the misfit network is trained like a misfit network for many
+    # electrodes.
     settings = (config or FitConfig()).checked()
     training = structs.replace(
         settings.training,
@@ -126,8 +127,8 @@ def fit_presses(
     noise = ChannelNoise.estimate(labelled.charge, unit_contact)
     with threads_and_seed(training.threads, training.seed):
         features = signed_features(labelled.charge, noise.transition_charge(labelled.charge))
-        # Cross-validation: train a network for each fold, and compute the answers to the presses of the fold.
-        # The first network is that which is returned. It learns from the networks of the folds.
+        # Cross-validation: train a network for each fold, and compute the answers to the presses of the fold. The first
+        # network is the one that is returned. It learns from the networks of the folds.
         network, *fold_networks = (
             InverseNetwork(domain, features, labelled.charge, settings.network, force_std) for _ in range(1 + N_FOLDS)
         )
@@ -183,11 +184,11 @@ def fit_presses(
 
 
 def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
-    """Select the presses with known place, force and charges, and check that their number suffices for a training.
+    """Return the presses with known place, force and charges, and check that there are enough for a training.
 
     If no press has a known force, every press gets the force `UNKNOWN_FORCE_N` with a standard deviation of the same
     size. A warning is logged if presses are left out. Another warning is logged if all presses have nearly the same
-    force, or no press has a known force.
+    force, or if no press has a known force.
 
     Args:
         presses: All presses of a file.
@@ -240,7 +241,7 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
 
 
 def merged_uncertain_places(presses: MeasuredPresses) -> Array:
-    """Return the contacts (x, y, F), in which all presses at one place have the same position, shape (n, 3), mm and N.
+    """Return contacts (x, y, F) in which all presses at one place have the same position, shape (n, 3), mm and N.
 
     A robot does not return to a place exactly, and the errors of its positions are known from `position_std_mm`.
     Neighbouring positions count as one place if their distance is at most twice the standard deviation of the
@@ -251,7 +252,7 @@ def merged_uncertain_places(presses: MeasuredPresses) -> Array:
 
 
 def constant_force_std(presses: MeasuredPresses) -> float | None:
-    """Return the relative standard deviation of the force of presses that all have nearly the same force.
+    """Return the relative standard deviation of the force if all presses have nearly the same force.
 
     The variance is the sum of the variance of the forces and the mean of the variances that the presses state.
 
@@ -268,10 +269,11 @@ def constant_force_std(presses: MeasuredPresses) -> float | None:
 
 
 def _unit_log_sizes(charge: Array) -> Array:
-    """Return the logarithm of the common size of the charges of each press, scaled to -1 to 1, shape (n,).
+    """Return for each press the logarithm of the common size of its charges, scaled to [-1, 1], shape (n,).
 
     If the force at a place changes, all charges change by about the same factor, and so does their common size. The
-    size therefore replaces an unknown force, whose effect on the charges would otherwise be taken for noise.
+    common size of the charges therefore replaces an unknown force. Otherwise, the effect of the force on the charges
+    would be taken for noise.
 
     Args:
         charge: Charges, shape (n, n_channel), pC.
@@ -285,11 +287,11 @@ def std_factors(contact: Array, std: Array, truth: Array) -> tuple[float, float]
     """Compute the factors by which standard deviations must be multiplied to agree with the observed errors.
 
     With these factors, the intervals of one standard deviation contain 68 % of the true values. If the errors have
-    longer tails than a normal distribution, the 95 % intervals contain less than 95 % of them.
+    longer tails than a normal distribution, the 95 % intervals contain less than 95 % of the true values.
 
     Args:
-        contact: Contacts (x, y, F) that were estimated by networks that were not trained on these presses, shape (n,
-            3), mm and N.
+        contact: Contacts (x, y, F), estimated by networks that were not trained on these presses, shape (n, 3), mm and
+            N.
         std: Standard deviations of the estimated contacts, shape (n, 3).
         truth: True contacts, shape (n, 3).
 
@@ -307,8 +309,8 @@ def _misfit_examples(charge: Array, unit_contact: Array, noise: ChannelNoise, co
     """Draw charges, and compute how much they differ from the charges of the most similar contacts.
 
     A level is a charge on a scale on which the noise has the standard deviation 1. The charges of contacts are known
-    only at the presses. Near each press, the levels are therefore approximated by a linear function of the contact, a
-    plane. The most similar contact is searched on these planes.
+    only at the presses. Near each press, the levels are therefore approximated by a linear function of the contact,
+    which is called a plane. The most similar contact is searched for on these planes.
 
     Args:
         charge: Charges of the presses, shape (n, n_electrode), pC.
@@ -339,16 +341,16 @@ def _cross_validate(
     The folds are the parts into which a cross-validation divides the presses. The contact of a press is the answer of
     the network that was not trained on the press. The misfit is the length of the difference between the level of the
     press and the level of the most similar contact. A level is a charge on a scale on which the noise has the standard
-    deviation 1. The most similar contact is searched on planes: near each press of the other folds, the level is
+    deviation 1. The most similar contact is searched for on planes: near each press of the other folds, the level is
     approximated by a linear function of the contact.
 
     Args:
-        fold_networks: Networks, one for each fold, of which the contact perceptrons are trained.
+        fold_networks: One network for each fold. The contact perceptrons of the networks are trained.
         presses: All presses.
         unit_contact: Contacts of the presses in unit coordinates, shape (n, 3).
         fold_of_press: Index of the fold of each press, shape (n,).
         noise: Noise of the charges.
-        config: Settings, whose seed is that of the first fold.
+        config: Settings. Their seed is the seed of the first fold.
 
     Returns:
         Contacts, standard deviations and misfits of all presses.

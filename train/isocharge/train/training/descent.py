@@ -30,7 +30,7 @@ class Soap:
     """The optimiser SOAP for one parameter. A parameter with one dimension, such as a bias, is trained by Adam.
 
     The class is not derived from `torch.optim.Optimizer`, because creating the first object of that class imports
-    PyTorch's compiler. The import takes longer than a tenth of a training.
+    PyTorch's compiler. This import takes more than a tenth of the time of a training.
 
     Attributes:
         parameter: The parameter, a vector or a matrix.
@@ -44,7 +44,8 @@ class Soap:
     def __init__(self, parameter: Tensor) -> None:
         """Prepare the first step: all averages are zero, and the eigenbases are identity matrices.
 
-        A matrix has two moments with their eigenbases: one for its rows, and one for its columns. A vector has none.
+        A matrix has two moments with their eigenbases: one for its rows, and one for its columns. A vector has no
+        moments.
 
         Args:
             parameter: The parameter, a vector or a matrix.
@@ -99,7 +100,7 @@ class Soap:
 
 
 def _rotate(matrix: Tensor, bases: Sequence[Tensor]) -> Tensor:
-    """Transform a matrix to the basis of the columns of two matrices. Without bases, return the matrix unchanged."""
+    """Return a matrix in the basis given by the columns of two matrices. Without bases, return the matrix unchanged."""
     if not bases:
         return matrix
     row_basis, column_basis = bases
@@ -146,9 +147,9 @@ class TrainingStage:
         The learning rate increases to its largest value during the first tenth of the steps, and then decreases to zero
         along a cosine. Weights that require no gradient, such as rounded weights, are not trained.
 
-        Rarely, a few steps destroy what a network has learned, and the rest of the training does not repair it. If the
-        mean loss increases by more than `MAX_LOSS_INCREASE`, the training therefore continues from the weights before
-        the latest two reports, with half of the learning rate.
+        Rarely, a few steps destroy what a network has learned, and the rest of the training does not repair the
+        network. If the mean loss increases by more than `MAX_LOSS_INCREASE`, the training therefore continues from the
+        weights before the latest two reports, with half of the learning rate.
 
         Raises:
             TrainingError: If a loss is not finite.
@@ -191,7 +192,7 @@ class TrainingStage:
 
 
 def relative_rate(progress: float) -> float:
-    """Return the learning rate divided by its largest value: it rises linearly, and then falls along half a cosine.
+    """Return the learning rate divided by its largest value. The rate rises linearly, then falls along half a cosine.
 
     Args:
         progress: Number of completed steps divided by the number of all steps.

@@ -59,12 +59,13 @@ class Fitted:
         noise: Noise for which the network was trained.
         test: Presses for measuring errors. The network was trained on other presses, unless `cross_validated` is given.
         sha256: Checksum of the training data.
-        made_with: Entries that the metadata of a release contain in addition to the usual entries. Among them may be
-            `cautions`, a list of sentences for users, and `constant_force`, if the network always answers one force.
+        made_with: Entries that the metadata of a release contain in addition to the usual entries. The additional
+            entries may be `cautions`, a list of sentences for users, and `constant_force` if the network always returns
+            the same force.
         files: Contents of additional files in the version folder of a release, by file name.
         description: Sections in Markdown that the card of a release contains before the errors; empty for none.
         cross_validated: Answers to the charges of `test` by networks that were not trained on these presses; None if
-            `network` itself was not trained on them.
+            `network` itself was not trained on these presses.
         outside: Presses outside the working area; None if they were not simulated.
         yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if the force is unknown
             or above the range of forces.
@@ -95,11 +96,11 @@ _log = logging.getLogger(__name__)
 
 
 ROUNDED_FRACTION = 0.25
-"""Number of steps after the hidden weights are rounded, relative to the number of steps before, dimensionless."""
+"""Number of steps after the rounding of the hidden weights, relative to the number of steps before the rounding."""
 
 
 def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitted:
-    """Train a network on presses, and fold it into the form of a release.
+    """Train a network on presses, and convert it to the form in which networks are released.
 
     The contact perceptron and the misfit perceptron are trained at the same time, in two threads. The misfit perceptron
     is trained on examples from the working area and from the rest of the film. A warning is logged if two contacts of
@@ -177,7 +178,7 @@ def threads_and_seed(count: int, seed: int) -> Iterator[None]:
     previous_count = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
-        # `fork_rng` restores the random state after the block; without devices, only that of the CPU.
+        # `fork_rng` restores the random state after the block; without devices, only the state of the CPU.
         with threadpool_limits(count), torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             yield

@@ -1,14 +1,14 @@
-"""Network that computes contacts from charges, in the form in which it is released, and its ONNX graph.
+"""Network that computes contacts from charges, in the form of a release, and the ONNX graph of the network.
 
 The network has three parts:
 
-- The input features are functions of the charges. They are logarithms of positive charges. If the charges can have both
-  signs, they are inverse hyperbolic sines of the charges.
+- The input features are functions of the charges. If all charges are positive, the input features are logarithms of the
+  charges. If the charges can have both signs, the input features are inverse hyperbolic sines of the charges.
 - Two perceptrons compute vectors from the input features. The entries of these vectors are called answers.
 - The output functions convert the answers to position, force, standard deviations, correlations and misfit.
 
-The ONNX graph defines how a network is evaluated. The runtimes of ONNX evaluate the graph, in single precision in a
-released model, and in double precision in the reference implementation of ONNX. The C export
+The ONNX graph defines how a network is evaluated. A runtime evaluates the graph of a released model in single
+precision. The reference implementation of ONNX evaluates a graph of the same network in double precision. The C export
 (`isocharge.train.export_c.model_source`) writes networks of the same form.
 
 Perceptron
@@ -18,10 +18,11 @@ For inputs x, the hidden layer l computes h_l = tanh(h_(l-1) W_l + b_l), where h
 The output layer computes y = h_L V + c + x S from the result h_L of the last hidden layer. The skip layer S maps the
 inputs linearly to the outputs. The hidden layers therefore only need to learn the nonlinear part of the function.
 
-A network has two perceptrons with equally many layers, for the contact and for the misfit. The function `fold` makes
-the whitening of the features a part of their first layers, and the units of the answers a part of their last layers. In
-a prediction for a single press, the overhead of each node of the graph takes more time than the arithmetic. In the
-graph, both perceptrons are therefore joined into one, whose later layers have block-diagonal weights.
+A network has one perceptron for the contact, and one perceptron for the misfit. Both perceptrons have the same number
+of layers. The function `fold` includes the whitening of the features in the first layer of each perceptron, and the
+units of the answers in the last layer. In a prediction for a single press, the overhead of each node of the graph takes
+more time than the arithmetic. The graph therefore joins both perceptrons into a single perceptron, whose later layers
+have block-diagonal weights.
 
 Correlations
 ------------
@@ -85,7 +86,7 @@ class ChargeFeatures:
 
 
 LARGEST_INT8 = np.iinfo(np.int8).max
-"""Largest absolute value of the integers by which weights are represented in 8 bits, in units of their scale."""
+"""Largest absolute value of the 8-bit integers that represent weights. A weight is an integer times a scale."""
 
 
 class Layer(NamedTuple):
@@ -116,24 +117,24 @@ class Perceptron:
 
 
 POSITION = slice(0, 2)
-"""Columns of the answers with x and y, mm."""
+"""Columns of the answers that contain x and y, mm."""
 
 LOG_FORCE = slice(2, 3)
-"""Column of the answers with the logarithm of the force in N."""
+"""Column of the answers that contains the logarithm of the force in N."""
 
 MEAN = slice(0, 3)
-"""Columns of the answers with x, y and the logarithm of the force."""
+"""Columns of the answers that contain x, y and the logarithm of the force."""
 
 LOG_STD = slice(3, 6)
-"""Columns of the answers with the logarithms of the standard deviations of x and y in mm and of the force in N."""
+"""Columns of the answers that contain the logarithms of the standard deviations of x, y (mm) and the force (N)."""
 
 LOG_FORCE_STD = slice(LOG_STD.stop - 1, LOG_STD.stop)
-"""Column of the answers with the logarithm of the standard deviation of the force."""
+"""Column of the answers that contains the logarithm of the standard deviation of the force."""
 
 ANGLES = slice(6, 14)
-"""Columns of the answers with the angles whose cosines determine the correlations, rad.
+"""Columns of the answers that contain the angles whose cosines determine the correlations, rad.
 
-They come after the other answers about the contact and before the misfit vector.
+The angles come after the other answers about the contact and before the misfit vector.
 """
 
 COSINES_TO_CORRELATIONS = np.array(
@@ -150,16 +151,16 @@ COSINES_TO_CORRELATIONS = np.array(
 ) / [1, 1, 4]
 """Matrix, shape (8, 3), by which the cosines of the eight angles are multiplied to get the correlations.
 
-The correlations are those of x with y, of x with the force, and of y with the force.
+The three columns give the correlations between x and y, between x and the force, and between y and the force.
 """
 
 OPSET = 17
-"""Version of the ONNX operators, which runtimes since 2022 support."""
+"""Version of the ONNX operator set. Runtimes support this version since 2022."""
 
 
 @dataclass
 class GraphBuilder:
-    """Builder of a graph, which collects nodes and constants in the order in which they are added.
+    """Builder that collects the nodes and constants of a graph in the order in which they are added.
 
     The nodes are lines in the textual syntax of ONNX, and a tensor is represented by its name.
 
@@ -201,7 +202,8 @@ class FoldedNetwork:
         features: Input features.
         contact: Perceptron whose answers are x and y (2), ln F (1), logarithms of the standard deviations (3), and
             angles of the correlations (8).
-        misfit: Perceptron whose answers are the misfit vector (n_electrode). It has as many layers as `contact`.
+        misfit: Perceptron whose answers are the misfit vector (n_electrode). The misfit perceptron has as many layers
+            as `contact`.
     """
 
     features: ChargeFeatures
@@ -242,7 +244,7 @@ class FoldedNetwork:
 
         # Split the answers: x and y, the logarithms of the force and of the three standard deviations, the angles that
         # determine the correlations, and the misfit vector. The exponentials of the limited logarithms are the force
-        # and the standard deviations. The names after `to` are those of the results, such as the output `contact_std`.
+        # and the standard deviations. The argument `to` names the results, such as the output `contact_std`.
         widths = builder.constant((2, 4, len(COSINES_TO_CORRELATIONS), n_electrode), np.int64)
         builder.add("Split <axis = 1>", answers, widths, to="plane, logs, angles, misfit_vector")
         limits = (builder.constant(-LARGEST_LOGARITHM), builder.constant(LARGEST_LOGARITHM))
@@ -267,7 +269,7 @@ class FoldedNetwork:
         return model
 
     def with_scaled_std(self, position_factor: float, force_factor: float) -> "FoldedNetwork":
-        """Return a network whose standard deviations of position and force are multiplied by two given factors.
+        """Return a network whose standard deviations are multiplied by a factor for the position and one for the force.
 
         The answers are logarithms of the standard deviations. Therefore, the logarithms of the factors are added to the
         bias of the last layer.
@@ -279,7 +281,7 @@ class FoldedNetwork:
 
 
 def _add_features(builder: GraphBuilder, features: ChargeFeatures) -> str:
-    """Add nodes that compute the input features of the charges.
+    """Add the nodes that compute the input features from the charges.
 
     The charges Q are first limited to a range. If all charges are positive, the features are ln(Q / typical charge),
     and the operator `Clip` applies the same limits to all electrodes. If charges may be negative, the features are
@@ -305,11 +307,11 @@ def _add_features(builder: GraphBuilder, features: ChargeFeatures) -> str:
 
 
 def _add_perceptrons(builder: GraphBuilder, inputs: str, perceptrons: Sequence[Perceptron]) -> str:
-    """Add nodes that evaluate several perceptrons with the same inputs as one perceptron.
+    """Add the nodes that evaluate several perceptrons together. All perceptrons have the same inputs.
 
-    The weights of the first layers and of the skip layers stand side by side. The weights of the later layers are
-    blocks on the diagonal of a matrix. The operator `Gemm` computes inputs @ weights + bias. The last layer adds the
-    output of the skip layer.
+    In the first layer and in the skip layer, the weights of the perceptrons stand side by side. In the later layers,
+    the weights are blocks on the diagonal of a matrix. The operator `Gemm` computes inputs @ weights + bias. The last
+    layer adds the output of the skip layer.
 
     Args:
         builder: Builder of the graph.
@@ -327,7 +329,8 @@ def _add_perceptrons(builder: GraphBuilder, inputs: str, perceptrons: Sequence[P
         joined_bias = builder.constant(np.concatenate(biases))
         hidden_outputs = builder.add("Tanh", builder.add("Gemm", hidden_outputs, joined_weight, joined_bias))
 
-    # The last layer has the output of the skip layer as its bias, which contains the bias of the last layer.
+    # The output of the skip layer, which includes the bias of the last layer, takes the place of the bias in the last
+    # `Gemm`.
     skip = builder.constant(np.hstack([perceptron.skip for perceptron in perceptrons]))
     last_weights, last_biases = zip(*(perceptron.last for perceptron in perceptrons), strict=True)
     skip_and_bias = builder.add("Gemm", inputs, skip, builder.constant(np.concatenate(last_biases)))
@@ -335,7 +338,7 @@ def _add_perceptrons(builder: GraphBuilder, inputs: str, perceptrons: Sequence[P
 
 
 def fold(perceptron: Perceptron, mean: Array, matrix: Array, answer_map: Layer) -> Perceptron:
-    """Make the whitening of the features and a linear map of the outputs a part of a perceptron.
+    """Include the whitening of the features and a linear map of the outputs in the layers of a perceptron.
 
     The whitening of the features becomes part of the first layer and of the skip layer. The linear map from the outputs
     to the answers becomes part of the last layer and of the skip layer.
@@ -362,7 +365,7 @@ def fold(perceptron: Perceptron, mean: Array, matrix: Array, answer_map: Layer) 
 
 
 TURN = slice(6, 9)
-"""Columns of the outputs of the contact perceptron with the turns, which are the angles minus a right angle.
+"""Columns of the contact perceptron's outputs that contain the turns. A turn is an angle minus a right angle.
 
 The means and the logarithms of the standard deviations come before the turns.
 """
@@ -375,7 +378,7 @@ ANGLES_TO_COSINE_ARGUMENTS = np.array(
     ],
     dtype=float,
 )
-"""Matrix, shape (3, 8), from the angles (a, b, c) to the arguments of the eight cosines.
+"""Matrix, shape (3, 8), that converts the angles (a, b, c) to the arguments of the eight cosines.
 
 The arguments are a, b, a - b, a + b, a - b - c, a - b + c, a + b - c and a + b + c.
 """
@@ -386,11 +389,11 @@ def linear_answer_map(domain: Domain) -> Layer:
 
     The outputs are three means, three logarithms of standard deviations, and three angles:
 
-    - The means are unit coordinates, which range from -1 to 1. The map converts them to x, y and ln F.
-    - The perceptron computes the logarithm of the relative standard deviation of the force. The answer is that of the
-      absolute standard deviation in N. The map therefore adds ln F.
-    - The correlations are weighted sums of the cosines of eight sums of the three angles. The map computes these sums
-      of angles.
+    - The means are unit coordinates, which range from -1 to 1. The map converts the means to x, y and ln F.
+    - The perceptron computes the logarithm of the relative standard deviation of the force. The answer is the logarithm
+      of the absolute standard deviation in N. The map therefore adds ln F.
+    - The correlations are weighted sums of eight cosines. The argument of each cosine is a sum of the angles, in which
+      some angles have a negative sign. The map computes the eight arguments.
 
     Args:
         domain: Domain that defines the centre and the scale of the unit coordinates.
@@ -402,8 +405,8 @@ def linear_answer_map(domain: Domain) -> Layer:
     weight[MEAN, MEAN] *= domain.scale
     bias[MEAN] = domain.centre
 
-    # Logarithms of the standard deviations: add ln(scale). For the force, also add ln F, and therefore copy the weights
-    # and the bias with which the map computes ln F from the means.
+    # Logarithms of the standard deviations: add ln(scale). For the force, also add ln F: copy the weights and the bias
+    # that compute ln F from the means.
     bias[LOG_STD] = np.log(domain.scale)
     weight[MEAN, LOG_FORCE_STD] = weight[MEAN, LOG_FORCE]
     bias[LOG_FORCE_STD] += bias[LOG_FORCE]

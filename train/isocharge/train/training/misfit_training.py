@@ -1,9 +1,9 @@
 """Training of the misfit perceptron: its examples and its loss.
 
 An example consists of a set of charges and the residuals of these charges with respect to the nearest contact. The
-nearest contact is found by a search. The distances of the charges from those of presses are multiples of the standard
-deviation of the noise. The charges of any number of electrodes are moved, so that the examples contain wrong gains,
-dead electrodes, and charges that no press causes.
+nearest contact is found by a search. Most charges are the charges of a press with added errors. The standard deviation
+of the errors is between a tenth and a thousand times the standard deviation of the noise. The errors affect any number
+of electrodes, so that the examples include wrong gains, dead electrodes, and charges that no press causes.
 """
 
 import numpy as np
@@ -25,12 +25,13 @@ LOG_DISTANCES = (-1.0, 3.0)
 
 
 def draw_charges(rng: np.random.Generator, charge: Array, noise: ChannelNoise, count: int) -> Array:
-    """Draw charges that differ from those of presses by errors of very different sizes.
+    """Draw charges that differ from the charges of presses by errors of very different sizes.
 
     Presses are chosen at random, and normally distributed errors are added to the levels of their charges. The level of
     a charge is its value on a scale on which the noise has the standard deviation 1. In each press, a random share of
     the electrodes has errors with one random standard deviation, from less than the noise to a thousand times the
-    noise. It is log-uniform within `LOG_DISTANCES`. The errors of the other electrodes are those of the noise.
+    noise. The logarithm of this standard deviation is uniformly distributed within `LOG_DISTANCES`. The errors of the
+    other electrodes are as large as the noise.
 
     Args:
         rng: Random number generator.
@@ -54,7 +55,7 @@ def draw_charges(rng: np.random.Generator, charge: Array, noise: ChannelNoise, c
 OUTSIDE_SHARE = 0.25
 """Share of the examples of the misfit network that are presses outside the working area, dimensionless.
 
-If the dataset has no such presses, there are no such examples.
+If the dataset has no presses outside the working area, this share is zero.
 """
 
 
@@ -71,11 +72,11 @@ def misfit_examples(
     """Draw the examples from which the misfit network learns, for a model of simulated presses.
 
     An example consists of charges, and of their residual: the difference from the charges of the nearest contact. Most
-    charges are drawn at random (`draw_charges`). All other charges are those of presses outside the working area.
+    charges are drawn at random (`draw_charges`). All other charges belong to presses outside the working area.
 
     Args:
         split: Presses for training, and the map from contacts to charges with which the nearest contacts are found.
-        features: Input features of the network, whose limits are also the limits of the charges.
+        features: Input features of the network. The charges of the examples are limited to the range of the features.
         outside: Presses outside the working area, from which a share of the examples is drawn; None if there are none.
         config: Noise, number of examples and seed.
 
@@ -100,12 +101,13 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
     """Define the training of the misfit perceptron.
 
     The targets of the perceptron are the residuals, whose lengths are the misfits. The inverse hyperbolic sine
-    compresses the lengths. Examples with vectors far above `FOCUS_LENGTH` have smaller weights than other examples.
+    compresses the lengths. Examples with vectors much longer than `FOCUS_LENGTH` have smaller weights than other
+    examples.
 
     Args:
         network: Network whose misfit perceptron is trained.
-        examples: Charges Q, pC, and their residuals (Q - Q(c)) / sigma, shape (2, n, n_electrode), where c is the
-            nearest contact and sigma the standard deviation of the noise.
+        examples: Charges Q, pC, and their residuals (Q - Q(c)) / sigma, shape (2, n, n_electrode). Here, c is the
+            nearest contact, and sigma is the standard deviation of the noise.
         config: Number of steps, batch size, learning rate and seed.
     """
     charges, residuals = examples

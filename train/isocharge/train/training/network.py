@@ -9,7 +9,7 @@ standard deviations of their noise, and Q(c) are the charges of a contact c. The
 is as short as possible. The length of the misfit vector is the misfit. If the measured charges agree exactly with the
 charges of a contact, the vector is zero. Near such charges, the vector is a smooth function of the charges, but its
 length is not smooth. Therefore, the perceptron learns the vector instead of the length. The length may be a tenth or
-several thousand, so it is compressed by the function asinh.
+several thousand. The length is therefore compressed by the function asinh.
 """
 
 from itertools import pairwise
@@ -61,8 +61,9 @@ def logarithmic_features(charge: Array, white_noise_pC: float = LOWEST_CHARGE) -
 def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
     """Return features for charges of both signs: asinh(charge / typical charge) minus its mean over the given charges.
 
-    Before the conversion, each charge is limited, so that the inverse hyperbolic sines may lie outside the range of
-    those of the given charges by at most the width of this range.
+    Before the conversion, each charge is limited to a range that is wider than the range of the given charges. On the
+    scale of the inverse hyperbolic sine, the limits are the smallest given value minus the width of the given range,
+    and the largest given value plus this width.
 
     Args:
         charge: Charges of presses, shape (n, n_electrode), pC.
@@ -71,7 +72,7 @@ def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
     asinh_charge = np.arcsinh(charge / typical)
     lowest = asinh_charge.min(axis=0)
     highest = asinh_charge.max(axis=0)
-    margin = highest - lowest  # the width of the range, by which the limits lie outside the range
+    margin = highest - lowest  # the limits lie outside the range by the width of the range
     return ChargeFeatures(
         typical_pC=typical,
         low_pC=np.sinh(lowest - margin) * typical,
@@ -128,12 +129,12 @@ class TrainablePerceptron(nn.Module):
         super().__init__()
         widths = (n_input, *hidden, n_output)
         self.linear_layers = [nn.Linear(n_in, n_out) for n_in, n_out in pairwise(widths)]  # from first to last
-        self.layers = nn.ModuleList(self.linear_layers)  # makes the parameters of the layers those of the perceptron
+        self.layers = nn.ModuleList(self.linear_layers)  # registers the parameters of the layers
         self.skip = nn.Linear(n_input, n_output, bias=False)
         nn.init.zeros_(self.skip.weight)
 
     def sharpen_first_layer(self) -> None:
-        """Replace the weights of the first layer by larger random weights, so that its units are clearly nonlinear.
+        """Replace the weights of the first layer by larger random weights, so that the units are clearly nonlinear.
 
         Near the rim of the working area, the posterior mean of the contact is a strongly nonlinear function of the
         charges. Units that are nearly linear for all inputs learn such a function slowly. Therefore, each unit gets a
@@ -194,7 +195,8 @@ class InverseNetwork(nn.Module):
         charge: Charges of the presses for training, shape (n, n_electrode), pC. Their features determine the whitening.
         config: Widths of the hidden layers.
         force_std: Relative standard deviation of the force if all presses have the same force. The network then always
-            answers the force in the middle of the domain with this standard deviation. None to learn the force.
+            returns the force in the middle of the domain, with this standard deviation. If None, the network learns the
+            force.
     """
 
     def __init__(
@@ -244,7 +246,7 @@ class InverseNetwork(nn.Module):
         self.whitening = nn.Buffer((principal_axes.T * inverse_std).float())
 
     def inputs(self, charge: Tensor) -> Tensor:
-        """Compute whitened features, which are the inputs of both perceptrons. Finite charges give finite inputs.
+        """Compute the whitened features, which are the inputs of both perceptrons. Finite charges give finite inputs.
 
         Args:
             charge: Charges, shape (n, n_electrode), pC.
@@ -294,7 +296,7 @@ def as_tensor(values: Reals) -> Tensor:
 
 
 def fold_network(network: InverseNetwork) -> FoldedNetwork:
-    """Make the whitening of the inputs and the units of the answers a part of the perceptrons of a trained network.
+    """Return a trained network whose perceptrons include the whitening of the inputs and the units of the answers.
 
     If all presses have the same force, the last layer of the contact perceptron always gives this force.
     """

@@ -27,10 +27,10 @@ from isocharge.train.training.folded_network import ChargeFeatures
 from isocharge.train.training.network import logarithmic_features, signed_features
 
 SIGNED_FEATURE_SCALE = 0.1
-"""Charge above which features of charges of both signs are logarithmic, dimensionless.
+"""Charge above which the features of charges of both signs are logarithmic, relative to the transition charge.
 
-It is relative to the charge above which the noise is proportional to the charge. On a taut uniaxial film, the value 0.1
-gave smaller position errors than the value 1.
+Above the transition charge, the noise is proportional to the charge. On a taut uniaxial film, the value 0.1 gave
+smaller position errors than the value 1.
 """
 
 
@@ -48,7 +48,7 @@ class TrainingData:
         outside: Presses between the domain and the clamp; None if there are none.
         yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if the force is unknown
             or above the range of forces.
-        field: Charges as a function of the contact; None to fit them to `presses`.
+        field: Charges as a function of the contact; None to fit this function to `presses`.
     """
 
     sensor: Sensor
@@ -93,19 +93,19 @@ class TrainingData:
 MAX_ERROR_OF_CERTAIN_FOLD = 2.0 * SUFFICIENT_ERROR
 """Largest relative error of the fitted charges at which a fold counts as certain.
 
-A poor fit has spurious folds, in the outer fifth of the domain.
+A poor fit has spurious folds in the outer fifth of the domain.
 """
 
 PROBABLE_FOLD_RATIO = 0.7
-"""Ratio of the radius of a fold of a poor fit to the radius of the domain below which the fold is probable."""
+"""Radius below which a fold of a poor fit is probable, relative to the radius of the domain."""
 
 SEARCHED_RADIUS_RATIO = 0.98
-"""Ratio of the radius within which folds are searched for to the radius of the domain.
+"""Radius within which folds are searched for, relative to the radius of the domain.
 
 At the edge of the domain, the presses do not determine the derivatives of the charges accurately."""
 
 MIN_RADIUS_RATIO = 0.2
-"""Smallest ratio of the radius without folds to the radius of the dataset at which a network can be trained."""
+"""Smallest radius without folds for which a network can be trained, relative to the radius of the dataset."""
 
 
 def invertible_domain(
@@ -159,7 +159,7 @@ def invertible_domain(
 
 @dataclass(frozen=True)
 class Split:
-    """Presses that are split by position into presses for training and for the test.
+    """Presses for training and presses for the test, which are separated by their positions.
 
     In the domain of the presses, the map from contacts to charges can be inverted.
 
@@ -169,8 +169,8 @@ class Split:
         test: Presses for measuring errors.
         field: Map from contacts to charges, which is fitted to all presses.
         cautions: Sentences about folds of the map and about contacts with the same charges.
-        folded_charges: Approximation of the charges by a series, which includes the region where the map folds; None if
-            the map does not fold.
+        folded_charges: Series that approximates the charges in a domain that includes the region where the map folds;
+            None if the map does not fold.
     """
 
     domain: Domain
@@ -182,7 +182,7 @@ class Split:
 
     @classmethod
     def by_position(cls, data: TrainingData, training: TrainingConfig) -> "Split":
-        """Split presses into a part for training and a part for the test, and fit a charge field to them.
+        """Split presses into a part for training and a part for the test, and fit a charge field to the presses.
 
         A charge field is a smooth map from contacts to charges. The map folds where different contacts have the same
         charges. The field determines the largest disk in which the map certainly does not fold. Only the presses within
@@ -212,8 +212,8 @@ class Split:
         """Choose the features of the charges for the training presses.
 
         The features are logarithms of the charges if all charges are positive. If some charges are not positive, the
-        features are inverse hyperbolic sines of charge / typical charge. They are nearly linear for charges below the
-        typical charge of the channel, and nearly logarithmic above it.
+        features are inverse hyperbolic sines of charge / typical charge. These features are nearly linear for charges
+        below the typical charge of the channel, and nearly logarithmic for charges above it.
 
         Args:
             noise: Noise of the charges, which determines the typical charges or the lower limit of the charges.
