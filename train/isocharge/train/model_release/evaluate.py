@@ -1,4 +1,4 @@
-"""Measurement of the errors of a network, and of its wrong answers without a flag, on presses outside its training."""
+"""Measurement of the errors of a network, and of its wrong answers without a flag, on presses not used for training."""
 
 from collections.abc import Callable, Mapping
 from statistics import NormalDist
@@ -25,16 +25,16 @@ FORCES_NEAR_1_N = (0.8, 1.25)
 """Smallest and largest force of the presses on which the detection of faults is measured, N."""
 
 N_GOOD_PRESSES = 50_000
-"""Smallest number of presses with noise for the percentiles of the misfit. Fewer presses are repeated."""
+"""Smallest number of presses with noise for the percentiles of the misfit. If there are fewer, they are repeated."""
 
 HELD_PRESSES = "measured_presses"
-"""Name of the error entry that contains the number of measured presses. Errors on simulated presses do not have it."""
+"""Name of the error entry that contains the number of measured presses. Simulated presses have no such entry."""
 
 
 def evaluate(fitted: Fitted) -> dict[str, float]:
     """Measure the errors of a trained network on presses that were not used in its training.
 
-    The errors of a network of measured presses are those of the cross-validation. The errors of a cross-validation
+    If the network was trained on measured presses, its errors are taken from the cross-validation. These errors also
     contain the errors of the measured places and forces.
 
     Args:
@@ -42,11 +42,11 @@ def evaluate(fitted: Fitted) -> dict[str, float]:
 
     Returns:
         Errors by name. The position errors are in mm, and the force errors are in percent of the force. The coverages
-        of the 68 and 95 % intervals are fractions of the coordinates, 0 to 1. If the network always answers the same
-        force, there are no errors of the force, and the coverages are those of x and y. Further entries are the misfits
-        that 1 % and 0.1 % of the good presses exceed. For simulated presses, the result also contains the errors
-        without noise, and the fractions of faults that cause an alarm. For measured presses, the result also contains
-        the number of presses.
+        of the 68 % and 95 % intervals are the fractions of the true values that lie in these intervals, 0 to 1. If the
+        network always returns the same force, there are no errors of the force, and the coverages refer only to x and
+        y. Further entries are the misfits that 1 % and 0.1 % of the good presses exceed. For simulated presses, the
+        result also contains the errors without noise, and the fractions of faults that cause an alarm. For measured
+        presses, the result also contains the number of presses.
     """
     if fitted.cross_validated is None:
         return simulated_errors(fitted.predict, fitted.test, fitted.noise)
@@ -61,9 +61,9 @@ def evaluate(fitted: Fitted) -> dict[str, float]:
 
 
 def simulated_errors(predict: Predict, presses: LabelledPresses, noise: Noise) -> dict[str, float]:
-    """Measure the errors of a network on simulated presses, with and without noise, and how it detects faults.
+    """Measure the errors of a network on simulated presses, with and without noise, and its detection of faults.
 
-    A fault counts as detected if the misfit is larger than that of 99 % of good presses.
+    A fault counts as detected if the misfit is larger than the misfits of 99 % of good presses.
 
     Args:
         predict: Function that computes the answers of the network.
@@ -111,7 +111,7 @@ def contact_errors(contact: Array, std: Array, truth: Array) -> dict[str, float]
 
 
 def _coverages(estimate: Array, std: Array, truth: Array) -> dict[str, float]:
-    """Return the fractions of true values in the 68 and 95 % intervals around the estimates, all of the same shape."""
+    """Return the fractions of true values in the 68 and 95 % intervals. All three arrays have the same shape."""
     deviation = np.abs(estimate - truth) / std  # in reported standard deviations
     return {
         "coverage_68": rounded(np.mean(deviation < 1.0)),

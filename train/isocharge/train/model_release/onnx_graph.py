@@ -2,7 +2,7 @@
 
 The reader extracts the constants of a graph, makes a new graph with these constants, and compares both graphs.
 Therefore, only `FoldedNetwork` defines the structure of the graph. The reader refuses graphs that another program
-wrote. Before a graph is released, its outputs in single precision are compared with those in double precision.
+wrote. Before a graph is released, its outputs in single precision are compared with its outputs in double precision.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -77,8 +77,9 @@ def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:
 def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     """Return the network from which `write_graph` made a graph.
 
-    The constants have the order in which `FoldedNetwork.onnx_model` adds them: those of the features, those of the
-    hidden layers, the weights of the skip layer, and the bias and the weights of the last layer.
+    The constants have the order in which `FoldedNetwork.onnx_model` adds them. First come the constants of the
+    features, and then the constants of the hidden layers, the weights of the skip layer, and the bias and the weights
+    of the last layer.
 
     Args:
         graph: The graph.
@@ -129,12 +130,12 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
 
 
 def _select_units(joined: Perceptron, units: list[slice]) -> Perceptron:
-    """Return the perceptron that consists of some units of several joined perceptrons.
+    """Return the perceptron that consists of the selected units of several joined perceptrons.
 
     Args:
         joined: The joined perceptrons, which have the same inputs.
-        units: Units of each layer that belong to the perceptron, from the first layer to the last. They are columns of
-            the weights of the layer, and rows of the weights of the next layer.
+        units: Units of each layer that belong to the perceptron, from the first layer to the last. Each unit is a
+            column of the weights of its layer, and a row of the weights of the next layer.
     """
     joined_layers = (*joined.hidden, joined.last)
     units_before = [slice(None), *units[:-1]]  # all inputs before the first layer
@@ -160,8 +161,8 @@ N_EXTREME = 10_000
 EXTREME_CHARGES_pC = (-LARGEST, LOWEST_CHARGE, LARGEST)
 """Charges for which every output must be finite, pC.
 
-`LARGEST` is the largest float32 number. A network sets smaller charges to its lower limit, which is at most
-`LOWEST_CHARGE`, before it computes their logarithm. A negative charge therefore gives the smallest logarithm.
+`LARGEST` is the largest float32 number. Before a network computes a logarithm, it raises every charge below a lower
+limit to this limit, which is at most `LOWEST_CHARGE`. A negative charge therefore gives the smallest logarithm.
 """
 
 
@@ -172,13 +173,13 @@ def check_graph(
     noise: Noise,
     floors: Sequence[float] = FLOORS["contact"],
 ) -> Singles:
-    """Compare the outputs of an ONNX graph with those of its network, and choose charges for the golden vectors.
+    """Compare the outputs of an ONNX graph with the outputs of its network, and choose charges for the golden vectors.
 
-    Golden vectors are charges and their outputs, which are stored with a model, so that every computer can check its
-    answers. The outputs of the graph and of the network are compared for noisy charges of presses and for extreme
-    charges. At some charges, the outputs depend so strongly on the charges that the rounding of float32 numbers
-    matters. Such charges do not become golden vectors. For many further extreme charges, the function only checks that
-    the outputs are finite.
+    Golden vectors are charges together with the outputs for these charges. The golden vectors are stored with a model,
+    so that every computer can check its own answers. The outputs of the graph and of the network are compared for noisy
+    charges of presses and for extreme charges. At some charges, the outputs depend so strongly on the charges that the
+    rounding of float32 numbers matters. Such charges do not become golden vectors. For many further extreme charges,
+    the function only checks that the outputs are finite.
 
     Args:
         graph: The ONNX file.
@@ -218,12 +219,12 @@ def check_graph(
 def _choose_golden_charges(compute_exact: OutputFunction, presses: LabelledPresses, noise: Noise) -> Singles:
     """Choose charges for the golden vectors.
 
-    Three quarters are charges of presses, and one quarter are extreme charges.
+    Three quarters of the chosen charges are charges of presses, and one quarter are extreme charges.
 
-    Presses are only used if the standard deviation of their position is at most the median of all presses. For presses
-    with larger standard deviations, a small change of a charge may move the estimated position by millimetres. On these
-    presses, two runtimes that round float32 numbers differently could differ by more than the tolerance of the golden
-    vectors.
+    A press is only used if the standard deviation of its position is at most the median over all presses. For presses
+    with larger standard deviations, a small change of a charge may move the estimated position by millimetres. For such
+    presses, two runtimes that round float32 numbers differently could give outputs that differ by more than the
+    tolerance of the golden vectors.
 
     Args:
         compute_exact: Function that computes the outputs of the network in double precision.
