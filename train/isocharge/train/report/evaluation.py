@@ -67,10 +67,11 @@ class Method:
     Attributes:
         name: Name in the table and in the picture.
         library: Library that computes the estimates.
-        estimate: Function from charges, shape (n, n_electrode), pC, to contacts (x, y, F), shape (n, 3), mm and N. A
-            contact without an estimate is NaN.
-        single_call: Function from the charges of one press, shape (n_electrode,), pC, to a function without arguments
-            that estimates the contact of this press. None if `estimate` is the fastest way to estimate one contact.
+        estimate: Function that converts charges, shape (n, n_electrode), pC, to contacts (x, y, F), shape (n, 3), mm
+            and N. If there is no estimate for a press, the contact is NaN.
+        single_call: Function that takes the charges of one press, shape (n_electrode,), pC, and returns another
+            function. The returned function has no arguments, and estimates the contact of this press. None if
+            `estimate` is the fastest way to estimate one contact.
     """
 
     name: str
@@ -79,7 +80,7 @@ class Method:
     single_call: Callable[[Array], Callable[[], object]] | None = None
 
     def call_in_turn(self, charge: Array) -> Callable[[], object]:
-        """Return a function without arguments that estimates the contact of the next press in each call.
+        """Return a function without arguments. Each call of the function estimates the contact of the next press.
 
         The duration of the calls is measured. After the last press, the function begins again with the first press.
 
@@ -144,7 +145,8 @@ class Settings:
     """Settings of a report. The names of the attributes are keys of `report.json`.
 
     Attributes:
-        presses: Smallest number of simulated test presses. Fewer presses are repeated with other noise.
+        presses: Smallest number of simulated test presses. If there are fewer presses, they are repeated with other
+            noise.
         seconds: Duration for which the predictions of a method are timed, s.
         quick: Whether the report is a trial run, whose results are not meaningful.
     """
@@ -166,8 +168,8 @@ class MethodRecord:
         name: Name of the method.
         library: Library that computes the estimates.
         answered: Fraction of the presses for which the method returned an estimate, 0 to 1.
-        errors: Statistics of the errors on these presses, by the names of `contact_error_statistics`; empty if there
-            are no such presses.
+        errors: Statistics of the errors on the presses with an estimate, by the names of `contact_error_statistics`;
+            empty if no press has an estimate.
         single_press_us: Median duration of the estimate for one press, us.
     """
 
@@ -192,9 +194,9 @@ class Section:
         dataset_sha256: Checksum of the dataset.
         fitted_presses: Number of presses to which the methods were fitted.
         test_presses: Number of test presses.
-        limits: Cramér-Rao limits of the rms errors on the test presses, by the names of the errors. They are empty for
-            measured presses, whose noise is unknown, and without a charge map.
-        methods: Records of the methods. The evaluated model is the first one.
+        limits: Cramér-Rao limits of the rms errors on the test presses, by the names of the errors. There are no limits
+            for measured presses, whose noise is unknown, or without a charge map.
+        methods: Records of the methods. The evaluated model is the first method.
         left_out: Reasons why other methods or the limit could not be computed.
     """
 
@@ -222,7 +224,7 @@ def evaluate_dataset(dataset: Dataset, model_folder: Path, settings: Settings) -
 
     Raises:
         DatasetError: If the methods cannot be fitted to the dataset.
-        ModelError: If the model is for another sensor than the dataset.
+        ModelError: If the model and the dataset are for different sensors.
         PressError: If there are too few measured presses, or the model was calibrated from all presses that are held
             out.
     """
@@ -233,8 +235,8 @@ def evaluate_dataset(dataset: Dataset, model_folder: Path, settings: Settings) -
     presses, test = split_presses(covered_dataset, model_folder, model)
     domain = LabelledPresses.of(covered_dataset.samples).domain
     measured = is_measured(dataset)
-    # The noise determines the weights of the charges in a fit. It is added only to simulated presses, because the
-    # charges of measured presses already contain noise.
+    # The noise determines the weights of the charges in a fit. The noise is added only to simulated presses, because
+    # the charges of measured presses already contain noise.
     noise = noise_of(model)
     if not measured:
         repeated_test = test.repeated(settings.presses)
@@ -286,7 +288,7 @@ def _covered_presses(dataset: Dataset, model: ModelMetadata) -> Dataset:
     """Select the presses in the working area and in the range of forces of a model.
 
     Raises:
-        DatasetError: If there are none.
+        DatasetError: If there are no such presses.
         PressError: If there are too few measured presses.
     """
     samples = dataset.samples
@@ -307,12 +309,13 @@ def _covered_presses(dataset: Dataset, model: ModelMetadata) -> Dataset:
 def split_presses(
     dataset: Dataset, model_folder: Path, model: ModelMetadata
 ) -> tuple[LabelledPresses, LabelledPresses]:
-    """Split presses into those to which methods are fitted, and those that are held out for the test.
+    """Split presses into presses to which methods are fitted, and presses that are held out for the test.
 
-    In a simulated dataset, a tenth of the positions is held out. A training on the same dataset also holds these
-    positions out, or only some of the positions if the configuration of the training states a smaller share. The test
-    uses only positions that neither the report nor the training uses for fitting. Measured datasets are smaller. In a
-    measured dataset, a fifth of the positions is held out, except presses that a calibration of the model has used.
+    In a simulated dataset, a tenth of the positions is held out. A training on the same dataset holds out the same
+    positions. If the configuration of the training states a smaller share, the training holds out only some of these
+    positions. The test uses only positions that neither the report nor the training uses for fitting. Measured datasets
+    are smaller. In a measured dataset, a fifth of the positions is held out, except presses that a calibration of the
+    model has used.
 
     Args:
         dataset: The presses of a dataset that the model covers.
@@ -354,8 +357,8 @@ def noise_of(model: ModelMetadata) -> NoiseModel:
 def _calibration_charges(model_folder: Path, model: ModelMetadata) -> Array:
     """Return the charges of all presses from which a model was calibrated, shape (n, n_electrode), pC.
 
-    A calibration may continue an earlier one, so the presses of all versions of the model are returned. A model that
-    was not calibrated has no such presses.
+    A calibration may continue an earlier calibration, so the presses of all versions of the model are returned. A model
+    that was not calibrated has no such presses.
     """
     files = model_folder.parent.glob(f"*/{PRESSES}")  # of all versions
     charges = [read_presses(file, model.electrodes).charge_pC for file in files]
@@ -367,16 +370,17 @@ def check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
     """Raise an error if a model was not trained for the sensor of a dataset.
 
     For measured presses, only the names of the electrodes and their order are compared, because a calibration changes
-    the film. A model of presses alone is refused, because it may have learned from the presses on which it would be
-    tested. For simulated presses, all values of the two sensors must be equal, except the names of the sensors.
+    the film. A model that was trained only on measured presses is refused, because it may have learned from the presses
+    on which it would be tested. For simulated presses, all values of the two sensors must be equal, except the names of
+    the sensors.
 
     Args:
         model: Metadata of the model.
         dataset: The dataset.
 
     Raises:
-        ModelError: If the sensors differ, or the model is one of presses alone. The message names the values that
-            differ.
+        ModelError: If the sensors differ, or if the model was trained only on measured presses. The message names the
+            values that differ.
     """
     names = dataset.sensor.electrode_names
     differences = [] if model.electrodes == names else [f"electrodes ({', '.join(model.electrodes)})"]

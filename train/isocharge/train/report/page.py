@@ -104,7 +104,7 @@ def _conditions(section: Section) -> str:
 
 
 def _table_lines(sections: Sequence[Section]) -> Iterator[str]:
-    """Yield the lines of the table: the header, and for each dataset the limit and the sorted methods."""
+    """Yield the lines of the table: first the header, and then the limit and the sorted methods of each dataset."""
     yield _table_line(HEADER)
     n_number_columns = len(HEADER) - TEXT_COLUMNS
     yield "|" + "---|" * TEXT_COLUMNS + "--:|" * n_number_columns  # numbers are aligned to the right
@@ -131,7 +131,7 @@ def _error_cells(errors: Mapping[str, float]) -> list[str]:
 
 
 def _position_error(record: MethodRecord) -> float:
-    """Return the root-mean-square position error of a method, mm; infinity without any estimate."""
+    """Return the root-mean-square position error of a method, mm; infinity if there is no estimate."""
     return record.errors.get("position_rms_mm", float("inf"))
 
 
@@ -181,7 +181,7 @@ def write_report(
     All methods are tested on presses at positions that are held out.
 
     Args:
-        folder: Folder to write; it must not exist.
+        folder: Folder to create. The folder must not exist.
         subjects: Datasets, each with the version folder of the model that is evaluated on it.
         settings: Settings of the report; None for the settings of a full report.
         command: Command that repeats the report, for the page; empty if there is none.
@@ -192,7 +192,7 @@ def write_report(
     Raises:
         OutputExists: If the folder exists.
         DatasetError: If the methods cannot be fitted to a dataset.
-        ModelError: If a model is for another sensor than its dataset.
+        ModelError: If a model and its dataset are for different sensors.
         PressError: If there are too few measured presses.
     """
     check_new_output(folder)
