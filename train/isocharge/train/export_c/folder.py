@@ -25,9 +25,10 @@ def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: 
     """Return the text of `isocharge_device.h`, which defines the settings of the signal chain as macros.
 
     A stage of the signal chain belongs to a section of a device file. The C sources implement only some of the stages.
-    The macro `ISOCHARGE_<SECTION>_ON` of such a stage is 1 if the stage is switched on. Its other macros have the names
-    of its settings in capital letters. A stage that the C sources lack is left out with a warning if it only processes
-    contacts, which a host can do as well. Any other such stage is an error, because the charges would be wrong.
+    The macro `ISOCHARGE_<SECTION>_ON` of an implemented stage is 1 if the stage is switched on. The other macros of the
+    stage have the names of its settings in capital letters. The device file may also switch on a stage that is not
+    implemented in C. If such a stage only processes contacts, it is left out with a warning, because a host can process
+    the contacts as well. Any other such stage is an error, because the charges would be wrong.
 
     Args:
         device: The board.
@@ -66,7 +67,7 @@ def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: 
 
 
 def settings_origin(device: Device) -> str:
-    """Return words that state where the settings of the signal chain come from, for comments and the README."""
+    """Return a phrase that states the origin of the settings of the signal chain, for comments and the README."""
     if device is ANY_BOARD:
         return "the defaults, because no device file was given"
     return f'from the device file "{c_comment(device.name)}"'

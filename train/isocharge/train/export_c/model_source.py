@@ -4,10 +4,10 @@ Features
 --------
 
 In C, the inputs of the first layer are the logarithm of one charge, ln q_0, and the logarithms ln(q_k / q_0) for the
-other charges q_k. The network remains the same function of the charges, but its rounding errors are smaller. The force
-changes all charges of a film together, and the position changes the ratios of the charges. The first layer of a trained
-network therefore has large weights of both signs. The logarithms are nearly equal, so that the terms of the sums in
-this layer nearly cancel:
+other charges q_k. With these inputs, the network remains the same function of the charges, but the rounding errors are
+smaller. The force changes all charges of a film together, and the position changes the ratios of the charges. The first
+layer of a trained network therefore has large weights of both signs. The logarithms are nearly equal, so that the terms
+of the sums in this layer nearly cancel:
 
     sum_k w_k ln q_k = (sum_k w_k) ln q_0 + sum_k w_k ln(q_k / q_0).
 
@@ -22,7 +22,7 @@ Layers
 A layer computes its outputs y = f(x W + c) from its inputs x. W are the weights, shape (inputs, outputs), c is the
 bias, and f is the hyperbolic tangent or the identity. The C function processes four inputs at a time, so that it reads
 and writes each output less often. Each input is multiplied by its row of W, which gives one product for each output.
-The product is added to the sum of this output. The inner loop of the C function runs over neighbouring outputs, and its
+Each product is added to the sum of its output. The inner loop of the C function runs over neighbouring outputs, and its
 number of iterations is constant. With -O2 or a higher level of optimisation, compilers therefore vectorise the loop
 without changing the order of any sum. Each weight that the training rounded to 8 bits is stored in one byte.
 """
@@ -106,7 +106,8 @@ def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
         values: Weights, shape (inputs, outputs).
 
     Returns:
-        Integers and the scales, shape (outputs,). If some weights are no multiples, the unchanged weights and None.
+        Integers and the scales, shape (outputs,). If some weights are not multiples of the scale, the unchanged weights
+        and None.
     """
     scale = np.abs(values).max(axis=0) / np.float32(LARGEST_INT8)
     nonzero_scale = np.where(scale > 0.0, scale, 1.0)  # a column of zeros has the scale 0
