@@ -41,7 +41,7 @@ ADVICE = "copy the model's folder again, or calibrate or train again"
 """What the user can do about a damaged file, for error messages."""
 
 NUMBERS = ("charge_std", "offset_pC", "pretension_MPa", "tension_std_MPa")
-"""Arrays that contain a single number or, for `offset_pC`, one for each electrode: attributes of `ChargeSeries`."""
+"""Arrays for attributes of `ChargeSeries` that are one number or, for `offset_pC`, one number for each electrode."""
 
 
 def charge_map_bytes(series: ChargeSeries) -> bytes:

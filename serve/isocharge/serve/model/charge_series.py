@@ -1,28 +1,29 @@
-"""Compact charge map of a film, which the file `charges.npz` of a model contains.
+"""Compact charge map of a film, stored in the file `charges.npz` of a model.
 
-A charge map gives the charges of the electrodes for any contact. This map consists of one value v for each electrode,
-which is a Chebyshev series in the contact:
+A charge map gives the charges of the electrodes for any contact. This map computes a value v_e for each electrode e.
+The value is a Chebyshev series in the contact:
 
     v_e = sum c_ijm T_i(x / r) T_j(y / r) T_m(l),   i + j <= degree, m <= force_degree,
 
 where T_i are Chebyshev polynomials, r is the radius of the domain, and l is the logarithm of the force, scaled to
 [-1, 1]. If all charges are positive, the charge is Q = exp(v). If some charges are not positive, the charge is Q = S(l)
-v, and the logarithm of the typical size S of the charges is a polynomial in l.
+v, where S is the typical size of the charges. The logarithm of S is a polynomial in l.
 
-Without pretension, the charge is nearly F^(2/3) g(x, y), with the force F and a smooth function g of the position. The
-value v is therefore smooth, and few terms suffice. For a contact outside the domain, v and ln S are extrapolated
-linearly in x, y and l from the nearest contact in the domain. If all charges are positive, Q is then a power of F for
-forces outside the domain, because ln Q is linear in ln F.
+Without pretension, the charge is nearly F^(2/3) g(x, y), where F is the force and g is a smooth function of the
+position. The value v is therefore smooth, and the series needs only a few terms. For a contact outside the domain, v
+and ln S are extrapolated linearly in x, y and l from the nearest contact in the domain. If all charges are positive, Q
+is then a power of F for forces outside the domain, because ln Q is linear in ln F.
 
 A calibrated film may change. The map then also depends on the state of the film, a vector (t, z_1, ..., z_K):
 
 - t is the change of the mean pretension since the calibration, MPa. The coefficients c are given for several values of
-  t, which are called nodes. Between the nodes, the coefficients are interpolated by a polynomial (Lagrange). A film
-  whose pretension cannot be followed has the single node 0.
+  t, which are called nodes. Between the nodes, the coefficients are interpolated by a polynomial (Lagrange). If the
+  pretension of a film cannot be tracked, its map has only the node 0.
 - z_k is the change of the film along direction k, in standard deviations. A direction is a linear combination of
   properties of the film that remained uncertain after the calibration. A change adds z_k (d_ke + t d'_ke) to v_e, where
   d_ke(x, y, F) and d'_ke(x, y, F) are further Chebyshev series. The series d' is needed because some combinations of
-  properties hardly change the charges at the pretension of the calibration, but do so at another pretension.
+  properties hardly change the charges at the pretension of the calibration, but change the charges at another
+  pretension.
 """
 
 from dataclasses import dataclass, field
@@ -36,7 +37,7 @@ from isocharge.common.contact_domain import Domain, into_unit_domain
 from isocharge.serve.model.robust_estimate import ModelValues
 
 CHUNK_SIZE = 4096
-"""Number of points at which a series is evaluated at the same time, which limits the memory."""
+"""Number of points at which a series is evaluated at once. This number limits the required memory."""
 
 
 @dataclass(frozen=True)
@@ -55,14 +56,14 @@ class Series:
     coefficients: Array
 
     def values_and_derivatives(self, coordinates: Array, excess: Array) -> Array:
-        """Evaluate the series and its derivatives with respect to the three coordinates, and continue it linearly.
+        """Evaluate the series and its derivatives with respect to the coordinates, and continue the series linearly.
 
         The points are processed in chunks of at most `CHUNK_SIZE` points. In each chunk, the method first sums over the
         polynomials in x and y, and then over the polynomials in the logarithm of the force.
 
         Args:
             coordinates: Scaled coordinates of n points, shape (n, 3). Coordinates outside [-1, 1] are clipped.
-            excess: Differences between the points to which the series is continued and these points, shape (n, 3).
+            excess: Steps from these points to the points to which the series is continued, shape (n, 3).
 
         Returns:
             Values at the continued points, and derivatives, shape (n, 4, n_electrode). The second axis contains the
@@ -170,7 +171,7 @@ MAX_VALUE = 100.0
 class ChargeSeries:
     """Compact charge map: charges of a film as a function of the contact and of the state of the film.
 
-    It implements the interface `ChargeMap` of `isocharge.simulate`.
+    The class implements the interface `ChargeMap` of `isocharge.simulate`.
 
     Attributes:
         domain: Contacts for which the map is valid.
@@ -178,16 +179,16 @@ class ChargeSeries:
         coefficients: Coefficients of v at each node, shape (n_node, degree + 1, degree + 1, force_degree + 1,
             n_electrode).
         node_MPa: Changes t of the mean pretension at the nodes, shape (n_node,), MPa, ascending and containing 0.
-        directions: Coefficients of the changes d of v by one unit of each direction, and of their derivatives d' with
-            respect to t, 1/MPa, shape (degree + 1, degree + 1, force_degree + 1, 2, K, n_electrode). By default, the
-            map has no directions.
+        directions: Coefficients of d and d' for each direction. d is the change of v for one unit of the direction, and
+            d' is the derivative of d with respect to t, 1/MPa. The shape is (degree + 1, degree + 1, force_degree + 1,
+            2, K, n_electrode). By default, the map has no directions.
         log_size: Chebyshev coefficients of ln S as a function of l; None if all charges are positive.
         is_folded: Whether different contacts of the domain have the same charges. A service then tracks contacts with a
             `ContactMixture`.
         charge_std: Standard deviation of the part of the charges that the map does not describe, relative to the
             charges.
-        offset_pC: Charges that are added to those of the electrodes, shape (n_electrode,) or one for all, pC. A
-            calibration found them in all presses.
+        offset_pC: Charges that are added to the computed charges, shape (n_electrode,) or one number for all
+            electrodes, pC. A calibration found these additional charges in all presses.
         pretension_MPa: Mean pretension of the film as it was calibrated, MPa.
         tension_std_MPa: Standard deviation of t when a stream begins, MPa.
     """
@@ -239,8 +240,9 @@ class ChargeSeries:
     def in_state(self, contact: Array, state: Array) -> ModelValues:
         """Compute the charges of contacts for any state of the film, and the derivatives of the charges.
 
-        The symbols are those at the beginning of this module. The value v is interpolated between its values at the
-        nodes of the pretension. Each direction k then adds z_k (d_k + t d'_k) to it. The charges follow from v.
+        The symbols are defined at the beginning of this module. The value v is interpolated between its values at the
+        nodes of the pretension. The change along each direction k then adds z_k (d_k + t d'_k) to v. The charges follow
+        from v.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -299,14 +301,14 @@ class ChargeSeries:
         return Series(self.directions.reshape(*self.directions.shape[:3], -1))
 
     def _nearest_in_domain(self, contact: Array) -> tuple[Array, Array]:
-        """Return the nearest contacts in the domain, and the differences to them, in unit coordinates.
+        """Return the nearest contacts in the domain, and the steps from them to the contacts, in unit coordinates.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Unit coordinates of the nearest contacts, shape (n, 3), and the differences, shape (n, 3), dimensionless.
-            The differences of contacts in the domain are zero.
+            Unit coordinates of the nearest contacts, shape (n, 3), and the steps, shape (n, 3), dimensionless. For a
+            contact in the domain, the step is zero.
         """
         unit_contact = self.domain.to_unit(contact)
         nearest = into_unit_domain(unit_contact)
@@ -316,12 +318,12 @@ class ChargeSeries:
         """Convert values v of the series into charges without the offset.
 
         If all charges are positive, v is the logarithm of the charge. If some charges are not positive, v is the charge
-        divided by the typical size S of charges at the force, whose scaled logarithm is l.
+        divided by S(l). Here, S is the typical size of the charges, and l is the scaled logarithm of the force.
 
         Args:
             value: v and its derivatives with respect to the unit coordinates, shape (n, 4, n_electrode).
             nearest: Nearest contacts in the domain, as `_nearest_in_domain` returns them.
-            excess: Differences to the nearest contacts.
+            excess: Steps from the nearest contacts to the given contacts, as `_nearest_in_domain` returns them.
 
         Returns:
             Charges without the offset, and their derivatives with respect to v, both of shape (n, n_electrode), pC.
@@ -347,7 +349,8 @@ def series_size(log_size: Array, unit_log_force: Array, excess: Array | float = 
     Args:
         log_size: Chebyshev coefficients of ln S as a function of l.
         unit_log_force: Logarithms l of the forces, scaled to [-1, 1], shape (n,).
-        excess: Amount by which l exceeds this range, shape (n,) or a number. ln S is continued linearly.
+        excess: Amount by which l lies outside the range from -1 to 1, shape (n,) or a number. Outside this range, ln S
+            is continued linearly.
 
     Returns:
         The size S, pC, and the derivative of ln S, dimensionless, each of shape (n, 1).
@@ -358,7 +361,7 @@ def series_size(log_size: Array, unit_log_force: Array, excess: Array | float = 
 
 
 def _limited_exp(logarithm: Array) -> Array:
-    """Compute exponential functions. The magnitudes of the arguments are limited to `MAX_VALUE`."""
+    """Compute the exponential of each logarithm. The magnitude of the logarithm is first limited to `MAX_VALUE`."""
     return np.exp(np.clip(logarithm, -MAX_VALUE, MAX_VALUE))
 
 

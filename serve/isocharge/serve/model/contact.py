@@ -24,10 +24,10 @@ from isocharge.serve.flags import BEYOND, MISFIT, OUTSIDE, STRESS
 from isocharge.serve.model.metadata import ModelMetadata
 
 STD_COLUMNS = slice(3, 6)
-"""Standard deviations among the ten numbers of a contact."""
+"""Columns of the standard deviations among the ten numbers of a contact."""
 
 CORRELATION_COLUMNS = slice(7, 10)
-"""Correlations among the ten numbers of a contact, which come last."""
+"""Columns of the correlations, which are the last three of the ten numbers of a contact."""
 
 
 class Contact(NamedTuple):
@@ -72,7 +72,7 @@ CLOSE_DISTANCE_mm = 0.3
 """Largest distance between two close contacts, mm."""
 
 CLOSE_FORCE_RATIO = 0.05
-"""Largest difference of the force between two close contacts, relative to the force of the reference contact."""
+"""Largest difference between the forces of two close contacts, relative to the force of the reference contact."""
 
 
 def is_close(contact: Contact, reference: Contact | None) -> bool:
@@ -83,7 +83,7 @@ def is_close(contact: Contact, reference: Contact | None) -> bool:
 
     Args:
         contact: The contact that is compared with the reference.
-        reference: The reference contact. If it is None, the result is False.
+        reference: The reference contact. If there is no reference contact (None), the result is False.
     """
     if reference is None:
         return False
@@ -120,7 +120,7 @@ class Contacts(NamedTuple):
 
 
 def add_covariance(contacts: Singles, covariance: Array) -> Singles:
-    """Return contacts with the covariance of an additional independent error. Correlations that are NaN remain NaN.
+    """Return contacts whose uncertainty includes an additional independent error. NaN correlations remain NaN.
 
     Args:
         contacts: The ten numbers of n contacts, shape (n, 10).
@@ -149,7 +149,7 @@ The smallest eigenvalue of the correlations of released models is between -5e-6 
 
 
 CORRELATION_PAIRS = np.array([[-1, 0, 1], [0, -1, 2], [1, 2, -1]])
-"""Number of the correlation of two errors among the correlations xy, xF and yF; -1 for an error with itself."""
+"""Index of the correlation between two errors in the list of the correlations xy, xF and yF; -1 on the diagonal."""
 
 
 def correlation_matrices(contacts: ArrayLike) -> Array:
@@ -194,7 +194,7 @@ def as_charges(charge_pC: ArrayLike, electrodes: tuple[str, ...], *, is_batch: b
         charge_pC: Charges, pC, in the order of the electrodes: shape (electrodes,) for one press, or shape
             (n, electrodes) for a batch.
         electrodes: Names of the electrodes.
-        is_batch: Whether the charges are those of a batch.
+        is_batch: Whether `charge_pC` contains a batch of presses.
 
     Raises:
         ChargeError: If the charges are not numbers, their array has another shape, or a charge is not finite. The
@@ -226,7 +226,7 @@ def as_float32(charges: NDArray[Any], electrodes: tuple[str, ...]) -> Singles:
 
     Raises:
         ChargeError: If a charge is not finite or beyond the range of float32. The message names the electrodes of all
-            such charges in the first row that contains one.
+            such charges in the first row with such a charge.
     """
     with np.errstate(over="ignore"):  # charges beyond the range of float32 become infinite and are refused below
         converted = np.ascontiguousarray(charges, dtype=np.float32)
@@ -257,9 +257,10 @@ area is the radius of the circle around the working area times this factor.
 """
 
 MIN_ROUNDNESS = 0.95
-"""Smallest ratio of the largest circle inside a round working area to the smallest circle around it, dimensionless.
+"""Smallest ratio of the inner radius to the outer radius of a round working area, dimensionless.
 
-The centre of both circles is the origin.
+The inner radius is the radius of the largest circle inside the area, and the outer radius is the radius of the smallest
+circle around the area. The centre of both circles is the origin.
 """
 
 
@@ -346,7 +347,8 @@ class Validity:
     def area_text(self) -> str:
         """Description of the working area for messages.
 
-        The text states the radius of the area if it is a disk around the origin, and its bounding box otherwise.
+        If the area is a disk around the origin, the text states its radius. Otherwise, the text states its bounding
+        box.
         """
         radius_mm = math.sqrt(self.inscribed_radius_squared_mm2)
         is_round = radius_mm > MIN_ROUNDNESS * np.linalg.norm(self.corners_mm, axis=1).max()
@@ -450,8 +452,8 @@ def inside_polygon(x: Reals, y: Reals, corners: Array) -> Booleans:
     """Compute whether points lie inside a polygon.
 
     A point is inside the polygon if a horizontal ray from the point to the right crosses an odd number of edges. The
-    ray crosses an edge under two conditions. Exactly one end of the edge is above the ray, and the edge intersects the
-    horizontal line to the right of the point.
+    ray crosses an edge if two conditions hold: exactly one end of the edge is above the ray, and the edge intersects
+    the horizontal line to the right of the point.
 
     Args:
         x: First coordinates of the points, shape (n,), in the unit of the corners.

@@ -110,7 +110,7 @@ class UnnoticedPresses(Struct, frozen=True, kw_only=True):
     def summary(self) -> str:
         """Sentence that states the share of unnoticed presses between the two circles.
 
-        The share is in percent. The share has one decimal if it is below 9.5 %, and no decimals otherwise.
+        The share is stated in percent. A share below 9.5 % has one decimal, and a larger share has no decimals.
         """
         min_force_N, max_force_N = self.force_N
         percent = 100.0 * self.total_share
@@ -140,8 +140,8 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         format_version: Version of the format of the metadata.
         yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if the force is unknown
             or above the range of forces.
-        unnoticed: Shares of presses outside the working area whose contact is wrong without a flag. None if they were
-            not measured.
+        unnoticed: Shares of presses outside the working area whose contact is wrong without a flag. None if the shares
+            were not measured.
     """
 
     name: ModelName

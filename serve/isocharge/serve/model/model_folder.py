@@ -89,7 +89,7 @@ def repositories(models: StrPath | None = None) -> list[Path]:
     """Return the repositories in which the name of a model is looked up, in the order of the search.
 
     Args:
-        models: Repository that is searched first. It must exist; the other folders need not exist.
+        models: Repository that is searched first. This repository must exist. The other folders need not exist.
 
     Raises:
         ModelError: If `models` is given and is not a folder.
@@ -104,8 +104,8 @@ def repositories(models: StrPath | None = None) -> list[Path]:
 def model_names(root: Path) -> list[str]:
     """Return the names of the models in a repository, which is a folder of models, in alphabetical order.
 
-    A folder whose name cannot be that of a model is skipped. An example is `lost+found` on a mounted volume, which only
-    the superuser may list. Any other folder that cannot be listed is assumed to be a model.
+    A folder is skipped if its name cannot be the name of a model. An example is `lost+found` on a mounted volume, which
+    only the superuser may list. Any other folder that cannot be listed is assumed to be a model.
     """
     folders = [folder for folder in _subfolders(root) if NAME.fullmatch(folder.name)]
     return sorted(folder.name for folder in folders if _may_be_model(folder))
@@ -149,7 +149,7 @@ def _version_folder(path: Path) -> Path | None:
 
 
 def version_folders(folder: Path) -> dict[int, Path]:
-    """Return the version folders of a model by their version numbers, in ascending order.
+    """Return the version folders of a model, with their version numbers as keys in ascending order.
 
     A version folder is a subfolder of the model folder whose name is the version number. The result is empty if the
     path is not a folder.
@@ -250,7 +250,8 @@ def read_checked(folder: Path, name: str, golden: Golden) -> bytes:
         golden: Golden vectors of the version, with the checksums.
 
     Raises:
-        ModelError: If the file cannot be read, or `golden.json` contains no checksum or another checksum of the file.
+        ModelError: If the file cannot be read, or if its checksum is missing in `golden.json` or differs from the one
+            in `golden.json`.
     """
     content = read_needed(folder / name, ModelError, "copy or export the model again")
     # If `golden.json` does not list the file, the comparison with this text fails, and the message contains the text.
@@ -297,7 +298,7 @@ def load_checked_model(folder: Path) -> Model:
 
     Raises:
         ModelError: If a file is missing, is damaged or belongs to another model, if a computed output differs from the
-            golden vectors, or if the folders have another name and version than the metadata.
+            golden vectors, or if the names of the folders differ from the name and the version in the metadata.
     """
     model = load_model(folder)
     _check_folder_names(folder, model.metadata)
@@ -312,7 +313,8 @@ def load_checked_model(folder: Path) -> Model:
 def _check_folder_names(folder: Path, metadata: ModelMetadata) -> None:
     """Check that a version folder and its parent are named after the version and the name of the model.
 
-    A version folder may have another name than a number, for example while it is prepared. It is then not checked.
+    A version folder may have a name that is not a number, for example while the version is prepared. Such a folder is
+    not checked.
 
     Args:
         folder: The version folder. If its path ends in `..` and a version, as in `../1`, only the version is checked.
@@ -358,8 +360,8 @@ def write_model(
         OutputExists: If this version exists already.
         OutputError: If the folder cannot be written.
         ChargeError: If the golden charges do not fit the electrodes.
-        ModelError: If a reader would refuse the model, or its metadata differ from `metadata`. After any error no file
-            of the version remains.
+        ModelError: If a reader would refuse the model, or if its metadata differ from `metadata`. After any error, no
+            file of the version remains.
     """
     folder = Path(folder)
     target = check_target(folder, metadata.version, metadata.electrodes)
@@ -378,7 +380,8 @@ def write_model(
         files = {GRAPH_FILE: onnx_model, "golden.json": golden.to_json(), "card.md": card.encode(), **companion_files}
         for name, content in files.items():
             write_whole(draft / name, content)
-        # Make all checks that are made when a model is read. The metadata in the graph must also be the expected ones.
+        # Make all checks that are made when a model is read. The metadata in the graph must also equal the expected
+        # metadata.
         model = load_model(draft)
         differences = metadata.to_props().items() ^ model.metadata.to_props().items()
         if differences:
@@ -400,11 +403,11 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
 
     Raises:
         OutputExists: If the version exists already.
-        OutputError: If the folder cannot be written, for example because a file has its name.
+        OutputError: If the folder cannot be written, for example because a file has the same name.
         ModelError: If the name of the folder is not a valid name of a model, or if the folder contains a model with
-            other electrodes or another order of them. Also if the folder contains other files, and is therefore no
-            folder of one model: it may be a dataset, one version of a model, or the folder in which several models have
-            their folders.
+            other electrodes or with another order of the electrodes. The error is also raised if the folder contains
+            other files and is therefore not the folder of one model. Such a folder may be a dataset, a single version
+            of a model, or a repository of several models.
     """
     target = folder / str(version)
     check_new_output(target)

@@ -34,16 +34,16 @@ class Predictor:
     """A loaded model that computes contacts from charges.
 
     All methods may be called from any thread. `predict` and `predict_into` use memory that the predictor allocates
-    once, so that only one thread at a time executes them. Threads that must not wait for each other need their own
-    predictors. `predict_batch` does not use this memory. A predictor that is copied or unpickled is loaded again from
-    its folder.
+    once, so only one thread at a time can execute these two methods. Threads that must not wait for each other need
+    their own predictors. `predict_batch` does not use this memory. A predictor that is copied or unpickled is loaded
+    again from its folder.
 
     Attributes:
         folder: Version folder of the model.
         metadata: Metadata of the model, such as the sensor, the electrodes, the working area and the measured errors.
         validity: Domain in which the model is valid. `validity.batch_flags` returns the flags of a batch.
-        noise: Noise of the charges for which the standard deviations are stated: that of the training, or that of
-            `with_noise`.
+        noise: Noise of the charges for which the standard deviations are stated: the noise of the training, or the
+            noise that was given to `with_noise`.
 
     Example:
         >>> from isocharge.serve import Predictor
@@ -76,21 +76,22 @@ class Predictor:
         self.noise = loaded.metadata.noise
 
     def with_noise(self, white_pC: ArrayLike, gain: ArrayLike) -> "Predictor":
-        """Return a predictor of the same model for charges with another noise.
+        """Return a predictor of the same model for charges whose noise differs from the noise of the training.
 
-        The predicted positions and forces are the same. If the given noise is larger than that of the training, it
-        increases the standard deviations of the contacts, and the misfit is in units of the given noise. If the given
-        noise is smaller, the standard deviations and the misfit do not change. The method `predict_into` ignores the
-        given noise.
+        The predicted positions and forces are the same. If the given noise is larger than the noise of the training,
+        the standard deviations of the contacts increase. The misfit is then stated in units of the given noise. If the
+        given noise is smaller, the standard deviations and the misfit do not change. The method `predict_into` ignores
+        the given noise.
 
         Args:
-            white_pC: Standard deviation of the part of the noise that does not depend on the charge, pC. It is one
-                number for all electrodes, or one number for each electrode, as a list or an array.
+            white_pC: Standard deviation of the part of the noise that does not depend on the charge, pC. The argument
+                is one number for all electrodes, or a list or an array with one number for each electrode.
             gain: Standard deviation of the part that is proportional to the charge, relative to the charge, as one
                 number or as one number for each electrode.
 
         Raises:
-            ChargeError: If a standard deviation is not a finite number of at least 0, or if a list has another length.
+            ChargeError: If a standard deviation is not a finite number of at least 0, or if a list does not have one
+                number for each electrode.
         """
         content = {"name": "stated", "white_pC": np.asarray(white_pC).tolist(), "gain": np.asarray(gain).tolist()}
         noise = convert(content, ModelNoise, "noise", ChargeError)  # checks the types and the signs
@@ -107,7 +108,7 @@ class Predictor:
         return new_predictor
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return how `copy` and `pickle` create the predictor again, because the onnxruntime session has no copy.
+        """Return how `copy` and `pickle` create the predictor again, because an onnxruntime session cannot be copied.
 
         The predictor is loaded again from its folder. If the noise was stated with `with_noise`, this noise and its
         limits for touches are restored.
@@ -192,8 +193,8 @@ class Predictor:
         Args:
             charge_pC: Touch charges, shape (electrodes,), float32, pC, in the order of `metadata.electrodes`. If a
                 charge is NaN, the result is NaN.
-            out: Array of float32 for the values of the contact in the order of the attributes of `Contact`, shape
-                (10,).
+            out: Array to which the ten values of the contact are written, float32, shape (10,). The values have the
+                order of the attributes of `Contact`.
 
         Raises:
             ChargeError: If an array is not float32 or has another shape. Nothing is written in this case.
@@ -226,7 +227,7 @@ class Predictor:
         return Contacts(*self.predict_rows(charges).T)
 
     def _predict_with_noise(self, charge_pC: Singles) -> Contacts:
-        """Compute the contacts of n presses whose charges have more noise than those of the training.
+        """Compute the contacts of n presses whose charges have more noise than the charges in the training.
 
         The effects of the additional noise of all charges are added to the covariance of each contact. An effect is the
         change of the contact by one standard deviation of the additional noise of one charge. The misfit is divided by
@@ -246,7 +247,7 @@ class Predictor:
         return Contacts(*add_covariance(contacts, covariance).T)._replace(misfit=misfit[:, 0])
 
     def _noise_effects(self, charge_pC: Singles, extra_std_pC: Array) -> tuple[Singles, Array]:
-        """Compute contacts, and how much the additional noise of each charge changes them.
+        """Compute contacts, and the change of each contact by the additional noise of each charge.
 
         Each charge is raised and lowered by the standard deviation of its additional noise. Half of the difference
         between the two contacts is the effect of the noise of this charge (central difference).
@@ -256,7 +257,7 @@ class Predictor:
             extra_std_pC: Standard deviations of the additional noise, shape (n, electrodes), pC.
 
         Returns:
-            The ten numbers of each contact, shape (n, 10). Changes of x, mm, y, mm, and the force, N, by the noise of
+            The ten numbers of each contact, shape (n, 10). Changes of x (mm), y (mm) and the force (N) by the noise of
             each electrode, shape (electrodes, n, 3).
         """
         # The step k changes only the charge k of every press. The axes are the step, the press and the charge.

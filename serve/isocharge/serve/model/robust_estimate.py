@@ -1,4 +1,4 @@
-"""Robust least squares for a state that many presses share, with an unknown or uncertain contact of each press.
+"""Robust least squares for a state that many presses share. The contact of each press is unknown or uncertain.
 
 Each of n presses gives the charges q_i of e electrodes. A charge map predicts the charges Q(u_i, s) of a contact u_i
 and a state s. The state contains the unknowns that all presses share, such as the pretension of a film. The estimate
@@ -8,11 +8,11 @@ minimises
 
     chi2_i = (q_i - Q(u_i, s))' V_i^-1 (q_i - Q(u_i, s)) + sum_k ((u_ik - v_ik) / w_ik)^2.
 
-The first term is the negative logarithm of a Student's t distribution with nu degrees of freedom, so that presses that
-no contact explains (such as a touch with two fingers) hardly change the state. m_i is the number of charges and of
-measured coordinates of the press minus the three coordinates of its contact. v_ik and w_ik are a measured coordinate
-and its standard deviation. The last term is the negative logarithm of a Gaussian prior of the state with the mean s0
-and the precision P.
+The first term is the negative logarithm of a Student's t distribution with nu degrees of freedom. A press that no
+contact explains, such as a touch with two fingers, therefore hardly changes the state. m_i is the number of charges of
+the press plus the number of its measured coordinates, minus three for the unknown coordinates of its contact. v_ik and
+w_ik are a measured coordinate and its standard deviation. The last term is the negative logarithm of a Gaussian prior
+of the state with the mean s0 and the precision P.
 
 The minimum is found by damped Gauss-Newton steps with weights that follow from chi2_i (iteratively reweighted least
 squares; Holland and Welsch 1977). The three coordinates of each contact are eliminated by their Schur complement, so
@@ -30,12 +30,12 @@ FIRST_DAMPING = 1e-3
 """Damping of the first step, relative to the diagonal of the normal matrix."""
 
 DAMPING_FACTOR = 10.0
-"""Factor by which the damping decreases after a successful step, and increases after an unsuccessful one."""
+"""Factor by which the damping decreases after a successful step, and increases after an unsuccessful step."""
 
 RELATIVE_RIDGE = 1e-9
-"""Addition to the diagonal of the normal matrix of a contact, relative to its trace.
+"""Value that is added to the diagonal of the normal matrix of a contact, relative to the trace of the matrix.
 
-The matrix can then be inverted near a fold of the charge map.
+With this value, the matrix can be inverted even near a fold of the charge map.
 """
 
 MAX_REJECTED_STEPS = 6
@@ -65,10 +65,10 @@ class RobustPoint(NamedTuple):
         residual: Whitened residuals of the charges, shape (n, e).
         by_contact: Whitened derivatives of the charges with respect to the contacts, shape (n, e, 3).
         by_state: Whitened derivatives of the charges with respect to the state, shape (n, e, p).
-        contact_residual: Measured minus present coordinates over their standard deviations, shape (n, 3).
+        contact_residual: Measured minus present coordinates, divided by their standard deviations, shape (n, 3).
         chi2: Squared residuals of the presses, shape (n,).
         weights: Weights of the presses, shape (n,).
-        cost: Minimised function.
+        cost: Value of the minimised function.
     """
 
     state: Array
@@ -99,8 +99,8 @@ class RobustProblem:
     ) -> None:
         """Compute the quantities that do not depend on the unknowns: whitening, precision and weights.
 
-        A residual of the charges is whitened: it is multiplied by a matrix that makes its errors independent, with the
-        standard deviation 1.
+        The residuals of the charges are whitened: they are multiplied by a matrix that makes their errors independent,
+        with the standard deviation 1.
 
         Args:
             model: Function that predicts the charges from contacts, shape (n, 3), and a state, shape (p,). The
@@ -109,7 +109,7 @@ class RobustProblem:
             covariance_pC2: Covariances of the charges of each press, shape (n, e, e), pC^2.
             prior_mean: Mean of the Gaussian prior of the state, shape (p,).
             prior_covariance: Covariance of the Gaussian prior of the state, shape (p, p).
-            measured_contacts: Measured coordinates of the contacts, shape (n, 3). Those without a finite standard
+            measured_contacts: Measured coordinates of the contacts, shape (n, 3). Coordinates without a finite standard
                 deviation are ignored.
             contact_std: Standard deviations of the measured coordinates, shape (n, 3); NaN or infinity for a coordinate
                 that is not measured. By default, no coordinate is measured.
@@ -149,7 +149,7 @@ class RobustProblem:
             state_bounds: Smallest and largest values of the state, each of shape (p,). The state is clipped.
             max_steps: Largest number of steps.
             tolerance: The search ends when a step reduces the minimised function by less than this value. A step of one
-                standard deviation of the state reduces it by about 0.5.
+                standard deviation of the state reduces the function by about 0.5.
         """
         point = self.evaluate(start_state, start_contacts)
         damping = FIRST_DAMPING
@@ -189,8 +189,8 @@ class RobustProblem:
             state: State, shape (p,).
             contacts: Contacts, shape (n, 3).
         """
-        # Residuals divided by their standard deviations. Those of the charges are whitened, and those of coordinates
-        # that were not measured are 0.
+        # Residuals divided by their standard deviations. The residuals of the charges are whitened. The residuals of
+        # coordinates that were not measured are 0.
         values = self._model(contacts, state)
         charge_difference_pC = self._charge_pC - values.charge_pC
         residual = (self._whitening @ charge_difference_pC[:, :, None])[:, :, 0]  # shape (n, e)
@@ -222,11 +222,11 @@ class RobustProblem:
     ) -> tuple[Array, Array]:
         """Compute the normal equations N ds = g of a step ds of the state, from which the contacts are eliminated.
 
-        After the step, the whitened residuals of press i are r_i - C_i du_i - S_i ds, with the symbols and the shifts
-        du_i = a_i - B_i ds of the method `_contact_shifts`. With these shifts, they become
-        (r_i - C_i a_i) - (S_i - C_i B_i) ds. The step sets the derivative of the minimised function with respect to the
-        state to zero. With the prior (mean s0, precision P) and the weight w_i of each press, which is small if the
-        residuals of the press are large, this condition gives
+        The method `_contact_shifts` defines the symbols, and the shifts du_i = a_i - B_i ds of the contacts. After the
+        step, the whitened residuals of press i are r_i - C_i du_i - S_i ds = (r_i - C_i a_i) - (S_i - C_i B_i) ds. The
+        step sets the derivative of the minimised function with respect to the state to zero. The prior has the mean s0
+        and the precision P. The weight w_i of press i is small if the residuals of the press are large. The condition
+        for the step then gives
 
             N = P + sum_i w_i S_i' (S_i - C_i B_i),        g = P (s0 - s) + sum_i w_i S_i' (r_i - C_i a_i).
 
@@ -254,9 +254,9 @@ class RobustProblem:
 
         The whitened derivatives of press i are C_i with respect to its contact and S_i with respect to the state. For a
         step ds of the state, the contact moves by du_i = a_i - B_i ds, with a_i = M_i^-1 (C_i' r_i + W m_i) and
-        B_i = M_i^-1 C_i' S_i. The residuals of the charges are r_i, and those of the measured coordinates are m_i, in
-        standard deviations. W is the diagonal matrix of the inverse standard deviations of the coordinates, and M_i is
-        C_i' C_i + W^2 with a damped diagonal.
+        B_i = M_i^-1 C_i' S_i. r_i are the residuals of the charges, and m_i are the residuals of the measured
+        coordinates, in standard deviations. W is the diagonal matrix of the inverse standard deviations of the
+        coordinates, and M_i is C_i' C_i + W^2 with a damped diagonal.
 
         Args:
             point: State and contacts.

@@ -1,14 +1,14 @@
-"""Functions that open, check and run the ONNX session of a model, and the golden vectors that its outputs must equal.
+"""Functions that open, check and run the ONNX session of a model, and golden vectors that test its outputs.
 
 The network of a model takes microseconds to run. A session therefore uses one thread, because a second thread would
 cost more time than it saves. Between two runs, the session sleeps. By default, onnxruntime would wait actively, and a
 stream of 100 frames per second would keep most of a processor core busy. `BoundPress` is the fastest way to compute one
 press, because its memory for input and output is bound to the session only once.
 
-Golden vectors are input charges and the outputs that the model computed when it was exported. The file `golden.json`
-stores the golden vectors and the checksum of `model.onnx`. The checksum shows whether `model.onnx` is still the
-released file. A comparison with the stored outputs shows whether another machine or another version of onnxruntime
-computes the same outputs. A computed output a agrees with a stored output b if
+Golden vectors are input charges and the outputs that the model computed for these charges when it was exported. The
+file `golden.json` stores the golden vectors and the checksum of `model.onnx`. The checksum shows whether `model.onnx`
+is still the released file. A comparison with the stored outputs shows whether another machine or another version of
+onnxruntime computes the same outputs. A computed output a agrees with a stored output b if
 
     |a - b| <= 1e-5 max(|b|, floor),
 
@@ -54,7 +54,7 @@ COLUMNS = {
 """Columns of each output among the ten values of a `Contact`."""
 
 EXTERNAL_DATA = b"\x0a\x08location"
-"""Encoded key of the entry of an ONNX tensor that names the file with the numbers of the tensor."""
+"""Encoded key of an entry of an ONNX tensor. The entry names the file that contains the numbers of the tensor."""
 
 
 def open_session(onnx_model: bytes, where: str) -> ort.InferenceSession:
@@ -127,7 +127,8 @@ def check_interface(session: ort.InferenceSession, n_electrode: int, where: str)
         where: Name or file of the model, for error messages.
 
     Raises:
-        ModelError: If the input or an output is missing, is not as required, or is not expected.
+        ModelError: If the input or an output is missing or not as required, or if the model has an additional input or
+            output.
     """
     widths = {INPUT: n_electrode} | OUTPUTS
     expected = {name: ("tensor(float)", ["n", width]) for name, width in widths.items()}
@@ -213,7 +214,7 @@ FLOORS = {
 """Floor for each column of an output, in the unit of the column. Below the floor, the tolerance is constant."""
 
 RANGE_SHARE = 0.05
-"""Floor of x, y and the force relative to the range of the model, if this is more than the floor in `FLOORS`."""
+"""Floor of x, y and the force, relative to the range of the model, unless the floor in `FLOORS` is larger."""
 
 
 def contact_floors(metadata: ModelMetadata) -> tuple[float, float, float]:
@@ -239,7 +240,7 @@ Rows = Annotated[list[list[Finite]], Meta(min_length=1)]
 
 
 class Tolerance(Struct, frozen=True):
-    """Largest differences of outputs, the object `tolerance` of `golden.json`.
+    """Largest accepted differences of outputs, which are the object `tolerance` of `golden.json`.
 
     Attributes:
         relative: Largest difference of two outputs, relative to max(|output|, floor).
@@ -253,11 +254,11 @@ class Tolerance(Struct, frozen=True):
 
 
 class Golden(Struct, frozen=True):
-    """Golden vectors of one model, the content of `golden.json`.
+    """Golden vectors of one model, which are the content of `golden.json`.
 
     Attributes:
         sha256: Checksum of the model file.
-        tolerance: Largest differences of outputs.
+        tolerance: Largest accepted differences of outputs.
         inputs: Rows of input charges, pC, by the name of the input.
         outputs: Rows of outputs by name.
         files: Checksums of the files that lie beside the model, such as `charges.npz`, by file name.
