@@ -58,8 +58,8 @@ class ErrorSummary:
         noise: Expected root mean square of the errors that the noise of the charges causes.
         rig: Expected root mean square of the errors that the uncertainty of the rig causes.
         explained: Expected root mean square of the errors that noise and rig cause together.
-        beyond: Square root of rms^2 - explained^2, which is the part that noise and rig do not explain; 0 if this
-            difference is negative.
+        beyond: Part of the errors that noise and rig do not explain: the square root of rms^2 - explained^2, or 0 if
+            this difference is negative.
     """
 
     presses: int
@@ -77,8 +77,8 @@ class ErrorSummary:
 
         Args:
             error: Components of the error of each press, shape (n, components); NaN where unknown.
-            noise_std: Standard deviations of the components that the noise of the charges causes.
-            rig_std: Standard deviations of the components that the uncertainty of the rig causes.
+            noise_std: Standard deviations of the components, as caused by the noise of the charges.
+            rig_std: Standard deviations of the components, as caused by the uncertainty of the rig.
 
         Returns:
             The summary; None if there are no presses with known errors.
@@ -123,7 +123,8 @@ class PressCheck:
         verdict: The result of the comparison in words.
         notes: Further findings, as one sentence for each finding.
         errors: Errors of each press.
-        std_factor: Factor for the standard deviations of the model with a guarantee; None if there are too few presses.
+        std_factor: Factor for the standard deviations of the model that guarantees a coverage; None if there are too
+            few presses.
     """
 
     model: str
@@ -193,9 +194,9 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     selected_count = int(is_selected.sum())
     agreement = Agreement.from_errors(errors, is_selected)
 
-    # Summarise the errors of the positions and those of the forces, together with the standard deviations that noise
-    # and rig cause. Each array has the columns x, y (mm) and force (relative), shape (n_selected, 3). `FORCE` is the
-    # index of the column of the force.
+    # Summarise the errors of the positions and the errors of the forces, together with the standard deviations that
+    # noise and rig cause. Each array has the columns x, y (mm) and force (relative), shape (n_selected, 3). `FORCE` is
+    # the index of the column of the force.
     selected = (errors.error[is_selected], errors.noise_std[is_selected], errors.rig_std[is_selected])
     position_mm = ErrorSummary.from_errors(*[columns[:, :FORCE] for columns in selected])
     force_percent = ErrorSummary.from_errors(*[100.0 * columns[:, FORCE:] for columns in selected])
@@ -237,7 +238,7 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
 def _bad_presses(errors: PressErrors) -> Booleans:
     """Find bad presses. A bad press has an improbable error, although all other presses agree with the model.
 
-    Presses are considered bad only if three conditions hold. All presses together do not agree with the model, only a
+    Presses are considered bad only under three conditions: the presses as a whole do not agree with the model, only a
     few presses have improbable errors, and the other presses agree with the model. A single press always counts as few.
     At least `MIN_PRESSES` presses must remain.
 
@@ -332,8 +333,9 @@ def _remedies(
     """Yield notes about possible remedies for a model that does not fit.
 
     The first note states which standard deviations of the measured positions and forces would explain the errors. This
-    note is omitted if none would, for example if all positions are shifted equally, or if the charges fit no press. The
-    second note recommends a calibration, or training with the measured presses.
+    note is omitted if no standard deviations would explain the errors, for example if all positions are shifted
+    equally, or if the charges fit no press. The second note recommends a calibration, or training with the measured
+    presses.
 
     Args:
         errors: Errors of all presses.

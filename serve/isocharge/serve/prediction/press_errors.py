@@ -1,4 +1,4 @@
-"""Errors of a model on measured presses, and tests of whether noise and rig explain them.
+"""Errors of a model on measured presses, and tests of whether noise and rig explain these errors.
 
 The rig is the machine that sets the position and the force of each press. The expected variance of an error is the sum
 of two variances. The first variance is caused by the noise of the charges, and is reported by the model. The second
@@ -34,7 +34,7 @@ NOT_TRAINED = "not trained for"
 """Reasons why a press is excluded from the comparison, as parts of a sentence."""
 
 FORCE = 2
-"""Column of the force in the errors and standard deviations of `PressErrors`. The columns before it are x and y."""
+"""Column of the force in the errors and standard deviations of `PressErrors`. Columns 0 and 1 are x and y."""
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,9 @@ class PressErrors:
     def chi_squared(self) -> Array:
         """Squared Mahalanobis distance between each error (x, y, force) and zero, shape (n,).
 
-        The covariance of the errors is that of the noise, with the correlations that the model states, plus that of the
-        rig, whose errors are independent. Unknown errors do not count.
+        The covariance of the errors is the sum of two covariances. The covariance of the noise contains the
+        correlations that the model states. The covariance of the rig is diagonal, because the errors of the rig are
+        independent. Unknown errors do not count.
         """
         # Only the noise is correlated. In the correlation of two errors, the correlation of the noise is therefore
         # multiplied by the share of noise in the standard deviation of each error. The diagonal elements are 1.
@@ -161,9 +162,10 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
 
 
 NOISE_ALLOWANCE = 1.5
-"""Ratio of the real noise to the noise of a model up to which a model is accepted, dimensionless.
+"""Largest accepted ratio of the real noise to the noise of a model, dimensionless.
 
-A calibration with eight presses determines the noise to about 30 %, and one with 20 presses to about 10 %.
+A calibration with eight presses determines the noise to about 30 %, and a calibration with 20 presses determines the
+noise to about 10 %.
 """
 
 
@@ -179,7 +181,7 @@ def misfit_limit(metadata: ModelMetadata) -> float:
 
 
 def _exclusion_reasons(validity: Validity, presses: MeasuredPresses) -> NDArray[np.str_]:
-    """For each press, return why the press is excluded from the comparison, or an empty text if it is compared.
+    """Return the reason why each press is excluded from the comparison. The reason is empty for a compared press.
 
     The model is compared with presses in its domain, which consists of the working area and the range of forces. The
     measured position and the measured force determine whether a press lies in this domain.
@@ -200,9 +202,10 @@ def _exclusion_reasons(validity: Validity, presses: MeasuredPresses) -> NDArray[
 
 
 TEST_SIGNIFICANCE = 0.01 / 3.0
-"""Probability that one test rejects a model that fits.
+"""Probability that a single test rejects a model that fits.
 
-The three tests, of the scatter, of the common errors and of the misfits, reject it together with a probability of 1 %.
+There are three tests: of the scatter, of the common errors and of the misfits. The probability that the three tests
+together reject a model that fits is 1 %.
 """
 
 MAX_ACCEPTED_CHI_SQUARED = 1.1
@@ -222,9 +225,10 @@ class CommonError(NamedTuple):
     """Estimates of the errors of x, y and the force that are common to all presses, such as a shift of all positions.
 
     Attributes:
-        mean: Weighted means of the errors, shape (3,), mm, and relative to the force; NaN if no error is known.
-        std: Standard errors of the means, shape (3,). They are larger if the errors scatter more than noise and rig
-            explain.
+        mean: Weighted means of the errors of x (mm), y (mm) and the force (relative), shape (3,); NaN if no error is
+            known.
+        std: Standard errors of the means, shape (3,). The standard errors are increased if the errors scatter more than
+            noise and rig explain.
         significance: Means divided by standard errors that include a constant error of the rig, shape (3,).
     """
 
@@ -239,7 +243,7 @@ def common_error(error: Array, variance: Array, rig_std: Array) -> CommonError:
 
     The estimates are the means of the errors, weighted with the inverse of their expected variances. If the errors
     scatter more than their expected variances, the standard errors are increased. The significance is the ratio of a
-    mean to its standard error, which then also contains the part of the rig's error that is equal in all presses.
+    mean to a standard error that also contains the part of the rig's error that is equal in all presses.
 
     Args:
         error: Errors of x, y and the force, shape (n, 3); NaN where unknown.
@@ -269,7 +273,7 @@ class Agreement:
 
     Attributes:
         chi_squared: Sum of `PressErrors.chi_squared`.
-        degrees: Number of degrees of freedom of the sum, which is the number of known errors.
+        degrees: Number of degrees of freedom of the sum, equal to the number of known errors.
         p_value: Probability that noise and rig alone cause a larger sum; NaN without presses.
         common: Errors that are common to all presses.
         common_p_value: Probability that noise and rig alone cause larger common errors; NaN without presses.
@@ -327,12 +331,12 @@ class Agreement:
 def chi_squared_deviate(statistic: ArrayLike, degrees: ArrayLike) -> Array:
     """Convert chi-squared variables to variables with a standard normal distribution, shape (n,).
 
-    The cube root of a chi-squared variable, divided by its degrees of freedom k, is approximately normal with the mean
-    1 - 2 / (9 k) and the variance 2 / (9 k) (Wilson and Hilferty 1931).
+    Each variable is divided by its degrees of freedom k. The cube root of the quotient is approximately normal with the
+    mean 1 - 2 / (9 k) and the variance 2 / (9 k) (Wilson and Hilferty 1931).
 
     Args:
         statistic: The chi-squared variables, shape (n,), not negative.
-        degrees: Their degrees of freedom, shape (n,), 1 or more.
+        degrees: Degrees of freedom of the variables, shape (n,), 1 or more.
     """
     variance = 2.0 / np.multiply(9.0, degrees)
     cube_root = np.cbrt(np.divide(statistic, degrees))
@@ -342,9 +346,9 @@ def chi_squared_deviate(statistic: ArrayLike, degrees: ArrayLike) -> Array:
 def chi_squared_survival(statistic: float, degrees: int) -> float:
     """Compute the probability that a chi-squared variable exceeds a value.
 
-    The error of the probability is below 0.05 with one degree of freedom, and below 0.013 with more. For probabilities
-    from 0.001 to 0.02, the relative error is below 20 %. Smaller probabilities are overestimated, up to 2.5 times at
-    1e-5.
+    The error of the probability is below 0.05 for one degree of freedom, and below 0.013 for more degrees. For
+    probabilities from 0.001 to 0.02, the relative error is below 20 %. Smaller probabilities are overestimated, by a
+    factor of up to 2.5 at 1e-5.
 
     Args:
         statistic: The value, not negative.

@@ -51,9 +51,9 @@ def read_charges(path: Path, electrodes: tuple[str, ...]) -> Array:
 def write_contacts(charge_pC: Array, predictor: Predictor, out: TextIO) -> None:
     """Write the contacts of a table of charges as CSV, with one row for each press.
 
-    The columns are the attributes of `Contact` without the correlations, and `flags`, in which the flags of a press are
-    separated by blanks. Numbers have six decimals. If the charges of a press do not exceed the noise of the model, its
-    force is 0, and its other cells are empty.
+    The columns are the attributes of `Contact` without the correlations, followed by `flags`. In the last column,
+    blanks separate the flags of a press. Numbers have six decimals. If the charges of a press do not exceed the noise
+    of the model, its force is 0, and its other cells are empty.
 
     Args:
         charge_pC: Charges, shape (n, electrodes), pC.
@@ -85,8 +85,8 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
         ChargeError: If the charges do not fit the model.
     """
     metadata = predictor.metadata
-    # Few rows are predicted at a time, because the model and Python numbers need a hundred times as much memory as the
-    # array.
+    # Only a few rows are predicted at a time, because the model and Python numbers need a hundred times as much memory
+    # as the array.
     for start in range(0, len(charge_pC), MAX_BATCH):
         block = np.asarray(charge_pC[start : start + MAX_BATCH])
         contacts = predictor.predict_batch(block)
