@@ -25,10 +25,11 @@ from isocharge.serve.presses.number_columns import CHARGE_RULE, ColumnRule, Numb
 from isocharge.serve.presses.table_file import MAX_COLUMNS, CsvTable, csv_text, open_table
 
 POSITION_STD_MM = 0.1
-"""Default standard deviation of a position, mm. It is typical of a stage that is set by hand."""
+"""Default standard deviation of a position, mm. This value is typical of a stage that is set by hand."""
 
 FORCE_STD = 0.01
-"""Default standard deviation of a force relative to the force, dimensionless. It is typical of a simple load cell."""
+"""Default standard deviation of a force relative to the force, dimensionless. This value is typical of a simple load
+cell."""
 
 MAX_ROWS = 1_000_000
 """Largest number of presses in a file."""
@@ -36,7 +37,7 @@ MAX_ROWS = 1_000_000
 CONTACT = ("x_mm", "y_mm", "force_N")
 
 TEMPERATURE = "temperature_C"
-"""Name of a column that is neither used nor taken for an electrode."""
+"""Name of a column that is not used and that does not count as an electrode."""
 
 _POSITION = "a position in mm, or an empty cell if it is unknown"
 
@@ -47,7 +48,7 @@ PRESS_RULES = {
     "position_std_mm": ColumnRule("a positive standard deviation in mm", is_positive=True),
     "force_std": ColumnRule("a positive share of the force up to 1 (0.01 is 1 %)", maximum=1.0, is_positive=True),
 }
-"""The columns of a file of presses that are not electrodes."""
+"""Rules of the columns that are not electrodes, by the names of the columns in a file of presses."""
 
 MAX_ELECTRODES = MAX_COLUMNS - len(PRESS_RULES)
 """Largest number of electrodes in a file of presses."""
@@ -59,7 +60,7 @@ class MeasuredPresses:
 
     Attributes:
         contact: Position and force (x_mm, y_mm, force_N) of each press, shape (n, 3); NaN if unknown. Either both x and
-            y are known, or neither.
+            y are known, or neither is known.
         charge_pC: Touch charges, shape (n, electrodes), pC; NaN if unknown. At least one charge of each press is known.
         position_std_mm: Standard deviation of x and of y, shape (n,), mm.
         force_std: Standard deviation of the force relative to the force, shape (n,), dimensionless.
@@ -136,13 +137,13 @@ class MeasuredPresses:
     def line_words(self) -> str:
         """Line numbers of the presses for a message, such as "line 3" or "lines 3, 4, 7".
 
-        Only the first ones are listed.
+        Only the first line numbers are listed.
         """
         return f"{'line' if len(self) == 1 else 'lines'} {cut(', '.join(map(str, self.lines)))}"
 
     @property
     def columns(self) -> dict[str, Array]:
-        """Columns of numbers that a file of these presses has: a dictionary from names to arrays of shape (n,)."""
+        """Columns of a file of these presses, as a dictionary from names of columns to arrays of shape (n,)."""
         columns = dict(zip(CONTACT, self.contact.T, strict=True))  # x_mm, y_mm and force_N
         columns |= dict(zip(self.electrodes, self.charge_pC.T, strict=True))
         return columns | {"position_std_mm": self.position_std_mm, "force_std": self.force_std}
@@ -186,7 +187,7 @@ class MeasuredPresses:
 
 
 def _refuse_half_positions(columns: NumberColumns) -> None:
-    """Raise an error for the first press of which only one of x and y is known.
+    """Raise an error for the first press for which only one of the two coordinates x and y is known.
 
     Args:
         columns: Columns of the presses, with `x_mm` and `y_mm`.
@@ -215,8 +216,9 @@ def read_presses(
         path: The file, with up to `MAX_ROWS` presses.
         electrodes: Names of the electrodes, in the requested order of the charges. If None, all columns without another
             meaning are electrodes.
-        position_std_mm: Standard deviation of x and of y for presses for which the file states none, mm.
-        force_std: Standard deviation of the force for presses for which the file states none, relative to the force.
+        position_std_mm: Standard deviation of x and of y, mm, for presses without a standard deviation in the file.
+        force_std: Standard deviation of the force, relative to the force, for presses without a standard deviation of
+            the force in the file.
 
     Raises:
         PressError: If the file cannot be used. The message names the file, the line and the column, and states what was

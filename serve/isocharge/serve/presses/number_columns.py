@@ -53,7 +53,7 @@ class NumberColumns:
 
     Attributes:
         values: The columns by their names, each of shape (n,); NaN for an empty cell.
-        lines: Number of the line of each row.
+        lines: Line number of each row in the file.
     """
 
     values: Mapping[str, Array]

@@ -1,8 +1,9 @@
 """Factor by which the standard deviations of a model are multiplied to guarantee the coverage of its regions.
 
-The factor is an order statistic of held-out presses (split conformal prediction, Vovk 2012, proposition 2a). With n
-presses that were not used for the training or the calibration, the share of future contacts whose score is at most the
-k-th smallest score has the distribution Beta(k, n + 1 - k). The errors may have any distribution.
+The factor is an order statistic of held-out presses (split conformal prediction, Vovk 2012, proposition 2a). Let n be
+the number of presses that were not used for the training or the calibration. The share of future contacts whose score
+does not exceed the k-th smallest score then has the distribution Beta(k, n + 1 - k). The errors may have any
+distribution.
 """
 
 import math
@@ -13,13 +14,13 @@ import numpy as np
 from isocharge.common.arrays import Array
 
 COVERAGE = 0.9
-"""Share of contacts that the 95 % regions contain at least, after the factor is applied."""
+"""Smallest share of contacts that the 95 % regions contain after the factor is applied."""
 
 CONFIDENCE = 0.9
 """Probability that the statement about the coverage is true."""
 
 FEWEST_HELD_OUT = 22
-"""Smallest number of presses from which a factor follows. For fewer presses n, 1 - COVERAGE**n is below CONFIDENCE."""
+"""Smallest number of presses that gives a factor. For a smaller number n, 1 - COVERAGE**n is below CONFIDENCE."""
 
 REGION_QUANTILES = (3.841, 5.991, 7.815)
 """95 % quantiles of chi-squared with one, two and three degrees of freedom."""
@@ -29,7 +30,7 @@ class StdFactor(NamedTuple):
     """Factor by which the standard deviations of a model must be multiplied on this film.
 
     Attributes:
-        factor: The factor, dimensionless. It may be smaller than 1.
+        factor: The factor, dimensionless. The factor may be smaller than 1.
         presses: Number of presses from which the factor was computed.
     """
 
@@ -51,8 +52,8 @@ class StdFactor(NamedTuple):
 
         The score of a press is the factor with which its 95 % region just contains the measured values. The region is
         an ellipsoid with axes along x, y and the force, without the correlations that the model states. The result is
-        the smallest score that is large enough for the share `COVERAGE` of all future presses with the probability
-        `CONFIDENCE`.
+        the smallest score that meets a condition: with the probability `CONFIDENCE`, the score is large enough for at
+        least the share `COVERAGE` of all future presses.
 
         Args:
             error: Errors of x, y and the force, shape (n, 3); NaN if unknown. A press without a known error is left

@@ -1,13 +1,13 @@
 """Files with columns of numbers, as CSV text.
 
-The columns are separated by commas, semicolons, tabs or bars. The header is the first row that contains a name with a
-meaning; rows above it are ignored. The decimal mark is a point or a comma, and the same in the whole file. A number
-such as `1,064` may be 1.064 or 1064. A file in which no number determines the decimal mark is therefore refused. A
-point is always the decimal mark if commas separate the columns.
+The columns are separated by commas, semicolons, tabs or bars. The header is the first row that contains a known name of
+a column. Rows above the header are ignored. The decimal mark is a point or a comma, and must be the same in the whole
+file. A number such as `1,064` may be 1.064 or 1064. A file is therefore refused if every mark in its numbers may be a
+separator of thousands. If commas separate the columns, a point is always the decimal mark.
 
-A row that begins with # is a comment, or the header if no other row is. Blank rows, and a row below the header that has
-the units mm, N and pC in the columns to read, are ignored. Blanks before and after a name or a number are also ignored.
-The texts `nan` and `inf` are not accepted.
+A row that begins with # is a comment. If no other row is a header, a comment can be the header. Blank rows are ignored.
+The first row below the header is also ignored if the columns to read contain units in this row: mm, N and pC. Blanks
+before and after a name or a number are ignored, too. The texts `nan` and `inf` are not accepted.
 """
 
 import csv
@@ -42,29 +42,29 @@ _UNITS = frozenset({"mm", "N", "pC", "1", "-", ""})
 """Cells of a row of units below the header."""
 
 _MAX_LINES_TO_HEADER = 100
-"""Number of lines at the beginning of a file among which the header is searched."""
+"""Number of lines at the beginning of a file that are searched for the header."""
 
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:([.,])[0-9]*)?|([.,])[0-9]+)(?:[eE][-+]?[0-9]+)?")
-"""Number with or without a decimal mark, which is a group."""
+"""Number with or without a decimal mark. The mark is a group of the regular expression."""
 
 _PARQUET_START = "PAR1"
 """Beginning of a Parquet file."""
 
 _WRONG_BYTE = re.compile("[\0\udc80-\udcff]")
-"""Zero byte, or a byte that is not UTF-8, which the error handler `surrogateescape` replaces by a surrogate."""
+"""Zero byte, or the surrogate by which the error handler `surrogateescape` replaces a byte that is not UTF-8."""
 
 _THOUSANDS = re.compile(r"[-+]?[1-9][0-9]{0,2}[.,][0-9]{3}")
 """Number whose mark may be a separator of thousands."""
 
 _UNIT_AT_END = re.compile(r"[\W_](?:[uµμnmc]?m|in|(?:da|[uµμmck])?n|m?k?gf?|lbf?|[uµμfpn]?c)[\W_]*$")
-"""Unit in lower case of a length, a force or a charge at the end of the name of a column."""
+"""Lower-case unit of a length, a force or a charge at the end of the name of a column."""
 
 
 class CsvTable:
     """Table of numbers that is read from a CSV text. The columns can be read only once.
 
     Attributes:
-        header: Names of the columns. Names without a meaning have no blanks at their ends.
+        header: Names of the columns. Blanks at the ends of unknown names are removed.
     """
 
     def __init__(
@@ -89,7 +89,8 @@ class CsvTable:
         self._mark = ""  # point or comma in the numbers of the file; empty until a number has one
         self._is_mark_decimal = False  # whether a number has shown that the mark does not separate thousands
 
-        # Search the header among the first lines. If the header is a comment, `header_line` is without the # before it.
+        # Search for the header among the first lines. If the header is a comment, `header_line` does not contain the
+        # mark #.
         line_iterator = self._checked_lines(lines)
         first_lines = list(islice(line_iterator, _MAX_LINES_TO_HEADER))
         lines_above, self._separator, header_line = _find_header(first_lines or [""], names)
@@ -124,9 +125,9 @@ class CsvTable:
             The required columns, and then the optional columns.
 
         Raises:
-            InputError: If a required column is missing, if one of these columns occurs twice, if the name of a
-                column is almost that of a column that the file does not contain, such as `a (pC)` for `A`, if the file
-                is damaged or has more than `max_rows` rows, or if a cell violates the rule of its column.
+            InputError: If a required column is missing, or if a required or optional column occurs twice. If the name
+                of a column is similar to the name of a missing column, such as `a (pC)` to `A`. If the file is damaged
+                or has more than `max_rows` rows. If a cell violates the rule of its column.
         """
         known_rules = {**required, **optional}
         other_names = [name for name in self.header if name not in known_rules]
@@ -154,9 +155,10 @@ class CsvTable:
             names: Names of columns that have a meaning.
 
         Raises:
-            InputError: If a column has such a name. The message lists all such columns.
+            InputError: If the name of a column is a probable misspelling. The message lists all such columns.
         """
-        # Collect the spellings of each missing name. A column with one of these spellings is probably this column.
+        # Collect the spellings of each missing name. A column with one of these spellings is probably the missing
+        # column.
         missing_name_of_spelling: dict[str, str] = {}
         for name in names:
             if name not in self.header:
@@ -247,11 +249,11 @@ class CsvTable:
     def _number(self, text: str) -> float | None:
         """Return the number in a cell: NaN for an empty cell, and None for a cell without a finite number.
 
-        The point or the comma in a number is called its mark. All numbers of a file must have the same mark. It may be
-        a decimal mark, or a separator of thousands as in `1,064`. Some numbers show that the mark is a decimal mark:
-        `0,5`, `12,34` and `1,064e3` cannot be whole numbers with a separator of thousands.
+        The point or the comma in a number is called its mark. All numbers of a file must have the same mark. The mark
+        may be a decimal mark, or a separator of thousands as in `1,064`. Some numbers show that the mark is a decimal
+        mark: `0,5`, `12,34` and `1,064e3` cannot be whole numbers with a separator of thousands.
 
-        The function stores the first mark of the file in `_mark`. As soon as a number has shown that it is a decimal
+        The function stores the first mark of the file in `_mark`. As soon as a number shows that this mark is a decimal
         mark, `_is_mark_decimal` becomes true.
 
         Args:
@@ -295,8 +297,8 @@ class CsvTable:
         """Return the error for a wrong header.
 
         Args:
-            reason: What is wrong with some names, for the error message.
-            names: These names.
+            reason: Description of the fault of some names, for the error message.
+            names: The names that have this fault.
         """
         return self.error(
             f": expected {self._expected}, got the header {shown(list(self.header))}; {reason}: {shown(names)}"
@@ -391,9 +393,9 @@ def _is_row_of_units(cells: list[str]) -> bool:
 def _find_header(lines: Sequence[str], names: Collection[str]) -> tuple[int, str, str]:
     """Find the header at the beginning of a text, and the separator of the columns.
 
-    The header is the first line that contains a name and no number, and is no comment. If there is no such line, the
-    header is the first comment that contains a name and no number, because `numpy.savetxt` writes such headers. If
-    there is no such comment, the header is the first line.
+    The header is the first line that is not a comment and contains a name but no number. If there is no such line, the
+    header is the first comment that contains a name but no number, because `numpy.savetxt` writes such headers. If
+    there is no such comment, the header is the first line of the text.
 
     Args:
         lines: First lines of the text, at least one.
@@ -413,12 +415,12 @@ def _find_header(lines: Sequence[str], names: Collection[str]) -> tuple[int, str
 
 
 def _best_separator(line: str, names: Collection[str]) -> str:
-    """Return the separator that divides a line into the most names with a meaning, and then into the most cells."""
+    """Return the separator that gives the most known names in a line. The number of cells decides a tie."""
     return max(_SEPARATORS, key=partial(_header_score, line, names))
 
 
 def _header_score(line: str, names: Collection[str], separator: str) -> tuple[int, int]:
-    """Return the number of names in a line, which is 0 if the line contains a number, and the number of cells.
+    """Return the number of known names and the number of cells in a line. A line with a number has no names.
 
     Args:
         line: The line.
@@ -435,7 +437,7 @@ def _header_score(line: str, names: Collection[str], separator: str) -> tuple[in
 
 
 def _spellings(name: str) -> set[str]:
-    """Return spellings of the name of a column, two of which are equal if the names are similar.
+    """Return spellings of the name of a column. Similar names have at least one spelling in common.
 
     A spelling consists of the letters and digits of the name in lower case, with or without a unit at the end. For
     example, `x_mm` gives `xmm` and `x`, and `X (cm)` gives `xcm` and `x`.
@@ -455,7 +457,7 @@ def open_table(path: Path, names: Collection[str], error_class: type[InputError]
         expected: Description of the expected header, for error messages.
 
     Yields:
-        The table, whose columns have not been read yet.
+        The table. Its columns have not been read yet.
 
     Raises:
         error_class: If the file cannot be read, either when it is opened or when the block reads the columns.
