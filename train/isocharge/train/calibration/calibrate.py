@@ -1,4 +1,4 @@
-"""Calibration of a film: estimation of its properties from measured presses, by solving the film that is found."""
+"""Calibration of a film: its properties are estimated from measured presses, and the estimated film is solved again."""
 
 from concurrent.futures import Executor
 
@@ -31,7 +31,7 @@ MAX_SOLVED_FILMS = 4
 """Largest number of axisymmetric films that are solved one after the other."""
 
 SAME_FILM_STD = 0.3
-"""Largest accepted distance of an estimated property from that of the solved film, in standard deviations."""
+"""Largest accepted difference between an estimated property and that of the solved film, in standard deviations."""
 
 MAX_NEGLECTED_EFFECT = 0.001
 """Second-order effect of the imperfections, relative to the charges, above which the uneven film itself is solved."""
@@ -44,7 +44,7 @@ NOT_CONVERGED = (
 """Caution about an uneven film whose solution changes the estimate again and again."""
 
 MAX_USUAL_NOISE = 0.01
-"""Noise that is proportional to the charge, above which a caution is given, dimensionless."""
+"""Noise, relative to the charge, above which a caution is given, dimensionless."""
 
 PLACEMENT_PROPERTIES = ("shift_x", "shift_y", "rotation")
 """Names of the properties that describe where the electrodes are."""
@@ -63,9 +63,9 @@ def calibrate(
 ) -> CalibrationResult:
     """Estimate the properties of a film from presses on this film.
 
-    The presses are checked first, and presses with the charges of an earlier press are left out. Then an axisymmetric
-    film is solved, the properties are estimated with the charges of this film and their derivatives, and the film is
-    solved again until the estimate hardly changes. If the film is uneven, the uneven film itself is solved.
+    The presses are checked first, and a press with the same charges as an earlier press is left out. Then an
+    axisymmetric film is solved, and the properties are estimated with the charges of this film and their derivatives.
+    Both steps are repeated until the estimate hardly changes. If the film is uneven, the uneven film itself is solved.
 
     Args:
         presses: The presses in the order in which they were made, with position, force or both, and the standard
@@ -73,9 +73,10 @@ def calibrate(
             force can show how the film has changed since an earlier calibration.
         problem: The calibration problem.
         executor: Executor that runs the solves; None for this process.
-        start: A solved film that is used first, from an earlier calibration of the same problem; None to solve one.
-        accurate: Whether an uneven film is solved. If False, its unevenness is a first-order change, which is enough
-            to choose further presses.
+        start: Solved film of an earlier calibration of the same problem, with which the calibration begins; None to
+            solve a new film.
+        accurate: Whether an uneven film is solved. If False, the unevenness is only taken into account to first order,
+            which is enough to choose further presses.
 
     Raises:
         PressError: If the records of the presses are impossible, if no film explains the presses, or if the electrodes
@@ -127,7 +128,9 @@ def calibrate(
 def solve_even(
     problem: CalibrationProblem, executor: Executor | None = None, values: Array | None = None
 ) -> FilmCharges:
-    """Solve the axisymmetric film with given properties under an axisymmetric probe, at a few presses.
+    """Return the charges of an axisymmetric film with given properties, for which a few presses are solved.
+
+    The presses are made with an axisymmetric probe.
 
     Args:
         problem: The calibration problem.
@@ -150,9 +153,9 @@ def _fit_film(
     """Estimate a film from presses, of which most are in the solved domain.
 
     Axisymmetric films are solved and the properties are estimated in turn, until the estimate hardly changes. The
-    estimated film is then solved with its imperfections and its real probe, and the properties are estimated again,
-    which is repeated once if the estimate changes the film much. A nearly even film under an axisymmetric probe does
-    not need this.
+    estimated film is then solved with its imperfections and its real probe, and the properties are estimated again.
+    These two steps are repeated once if the estimate has changed the film much. A nearly even film under an
+    axisymmetric probe does not need them.
 
     Args:
         problem: The calibration problem.
@@ -202,10 +205,10 @@ def _fit_film(
 
 
 def _largest_deviation(estimation: Estimation) -> float:
-    """Return the largest difference between a property of the estimate and of the solved film, in standard deviations.
+    """Return the largest difference between properties of the estimated and the solved film, in standard deviations.
 
-    Only properties that change the stress of an axisymmetric film are compared. The charges follow changes of the other
-    properties exactly, or these properties are imperfections.
+    Only properties that change the stress of an axisymmetric film are compared. The other properties are imperfections,
+    or their effects on the charges are exact without a new solution.
     """
     film, charges = estimation.film, estimation.charges
     is_even = charges.prior.changes_stress & ~charges.prior.is_imperfection
@@ -216,11 +219,12 @@ def _largest_deviation(estimation: Estimation) -> float:
 def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
     """Return whether first-order changes of a solved film give the charges of a film with given properties accurately.
 
-    The solved film may lack imperfections, of which only the first-order effects on the charges are then known. They
-    are accurate enough if the second-order effects are small. A second-order effect is about the square of the
-    first-order effect. An uneven tension has a further second-order effect, although its first-order effect is small:
-    if u is its ratio to the mean tension, the film behaves as if the mean tension were smaller by up to u^2 / 2 of
-    itself. If the solved probe or the solved material lacks a property, even the first-order effect is unknown.
+    The solved film may lack some imperfections. Of these imperfections, only first-order effects on the charges are
+    known. First-order effects are accurate enough if the second-order effects are small. A second-order effect is about
+    the square of the first-order effect. An uneven tension has a further second-order effect, even if its first-order
+    effect is small. If u is the ratio of the uneven to the mean tension T, the film behaves as if the mean tension were
+    smaller by up to T u^2 / 2. If the solved probe or the solved material lacks a property, even the first-order effect
+    of this property is unknown.
 
     Args:
         charges: The solved film, with its charges and their derivatives.
@@ -241,7 +245,7 @@ def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
     missing = np.where(can_be_missing, values - charges.values, 0.0)  # missing part of each property
     first_order_effect = np.linalg.norm(jacobian @ missing) / charge_size
 
-    # Compute the further effect of an uneven tension: that of the decrease of the mean tension by u^2 / 2 of itself.
+    # Compute the further effect of an uneven tension, which acts like a decrease of the mean tension T by T u^2 / 2.
     tension_index = prior.index(PRETENSION.name)
     missing_tensions = missing[np.isin(prior.names, UNEVEN_TENSIONS)]  # components of u
     lost_tension_MPa = 0.5 * values[tension_index] * (missing_tensions**2).sum()
@@ -250,7 +254,7 @@ def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
 
 
 def _is_uninformative(presses: MeasuredPresses) -> bool:
-    """Return whether presses cannot contain any information about the film, because they only determine their contacts.
+    """Return whether presses only determine their own contacts, and so contain no information about the film.
 
     This is the case if all contacts are unknown, and each press has at most three charges for its x, y and force.
     Without presses, the result is False.
@@ -262,8 +266,8 @@ def _check_placement(film: FilmEstimate) -> None:
     """Check that the estimated shift and rotation of the electrodes are inside the ranges that the estimator searches.
 
     Raises:
-        PressError: If one of them is at an end of its range. The true value then probably lies outside the range, so
-            that neither the estimate nor its standard deviation is right.
+        PressError: If the shift or the rotation is at an end of its range. The true value then probably lies outside
+            the range, so that neither the estimate nor its standard deviation is right.
     """
     for film_property in film.layout.prior.properties:
         value = film.value(film_property.name)

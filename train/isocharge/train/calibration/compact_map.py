@@ -1,13 +1,13 @@
-"""Compact charge map of a calibrated film (`ChargeSeries`), from which films similar to it can be drawn.
+"""Compact charge map (`ChargeSeries`) of a calibrated film, from which similar films can be drawn at random.
 
-The posterior distribution of a calibration has many unknowns, of which only a few linear combinations change the
-charges. These combinations are called directions. The compact charge map contains the changes of the charges along each
-direction. The training uses them to draw films, and the live follower uses them to find out how the real film differs
-from the estimated one.
+The posterior distribution of a calibration has many unknowns, but only a few linear combinations of the unknowns change
+the charges. These combinations are called directions. The compact charge map contains the changes of the charges along
+each direction. The training uses the directions to draw films. The live follower uses the directions to find out how
+the real film differs from the estimated film.
 
-The nodes of the map are films with other pretensions. Their charges are those of the calibrated film, changed by as
-much as those of a nearly axisymmetric film between the pretension of the calibration and the other one. The changes
-along the directions are also computed for these films, because they depend on the pretension.
+The nodes of the map are films with other pretensions. Their charges are computed from those of the calibrated film:
+each charge changes in the same proportion as on a nearly axisymmetric film with the same change of the pretension. The
+changes along the directions depend on the pretension, so they are also computed at the nodes.
 
 Worker processes compute the charges of the films. This module does not import torch, so that the workers start quickly.
 """
@@ -37,27 +37,27 @@ SERIES_CONTACTS = 6800
 """Number of contacts to which the series of the charges are fitted."""
 
 CHANGE_CONTACTS = 2000
-"""Number of contacts to which the changes of the charges to other pretensions are fitted."""
+"""Number of contacts to which the changes of the charges with the pretension are fitted."""
 
 CHANGE_DEGREES = (10, 5)
-"""Degrees of the series of these changes in the position and in the force."""
+"""Degrees in the position and in the force of the series that describe how the charges change with the pretension."""
 
 DIRECTION_CONTACTS = 1200
-"""Number of contacts to which the series of the directions are fitted."""
+"""Number of contacts to which the series for the effects of the directions are fitted."""
 
 DIRECTION_DEGREES = (8, 3)
-"""Degrees of the series of the directions in the position and in the force."""
+"""Degrees in the position and in the force of the series that describe the effects of the directions."""
 
 MIN_DIRECTION = 0.1
-"""Smallest root-mean-square effect of a direction on a charge, in standard deviations of the noise, that is kept."""
+"""Smallest root-mean-square effect on a charge, in standard deviations of the noise, for which a direction is kept."""
 
 MAX_SERIES_ERROR = 0.03
-"""Largest relative error of the charges at all nodes. If it is larger, the outermost node is left out."""
+"""Largest relative error of the charges over all nodes. If the error is larger, the outermost node is left out."""
 
 NODES_MPa = (-0.7, -0.3, 0.0, 0.4, 0.9)
-"""Changes of the pretension at the nodes of a film that can be followed, MPa.
+"""Changes of the pretension at the nodes, MPa, for a film whose changes can be followed.
 
-Changes that would make the film slack are replaced by the largest decrease that does not."""
+Changes that would make the film slack are replaced by the largest decrease that keeps the film taut."""
 
 SEED = 3
 """Seed of the contacts and of the drawn films."""
@@ -68,11 +68,11 @@ def compact_charges(
 ) -> ChargeSeries:
     """Compute the compact charge map of an estimated film.
 
-    The map contains the charges at the nodes, which are films with other pretensions, and the effects of the
-    directions, which are the linear combinations of the unknowns of the film that change the charges. Both are series
-    that are fitted to the charges of random contacts. The charges at the nodes and the effects of the directions take
-    long to compute, and are computed only for the first contacts. These also cover the domain, because the order is
-    random.
+    The map has two parts: the charges at the nodes, and the effects of the directions. The nodes are films with other
+    pretensions. The directions are the linear combinations of the unknowns of the film that change the charges. Both
+    parts are series that are fitted to the charges of random contacts. The charges at the nodes and the effects of the
+    directions take long to compute, and are computed only for the first contacts. The first contacts also cover the
+    domain, because the order of the contacts is random.
 
     Args:
         domain: Contacts for which the map is needed.
@@ -109,7 +109,7 @@ def compact_charges(
     return replace(
         series,
         directions=_directions(series, film, calibrated, remaining_films, few_contacts, few_charges, executor),
-        # A film is at most as well described as its charges can be measured.
+        # The description of a film is at best as accurate as the measurement of its charges.
         charge_std=max(series.charge_std, film.noise.gain),
         offset_pC=film.values[film.layout.offset],
         pretension_MPa=film.value(PRETENSION.name),
@@ -119,12 +119,12 @@ def compact_charges(
 
 @dataclass(frozen=True)
 class _ChangedFilm:
-    """The calibrated film, or a film whose tension differs from it by the same amount in all directions.
+    """The calibrated film, or the same film after a change of the tension that is equal in all directions.
 
     Attributes:
         change_MPa: Change of the pretension, MPa.
-        charges: Charges of a solved film and of similar films. For the calibrated film, it is the film that the
-            calibration has solved. For a changed film, it is axisymmetric.
+        charges: Charges of a solved film and of similar films. For the calibrated film, the solved film is that of the
+            calibration. For a changed film, the solved film is axisymmetric.
         values: Properties of the changed film, shape (n_property,).
         value_jacobian: Derivatives of `values` with respect to the properties of the calibrated film, shape
             (n_property, n_property).
@@ -136,7 +136,7 @@ class _ChangedFilm:
     value_jacobian: Array
 
     def changed(self, change_MPa: float, executor: Executor | None) -> "_ChangedFilm":
-        """Solve the axisymmetric film whose pretension differs from that of this calibrated film.
+        """Return this calibrated film with another pretension, for which an axisymmetric film is solved.
 
         If the change is zero, nothing is solved: the calibration has already solved an axisymmetric film whose
         properties hardly differ from those of this film.
@@ -208,7 +208,7 @@ def _fit_accurate_nodes(
         domain: Contacts for which the series is needed.
         electrodes: Names of the electrodes.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        charge: Their charges at the nodes, shape (n, n_node, n_electrode), pC.
+        charge: Charges of the contacts at the nodes, shape (n, n_node, n_electrode), pC.
         node_MPa: Changes of the pretension at the nodes, shape (n_node,), MPa.
     """
     series = fit_film_series(domain, electrodes, contact, charge, node_MPa)
@@ -226,7 +226,7 @@ def _fit_accurate_nodes(
 
 
 def _nodes(film: FilmEstimate) -> Array:
-    """Return the changes of the pretension at the nodes, of which none makes the film slack, shape (n_node,), MPa."""
+    """Return changes of the pretension at the nodes that do not make the film slack, shape (n_node,), MPa."""
     sensor, _ = film.layout.prior.film(film.film_values)
     smallest_tension_MPa = sensor.film.pretension - np.hypot(*sensor.film.deviator)  # over all directions
     lowest_MPa = min(0.0, -0.95 * smallest_tension_MPa)
@@ -238,17 +238,17 @@ def _nodes(film: FilmEstimate) -> Array:
 def _node_charges(unit_contact: Array, charge: Array, first_charge: Array, node_MPa: Array) -> Array:
     """Compute the charges of the calibrated film at the nodes from those of axisymmetric films.
 
-    The charges of an axisymmetric film change by a certain ratio if its pretension changes from that of the calibration
-    to that of a node. The charges of the calibrated film change by about the same ratio, although this film is not
-    axisymmetric. The ratio is a smooth function of the contact. It is known for the first contacts, and a series that
-    is fitted to them gives the ratios of the other contacts.
+    The charges of an axisymmetric film change by a certain ratio if its pretension changes from the value of the
+    calibration to the value of a node. The charges of the calibrated film change by about the same ratio, although this
+    film is not axisymmetric. The ratio is a smooth function of the contact. The ratio is computed for the first
+    contacts. A series that is fitted to these ratios gives the ratios of the other contacts.
 
     If all charges have the same sign, the change is relative to the charge itself. Otherwise, some charges are nearly
     zero, and the change is relative to the root of the sum of the squared charges of all electrodes.
 
     Args:
         unit_contact: Contacts in unit coordinates, shape (n, 3).
-        charge: Their charges on the calibrated film, shape (n, n_electrode), pC.
+        charge: Charges of the contacts on the calibrated film, shape (n, n_electrode), pC.
         first_charge: Charges of the first contacts on the axisymmetric films at the nodes, shape (n_first, n_node,
             n_electrode), pC.
         node_MPa: Changes of the pretension, one of which is zero, shape (n_node,), MPa.
@@ -259,7 +259,7 @@ def _node_charges(unit_contact: Array, charge: Array, first_charge: Array, node_
     has_one_sign = np.ptp(np.sign(first_charge)) == 0.0
 
     def change_unit(film_charge: Array) -> Array:
-        """Return the charges to which the changes of given charges, shape (n, 1, n_electrode), are relative."""
+        """Return the unit in which changes of charges are expressed, for charges of shape (n, 1, n_electrode)."""
         return film_charge if has_one_sign else np.linalg.norm(film_charge, axis=2, keepdims=True)
 
     # Compute the relative changes of the charges of the first contacts, shape (n_first, n_node, n_electrode).
@@ -286,7 +286,7 @@ def _directions(
     charge: Array,
     executor: Executor | None,
 ) -> Array:
-    """Find the directions in which the charges of the film are uncertain, and fit series to their effects.
+    """Find the directions that make the charges of the film uncertain, and fit series to the effects of the directions.
 
     A direction is a linear combination of the unknowns of the film. The directions are chosen so that their effects on
     the charges are uncorrelated, and directions with effects below `MIN_DIRECTION` are left out. The effects are
@@ -300,13 +300,13 @@ def _directions(
         series: Map of the charges without directions.
         film: The estimate of the calibrated film.
         calibrated: The calibrated film.
-        films: The films at the nodes of the series, by ascending change of the pretension.
+        films: The films at the nodes of the series, in ascending order of the changes of the pretension.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
-        charge: Their most probable charges, shape (n, n_electrode), pC.
+        charge: Most probable charges of the contacts, shape (n, n_electrode), pC.
         executor: Executor that computes the charges of the films; None for this process.
 
     Returns:
-        Coefficients, as in `ChargeSeries.directions`.
+        Coefficients of the series, in the form of `ChargeSeries.directions`.
     """
     unit_contact = series.domain.to_unit(contact)
     size = None  # the typical size S of the charges, shape (n, 1), pC; None if the values are ln Q
@@ -356,20 +356,21 @@ def _directions(
 def _value_changes(
     films: list[_ChangedFilm], film: FilmEstimate, contact: Array, size: Array | None, executor: Executor | None
 ) -> list[Array]:
-    """Compute the changes of the values v of a charge map that the uncertainty of the unknowns causes.
+    """Compute how the uncertainty of the unknowns changes the values v of a charge map.
 
     The unknowns are correlated. They are replaced by the same number of linear combinations that are uncorrelated and
-    have the standard deviation 1. The function returns the changes by one standard deviation of each combination.
+    have the standard deviation 1. The function returns the changes of v that one standard deviation of each combination
+    causes.
 
     Args:
-        films: Films whose charges are changed.
+        films: Films for which the changes are computed.
         film: The estimate of the calibrated film, with the covariance of the unknowns.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         size: Typical size S of the charges if the values are Q / S, shape (n, 1), pC; None if the values are ln Q.
         executor: Executor that computes the charges of the films; None for this process.
 
     Returns:
-        Changes for each film, shape (n, n_electrode, n_unknown).
+        One array of changes of v for each film, shape (n, n_electrode, n_unknown).
     """
     # The columns of the root contain the changes of the unknowns by one standard deviation of each combination. The
     # unknowns are those of `_ChangedFilm.linearised`.

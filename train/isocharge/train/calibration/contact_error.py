@@ -1,14 +1,14 @@
 """Errors that the uncertainty of a film causes in estimated contacts, and the presses that reduce them most.
 
-Let du be the error of the unknowns of the film. It changes the charges that the model expects at each contact, and the
-error dc of the estimated contact compensates this change as well as possible:
+Let du be the error of the unknowns of the film. This error changes the charges that the model expects at each contact.
+The error dc of the estimated contact compensates the change as well as possible:
 
     dc = -G du,   G = (J' W J + P)^-1 J' W A.
 
-Here J is the derivative of the charges with respect to the contact, A that with respect to the unknowns, and W is the
-inverse of the noise covariance. P is the inverse covariance of a contact that may lie anywhere in the domain; it keeps
-the errors finite where the map from contacts to charges folds. Noise alone causes errors with the covariance
-(J' W J + P)^-1, which is the Cramer-Rao limit.
+Here J and A are the derivatives of the charges with respect to the contact and to the unknowns, and W is the inverse
+covariance of the noise. P is the inverse covariance of a contact that may lie anywhere in the domain. The matrix P
+keeps the errors finite where the map from contacts to charges folds. Noise alone causes errors with the covariance
+matrix (J' W J + P)^-1, which is the Cramer-Rao limit.
 
 The information that a press adds about the film hardly depends on its charges. The best next press can therefore be
 chosen before any charge is measured. Several presses are chosen one after the other (greedy A-optimal design,
@@ -34,16 +34,16 @@ from isocharge.train.calibration.problem import CalibrationProblem
 from isocharge.train.data.contact_errors import rms
 
 N_CONTACTS = 200
-"""Number of contacts over which the errors are averaged, and of positions that are compared for the next press."""
+"""Number of contacts over which errors are averaged, and number of positions compared for the next press."""
 
 CANDIDATE_FORCES = (0.15, 0.45, 0.95)
 """Forces that are compared, on a logarithmic scale from 0 (smallest force) to 1 (largest force)."""
 
 GRID_MM = 0.5
-"""Grid to which proposed positions are rounded, mm, so that a person can set them."""
+"""Spacing of the grid to which proposed positions are rounded, mm, so that a person can set the positions."""
 
 GRID_N = 0.05
-"""Largest grid to which proposed forces are rounded, N. The grid is at most the smallest force of the domain."""
+"""Largest step to which proposed forces are rounded, N. The step is at most the smallest force of the domain."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +106,11 @@ class ContactSensitivity:
         return ContactError.of(CramerRao(self.noise_covariance))
 
     def film_error(self, covariance: Array) -> ContactError:
-        """Return the errors that a covariance of the unknowns causes, shape (n_unknown, n_unknown)."""
+        """Return the rms errors of the contacts for a covariance of the unknowns, shape (n_unknown, n_unknown)."""
         return ContactError.of(self.film_limits(covariance))
 
     def film_limits(self, covariance: Array) -> CramerRao:
-        """Return the errors of each contact that a covariance of the unknowns causes.
+        """Return the errors of each contact for a given covariance of the unknowns.
 
         Args:
             covariance: Covariance of the unknowns, shape (n_unknown, n_unknown).
@@ -120,11 +120,11 @@ class ContactSensitivity:
 
 @dataclass(frozen=True)
 class ProposedPress:
-    """A proposed press, and the errors that the uncertainty of the film causes after it.
+    """A proposed press, and the contact errors that the uncertainty of the film still causes after this press.
 
     Attributes:
-        x_mm: Position, mm.
-        y_mm: Position, mm.
+        x_mm: Coordinate x of the position, mm.
+        y_mm: Coordinate y of the position, mm.
         force_N: Force, N.
         position_mm: Root-mean-square position error after the press, mm.
         force_percent: Root-mean-square force error after the press, %.
@@ -154,7 +154,8 @@ def next_presses(
     """Propose the presses that reduce the errors of later contacts most.
 
     The errors are those that the uncertainty of the film causes. The presses are chosen one after the other from a list
-    of candidates. Each of them most reduces the sum of the squared errors that remains after the presses before it.
+    of candidates. Each chosen press is the candidate that most reduces the sum of the squared errors that remain after
+    the previous presses.
 
     Args:
         problem: The calibration problem.
@@ -176,10 +177,11 @@ def next_presses(
     _, jacobian = _linearise_at(film, charges, candidates, contact_std).eliminated()
     sensitivity = ContactSensitivity.of(film, charges, problem.domain)
 
-    # The gain G contains the changes of x, y and ln F of later contacts by errors of the unknowns. Divide it by the
-    # errors that the noise causes, so that the squares of the three coordinates can be added. If the unknowns have the
-    # covariance C, the sum of the squared errors of all contacts is the trace of G C G', which is that of C G' G. The
-    # product G' G is a sum over the contacts (n) and their coordinates (i), and has two axes of unknowns (j and k).
+    # The gain G contains the derivatives of x, y and ln F of later contacts with respect to errors of the unknowns.
+    # Divide it by the errors that the noise causes, so that the squares of the three coordinates can be added. If the
+    # unknowns have the covariance C, the sum of the squared errors of all contacts is the trace of G C G', which equals
+    # the trace of C G' G. The product G' G is a sum over the contacts (n) and their coordinates (i), and has two axes
+    # of unknowns (j and k).
     noise_std = np.sqrt(np.diagonal(sensitivity.noise_covariance, axis1=1, axis2=2).mean(axis=0))  # shape (3,)
     gain = sensitivity.film_gain / noise_std[:, None]
     squared_gain = np.einsum("nij,nik->jk", gain, gain)  # G' G, shape (n_unknown, n_unknown)

@@ -1,4 +1,4 @@
-"""Search for mistakes in the records of presses, if no film explains these presses.
+"""Search for mistakes in the records of presses that no film explains.
 
 The search considers swapped charge columns, wrong gains, rotated or mirrored axes of the rig, and wrong units. For each
 mistake, a corrected copy of the presses is compared with the charges of a few films. If the correction of a mistake
@@ -21,13 +21,14 @@ from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.press_data import in_domain
 
 MAX_DEAD_RATIO = 0.1
-"""Ratio of the typical charge of a channel to that of all channels, below which the channel counts as dead.
+"""A channel counts as dead if its typical charge, divided by that of all channels, is below this ratio.
 
-A dead channel may have some crosstalk or an offset. The limit is lower for a channel whose charges are smaller than
-those of the other channels on some possible film, and for presses of unknown places and forces."""
+Even a dead channel may show small charges, because of crosstalk or an offset. The limit is lower for a channel that has
+smaller charges than the other channels on some possible film. The limit is also lower for presses of unknown places and
+forces."""
 
 UNPLACED_RATIO = 0.2
-"""Factor of this limit for presses of unknown places and forces, which may all be near one electrode."""
+"""Factor of `MAX_DEAD_RATIO` for presses of unknown places and forces, which may all be near one electrode."""
 
 UNIT_CORRECTIONS = {
     "the forces are in g, not N": (1.0, 9.80665e-3, 1.0),
@@ -44,27 +45,27 @@ UNIT_CORRECTIONS = {
 }
 """Wrong units that the search for mistakes considers.
 
-Each entry is a sentence, and the factors that correct the positions, the forces and the charges.
+Each entry maps a sentence about the mistake to the factors that correct the positions, the forces and the charges.
 """
 
 PRETENSIONS_MPa = (0.3, 1.5, 3.0)
 """Pretensions of the films with which presses are compared, MPa."""
 
 SCATTER_STD = 0.1
-"""Usual standard deviation, over electrodes and presses, of the logarithm of measured divided by expected charges.
+"""Usual standard deviation of ln(measured charge / expected charge) over the electrodes and presses.
 
-The gains and the shift of the electrodes cause such a scatter."""
+The gains of the electrodes and a shift of the electrodes cause such a scatter."""
 
 OFFSET_STD = 0.6
-"""Usual standard deviation of the common offset of all logarithms of measured divided by expected charges.
+"""Usual standard deviation of the offset that all logarithms ln(measured charge / expected charge) share.
 
 The piezoelectric coefficients cause such an offset."""
 
 MAX_SQUARED_DEVIATION = 4.0
-"""Upper limit of the squared deviation between logarithms of charges, which bounds the effect of outliers."""
+"""Upper limit of a squared deviation of logarithms of charges. This limit bounds the effect of outliers."""
 
 SUSPICIOUS_MISFIT = 8.0
-"""Misfit of presses, as `misfit` returns it, above which they probably contain a mistake."""
+"""Presses whose misfit, as returned by `misfit`, exceeds this number probably contain a mistake."""
 
 BETTER_MISFIT_RATIO = 0.25
 """Ratio of two misfits below which one explanation of the presses counts as clearly better than another."""
@@ -80,7 +81,7 @@ AXIS_CORRECTIONS = {
 }
 """Rotations and reflections of the axes that the search for mistakes considers.
 
-Each entry is a description, and the correct coordinates x and y in terms of the written coordinates.
+Each entry maps a description to the correct coordinates x and y, expressed by the written coordinates.
 """
 
 
@@ -110,8 +111,8 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
     Args:
         presses: The measured presses. Only presses with a known place and force show a wrong sign.
-        charges: Charges of a film and of similar films. A channel with small charges does not count as dead if one of a
-            few examined films has similarly small charges.
+        charges: Charges of a film and of similar films. A channel with small charges does not count as dead if it has
+            similarly small charges on one of a few examined films.
 
     Raises:
         PressError: If a channel has no charges, is dead or has the wrong sign.
@@ -124,8 +125,7 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
     film_charges = expected_charges(charges, placed.contact)
     # A ratio is the typical charge of a channel, divided by that of all channels. Find the smallest ratio that a
     # working channel may have. If all places are unknown, all presses may be far from an electrode. Otherwise, use the
-    # smallest ratio on a few films, but at most 1: a channel does not count as dead because its charges should be
-    # larger.
+    # smallest ratio on a few films, but at most 1, so that large expected charges of a channel do not raise its limit.
     smallest_usual_ratio = np.array(UNPLACED_RATIO)
     if len(placed):
         film_ratios = [_charge_ratios(film_charge) for film_charge in film_charges]
@@ -142,7 +142,7 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
 
 
 def _check_signs(presses: MeasuredPresses, film_charges: Array) -> None:
-    """Raise an error if most charges of a channel have the opposite sign to that of every film.
+    """Raise an error if most charges of a channel have the opposite sign to the charges of every film.
 
     Args:
         presses: The measured presses with a known place and force.
@@ -168,7 +168,8 @@ def _check_signs(presses: MeasuredPresses, film_charges: Array) -> None:
 def _charge_ratios(charge: Array) -> Array:
     """Return the typical charge of each channel, divided by that of all channels, shape (n_electrode,).
 
-    A typical charge is the median of magnitudes. The ratio is 1 for channels whose typical charges are all zero.
+    The typical charge of a channel is the median magnitude of its charges. The typical charge of all channels is the
+    median over the channels. If this median is zero, all ratios are 1.
 
     Args:
         charge: Charges, shape (n, n_electrode), pC; NaN where a charge was not measured.
@@ -199,8 +200,8 @@ def expected_charges(charges: FilmCharges, contact: Array) -> Array:
 def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
     """Find the mistakes whose correction makes the presses agree far better with a film.
 
-    The misfit of the corrected presses must be small, and clearly smaller than before. Mistakes with clearly larger
-    misfits than the most probable mistake are left out.
+    The misfit of the corrected presses must be small, and clearly smaller than before. A mistake is left out if the
+    misfit after its correction is clearly larger than the misfit after the best correction.
 
     Args:
         presses: The measured presses. A press whose place or force is unknown is not used.
@@ -229,18 +230,18 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
 
 
 def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
-    """Compute how much the charges of presses differ from those of the film that agrees best with them.
+    """Compute the misfit between the charges of presses and the charges of the film that agrees best with them.
 
-    The films are those of `expected_charges`, which differ in their pretension. The misfit of one film is computed from
-    the logarithms of the ratios of measured charges to the charges of the film. It is the sum of two terms. The first
-    term is the mean squared deviation of the logarithms from their median, divided by `SCATTER_STD` squared. Each
-    squared deviation is limited to `MAX_SQUARED_DEVIATION`. The second term is the squared median of the logarithms,
-    divided by `OFFSET_STD` squared. The function returns the smallest misfit of all films. Correctly recorded presses
-    usually have a misfit of about 1, and a misfit of 20 indicates a mistake in the records.
+    The compared films are those of `expected_charges`, which differ in their pretension. The misfit of one film is
+    computed from the logarithms of the ratios of measured charges to the charges of the film. It is the sum of two
+    terms. The first term is the mean squared deviation of the logarithms from their median, divided by `SCATTER_STD`
+    squared. Each squared deviation is limited to `MAX_SQUARED_DEVIATION`. The second term is the squared median of the
+    logarithms, divided by `OFFSET_STD` squared. The function returns the smallest misfit of all films. Correctly
+    recorded presses usually have a misfit of about 1, and a misfit of 20 indicates a mistake in the records.
 
     Args:
-        presses: The measured presses, of which those with a known place and force are used. Without such presses, the
-            misfit is 0. If most of them lie outside the domain of the films, the misfit is infinite.
+        presses: The measured presses. Only presses with a known place and force are used. Without such presses, the
+            misfit is 0. If most of the used presses lie outside the domain of the films, the misfit is infinite.
         charges: Solved film, from which the charges of the films with other pretensions follow.
     """
     placed = presses[presses.placed]
@@ -260,15 +261,16 @@ def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
 def _log_ratio(measured: Array, expected: Array) -> Array:
     """Return the logarithms of the ratios of measured to expected charges.
 
-    The logarithm is very small if the two charges have opposite signs or the expected charge is zero, and NaN if the
-    measured charge is NaN.
+    The logarithm is a large negative number if the two charges have opposite signs or the expected charge is zero. The
+    logarithm is NaN if the measured charge is NaN.
 
     Args:
         measured: Measured charges, pC.
-        expected: Charges of films, pC, of a shape that can be broadcast with that of the measured charges.
+        expected: Charges of films, pC. Their shape must be compatible with that of the measured charges for
+            broadcasting.
 
     Returns:
-        Logarithms, of the broadcast shape.
+        Logarithms, with the broadcast shape of the two arrays.
     """
     tiny = np.finfo(float).tiny  # avoids a division by zero and the logarithm of zero
     ratio = measured * expected / np.maximum(expected**2, tiny)
@@ -284,7 +286,7 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
 
     Args:
         presses: The measured presses, all with a known place and force.
-        charges: Charges of a film and of similar films, with which plausible orders of the columns are found.
+        charges: Charges of a film and of similar films, which are used to find plausible orders of the columns.
 
     Yields:
         A sentence that describes the mistake; the corrected contacts (x, y, F), shape (n, 3), mm and N; and the
@@ -375,7 +377,7 @@ def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: st
 
 
 def is_one_place(presses: MeasuredPresses) -> bool:
-    """Return whether some presses have known positions, and all these positions are the same within their errors."""
+    """Return whether at least one position is known, and all known positions are equal within their errors."""
     is_known = np.isfinite(presses.contact[:, 0])
     if not is_known.any():
         return False

@@ -3,12 +3,13 @@
 The unknowns of the film and the contacts of the presses are found together by nonlinear least squares (Gauss-Newton). A
 contact may be known exactly, known with an error, or unknown. The contacts are eliminated in every step (variable
 projection, Golub and Pereyra 1973). During the search, presses that do not agree with the others get a lower weight,
-according to Student's t distribution (Lange and others, 1989). The final estimate is computed without them.
+according to Student's t distribution (Lange and others, 1989). The final estimate leaves out the presses that do not
+agree with the others.
 
-Some facts are not known beforehand: how uneven a film is, how large its discrepancy and the errors of the presses are,
-and whether the session has offsets of the charges or of the forces, or a drift. Each combination of these cases is a
-hypothesis. The evidence of a hypothesis follows from the linearised problem (MacKay 1992), and the estimate is the mean
-over the hypotheses, weighted by their evidence.
+Some facts are not known beforehand: how uneven the film is, how large its discrepancy is, how large the errors of the
+presses are, and whether the session has a drift, offsets of the charges, or an offset of the forces. Each combination
+of assumptions about these facts is a hypothesis. The evidence of a hypothesis follows from the linearised problem
+(MacKay 1992), and the final estimate is the mean of the estimates under all hypotheses, weighted by their evidence.
 """
 
 from collections.abc import Iterator
@@ -30,13 +31,13 @@ from isocharge.train.calibration.film_estimate import SESSION, FilmEstimate, Pri
 from isocharge.train.calibration.press_data import Linearised, PressData, PressErrors, in_domain, model_values
 
 BAD_PROBABILITY = 1e-5
-"""Probability of residuals as large as those of a press, below which the press is left out."""
+"""A press is left out if the probability of residuals as large as its own is below this number."""
 
 MAX_RESIDUAL = 3.0
 """Root mean square residual above which no film explains the presses, in standard deviations of the noise."""
 
 MAX_BAD_SHARE = 0.3
-"""Share of presses that do not agree with the others, above which no film explains the presses."""
+"""Largest share of presses that may disagree with the others. With a larger share, no film explains the presses."""
 
 FEW_PRESSES = 3
 """Largest number of presses that counts as few. Among a few presses, a bad press cannot be recognised."""
@@ -44,7 +45,7 @@ FEW_PRESSES = 3
 IMPERFECTION_SCALES = (((0.1, 0.1), 0.1), ((1.0, 0.1), 0.2), ((1.0, 1.0), 0.6), ((2.5, 2.5), 0.1))
 """Sizes of the uneven tension and of the other imperfections, with their prior probabilities.
 
-The sizes are relative to the prior standard deviations. An uneven tension may be the only imperfection.
+The sizes are relative to the prior standard deviations. In the second case, only the uneven tension is large.
 """
 
 DISCREPANCY_SIZES = ((0.001, 0.7), (0.005, 0.2), (0.02, 0.1))
@@ -57,26 +58,27 @@ FORCE_SCATTERS = (
     ((0.0, 0.03), 0.03),
     ((0.0, 0.12), 0.03),
 )
-"""Random errors of the forces beyond the stated ones, with their prior probabilities.
+"""Random errors of the forces in addition to the stated errors, with their prior probabilities.
 
-The two numbers are those of `PressErrors`: one error is relative to the force, the other is the same for all forces.
+The first number is `PressErrors.force_scatter`, which is relative to each force. The second number is
+`PressErrors.constant_force_scatter`, which is the same for all forces.
 """
 
 POSITION_RATIOS = ((1.0, 0.8), (3.0, 0.1), (8.0, 0.1))
-"""Errors of the positions relative to the stated ones, with their prior probabilities."""
+"""Ratios of the real to the stated errors of the positions, with their prior probabilities."""
 
 NOISE_RATIOS = ((0.3, 0.02), (1.0, 0.34), *((2.0 ** (step / 2), 0.08) for step in range(1, 9)))
-"""Noise of the charges, relative to that of a frame from a good amplifier, with its prior probabilities.
+"""Ratios of the noise of the charges to the noise of a frame from a good amplifier, with their prior probabilities.
 
-A ratio above 1 only concerns the noise that is proportional to the charge. With the smallest ratio, the charges of the
-presses are averages of about ten frames.
+A ratio above 1 only increases the noise that is proportional to the charge. The smallest ratio applies to presses whose
+charges are averages of about ten frames.
 """
 
 MIN_WEIGHT = 1e-6
 """Weight of a hypothesis below which its estimate is neglected."""
 
 MAX_SEARCHES = 5
-"""Largest number of searches with other errors than the stated ones."""
+"""Largest number of searches that assume errors other than the stated errors."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
     """Yield all hypotheses about presses: all combinations of the sizes that are not known beforehand.
 
     The sizes are independent, so the probability of a hypothesis is the product of the probabilities of its sizes.
-    Hypotheses with the same errors of the presses follow one another, because the sizes of these errors come first.
+    Hypotheses with the same errors of the presses follow one another, because the errors of the presses change last.
 
     Args:
         noise: Noise of a frame from a good amplifier.
@@ -128,7 +130,7 @@ def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
 
 
 SEARCH_SIZES = np.array([1.0, 1.0, 1.0, 0.01, *(one.stds[-1][0] for one in SESSION)])
-"""Sizes of the parts of the prior covariance with which the most probable unknowns are searched.
+"""Sizes of the parts of the prior covariance, used in the search for the most probable unknowns.
 
 No size is zero, so that all unknowns can differ from their means.
 """
@@ -139,14 +141,15 @@ class Estimation:
     """Result of the estimator.
 
     Attributes:
-        charges: The solved film, with whose charges and derivatives the unknowns were estimated.
+        charges: The solved film, whose charges and derivatives were used to estimate the unknowns.
         film: The estimate, averaged over the hypotheses.
         contact: Most probable contacts (x, y, F), shape (n, 3), mm and N.
         is_bad: Whether each press was left out, shape (n,).
-        press_chi2: Squared residuals of each press per redundant measurement, shape (n,); NaN without redundancy.
-        chi2: Sum of the squared residuals of all presses that were not left out, and of the prior, under the most
-            probable hypothesis.
-        redundancy: Number of redundant measurements of these presses, but at least 1.
+        press_chi2: Sum of the squared residuals of each press, divided by its number of redundant measurements, shape
+            (n,); NaN for a press without redundant measurements.
+        chi2: Sum of squared residuals under the most probable hypothesis. The sum contains the residuals of the prior
+            distribution, and of all presses that were not left out.
+        redundancy: Number of redundant measurements of the presses that were not left out, but at least 1.
         hypothesis: The most probable hypothesis.
     """
 
@@ -166,7 +169,7 @@ class Estimation:
 
     @property
     def is_improbable(self) -> bool:
-        """Whether the residuals are larger than random errors of the most probable hypothesis cause."""
+        """Whether the residuals are too large to be random errors under the most probable hypothesis."""
         return bool(self.chi2 > chdtri(self.redundancy, BAD_PROBABILITY))
 
     @property
@@ -178,15 +181,15 @@ class Estimation:
 def estimate(charges: FilmCharges, data: PressData, prior: Prior, previous: Estimation | None = None) -> Estimation:
     """Estimate a film from presses, with the derivatives of one solved film.
 
-    Each search assumes certain errors of the presses: the first search assumes the stated errors, and each further
-    search those of the most probable hypothesis of the search before it, until they do not change. If the first search
-    finds a bad press, the second search assumes larger errors, because the stated errors may be too small.
+    Each search assumes certain errors of the presses. The first search assumes the stated errors. Each further search
+    assumes the errors of the most probable hypothesis of the previous search, until no error changes. If the first
+    search finds a bad press, the second search assumes larger errors, because the stated errors may be too small.
 
     Args:
         charges: Charges of a solved film and of similar films.
         data: The presses with their stated errors, and with the noise of a frame from a good amplifier.
         prior: Prior distribution of the unknowns.
-        previous: Estimate from which the search begins; None for the prior mean and the measured contacts.
+        previous: Estimate at which the search begins; None to begin at the prior mean and the measured contacts.
     """
     all_hypotheses = list(hypotheses(data.noise))
     assumed = PressErrors(data.noise)
@@ -222,7 +225,7 @@ def _estimate_with_errors(
         assumed: Errors of the presses that the search assumes.
         prior: Prior distribution of the unknowns.
         all_hypotheses: The hypotheses.
-        previous: Estimate from which the search begins; None for the prior mean and the measured contacts.
+        previous: Estimate at which the search begins; None to begin at the prior mean and the measured contacts.
     """
     data = stated.with_errors(assumed)
     found = _probable_point(charges, data, prior, previous)
@@ -261,8 +264,8 @@ def _estimate_with_errors(
 def _find_bad_presses(redundancy: Integers, chi2: Array) -> Booleans:
     """Return whether each press is to be left out, because its residuals are improbably large, shape (n,).
 
-    If most presses seem to be bad, the assumed film is wrong, and not the presses. Among a few presses, a bad press
-    cannot be recognised. In both cases, no press is bad.
+    If most presses seem to be bad, the assumed film is wrong rather than the presses. Among a few presses, a bad press
+    cannot be recognised. In both cases, no press counts as bad.
 
     Args:
         redundancy: Number of redundant measurements of each press, shape (n,).
@@ -280,7 +283,7 @@ def _probable_point(charges: FilmCharges, data: PressData, prior: Prior, previou
         charges: Charges of a solved film and of similar films.
         data: The presses with the assumed errors.
         prior: Prior distribution of the unknowns.
-        previous: Estimate from which the search begins; None for the prior mean and the measured contacts.
+        previous: Estimate at which the search begins; None to begin at the prior mean and the measured contacts.
     """
     # The search needs finite numbers, so the largest number replaces the infinite variance of an unknown charge.
     charge_variance = np.nan_to_num(data.charge_std**2)  # shape (n, n_electrode)
@@ -307,14 +310,14 @@ class _Average(NamedTuple):
 
     Attributes:
         hypotheses: Hypotheses whose weight is not negligible.
-        weight: Weight of each of these hypotheses, which is proportional to its evidence, shape (n_hypothesis,).
-        chi2: Smallest sum of the squared residuals under each of these hypotheses, shape (n_hypothesis,).
-        largest_log_evidence: Logarithm of the largest evidence of a hypothesis.
+        weight: Weight of each hypothesis in `hypotheses`, proportional to its evidence, shape (n_hypothesis,).
+        chi2: Smallest sum of squared residuals under each hypothesis in `hypotheses`, shape (n_hypothesis,).
+        largest_log_evidence: Logarithm of the largest evidence among the hypotheses.
         unknowns: Weighted mean of the unknowns, shape (n_unknown,), within their bounds.
         covariance: Covariance of the unknowns, shape (n_unknown, n_unknown).
-        log_contact: Contacts (x, y, ln F) that fit best to the mean unknowns, shape (n, 3).
-        noise: Root mean square of the noise. Averages of frames may have less noise than a frame, but this noise is at
-            least the stated noise of a frame.
+        log_contact: Contacts (x, y, ln F) that agree best with the mean unknowns, shape (n, 3).
+        noise: Root mean square of the noise. It is at least the stated noise of one frame, even if the charges are
+            averages of several frames.
     """
 
     hypotheses: list[Hypothesis]
@@ -338,13 +341,14 @@ def _average_estimates(
 ) -> _Average:
     """Estimate the unknowns under each hypothesis, and average the estimates with weights.
 
-    The weight of a hypothesis is its evidence, divided by the sum over all hypotheses. Hypotheses with a weight below
-    `MIN_WEIGHT` are left out. The charges are linearised at given unknowns and contacts.
+    The weight of a hypothesis is its evidence, divided by the sum of the evidence of all hypotheses. Hypotheses with a
+    weight below `MIN_WEIGHT` are left out. The charges are linearised at given unknowns and contacts.
 
     Args:
         charges: Charges of a solved film and of similar films.
-        stated: The presses with their stated errors, which a hypothesis replaces by its own.
-        data: The same presses with the errors that the search has assumed, with which the contacts are changed.
+        stated: The presses with their stated errors, which each hypothesis replaces by its own errors.
+        data: The same presses with the errors that the search has assumed. The changes of the contacts are computed
+            with these errors.
         prior: Prior distribution of the unknowns.
         all_hypotheses: The hypotheses. Those with the same errors of the presses follow one another.
         unknowns: Unknowns at which the charges are linearised, shape (n_unknown,).
@@ -372,7 +376,7 @@ def _average_estimates(
     mean = weight @ means
 
     # The covariance of the average is the mean prior covariance, minus the mean reduction by the presses, plus the
-    # covariance of the means of the hypotheses. The mean prior covariance is that of the mean squared sizes.
+    # covariance of the means of the hypotheses. The mean prior covariance follows from the mean squared sizes.
     mean_squared_sizes = weight @ np.array([one.sizes**2 for one in probable])
     covariance = prior.covariance(np.sqrt(mean_squared_sizes))
     covariance -= sum(reduction for _, reduction in posteriors)
@@ -395,19 +399,19 @@ def _average_estimates(
 class _HypothesisGroup:
     """Hypotheses with the same errors of the presses, and the linearised residuals of the presses with these errors.
 
-    The residuals r at the prior means, without the effect of the contacts, have the covariance S = 1 + J P J'. The
-    matrix J contains their derivatives with respect to the unknowns. The prior covariance P of the unknowns is a sum of
-    parts, each multiplied by the square of a size, which depends on the hypothesis.
+    Let r be the residuals at the prior means, from which the effect of the contacts is eliminated. The covariance of r
+    is S = 1 + J P J'. The matrix J contains the derivatives of r with respect to the unknowns. The prior covariance P
+    of the unknowns is a sum of parts. Each part is multiplied by the square of a size that depends on the hypothesis.
 
     Attributes:
         hypotheses: The hypotheses.
         prior: Prior distribution of the unknowns.
-        residual: Residuals r, shape (m,), in a basis of all residuals that the unknowns change.
+        residual: Components of the residuals r in a basis of all changes that the unknowns can cause, shape (m,).
         jacobian: Derivatives J, shape (m, n_unknown).
         parts: J P J' for each part of the prior covariance, shape (n_part, m, m).
-        other_chi2: Sum of the squared residuals that the unknowns do not change.
-        log_volume: Part of the logarithm of the evidence that is the same for all these hypotheses. It contains the
-            standard deviations of the measurements, and the volume of the contacts that agree with them.
+        other_chi2: Sum of the squares of the components of the residuals that the unknowns do not change.
+        log_volume: Part of the logarithm of the evidence that is the same for all hypotheses of the group. This part
+            contains the standard deviations of the measurements, and the volume of the contacts that agree with them.
     """
 
     hypotheses: list[Hypothesis]
@@ -429,12 +433,12 @@ class _HypothesisGroup:
         these components is the same under all hypotheses.
 
         Args:
-            model: Charges at the unknowns, as `model_values` returns them.
-            data: The presses with the given errors.
+            model: Charges for the given unknowns and their derivatives, as returned by `model_values`.
+            data: The presses with the errors that the hypotheses of the group assume.
             contact: Contacts (x, y, ln F), shape (n, 3).
-            unknowns: The unknowns, shape (n_unknown,).
+            unknowns: Unknowns at which the residuals are linearised, shape (n_unknown,).
             prior: Prior distribution of the unknowns.
-            group: Hypotheses with the given errors.
+            group: The hypotheses of the group.
         """
         linearised = Linearised.of(model, data, contact)
         eliminated, eliminated_jacobian = linearised.eliminated()  # (n, n_electrode) and (n, n_electrode, n_unknown)
@@ -454,14 +458,14 @@ class _HypothesisGroup:
         )
 
     def chi2_and_log_evidence(self) -> tuple[Array, Array]:
-        """Compute how well the measurements agree with each hypothesis.
+        """Compute the smallest sum of squared residuals and the logarithm of the evidence for each hypothesis.
 
-        Under a hypothesis, the residuals r are normally distributed with the covariance S. The evidence is their
-        probability density, times the prior probability of the hypothesis.
+        Under a hypothesis, the residuals r are normally distributed with the covariance S. The evidence is the
+        probability density of the residuals, multiplied by the prior probability of the hypothesis.
 
         Returns:
-            Smallest sum of the squared residuals of the presses and of the prior distribution that any unknowns give,
-            and logarithm of the evidence, each of shape (n_hypothesis,).
+            Smallest sum of the squared residuals of the presses and of the prior distribution, over all values of the
+            unknowns, and logarithm of the evidence. Both have the shape (n_hypothesis,).
         """
         factors = np.linalg.cholesky(self._covariance(self._squared_sizes))  # shape (n_hypothesis, m, m)
         weighted = [cho_solve((factor, True), self.residual, check_finite=False) for factor in factors]  # S^-1 r
@@ -474,15 +478,16 @@ class _HypothesisGroup:
     def posterior(self, weight: Array) -> tuple[Array, Array]:
         """Estimate the unknowns under each of the n hypotheses whose weight is positive.
 
-        The estimate under a hypothesis is a normal distribution. Its mean is the prior mean minus P J' S^-1 r. Its
-        covariance is P - P J' S^-1 J P: the prior covariance minus a reduction, which the presses cause.
+        The estimate under a hypothesis is a normal distribution. With the symbols of the class, its mean is the prior
+        mean minus P J' S^-1 r. Its covariance is P - P J' S^-1 J P: the prior covariance minus a reduction, which the
+        presses cause.
 
         Args:
             weight: Weight of each hypothesis, shape (n_hypothesis,).
 
         Returns:
-            Means of the unknowns under the n hypotheses, shape (n, n_unknown), and the sum of the reductions of these
-            hypotheses times their weights, shape (n_unknown, n_unknown).
+            Means of the unknowns under the n hypotheses, shape (n, n_unknown), and the weighted sum of the reductions
+            of the covariance under these hypotheses, shape (n_unknown, n_unknown).
         """
         is_used = weight > 0.0
         squared_sizes = self._squared_sizes[is_used]  # shape (n, n_part)

@@ -1,10 +1,11 @@
 """Charges of a solved film and of similar films, with their derivatives with respect to the properties of the film.
 
 The charges of the solved film are exact, for any film and any probe. The positions and gains of the electrodes and the
-piezoelectric coefficients only change how the solved stress is read, so their effect is exact as well. The other
-properties change the stress, and their effects are first-order changes. The derivatives for these changes are computed
-for an axisymmetric film with the mean properties under an axisymmetric probe, because this computation takes only
-seconds. If the properties differ much from those of the solved film, the film is solved again (`calibrate`).
+piezoelectric coefficients only change how the charges follow from the solved stress, so the effects of these properties
+are exact as well. The other properties change the stress, and their effects are first-order changes. The derivatives
+for the first-order changes are computed for an axisymmetric film with the mean properties under an axisymmetric probe,
+because this computation takes only seconds. If the properties differ much from those of the solved film, the film is
+solved again (`calibrate`).
 """
 
 from concurrent.futures import Executor
@@ -23,7 +24,7 @@ DIFFERENCE_STEP = 1.0 / 3.0
 """Step of the difference quotients, in prior standard deviations of the property."""
 
 MAX_LOG_CHANGE = 1.0
-"""Largest change of the logarithm of a charge to which a first-order change is applied."""
+"""Largest first-order change of a charge, relative to the charge, that is applied to the logarithm of the charge."""
 
 
 @dataclass(frozen=True)
@@ -121,16 +122,17 @@ class FilmCharges:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Charges, pC, and their derivatives with respect to the contact (x, y, ln F) and to the properties, which
-            take the place of the state. The derivatives with respect to the contact are those of the solved film.
+            Charges, pC, and their derivatives with respect to the contact (x, y, ln F) and to the properties. The
+            properties take the place of the state in `ModelValues`. The derivatives with respect to the contact are
+            those of the solved film.
         """
         sensor = self._sensor_with_readout(values)
         solved_charge, contact_slopes, derivatives = self._solved_charges(sensor, contact)
         charge, factor = _add_stress_changes(solved_charge, self._property_changes(values), derivatives)
 
-        # The derivatives are those of the charges with respect to the uneven parts of the pretension in MPa, but the
-        # values contain them as shares s of the pretension T. Each part is s T. By the chain rule, the derivative with
-        # respect to s is T times that with respect to the part, and s times the latter is added to that for T.
+        # The derivatives D so far are taken with respect to the uneven parts of the pretension in MPa. The values
+        # contain each part as a share s of the pretension T, so the part is s T. By the chain rule, the derivative with
+        # respect to s is T D, and s D is added to the derivative with respect to T.
         for name in UNEVEN_TENSIONS:
             share = values[self.prior.index(name)]
             derivatives[PRETENSION.name] = derivatives[PRETENSION.name] + share * derivatives[name]
@@ -146,7 +148,8 @@ class FilmCharges:
             if declared.name not in derivatives:
                 derivatives[declared.name] = self._readout_derivative(sensor, declared, contact)
 
-        # These are derivatives of the charges of the solved film. The factor makes them those of the changed charges.
+        # So far, the derivatives belong to the charges of the solved film. The factor adapts them to the changed
+        # charges.
         columns = np.stack([derivatives[name] for name in self.prior.names], axis=2)  # (n, n_electrode, n_property)
         return ModelValues(charge, contact_slopes, factor[:, :, None] * columns)
 
@@ -160,7 +163,7 @@ class FilmCharges:
         return sensor
 
     def _mechanics(self, values: Array) -> dict[str, float]:
-        """Return the properties by name, with the uneven parts of the pretension in MPa instead of relative to it.
+        """Return the properties by name, with the uneven parts of the pretension in MPa instead of as shares.
 
         Args:
             values: Properties of a film, shape (n_property,).
@@ -171,7 +174,7 @@ class FilmCharges:
         return value_of
 
     def _property_changes(self, values: Array) -> dict[str, float]:
-        """Return the differences from the properties of the solved film, by name; see `_mechanics`."""
+        """Return the differences between given properties and those of the solved film, by name; see `_mechanics`."""
         solved, changed = self._mechanics(self.values), self._mechanics(values)
         return {name: changed[name] - solved[name] for name in changed}
 
@@ -179,9 +182,10 @@ class FilmCharges:
         """Compute charges of the solved film, and their derivatives with respect to properties that change the stress.
 
         The values of the properties "young" and "thickness" are the logarithms of Young's modulus E and of the
-        thickness h. Their derivatives follow from the other derivatives, because the stress divided by E only depends
-        on F / (E h), where F is the force, and on the tensions divided by E. The small effect of the bending is
-        neglected here, and so is that of the radius of the probe on the charges of the contact pressure (d33).
+        thickness h. The derivatives with respect to these logarithms follow from the other derivatives. The reason is
+        that the stress divided by E only depends on F / (E h), where F is the force, and on the tensions divided by E.
+        Two small effects are neglected here: the bending, and the effect of the radius of the probe on the charges of
+        the contact pressure (d33).
 
         Args:
             sensor: Sensor with the electrodes and the coefficients.
@@ -189,8 +193,8 @@ class FilmCharges:
 
         Returns:
             Charges, shape (n, n_electrode), pC; their derivatives with respect to the contact (x, y, ln F), shape (n,
-            n_electrode, 3); and their derivatives by the name of the property, each of shape (n, n_electrode), pC per
-            unit. The unit of the uneven parts of the pretension is MPa.
+            n_electrode, 3); and their derivatives with respect to properties, by the name of the property, each of
+            shape (n, n_electrode), pC per unit. The unit of the uneven parts of the pretension is MPa.
         """
         solved_charge, contact_slopes = _read(self.film, sensor).linearised(contact)
         force_slope = contact_slopes[:, :, 2]
@@ -233,22 +237,22 @@ class FilmCharges:
 def _add_stress_changes(
     solved_charge: Array, changes: dict[str, float], derivatives: dict[str, Array]
 ) -> tuple[Array, Array]:
-    """Return the charges of a film whose properties differ from those of a solved film, to first order.
+    """Apply first-order changes of the properties to the charges of a solved film, and return the changed charges.
 
-    Only properties that change the stress count. The sum of their effects on a charge is a first-order change. Relative
-    to the charge, it is the change of the logarithm of the charge, so that the charge is multiplied by its exponential.
-    If the sum is not smaller than `MAX_LOG_CHANGE` times the charge, the exponential would be inaccurate, and the sum
-    is added to the charge itself.
+    Only properties that change the stress count. The effects of these properties on a charge are added up. Divided by
+    the charge, the sum is the change of the logarithm of the charge, so the charge is multiplied by the exponential of
+    this ratio. If the sum is not smaller than `MAX_LOG_CHANGE` times the charge, the exponential would be inaccurate,
+    and the sum is added to the charge itself.
 
     Args:
         solved_charge: Charges of the solved film, shape (n, n_electrode), pC.
-        changes: By how much properties differ from those of the solved film, by their names.
+        changes: Differences between the properties and those of the solved film, by the names of the properties.
         derivatives: Derivatives of the charges of the solved film with respect to the properties that change the
             stress, by their names, each of shape (n, n_electrode), pC per unit.
 
     Returns:
-        Charges, shape (n, n_electrode), pC, and the ratios of the derivatives of these charges to those of the charges
-        of the solved film, of the same shape.
+        Charges, shape (n, n_electrode), pC, and factors of the same shape, by which the derivatives of the solved
+        charges must be multiplied.
     """
     addition = np.zeros_like(solved_charge)
     for name, derivative in derivatives.items():
@@ -263,7 +267,7 @@ def _add_stress_changes(
 
 
 def round_probe(probe: Probe) -> Probe:
-    """Return an axisymmetric probe unchanged, and the circular probe with the same area for any other probe."""
+    """Return the probe itself if it is axisymmetric, or else the circular probe with the same area."""
     return probe if probe.is_axisymmetric else Circle(float(np.sqrt(probe.area / np.pi)))
 
 

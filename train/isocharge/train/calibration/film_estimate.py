@@ -1,8 +1,8 @@
 """Estimate of a film: a Gaussian distribution of its properties, its discrepancy, and the unknowns of the session.
 
-The discrepancy contains smooth differences between the real charges and those of the film with its best properties. A
-real film has features that no property describes. For each electrode, a Gaussian process of finite rank models their
-effects (Kennedy and O'Hagan 2001). The relative change of the charge of the electrode e is
+A real film has features that no property describes. The discrepancy is the smooth difference between the real charges
+and the charges of the film with its best properties. For each electrode, a Gaussian process of finite rank models the
+discrepancy (Kennedy and O'Hagan 2001). The relative change of the charge of the electrode e is
 
     sum c_eijm T_i(x / r) T_j(y / r) T_m(l),    i + j + m <= DEGREE, m <= FORCE_DEGREE,
 
@@ -57,7 +57,7 @@ def terms(contact: Array, domain: Domain) -> Array:
 def discrepancy_jacobian(charge: Array, contact: Array, domain: Domain) -> Array:
     """Compute the derivatives of charges with respect to the coefficients of the discrepancy.
 
-    The discrepancy of an electrode multiplies the charge of this electrode.
+    The discrepancy of an electrode is a relative change of the charge of this electrode.
 
     Args:
         charge: Charges without discrepancy, shape (n, n_electrode), pC.
@@ -84,7 +84,8 @@ def _degrees() -> Integers:
 def unit_covariance(n_electrode: int) -> Array:
     """Return the prior covariance of the coefficients for a discrepancy of the size 1.
 
-    The factors FADING^(i + j + m) belong to `terms`. The coefficients of a term are correlated between electrodes.
+    The covariance does not contain the factors FADING^(i + j + m), because `terms` contains them. The coefficients of a
+    term are correlated between electrodes.
 
     Returns:
         Covariance, shape (n_term * n_electrode, n_term * n_electrode). The coefficients of a term follow one another.
@@ -103,12 +104,12 @@ class SessionProperty:
     """Declaration of unknowns of a session of presses, whose effects on the charges are proportional to their values.
 
     Attributes:
-        name: Name of the unknown, to which the name of the electrode is added for `offset`.
+        name: Name of the unknown. For `offset`, the name of the electrode is added to this name.
         stds: Standard deviations of the prior distribution that are considered, with their probabilities.
         effect: Function that computes the derivatives of the charges, shape (n, n_electrode, n_value). Its arguments
             are the times of the presses, shape (n,), the charges of the film, and their derivatives with respect to the
             force, both of shape (n, n_electrode).
-        caution: Words about values that are certainly not zero, with the field `values`.
+        caution: Text of the caution about values that are certainly not zero. The values replace the field `values`.
     """
 
     name: str
@@ -140,7 +141,7 @@ SESSION = (
         "model are without this offset",
     ),
 )
-"""All unknowns of a session, in the order of the vector.
+"""All unknowns of a session, in their order in the vector of unknowns.
 
 The smaller standard deviation stands for an unknown that is zero. It is positive, so that the covariance is invertible.
 """
@@ -148,7 +149,7 @@ The smaller standard deviation stands for an unknown that is zero. It is positiv
 
 @dataclass(frozen=True)
 class Layout:
-    """Order of the unknowns in the vector: properties of the film, of the session, coefficients of the discrepancy.
+    """Order of the unknowns: properties of the film, unknowns of the session, coefficients of the discrepancy.
 
     Attributes:
         prior: Prior distribution of the properties of the film.
@@ -167,17 +168,17 @@ class Layout:
 
     @property
     def film(self) -> slice:
-        """Properties of the film."""
+        """Slice of the vector with the properties of the film."""
         return slice(0, len(self.prior.names))
 
     @property
     def offset(self) -> slice:
-        """Offsets of the electrodes, which are the first unknowns of the session."""
+        """Slice of the vector with the offsets of the electrodes, which are the first unknowns of the session."""
         return slice(self.film.stop, self.film.stop + len(self.prior.sensor.electrodes))
 
     @property
     def coefficients(self) -> slice:
-        """Coefficients of the discrepancy."""
+        """Slice of the vector with the coefficients of the discrepancy."""
         return slice(self.offset.stop + len(SESSION) - 1, len(self.names))
 
     def index(self, name: str) -> int:
@@ -245,7 +246,7 @@ class FilmEstimate:
         return replace(self, values=values, covariance=covariance)
 
     def session_cautions(self) -> list[str]:
-        """Return sentences about unknowns of the session that differ from zero by three standard deviations."""
+        """Return sentences about session unknowns that differ from zero by more than three standard deviations."""
         cautions = []
         for one in SESSION:
             certain_values = [
@@ -259,10 +260,10 @@ class FilmEstimate:
 
 
 REMAINING_DISCREPANCY = 0.3
-"""Size of the discrepancy that an earlier calibration could not show, relative to the size of the hypothesis."""
+"""Size of the part of the discrepancy that an earlier calibration could not show, relative to the hypothesis."""
 
 PLANNING_SIZES = np.array([1.0, 0.5, 0.5, 0.01, *(one.stds[0][0] for one in SESSION)])
-"""Sizes of the parts of the prior covariance with which presses are planned before the first press."""
+"""Sizes of the parts of the prior covariance that are assumed to plan presses before the first press."""
 
 
 @dataclass(frozen=True)
@@ -271,7 +272,8 @@ class Prior:
 
     Attributes:
         layout: Order of the unknowns.
-        earlier: Estimate of an earlier calibration with its drift; None for the prior distribution of the sensor.
+        earlier: Estimate of an earlier calibration, including the drift since then; None for the prior distribution of
+            the sensor.
     """
 
     layout: Layout
@@ -288,7 +290,7 @@ class Prior:
 
     @property
     def bounds(self) -> tuple[Array, Array]:
-        """Smallest and largest unknowns, each of shape (n_unknown,); infinite except for the properties of the film."""
+        """Lower and upper bounds of the unknowns, shape (n_unknown,), infinite except for properties of the film."""
         high = np.full(self.layout.coefficients.stop, np.inf)
         low = -high
         low[self.layout.film], high[self.layout.film] = self.layout.prior.bounds
@@ -296,15 +298,15 @@ class Prior:
 
     @cached_property
     def parts(self) -> Array:
-        """Terms whose sum is the covariance of the unknowns, shape (4 + n_session, n_unknown, n_unknown).
+        """Matrices whose weighted sum is the covariance of the unknowns, shape (4 + n_session, n_unknown, n_unknown).
 
         The first part is the covariance that is the same under all hypotheses. The other parts are the covariances of
         the uneven tension, of the other imperfections, of the discrepancy, and of each entry of `SESSION`, all of the
-        size 1. A hypothesis multiplies each of them by the square of its size; see `Hypothesis.sizes`.
+        size 1. A hypothesis multiplies each of these parts by the square of a size; see `Hypothesis.sizes`.
 
-        After an earlier calibration, the first part is the covariance that it has found, which contains the
-        imperfections. Their own parts are then zero, and the part of the discrepancy describes only what the earlier
-        calibration could not show.
+        After an earlier calibration, the first part is the covariance of the earlier estimate, which includes the
+        imperfections. The parts of the imperfections are then zero, and the part of the discrepancy describes only what
+        the earlier calibration could not show.
         """
         layout = self.layout
         n_unknown = layout.coefficients.stop
@@ -339,6 +341,6 @@ class Prior:
         """Return the covariance of the unknowns, shape (n_unknown, n_unknown).
 
         Args:
-            sizes: Size of each part, by whose square the part is multiplied, shape (4 + n_session,).
+            sizes: Sizes of the parts, shape (4 + n_session,). Each part is multiplied by the square of its size.
         """
         return np.tensordot(sizes**2, self.parts, 1)

@@ -1,7 +1,8 @@
 """Presses from which the network of a calibrated film learns.
 
-They are pressed on films that are drawn from the posterior distribution, with noise. The standard deviations of the
-network therefore contain the noise and everything that is not known about the film.
+The presses are made, with noise, on films that are drawn from the posterior distribution of the calibration. The
+standard deviations of the network therefore include the effects of the noise and of everything that is not known about
+the film.
 """
 
 from concurrent.futures import Executor
@@ -38,7 +39,8 @@ def training_data(
         executor: Executor that solves the presses outside the working area; None for this process.
 
     Returns:
-        The presses inside and outside the working area, with the sensor, the probe and the force at which it yields.
+        The presses inside and outside the working area, with the sensor, the probe and the force at which the film
+        yields.
     """
     rng = np.random.default_rng([SEED, 1])
     domain = series.domain
@@ -91,7 +93,8 @@ def _outside_presses(charges: FilmCharges, domain: Domain, executor: Executor | 
     """Solve presses between the working area and the clamp.
 
     From these presses, the network only learns which charges belong to no contact. The imperfections of the film hardly
-    matter for that, so the presses are solved on the axisymmetric film without them, under a circular probe.
+    matter for this purpose, so the presses are solved on the axisymmetric film without imperfections, under a circular
+    probe.
 
     Args:
         charges: Charges of the solved film, which contain the map of the axisymmetric film.
@@ -99,7 +102,7 @@ def _outside_presses(charges: FilmCharges, domain: Domain, executor: Executor | 
         executor: Executor that runs the solves; None for this process.
 
     Returns:
-        The presses; None if the working area leaves no room for presses.
+        The presses; None if there is no room for presses outside the working area.
     """
     round_map = charges.slopes.film  # of the axisymmetric film
     outermost = outermost_distance(round_map.sensor.film, round_map.probe.under(domain.force_range[1]))

@@ -12,10 +12,11 @@
 A further calibration in the same folder becomes its next version. A server loads the new version when it reloads its
 models. Programs only read the version folders, and the copies above the version folders are for people.
 
-The file `calibration.json` contains the value and the standard deviation of each unknown, in the unit of the property
-of the same name. The unit of an `offset` is pC, that of `force_offset` is N, and coefficients have no unit.
-`correlations` is the lower triangle of the correlation matrix of all unknowns, in this order: one row for each unknown,
-without the diagonal, rounded to six digits. The correlations of an unknown whose standard deviation is zero are zero.
+The file `calibration.json` contains the value and the standard deviation of each unknown. Both have the unit of the
+property with the same name. The unit of an `offset` is pC, the unit of `force_offset` is N, and coefficients have no
+unit. The entry `correlations` is the lower triangle of the correlation matrix of all unknowns, without the diagonal. It
+has one row for each unknown, in the order of the unknowns. The correlations are rounded to six digits. If the standard
+deviation of an unknown is zero, its correlations are zero.
 """
 
 import json
@@ -176,7 +177,7 @@ def _correlation_matrix(path: Path, rows: list[list[float]], count: int) -> Arra
 
     Args:
         path: File that contains the triangle, for messages.
-        rows: Rows of the triangle without the diagonal. The row i has i numbers.
+        rows: Rows of the triangle without the diagonal. Row i has i numbers, for i from 0.
         count: Number of unknowns.
 
     Returns:
@@ -255,14 +256,15 @@ def write_calibration(
 ) -> Path:
     """Train the network of a calibrated film, and write it as the next version of a model folder.
 
-    The readable files of the version are also copied to the folder itself.
+    The files that people read are also copied from the version folder to the folder itself.
 
     Args:
         result: Result of the calibration.
         folder: A new folder, or the folder of an earlier calibration.
         command: Command that repeats this calibration, for the card.
         held_out: Presses that were not used for the calibration. The standard deviations of the model are multiplied by
-            a factor with which its 95 % regions hold for contacts like these presses (`StdFactor`). None for no factor.
+            a factor (`StdFactor`), so that the 95 % regions of the model hold for contacts like these presses. None for
+            no factor.
         config: Sizes and steps of the training; None for the defaults.
         executor: Executor that runs solves; None for this process.
 
@@ -322,8 +324,8 @@ def usable_held_out(
 ) -> MeasuredPresses:
     """Select the held-out presses that show how large the errors of the model are.
 
-    These are the presses in the working area with all charges and with a known position or force. Presses with the
-    charges of an earlier held-out press are left out.
+    A held-out press is selected if it lies in the working area, has all charges, and has a known position or force. A
+    press with the same charges as an earlier held-out press is left out.
 
     Args:
         held_out: Presses that were not used for the calibration.
@@ -331,7 +333,7 @@ def usable_held_out(
         problem: The calibration problem.
 
     Raises:
-        PressError: If a held-out press is also one of the calibration, or if fewer than `FEWEST_HELD_OUT` presses
+        PressError: If a held-out press was also used for the calibration, or if fewer than `FEWEST_HELD_OUT` presses
             remain, so that the factor for the standard deviations of the model cannot be computed.
     """
     domain = problem.domain
@@ -418,9 +420,9 @@ def read_earlier(folder: StrPath, problem: CalibrationProblem, *presses: Measure
             for presses that do not exist.
 
     Raises:
-        PressError: If the folder contains no calibration, or a calibration of another problem, or if one of the presses
-            belongs to a calibration in the folder. It would count twice, and the standard deviations would be too
-            small.
+        PressError: If the folder contains no calibration or a calibration of another problem, or if one of the presses
+            was already used for a calibration in the folder. Such a press would count twice, and the standard
+            deviations would be too small.
     """
     folder = Path(folder)
     calibrated_versions = [version for version in version_folders(folder).values() if (version / RESULT).is_file()]

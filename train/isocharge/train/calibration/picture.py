@@ -1,4 +1,4 @@
-"""Picture of a calibration, with a map of the contact error, and residuals of the presses."""
+"""Picture of a calibration, with a map of the position error and the residuals of the presses."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,7 +14,7 @@ GOOD_PRESS_COLOUR = "#3a7ca5"
 
 
 def calibration_picture(result: CalibrationResult) -> Figure:
-    """Draw the position error that the uncertainty of the film causes, the presses, and their residuals.
+    """Draw the presses, their residuals, and a map of the position error that the uncertainty of the film causes.
 
     Args:
         result: Result of the calibration.

@@ -23,10 +23,10 @@ class PressErrors(NamedTuple):
 
     Attributes:
         noise: Noise of the charges.
-        position_ratio: Standard deviation of the positions, relative to the stated one.
+        position_ratio: Standard deviation of the positions, divided by the stated standard deviation.
         force_scatter: Standard deviation of a further error of the forces, relative to the force.
-        constant_force_scatter: Standard deviation of a further error that is the same for all forces, relative to their
-            geometric mean. The noise of a load cell is such an error.
+        constant_force_scatter: Standard deviation of a further error of the forces, relative to their geometric mean.
+            This standard deviation is the same for small and large forces, like that of the noise of a load cell.
     """
 
     noise: NoiseModel
@@ -42,7 +42,7 @@ class PressData:
     Attributes:
         charge: Charges, shape (n, n_electrode), pC; zero if unknown.
         charge_std: Standard deviations of the noise, shape (n, n_electrode), pC; infinite if the charge is unknown.
-        noise: Noise of the charges, from which these standard deviations follow.
+        noise: Noise of the charges, from which the standard deviations `charge_std` follow.
         contact: Measured contacts (x, y, ln F), shape (n, 3); the middle of the domain if unknown.
         contact_std: Standard deviations of the contacts, shape (n, 3); infinite if unknown.
         time: Time of each press in the session, from -0.5 to 0.5, shape (n,).
@@ -57,15 +57,16 @@ class PressData:
 
     @classmethod
     def of(cls, presses: MeasuredPresses, noise: NoiseModel, domain: Domain) -> "PressData":
-        """Convert presses, whose electrodes have the order of the sensor.
+        """Convert measured presses whose electrodes are in the order of the sensor.
 
-        Presses at one place share the error of their position, which is hardly reduced by their mean. The standard
-        deviation of the position of each of n such presses is therefore multiplied by the square root of n.
+        Presses at one place share the error of their position, so this error is hardly smaller for the mean of the
+        presses. If n presses are at one place, the standard deviations of their positions are therefore multiplied by
+        the square root of n.
 
         Args:
             presses: The presses; NaN stands for unknown values.
             noise: Noise of the charges.
-            domain: Contacts that are possible.
+            domain: Domain of the possible contacts.
         """
         # Replace unknown values by finite numbers. Their standard deviations are infinite, so they do not count.
         is_charge_known = np.isfinite(presses.charge_pC)
@@ -100,7 +101,7 @@ class PressData:
         return np.asarray(np.maximum(np.isfinite(self.measured_std).sum(axis=1) - 3, 0))
 
     def __getitem__(self, rows: Booleans) -> "PressData":
-        """Return some of the presses. Their times keep their reference."""
+        """Return some of the presses. The times of these presses do not change."""
         names = ("charge", "charge_std", "contact", "contact_std", "time")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
@@ -119,7 +120,8 @@ class PressData:
 class Linearised:
     """Residuals of presses and their derivatives, at given unknowns and contacts.
 
-    The residuals of a press are those of its charges and of its measured contact, in standard deviations.
+    The residuals of a press are those of its charges and of its measured contact, in standard deviations of the
+    measurements.
 
     Attributes:
         residual: Residuals, shape (n, n_electrode + 3).
@@ -133,7 +135,7 @@ class Linearised:
 
     @classmethod
     def of(cls, model: ModelValues, data: PressData, contact: Array) -> "Linearised":
-        """Compare the charges of a model, and contacts, with the measurements of presses.
+        """Compute the residuals of presses, and their derivatives, from the charges of a model and from given contacts.
 
         The residuals of a press are those of its charges and of the three coordinates of its contact, divided by the
         standard deviations of the measurements.
@@ -163,9 +165,9 @@ class Linearised:
     def eliminated(self) -> tuple[Array, Array]:
         """Return the part of the residuals that no change of the contacts can reduce, and its derivatives.
 
-        The residuals of a press are a vector. A change of the three coordinates of its contact only changes this vector
-        within a subspace of three dimensions. The results are components in an orthonormal basis of the other
-        n_electrode dimensions.
+        The residuals of a press are a vector. A change of the three coordinates of the contact changes this vector only
+        within a subspace of three dimensions. The results are the components of the vector in an orthonormal basis of
+        the other n_electrode dimensions.
 
         Returns:
             Residuals, shape (n, n_electrode), and derivatives with respect to the unknowns, shape (n, n_electrode,
@@ -201,14 +203,15 @@ def model_values(charges: FilmCharges, layout: Layout, time: Array, unknowns: Ar
     and coefficients of the discrepancy between the real film and its description.
 
     Args:
-        charges: Charges of a solved film, from which those of films with slightly other properties follow.
+        charges: Charges of a solved film and of similar films.
         layout: Order of the unknowns.
         time: Time of each press in the session, from -0.5 to 0.5, shape (n,).
         unknowns: Values of the unknowns, shape (n_unknown,).
-        contact: Contacts (x, y, ln F), shape (n, 3). Contacts outside the domain are moved to its nearest contact.
+        contact: Contacts (x, y, ln F), shape (n, 3). A contact outside the domain is replaced by the nearest contact
+            inside.
 
     Returns:
-        Charges, pC, and their derivatives with respect to x, y and ln F and to the unknowns.
+        Charges, pC, and their derivatives with respect to the contact (x, y, ln F) and to the unknowns.
     """
     metric_contact = in_domain(contact, charges.domain)  # (x, y, F), mm and N
     film_charge, contact_slopes, film_jacobian = charges.linearised(unknowns[layout.film], metric_contact)
@@ -224,5 +227,5 @@ def model_values(charges: FilmCharges, layout: Layout, time: Array, unknowns: Ar
 
 
 def in_domain(contact: Array, domain: Domain) -> Array:
-    """Convert contacts (x, y, ln F) to (x, y, F), and move contacts outside a domain to its nearest contact."""
+    """Convert contacts (x, y, ln F) to (x, y, F), and move contacts outside a domain to the nearest contacts inside."""
     return domain.to_contact(into_unit_domain((contact - domain.centre) / domain.scale))

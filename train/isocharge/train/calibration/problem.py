@@ -14,10 +14,10 @@ from isocharge.train.calibration.film_charges import round_probe
 from isocharge.train.calibration.film_estimate import PLANNING_SIZES, FilmEstimate, Layout, Prior
 
 POSITION_MARGIN_MM = 0.5
-"""Distance by which the solved presses extend beyond the working area, mm, because the places have errors."""
+"""Distance by which the solved presses extend beyond the working area, mm, to allow for errors of the places."""
 
 FORCE_MARGIN = 1.25
-"""Ratio by which the solved forces extend beyond the range of forces, because the forces have errors."""
+"""Ratio by which the solved forces extend beyond the range of forces, to allow for errors of the forces."""
 
 RIM_MARGIN = 1.3
 """Smallest distance of a solved press from the clamp, in units of the reach of the largest probe."""
@@ -34,7 +34,8 @@ class CalibrationProblem:
         force_range: Smallest and largest force of a contact, N.
         earlier: Estimate of an earlier calibration, with the drift since then; None to begin with the sensor file.
         stress_limit: Largest stress of the film that a proposed press may cause, MPa.
-        noise: Smallest noise of the charges, that of a good amplifier. The presses may show a larger noise.
+        noise: Smallest noise of the charges, which is the noise of a good amplifier. The presses may show a larger
+            noise.
 
     Example:
         >>> problem = CalibrationProblem(load_sensor("four-25um-biaxial"), Circle(1.0))  # doctest: +SKIP

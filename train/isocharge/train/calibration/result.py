@@ -12,7 +12,7 @@ from isocharge.train.calibration.film_estimate import FilmEstimate
 from isocharge.train.calibration.problem import CalibrationProblem
 
 IDENTIFIED_RATIO = 0.5
-"""Ratio of the standard deviation after the presses to that before, up to which a property counts as identified."""
+"""A property counts as identified if the presses reduce its standard deviation to at most this fraction."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class PropertyEstimate:
 
     Attributes:
         meaning: Description of the property.
-        unit: Its unit.
+        unit: Unit of the property.
         value: Most probable value.
         std: Standard deviation after the presses.
         before_std: Standard deviation before the presses.
@@ -42,9 +42,9 @@ class CalibrationResult:
 
     Attributes:
         problem: The calibration problem.
-        presses: The presses, with those that were left out as bad.
+        presses: The presses, including the bad presses that were left out of the estimate.
         estimation: Result of the estimator.
-        sensitivity: Effects of noise and of errors of the film on contacts.
+        sensitivity: Effects of noise and of errors of the film on estimated contacts.
         cautions: Warnings for the user.
     """
 
@@ -88,8 +88,9 @@ class CalibrationResult:
     def properties(self) -> dict[str, PropertyEstimate]:
         """Properties of the film by name, with their standard deviations before and after the presses.
 
-        Before the presses, the standard deviation is that of an earlier calibration or, without one, the declared
-        standard deviation. A property is identified if the presses have reduced it to `IDENTIFIED_RATIO`.
+        The standard deviation before the presses is that of an earlier calibration. Without an earlier calibration, it
+        is the declared standard deviation. The presses identify a property if they reduce its standard deviation to at
+        most the fraction `IDENTIFIED_RATIO`.
         """
         before = self.problem.film_before
         estimates = {}
@@ -106,7 +107,7 @@ class CalibrationResult:
 
     @property
     def summary(self) -> tuple[str, ...]:
-        """Sentences about the errors, the properties that the presses determine, and the presses."""
+        """Sentences about contact errors, the properties that the presses determine, the discrepancy, and the noise."""
         after = self.film_error
         before = self.film_error_before
         noise = self.sensitivity.noise_error

@@ -26,9 +26,9 @@ from isocharge.train.calibration.problem import CalibrationProblem, domain_words
 from isocharge.train.calibration.result import CalibrationResult
 
 SUFFICIENT_ERROR_RATIO = 0.5
-"""Ratio of two position errors up to which a session is complete.
+"""A session is complete when the ratio of two position errors is at most this number.
 
-The ratio is that of the error by the uncertainty of the film to the error by noise."""
+The ratio is the error due to the uncertainty of the film, divided by the error due to noise."""
 
 EXPECTED_ANSWER = (
     'Enter for "as proposed", the real "x y force" in mm and N (? for a value that is unknown), u to undo the last '
@@ -39,11 +39,11 @@ Reply = Literal["take", "undo", "quit"]
 """Action that a person requests."""
 
 REPLIES: dict[str, Reply] = {"": "take", "u": "undo", "q": "quit"}
-"""Actions by the word that a person types to request the action."""
+"""Action for each text that a person can type to request it."""
 
 
 _CELL = re.compile(r"\??|[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[-+]?[0-9]{1,2})?")
-"""Number, question mark or empty text for one value of a contact."""
+"""Pattern of the text for one value of a contact: a number, a question mark or nothing."""
 
 
 class Answer(NamedTuple):
@@ -63,7 +63,7 @@ def read_answer(text: str) -> Answer:
     """Convert the text that a person typed into an answer.
 
     Args:
-        text: Empty, a question mark, three values with blanks or commas between them, `u` or `q`.
+        text: An empty text, a question mark, three values with blanks or commas between them, `u` or `q`.
 
     Raises:
         PressError: If the text has none of these forms.
@@ -118,8 +118,8 @@ class PressSession:
             presses: Presses of an earlier session that is continued; None to begin without presses.
             position_std_mm: Standard deviation of the positions of further presses, mm.
             force_std: Standard deviation of the forces of further presses, relative to the force.
-            until: The session is complete when the position error due to the film, divided by that due to the noise,
-                is at most this number, as `SUFFICIENT_ERROR_RATIO`. With 0, the session is never complete.
+            until: Ratio of two position errors at which the session is complete, as explained at
+                `SUFFICIENT_ERROR_RATIO`. With 0, the session is never complete.
             executor: Executor that runs the solves; None for this process.
         """
         self.problem = problem
@@ -143,7 +143,7 @@ class PressSession:
 
     @cached_property
     def _charges(self) -> FilmCharges:
-        """Charges of the film that was solved last, with which the next fit begins. At first, it is an even film."""
+        """Charges of the film that was solved last, with which the next fit begins. The first solved film is even."""
         return solve_even(self.problem, self._executor)
 
     @property
@@ -165,7 +165,7 @@ class PressSession:
 
     @property
     def enough(self) -> bool:
-        """Whether the uncertainty of the film causes only small position errors, compared with the noise."""
+        """Whether the position errors due to the uncertainty of the film are small compared with those due to noise."""
         if self.result is None or len(self) < FEW_PRESSES:
             return False
         noise_mm = self.result.sensitivity.noise_error.position_mm
