@@ -20,16 +20,16 @@ from isocharge.simulate.noise import GaussianNoise
 from isocharge.train.data.contact_errors import rms, rounded
 
 N_NEIGHBOURS = 16
-"""Number of contacts to which a quadratic function is fitted, which has ten coefficients."""
+"""Number of contacts to which a quadratic function with ten coefficients is fitted."""
 
 MIN_REPEATED_CONTACTS = 10
-"""Smallest number of repeated contacts with which the noise is estimated only from the presses at these contacts.
+"""Smallest number of repeated contacts for which the noise is estimated from presses at repeated contacts alone.
 
-With three presses at each of them, the standard deviation of the noise of a channel is known to about 20 %. A single
-reference contact would not show how the noise depends on the charge."""
+With three presses at each repeated contact, the standard deviation of the noise of a channel is known to about 20 %. A
+single reference contact would not show how the noise depends on the charge."""
 
 SAME_CONTACT_DECIMALS = 3
-"""Decimals of the unit coordinates in which two contacts agree if they count as the same contact."""
+"""Two contacts count as the same contact if their unit coordinates agree to this number of decimals."""
 
 OUTLIER_STDS = 3.0
 """Number of standard deviations beyond which residuals count less, because they are not due to noise."""
@@ -41,25 +41,25 @@ The lower limit is needed because the presses do not determine the white noise i
 """
 
 EXTREME_SHARE = 0.01
-"""Share of the smallest charges of a channel, and share of its largest charges, that count as exceptions.
+"""This share of the charges of a channel counts as exceptionally small, and the same share as exceptionally large.
 
 The other charges show whether the charges of a channel vary, and whether they have both signs.
 """
 
 MIN_TRANSITION_RATIO = 0.5
-"""Smallest `ChannelNoise.transition_charge` of a channel with both signs, relative to `median_magnitude`.
+"""Smallest `ChannelNoise.transition_charge` for charges of both signs, relative to their `median_magnitude`.
 
-With a smaller value, the features of charges with little noise would have a kink where the charge changes its sign.
+With a smaller value, the features of a channel with little noise would have a kink at the charge 0.
 """
 
 LARGEST_LOGARITHM = 50.0
 """Largest magnitude of a logarithm of a charge, a force or a standard deviation.
 
-Its exponential is finite in single precision, also for charges that are far from those of the training.
+The limit keeps the exponential finite in single precision, even for charges that are far from those of the training.
 """
 
 MIN_GAIN_NOISE = 1e-4
-"""Smallest relative noise of the gain, which is that of a good amplifier.
+"""Smallest relative noise of the gain, which is the value for a good amplifier.
 
 With a smaller value, the level asinh(gain Q / white) / gain would be practically equal to Q / white.
 """
@@ -125,7 +125,7 @@ class ChannelNoise(GaussianNoise):
 
     @classmethod
     def alike(cls, noise: NoiseModel) -> "ChannelNoise":
-        """Create a noise model with the same noise on every electrode, whose parameters have the shape ()."""
+        """Create a noise model with the same noise on every electrode. Its parameters have the shape ()."""
         return cls(np.array(noise.white), np.array(max(noise.gain, MIN_GAIN_NOISE)), noise.name)
 
     def level(self, charge: Array) -> Array:
@@ -181,9 +181,9 @@ class LocalPlanes:
     Attributes:
         value: Value of the plane at its contact, shape (n, k).
         slope: Derivatives of the values with respect to the unit coordinates, shape (n, k, 3).
-        residual: Difference between the mean values of the presses and the value of the plane, shape (n, k). It is
-            divided by its standard deviation for values of presses with the variance 1.
-        reach: Distance of the farthest neighbour in unit coordinates, shape (n,).
+        residual: Difference between the mean values of the presses at a contact and the value of its plane, shape (n,
+            k). The difference is scaled so that its variance is equal to that of the noise of a single press.
+        reach: Distance from each contact to its farthest neighbour in unit coordinates, shape (n,).
     """
 
     value: Array
@@ -197,7 +197,7 @@ class LocalPlanes:
 
         The function maps the unit coordinates of a contact to the k values. Unit coordinates are x, y and ln F, scaled
         such that each of them ranges from -1 to 1. The plane is the tangent of the function at the contact. The values
-        at the contact itself are not used in the fit, so that its residual is independent of the plane. The residuals
+        at the contact itself are not used in the fit, so that the plane is independent of their noise. The residuals
         are scaled so that their variance is equal to that of the noise of a single press.
 
         Args:
@@ -240,9 +240,9 @@ class LocalPlanes:
     def residuals(self, values: Array) -> Array:
         """Compute the difference between each set of k values and the nearest point of all planes.
 
-        A plane is a linear function from contacts to values. It describes the values of the contacts near one press, up
-        to the distance of the farthest neighbour of the press. Each set of values is compared with `N_CANDIDATE_PLANES`
-        planes: those whose values at their own press are nearest to the set.
+        A plane is a linear function from contacts to values. The plane of a press describes the values at contacts that
+        are not farther from the press than its farthest neighbour. Each set of values is compared with
+        `N_CANDIDATE_PLANES` planes: those whose values at their own press are nearest to the set.
 
         Args:
             values: m sets of values, shape (m, k).
@@ -297,17 +297,17 @@ def _average_repeated(unit_contact: Array, values: Array) -> tuple[Array, Array,
 
 
 def _repeated_residuals(unit_contact: Array, charge: Array) -> tuple[Array, Array]:
-    """Compute the residuals of presses whose contact is repeated: the differences from the mean charges of the contact.
+    """Compute the differences between the charges of presses at repeated contacts and the mean charges of each contact.
 
-    The residuals are scaled so that they have the variance of the noise.
+    The differences are scaled so that they have the variance of the noise, and are returned as residuals.
 
     Args:
         unit_contact: Contacts in unit coordinates, shape (n, 3).
         charge: Measured charges, shape (n, n_electrode), pC.
 
     Returns:
-        The mean charges of the contact, and the residuals, both of shape (m, n_electrode), pC, for the m presses whose
-        contact is repeated.
+        For each of the m presses at repeated contacts, the mean charges of its contact, and its residuals. Both have
+        the shape (m, n_electrode) and the unit pC.
     """
     _, mean_charge, press_count, contact_of_press = _average_repeated(unit_contact, charge)
     is_repeated = press_count[contact_of_press] > 1
@@ -336,8 +336,8 @@ def _fit_noise(charge: Array, residual: Array) -> Array:
     deviations have the density of a normal distribution. For larger residuals, the density decreases more slowly, so
     that outliers have little effect on the result (Huber 1964, proposal 2).
 
-    A channel that is silent below a threshold does not show its noise there. Its charges of zero without a residual are
-    therefore left out. If they were used, the likelihood would be infinite for a white noise of zero.
+    A channel that is silent below a threshold does not show its noise there. Charges of zero with a residual of zero
+    are therefore left out. If they were used, the likelihood would be infinite for a white noise of zero.
 
     Args:
         charge: Estimates of the charges Q without noise, shape (n,), pC.
@@ -355,7 +355,7 @@ def _fit_noise(charge: Array, residual: Array) -> Array:
     units = smallest_number + rms(residual) / np.array([1.0, rms(charge)])
 
     def loss(log_std: Array) -> float:
-        """Return -2 times the logarithm of the density of a residual, without a constant, averaged over the residuals.
+        """Return the mean over the residuals of -2 times the logarithm of their density, up to a constant.
 
         Args:
             log_std: Logarithms of white and gain in their units, shape (2,).

@@ -35,8 +35,8 @@ CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = (
 """Degrees in the position and in the force that are tried, in this order, for positive charges.
 
 On a slack film, the logarithm of a charge is nearly a linear function of the logarithm of the force. On taut films, the
-charges are proportional to the force at small forces, and proportional to the power 2/3 of the force at large forces,
-which needs a higher degree."""
+charges are proportional to the force at small forces, and to its power 2/3 at large forces. This transition needs a
+higher degree."""
 
 SIGNED_CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = (
     (6, 1),
@@ -50,15 +50,16 @@ SIGNED_CANDIDATE_DEGREES: tuple[tuple[int, int], ...] = (
 )
 """Degrees in the position and in the force that are tried, in this order, for charges that are not all positive.
 
-The degrees in the force are higher than for positive charges. Charges of both signs occur on taut films, on which the
-exponent of the force changes with the force. The first steps increase the degree in the position, because charges
-change more with the position than their logarithms, and the few presses of a calibration determine few terms."""
+The degrees in the force are higher than for positive charges. Charges of both signs occur on taut films, where a charge
+is a power of the force with an exponent that changes with the force. The first steps increase the degree in the
+position, for two reasons: charges change more with the position than their logarithms do, and the few presses of a
+calibration determine few terms."""
 
 SIZE_DEGREE = 4
-"""Degree of the polynomial that approximates the logarithm of the size S of the charges as a function of l."""
+"""Degree of the polynomial in the logarithm of the force that approximates the logarithm of the size of the charges."""
 
 REFERENCE_NOISE = noise_model("reference")
-"""Noise for which the error of a series is chosen."""
+"""Noise with which the errors of a series are compared."""
 
 MIN_PRESSES_PER_TERM = 8
 """Smallest number of presses per coefficient. Fewer presses would not determine the slopes near the edge."""
@@ -88,7 +89,8 @@ def fit_charge_series(
         electrodes: Names of the electrodes, in the order of the charges.
         presses: Presses to which the series is fitted.
         validation: Other presses, on which the error is measured.
-        white_pC: White noise of the charges, pC, which decides which charges of both signs count as small.
+        white_pC: White noise of the charges, pC. If not all charges are positive, it decides which charges count as
+            small.
 
     Returns:
         The series with the smallest error among the degrees that were tried. Its `charge_std` is the root mean square
@@ -137,7 +139,8 @@ def fit_film_series(
 ) -> ChargeSeries:
     """Fit a charge series to the charges of one film at several pretensions, which are the nodes of the series.
 
-    Every tenth contact is used for the choice of the degrees, which are the same at all nodes.
+    The degrees of the series are the same at all nodes. They are chosen by the error at every tenth contact, which is
+    left out of the fit.
 
     Args:
         domain: Working area and range of forces of the contacts.
@@ -182,10 +185,10 @@ def _fit_log_size(unit_log_force: Array, charge: Array) -> Array:
 
 
 def determined_degree(coordinate: Array, largest: int) -> int:
-    """Return the largest degree of a polynomial that values at the given coordinates determine.
+    """Return the largest degree of a polynomial that is determined by its values at given coordinates.
 
-    For example, values at three coordinates, or close to them, determine a polynomial of the degree 2. Values at three
-    coordinates do not determine the values of a polynomial of a higher degree between these coordinates.
+    For example, values at or near three coordinates determine a polynomial of degree 2. These values do not determine a
+    polynomial of a higher degree between the three coordinates.
 
     Args:
         coordinate: Coordinates, scaled to [-1, 1], shape (n,).
@@ -204,7 +207,7 @@ def determined_degree(coordinate: Array, largest: int) -> int:
 
 
 def series_term_count(degree: int, force_degree: int) -> int:
-    """Return the number of terms of a series, from its total degree in x and y and its degree in the force."""
+    """Return the number of terms of a series with a given total degree in x and y, and a given degree in the force."""
     return (degree + 1) * (degree + 2) // 2 * (force_degree + 1)
 
 

@@ -19,15 +19,15 @@ from isocharge.simulate import Domain
 from isocharge.train.data.channel_noise import EXTREME_SHARE
 
 HULL_RATIO = 0.3
-"""Length above which an edge of the outline bends inwards to further places, dimensionless. The value 0 is the shortest
-distance between neighbouring places, and 1 is the longest distance.
+"""Relative length above which an edge of the outline is bent inwards to further places, dimensionless. The length 0
+stands for the shortest distance between neighbouring places, and the length 1 for the longest distance.
 """
 
 MIN_FORCE_RATIO = 1.1
 """Smallest ratio of the largest to the smallest force of a domain, which applies even if all forces are equal."""
 
 MIN_INDEPENDENCE = 1e-4
-"""Smallest ratio of the smallest to the largest singular value of columns that are linearly independent.
+"""Columns count as linearly independent if their smallest singular value is above this share of the largest.
 
 The columns are the standardised charges of the channels, or the coordinates of the places.
 """
@@ -109,7 +109,7 @@ def outline(places: Array) -> Array:
         Corners of the outline, anticlockwise, shape (n, 2), mm.
 
     Raises:
-        PressError: If the places lie on a line, or almost.
+        PressError: If the places lie exactly or nearly on one line.
     """
     # The singular values are proportional to the extents of the places along their principal axes.
     length, width = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
@@ -130,14 +130,14 @@ USUAL_DISTANCE_QUANTILE = 0.9
 """Share of the values of a column whose distance from the median is at most the usual distance, dimensionless."""
 
 MAX_DISTANCE_RATIO = 1_000.0
-"""Largest distance of a value from the median of its column, as a multiple of the usual distance."""
+"""Largest accepted distance of a value from the median of its column, as a multiple of the usual distance."""
 
 
 def check_measured_presses(presses: MeasuredPresses) -> None:
     """Check that a network can be trained on measured presses.
 
     Args:
-        presses: The presses. None of their positions, forces and charges may be unknown.
+        presses: The presses. All their positions, forces and charges must be known.
 
     Raises:
         PressError: If the charges of a channel hardly vary or are in ascending order, if a value is far from all
@@ -168,8 +168,8 @@ def _check_variation(name: str, charge: Array) -> None:
         charge: Charges of the channel, shape (n,), pC.
 
     Raises:
-        PressError: If all charges are in ascending order, or if all are equal without the share `EXTREME_SHARE` of the
-            largest and of the smallest charges.
+        PressError: If all charges are in ascending order, or if all charges are equal except for the shares
+            `EXTREME_SHARE` of the smallest and of the largest charges.
     """
     low, high = np.quantile(charge, (EXTREME_SHARE, 1.0 - EXTREME_SHARE))
     if np.isclose(low, high, atol=0.0):
@@ -192,7 +192,7 @@ def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compare
     distances that are not zero.
 
     Args:
-        presses: The presses, which contain the number of each line for the message.
+        presses: The presses, whose line numbers the message needs.
         name: Name of the column, for the message.
         values: Values of the column, shape (n,).
         compared_values: Numbers whose distances from their median are compared, shape (n,). They are the values or a

@@ -18,13 +18,13 @@ from isocharge.train.data.contact_errors import rounded
 from isocharge.train.data.presses import LabelledPresses
 
 FORCE_RATIO = 10.0
-"""Largest ratio of the largest to the smallest force of the presses on which shares are measured, dimensionless."""
+"""Largest ratio of two forces among the presses on which shares of wrong answers are measured, dimensionless."""
 
 N_SECTORS = 24
-"""Number of rings into which the area outside the working area is divided, and of sectors of each ring."""
+"""Number of rings outside the working area, and number of sectors in each ring."""
 
 N_NEIGHBOURS = 8
-"""Number of presses from which the share of a sector is computed. They are nearest to the middle of the sector."""
+"""Number of presses from which the share of a sector is computed: those nearest to the middle of the sector."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,9 @@ class OutsidePresses:
 
         Args:
             domain: Working area and range of forces of the network.
-            presses: Presses of the area for which a network was requested. The working area may be smaller, because the
-                map from contacts to charges folds beyond it. The presses beyond it are then used.
+            presses: Presses of the area for which a network was requested. The working area is smaller than this area
+                if the map from contacts to charges folds beyond the working area. The presses beyond the working area
+                are then used.
             outside: Presses farther from the centre than all of `presses`; None if there are none.
             seed: Seed of the random choice of the presses for training and of the presses for measuring.
 

@@ -23,10 +23,12 @@ from isocharge.simulate.numerics.disk import log_spaced_forces
 from isocharge.train.data.channel_noise import Noise
 
 LOWEST_CHARGE = 1.0
-"""Lower limit of a charge whose logarithm is computed, pC, unless the presses have smaller charges above the noise."""
+"""Usual lower limit of charges before their logarithm is computed, pC.
+
+The limit is lower if presses have smaller charges that exceed the noise."""
 
 HIGHEST_CHARGE = 1e6
-"""Upper limit of a charge whose logarithm is computed, pC. Larger charges are set to this value."""
+"""Upper limit of charges before their logarithm is computed, pC. Larger charges are set to this value."""
 
 SOLVER = "solver"
 """Name of a manifest entry. Every simulated dataset has this entry, and no measured dataset has it."""
@@ -41,7 +43,7 @@ PLACE_STEP_mm = 0.02
 """Largest distance between neighbouring positions that count as one place, mm. The noise of encoders is smaller."""
 
 MIN_PLACES = 50
-"""Smallest number of places for a fit, and smallest number of measured presses for a training or for errors."""
+"""Smallest number of places for a fit, and smallest number of measured presses for training or for measuring errors."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ class LabelledPresses:
         return self[np.arange(count) % len(self)]
 
     def noisy(self, noise: Noise, seed: int) -> Array:
-        """Return the charges with random noise, shape (n, n_electrode), pC. The noise is determined by its seed."""
+        """Return the charges with random noise, shape (n, n_electrode), pC. The seed determines the noise."""
         return noise.add(self.charge, np.random.default_rng(seed))
 
 
@@ -171,7 +173,7 @@ def split_by_position(presses: LabelledPresses, share: float) -> tuple[LabelledP
 
 
 def place_count(contact: Array) -> int:
-    """Return the number of different positions of contacts (x, y, F), shape (n, 3), rounded to 1 um."""
+    """Return the number of different positions of contacts (x, y, F), shape (n, 3), after rounding to 1 um."""
     return len(np.unique(np.round(contact[:, :2], 3), axis=0))
 
 
@@ -213,8 +215,8 @@ def merged_places(contact: Array, step_mm: float = PLACE_STEP_mm) -> Array:
 def position_ranks(contact: Array) -> Array:
     """Order the positions of presses, and return the rank of the position of each press.
 
-    The order is that of the checksums of the coordinates. The order is random but the same in every run, and the order
-    of two positions does not depend on the other positions.
+    The positions are ordered by the checksums of their coordinates. The order is random but the same in every run, and
+    the order of two positions does not depend on the other positions.
 
     Args:
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
@@ -261,9 +263,9 @@ def presses_of(dataset: Dataset, fewest: int = MIN_PRESSES) -> LabelledPresses:
 
 
 N_FOLDS = 5
-"""Number of parts of measured presses, of which one is held out for the measurement of errors.
+"""Number of parts into which measured presses are split. One part is held out to measure errors.
 
-It is also the number of networks of a cross-validation.
+A cross-validation trains the same number of networks.
 """
 
 
@@ -291,7 +293,7 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
 
 
 def have_charges_of(charge: Array, others: Array) -> Booleans:
-    """Return whether each press has the same charges as another given press, shape (n,).
+    """Return whether each press has the same charges as at least one of the other presses, shape (n,).
 
     Args:
         charge: Charges of the presses, shape (n, n_electrode), pC.
